@@ -1,8 +1,8 @@
-"""What the studies of quality share: candidates of a hand on an object and what is found out about them, kept on disk.
+"""Cached candidates of a hand on an object with their verdicts and metrics, shared by the studies of quality.
 
-A cell is one (hand, object) with a number of grasps of one revision of synthesize, planned as a job plans them. What a
-cell has found once is read again from its folder, so a study that was stopped goes on where it was, and two studies of
-as many grasps share them and their verdicts. Another folder begins anew.
+A cell is a pair of hand and object with a number of grasps of one revision of synthesize, planned as in a job. Its
+folder caches all results, so an interrupted study resumes, and studies with equal numbers of grasps share them and
+their verdicts.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ HANDS = {
     "barrett": "barrett_bh280/bh280.urdf",
     "shadow": "shadow/shadow_hand_right.urdf",
 }
-#: Not a seed that any setting was chosen with.
+#: Seed that was not used to choose any setting.
 SEED = 7001
 POSTURES = ("grasp", "pregrasp", "squeeze")
 
 
 @dataclass
 class Cell:
-    """Raw standard grasps of one hand on one object."""
+    """Standard candidates of one hand on one object."""
 
     folder: Path
     hand_name: str
@@ -61,19 +61,19 @@ class Cell:
 
     @property
     def cpu_seconds(self) -> float:
-        """CPU time of making the grasps [s]: other programs on the machine change it less than wall time."""
+        """CPU time of planning [s], which depends less on other load than wall time."""
         return float(self.grasps.info["cpu_seconds"])  # type: ignore[arg-type]
 
     @cached_property
     def grasps(self) -> GraspSet:
-        """The candidates; `seconds` is the wall time of making them with their postures, `info` has the CPU time."""
+        """Candidates with their postures; `seconds` is the wall time of planning, `info` has the CPU time."""
         file = self.folder / "grasps.npz"
         if file.is_file():
             with np.load(file) as stored:
                 parts = [Posture(stored[f"{name}_pose"], stored[f"{name}_joints"]) for name in POSTURES]
                 info: dict[str, object] = {"cpu_seconds": float(stored["cpu_seconds"])}
                 return GraspSet(*parts, stored["loss"], seconds=float(stored["seconds"]), info=info)
-        # Kernels are loaded and pieces made before the clock starts.
+        # Prepare kernels and pieces before the timed run.
         decompose(self.obj)
         planned(self.hand, self.obj, count=1, seed=1, fidelity="draft")
         began, cpu = time.perf_counter(), time.process_time()
@@ -95,7 +95,7 @@ class Cell:
         return found
 
     def verdicts(self, level: Level, hard: bool) -> dict[str, Any]:
-        """`success` of each grasp, its `reasons`, wall and CPU `seconds`, and the `terms` of the verdict."""
+        """Return `success` and `reasons` of each grasp, wall and CPU seconds, and the `terms` of the verdict."""
 
         def make() -> dict[str, Any]:
             grasps, began = self.grasps, time.process_time()
@@ -114,14 +114,14 @@ class Cell:
         return self.kept(f"{level}{'-hard' if hard else ''}", make)
 
     def kept(self, name: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-        """What `make` finds, from the cell's folder where it was found before."""
+        """Return the result of `make`, cached in the cell's folder."""
         return kept_json(self.folder / f"{name}.json", make)
 
 
 def planned(hand: HandModel, obj: ObjectModel, *, count: int, seed: int, fidelity: str = "standard") -> GraspSet:
-    """Candidates of a free object as a job plans them: candidates go through the trial of `trial_on`.
+    """Plan candidates of a free object as in a job, with its rollout, about the centre of the object.
 
-    Like a job's they are planned about the middle of the object, and their positions are on the grid.
+    Positions are rounded to the job's grid.
     """
     rollout = rollout_on(DEFAULT_CONTEXT, hand, obj.centred, lambda: decompose(obj.centred), in_scenes=False)
     found = synthesize(hand, obj.centred, PlanRequest(count, FIDELITIES[fidelity], seed, rollout=rollout))
@@ -129,7 +129,7 @@ def planned(hand: HandModel, obj: ObjectModel, *, count: int, seed: int, fidelit
 
 
 def kept_json(file: Path, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """What a file has, or what `make` finds, which it then has."""
+    """Return the content of a JSON file; if it does not exist, create it from `make`."""
     if not file.is_file():
         write_json(file, make())
     found: dict[str, Any] = json.loads(file.read_text())
@@ -137,7 +137,7 @@ def kept_json(file: Path, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
 
 
 def write_json(file: Path, value: object) -> None:
-    """Write so that a run that is killed leaves no half file."""
+    """Write atomically, so that a killed run leaves no partial file."""
     file.parent.mkdir(parents=True, exist_ok=True)
     partial = file.with_suffix(f".{os.getpid()}.tmp")
     partial.write_text(json.dumps(value, indent=1, allow_nan=False) + "\n")
@@ -147,10 +147,10 @@ def write_json(file: Path, value: object) -> None:
 def cell_parser(
     doc: str | None, *, objects: Sequence[str] | None = None, grasps: int = 64, hands: bool = True
 ) -> argparse.ArgumentParser:
-    """What a study of cells is told: `data`, `--work`, `--hands`, `--objects`, `--grasps`, with these defaults.
+    """Return a parser of `data`, `--work`, `--hands`, `--objects` and `--grasps` with these defaults.
 
     Args:
-        hands: whether it may be told which of `HANDS`.
+        hands: whether the parser has the option `--hands`.
     """
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path)
@@ -163,7 +163,7 @@ def cell_parser(
 
 
 def cells(data: Path, work: Path, hand_name: str, count: int, objects: list[str] | None = None) -> Iterator[Cell]:
-    """The cells of one hand, object by object; all objects of the data folder unless some are named."""
+    """Yield the cells of one hand for the named objects, by default for all objects of the data folder."""
     hand = hand_from_path(data / "hands" / HANDS[hand_name])
     folder = work / f"{hand_name}-{count}-{STAGE_REVISIONS['synthesize']}"
     for mesh in sorted((data / "objects").glob("*/clean.stl")):

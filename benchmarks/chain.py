@@ -1,16 +1,16 @@
-"""What a valid grasp costs from the planner to its row in the shard, of two checkouts in one run; prints Markdown.
+"""Cost of a valid grasp from the planner to its row in the shard, for two checkouts in one run; prints Markdown.
 
 usage: python -m benchmarks.chain BEFORE AFTER DATA_DIR [--grasps 64] [--pairs allegro:mug shadow:bottle] [--json OUT]
        python -m benchmarks.chain BEFORE AFTER --service [--pictures] [--method autograsp] [--grasps 256] [--pairs ...]
 
-BEFORE and AFTER are checkouts of graspd; DATA_DIR holds hands/. Each stage is run by one thread and timed by processor
-time: other programs on the machine change the ratios little. Nothing is stored or sent: that part is in
-docs/results/service.md.
+BEFORE and AFTER are checkouts of graspd; DATA_DIR holds hands/. One thread runs each stage. Times are processor time,
+so other load changes the ratios little. Nothing is stored or sent: docs/results/service.md has these costs.
 
-With --service a job of built-in hand and object goes through a whole service of each checkout: submitted over HTTP,
-planned, validated, measured, stored, indexed, after a small job that loads everything. Processor time is that of all
-processes of the service; beside it stands what BEFORE's planner alone takes for a candidate. With --pictures jobs are
-as examples/million/million.toml has them: for each batch six pictures of the object at rest on a table, eight rechecks.
+With --service, a job of a built-in hand and object runs through a whole service of each checkout: submitted over HTTP,
+planned, validated, measured, stored, indexed. A small job loads everything first. Processor time is that of all
+processes of the service; the table also has the time per candidate of BEFORE's planner alone. With --pictures, jobs
+have the options of examples/million/million.toml: per batch, six pictures of the object at rest on a table, and eight
+rechecks.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import time
 from pathlib import Path
 from typing import Any, Final
 
-#: Runs in each checkout: names of this one, or of graspd 0.2.
+#: Program for each checkout; it uses the names of this checkout, or those of graspd 0.2.
 CHILD: Final = """
 import json, sys, time
 import numpy as np
@@ -80,20 +80,20 @@ print(json.dumps({"valid": valid, "candidates": candidates, "ms": ms}))
 """
 
 
-#: What a job of the pilot asks for besides grasps.
+#: Options of the pilot's jobs besides the number of grasps.
 PILOT: Final = {"scenes": 2, "views": 3, "rechecks": 8, "budget": 4}
 
 
 def environment_of(root: Path) -> dict[str, str]:
-    """The surroundings in which a program uses the code of a checkout, whatever is installed."""
+    """Return an environment in which a program uses the code of a checkout, not the installed one."""
     environment = {key: value for key, value in os.environ.items() if not key.startswith("GRASPD_")}
-    # Where Python may keep no compiled modules each process compiles all of them, which no user's does.
+    # Allow bytecode caches: without them each process would compile all modules, unlike a user's.
     environment.pop("PYTHONDONTWRITEBYTECODE", None)
     return environment | {"PYTHONPATH": str(root)}
 
 
 def run(root: Path, *arguments: str) -> dict[str, Any]:
-    """The numbers of one checkout; ends the program if it fails."""
+    """Return the numbers of one checkout; end the program if the run fails."""
     done = subprocess.run(
         [sys.executable, "-c", CHILD, *arguments],
         cwd=root,
@@ -109,17 +109,17 @@ def run(root: Path, *arguments: str) -> dict[str, Any]:
 
 
 def row(stage: str, before: float, after: float) -> str:
-    """One line of the table: milliseconds of a core for a valid grasp."""
+    """Return one line of the table: core-ms per valid grasp."""
     return f"| {stage} | {before:.1f} | {after:.1f} | {before / after:.2f} |"
 
 
 def table(pair: str, before: dict[str, Any], after: dict[str, Any]) -> list[str]:
-    """The stages of one pair; the planner makes candidates, so all is told of a valid one."""
+    """Return the stages of one pair; costs are per valid grasp."""
     each = [{stage: ms / max(1, found["valid"]) for stage, ms in found["ms"].items()} for found in (before, after)]
     lines = [
-        f"### {pair}: {before['valid']} and {after['valid']} of {before['candidates']} hold",
+        f"### {pair}: {before['valid']} of {before['candidates']} candidates hold before, {after['valid']} after",
         "",
-        "| core-ms a valid grasp | before | after | times |",
+        "| core-ms per valid grasp | before | after | before / after |",
         "| --- | --- | --- | --- |",
     ]
     lines += [row(stage, each[0][stage], each[1][stage]) for stage in each[0]]
@@ -129,8 +129,8 @@ def table(pair: str, before: dict[str, Any], after: dict[str, Any]) -> list[str]
 
 
 def through_service(root: Path, hand: str, obj: str, grasps: int, wanted: dict[str, Any]) -> dict[str, float]:
-    """A job of valid grasps: how many, and the wall and processor time of the service."""
-    from benchmarks.service_of import service_of  # which uses this module
+    """Run a job; return its number of valid grasps, and the wall and processor time of the service."""
+    from benchmarks.service_of import service_of  # it imports this module
 
     with service_of(root) as service:
         service.job(hand=hand, object=obj, grasps=8, seed=1, **wanted)
@@ -141,25 +141,25 @@ def through_service(root: Path, hand: str, obj: str, grasps: int, wanted: dict[s
 
 
 def service_table(pair: str, before: dict[str, float], after: dict[str, float], raw_ms: float) -> list[str]:
-    """Rates of both jobs, and their ratios to the candidate rate of the first checkout's planner."""
+    """Return rates of both jobs, and their ratios to the candidate rate of the first checkout's planner."""
     rates = [found["valid"] / found["wall"] for found in (before, after)]
     costs = [1e3 * found["processor"] / found["valid"] for found in (before, after)]
     return [
-        f"### {pair}: {before['valid']:.0f} and {after['valid']:.0f} valid grasps",
+        f"### {pair}: {before['valid']:.0f} valid grasps before, {after['valid']:.0f} after",
         "",
-        "| through the service | before | after | times |",
+        "| through the service | before | after | ratio |",
         "| --- | --: | --: | --: |",
         f"| valid grasps/s | {rates[0]:.2f} | {rates[1]:.2f} | {rates[1] / rates[0]:.2f} |",
-        row("core-ms a valid grasp", *costs),
-        f"| core-ms a candidate of the planner alone, before | {raw_ms:.1f} | | |",
-        f"| valid grasps over candidates of that planner, for the same processor time | {raw_ms / costs[0]:.2f} "
+        row("core-ms per valid grasp", *costs),
+        f"| core-ms per candidate of the planner alone, before | {raw_ms:.1f} | | |",
+        f"| valid grasps per candidate of the planner alone, in equal processor time | {raw_ms / costs[0]:.2f} "
         f"| {raw_ms / costs[1]:.2f} | |",
         "",
     ]
 
 
 def compare_services(given: argparse.Namespace) -> dict[str, Any]:
-    """Jobs of all pairs through both services, one after the other."""
+    """Run jobs of all pairs through both services, one after the other."""
     found: dict[str, Any] = {}
     for number, pair in enumerate(given.pairs):
         hand, obj = pair.split(":")
@@ -192,8 +192,8 @@ def main() -> None:
     parser.add_argument("after", type=Path)
     parser.add_argument("data", type=Path, nargs="?")
     parser.add_argument("--service", action="store_true", help="jobs through the whole service")
-    parser.add_argument("--pictures", action="store_true", help="with --service: and pictures, as the pilot has them")
-    parser.add_argument("--method", default="fast_graspd", help="with --service: a planner that both have unchanged")
+    parser.add_argument("--pictures", action="store_true", help="with --service: also pictures, as in the pilot")
+    parser.add_argument("--method", default="fast_graspd", help="with --service: a planner that is equal in both")
     parser.add_argument("--grasps", type=int, help="of each pair, in batches of 32: 64 candidates, or 256 valid ones")
     parser.add_argument("--pairs", nargs="*", default=["allegro:mug", "shadow:bottle"])
     parser.add_argument("--json", type=Path)

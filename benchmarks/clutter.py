@@ -1,11 +1,11 @@
-"""Certified grasps of a target among neighbours on a table, per scene, within a time.
+"""Valid grasps of a target among neighbours on a table, per scene, in limited time.
 
 usage: python -m benchmarks.clutter DATA_DIR [--hand allegro] [--targets 025_mug ...] [--scenes 2] [--neighbours 4]
            [--seconds 60] [--json OUT]                            DATA_DIR holds hands/ and objects/
 
-Neighbours are drawn from the other objects and dropped with the target. The time runs from the first grasp planned to
-the verdict of the last one; kernels, convex pieces and drops are made before. A second is two of processor time, for
-the two cores of a small machine: other programs change the figures little. The gap is that to the nearest neighbour.
+Neighbours are drawn from the other objects and dropped with the target. The time includes planning and validation, but
+not kernels, convex pieces and drops. A second is two seconds of processor time, for two cores, so other load changes
+the figures little. The gap is the distance to the nearest neighbour.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.scenes.placement import gaps_between, neighbour_of, scenes_of
 
-#: Not a seed that any setting was chosen with.
+#: Seed that was not used to choose any setting.
 SEED = 505
 CORES = 2
 FIDELITY = FIDELITIES["standard"]
@@ -54,7 +54,7 @@ def study(hand: HandModel, obj: ObjectModel, others: list[ObjectModel], scene: i
     while (spent := (time.process_time() - began) / CORES) < seconds:
         made = validated_grasps(hand, obj, request, count=BATCH_SIZE, batch=batch, scenes=here, run=ExecutionContext())
         if (time.process_time() - began) / CORES > seconds and batch:
-            break  # its verdicts came too late
+            break  # too late to count
         found["valid"] += int(made.columns["quality/valid"].sum())
         found["candidates"] += made.planned
         found["clear"] += made.shares["clear_share"] * made.planned
@@ -73,7 +73,7 @@ def study(hand: HandModel, obj: ObjectModel, others: list[ObjectModel], scene: i
 def crowd(
     hand: HandModel, obj: ObjectModel, meshes: dict[str, Path], scene: int, said: argparse.Namespace
 ) -> tuple[list[ObjectModel], dict[str, Any]]:
-    """The neighbours of a scene and its numbers; neighbours that do not come to rest apart are drawn anew."""
+    """Return the neighbours and numbers of a scene; redraw neighbours that do not come to rest apart."""
     rng = np.random.default_rng([SEED, scene])
     while True:
         names = rng.choice(sorted(meshes), said.neighbours, replace=False)

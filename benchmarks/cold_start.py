@@ -1,12 +1,11 @@
-"""How long the first grasps take: of a command, of a process that plans, of a service; prints Markdown.
+"""Time to the first grasps of a command, of a planning process and of a service; prints Markdown.
 
 usage: python -m benchmarks.cold_start CHECKOUT ... [--hand allegro] [--object mug] [--runs 3] [--seeds 0 1 2 3]
            [--no-service | --command]
 
-Kernels and what else the user's cache holds are there: one run before the timed ones fills it. Clock time says what a
-user waits for and depends on what else runs, so checkouts take turns and the least of their times is told besides the
-median; processor time, of all processes together, depends on it little. What a seed's first grasp costs depends on
-whether the first attempts hold.
+An untimed run first fills the user's cache, for example with kernels. Wall time depends on other load, so runs of the
+checkouts alternate, and the table has the least time besides the median. CPU time, of all processes together, depends
+little on other load. The cost of a seed's first grasp depends on whether the first candidates hold.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from typing import Any, Final
 from benchmarks.chain import environment_of
 from benchmarks.service_of import service_of
 
-#: Laps of a process that makes one valid grasp; runs in each checkout, so it uses only what all have.
+#: Program that times the parts of a process up to a valid grasp; it uses only names that all checkouts have.
 FIRST: Final = """
 import json, sys, time
 laps, last = {}, time.process_time()
@@ -47,13 +46,13 @@ lap("hand and object")
 found = graspd.worker.generation.validated_grasps(hand, obj, request, count=1)
 lap("first valid grasp")
 graspd.worker.generation.validated_grasps(hand, obj, request, count=1, batch=1)
-lap("one more")
+lap("second valid grasp")
 print(json.dumps({"valid": len(found.grasps), "laps": laps}))
 """
 
 
 def first_grasp(root: Path, hand: str, obj: str) -> dict[str, float]:
-    """Seconds of one process: `clock`, `processor`, and processor time of its laps."""
+    """Return wall time and CPU time of one process, and the CPU time of its parts [s]."""
     before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     done = subprocess.run(
         [sys.executable, "-c", FIRST, hand, obj],
@@ -68,11 +67,11 @@ def first_grasp(root: Path, hand: str, obj: str) -> dict[str, float]:
         sys.exit(f"{root}: {done.stderr[-2000:]}")
     laps = json.loads(done.stdout.splitlines()[-1])["laps"]
     spent = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    return {"clock": clock, "processor": spent, **laps}
+    return {"wall time": clock, "CPU time": spent, **{f"CPU time: {lap}": value for lap, value in laps.items()}}
 
 
 def first_command(root: Path, hand: str, obj: str, seed: int) -> dict[str, float]:
-    """Seconds of `graspd synth -n 1`, from its start to its end; ends the program if it finds no valid grasp."""
+    """Return the times of `graspd synth -n 1` [s]; end the program if it finds no valid grasp."""
     before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "graspd", "synth", "--hand", hand, "--object", obj, "-n", "1"]
@@ -95,7 +94,7 @@ def first_command(root: Path, hand: str, obj: str, seed: int) -> dict[str, float
 
 
 def first_job(root: Path, hand: str, obj: str) -> dict[str, float]:
-    """Seconds of a service in an empty folder: until a worker waits, and from there until 32 valid grasps are there."""
+    """Return the times of a service in an empty folder [s]: start, and first job with 32 valid grasps."""
     with service_of(root) as service:
         spent, began = service.processor_s(), time.perf_counter()
         job = [
@@ -113,12 +112,16 @@ def first_job(root: Path, hand: str, obj: str) -> dict[str, float]:
         ]
         subprocess.run(job, cwd=root, env=environment_of(root), check=True, capture_output=True)
         clock = time.perf_counter() - began
-        return {"until a worker waits": service.ready_s, "job": clock, "processor": service.processor_s() - spent}
+        return {
+            "wall time until a worker waits": service.ready_s,
+            "wall time of the job": clock,
+            "CPU time of the job": service.processor_s() - spent,
+        }
 
 
 def head(title: str, names: Sequence[str]) -> list[str]:
-    """The first two lines of a table with one column a checkout and, of several, one for their quotient."""
-    cells = [title, *names, *(["times"] if len(names) > 1 else [])]
+    """Return the head of a table with one column per checkout and, for several, the ratio of first to last."""
+    cells = [title, *names, *(["ratio"] if len(names) > 1 else [])]
     return [f"| {' | '.join(cells)} |", "| --- |" + " --: |" * (len(cells) - 1)]
 
 
@@ -136,14 +139,14 @@ def table(title: str, found: Mapping[str, list[dict[str, float]]]) -> list[str]:
 
 
 def commands(roots: Sequence[Path], hand: str, obj: str, seeds: Sequence[int], runs: int) -> list[str]:
-    """What `graspd synth -n 1` takes with each seed; checkouts take turns."""
+    """Time `graspd synth -n 1` with each seed; runs of the checkouts alternate."""
     found: dict[tuple[int, Path], list[dict[str, float]]] = {(seed, root): [] for seed in seeds for root in roots}
     for turn in range(runs + 1):
         for (seed, root), timed in found.items():
             one = first_command(root.resolve(), hand, obj, seed)
             if turn:  # the first one fills the caches
                 timed.append(one)
-    lines = head("`graspd synth -n 1`, s", [str(root) for root in roots])
+    lines = head("`graspd synth -n 1` [s]", [str(root) for root in roots])
     for seed in (*seeds, None):
         mine = [
             [run for (of, at), all_ in found.items() if at == root and seed in (of, None) for run in all_]
@@ -151,10 +154,10 @@ def commands(roots: Sequence[Path], hand: str, obj: str, seeds: Sequence[int], r
         ]
         name = "all seeds" if seed is None else f"seed {seed}"
         for part, of, told in (
-            ("clock", median, "clock, median"),
-            ("clock", min, "clock, least"),
-            ("processor, user", median, "user"),
-            ("processor, system", median, "system"),
+            ("clock", median, "wall time, median"),
+            ("clock", min, "wall time, least"),
+            ("processor, user", median, "CPU time, user"),
+            ("processor, system", median, "CPU time, system"),
         ):
             lines.append(row(f"{name}: {told}", [of(run[part] for run in each) for each in mine]))
     return [*lines, ""]
@@ -166,16 +169,16 @@ def main() -> None:
     parser.add_argument("--hand", default="allegro")
     parser.add_argument("--object", default="mug")
     parser.add_argument("--runs", type=int, default=3)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3], help="of the command's grasps")
-    parser.add_argument("--no-service", action="store_true", help="command and process alone")
-    parser.add_argument("--command", action="store_true", help="the command alone")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3], help="seeds of the command")
+    parser.add_argument("--no-service", action="store_true", help="only command and process")
+    parser.add_argument("--command", action="store_true", help="only the command")
     given = parser.parse_args()
     lines = commands(given.checkouts, given.hand, given.object, given.seeds, given.runs)
     sys.stdout.write("\n".join(lines) + "\n")
     sys.stdout.flush()
-    stages: list[tuple[str, Any]] = [] if given.command else [("first valid grasp of a process, s", first_grasp)]
+    stages: list[tuple[str, Any]] = [] if given.command else [("first valid grasp of a process [s]", first_grasp)]
     if not given.no_service and not given.command:
-        stages.append(("32 valid grasps, the first job of a service, s", first_job))
+        stages.append(("first job of a service, 32 valid grasps [s]", first_job))
     for title, measure in stages:
         found: dict[str, list[dict[str, float]]] = {str(root): [] for root in given.checkouts}
         for turn in range(given.runs + 1):

@@ -1,19 +1,19 @@
-"""Whether two checkouts do the same: for a change that may move code but must not change what comes out.
+"""Compare the results of two checkouts, for changes that must not affect results.
 
     python -m benchmarks.compare_revisions BEFORE AFTER [--work FOLDER] [--methods fast_graspd,autograsp] [--no-job]
 
 BEFORE and AFTER are folders with a checkout each (`git worktree add`, or `git archive REVISION | tar -x -C FOLDER`).
-Both run with the Python that runs this, so its environment must suit both. Compared are
+Both use the running Python, so its environment must suit both. The program compares
 
-- the OpenAPI document: what is gone or changed is a difference, what was added is listed;
+- the OpenAPI document: removed or changed parts are differences, added parts are listed;
 - the help of every command, line by line;
-- shards of `graspd synth` for every built-in hand, on the CPU, each array bit for bit with its type, shape, chunks and
-  compression, and each attribute but those that tell of the run (time made, seconds needed);
-- the names in the store of a small job through the whole service (`graspd demo`), its shards as above, its JSON records
-  without times, sizes and checksums, all other objects byte for byte.
+- shards of `graspd synth` for every built-in hand, on the CPU: each array bit for bit with its type, shape, chunks and
+  compression, and each attribute except those of the run (date, seconds);
+- the store of a small job through the whole service (`graspd demo`): names, shards as above, JSON records without
+  times, sizes and checksums, and all other objects byte for byte.
 
-Fields added to a record are listed too, and are no difference. Printed besides: lines and modules of each room. Exit
-code 1: something differs.
+Fields added to a record are listed and are not differences. The output also has lines and modules of each package. Exit
+code 1: a difference exists.
 """
 
 from __future__ import annotations
@@ -45,13 +45,13 @@ ROOMS: Final = (
     "benchmarks",
     "examples",
 )
-#: Attributes of a shard that tell of the run and not of what was made.
+#: Attributes of a shard that depend on the run, not on its result.
 OF_THE_RUN: Final = {"seconds", "created"}
-#: Fields of a record that do; checksums are of times too, and a shard's attributes are compared in the shard.
+#: Fields of a record that depend on the run. Checksums cover times; shards are compared by their attributes.
 PASSING: Final = {"created", "origin", "at", "seconds", "sha256", "checksum", "size_bytes", "worker", "attributes"}
-#: Folders of a store that hold identities drawn anew for each service.
+#: Folders of a store with random identities of each service.
 DRAWN: Final = {"marks", "service"}
-#: Differences of one thing that are printed.
+#: Largest number of printed differences per comparison.
 _SHOWN: Final = 12
 
 DOCUMENT: Final = """
@@ -86,12 +86,12 @@ class Checkout:
     work: Path
 
     def run(self, *arguments: str) -> str:
-        """What Python prints with these arguments; ends the program if that fails."""
+        """Return the output of Python with these arguments; end the program on failure."""
         environment = {key: value for key, value in os.environ.items() if not key.startswith("GRASPD_")}
         environment |= {"PYTHONPATH": str(self.root), "COLUMNS": "120", "NO_COLOR": "1", "TERM": "dumb"}
         command = [sys.executable, *arguments]
         done = subprocess.run(command, cwd=self.root, env=environment, capture_output=True, text=True)
-        if done.returncode not in (0, 3):  # 3: `synth` found fewer grasps than asked
+        if done.returncode not in (0, 3):  # 3: `synth` found fewer grasps than wanted
             sys.exit(f"{self.root}: {' '.join(arguments)[:200]} ended with {done.returncode}\n{done.stderr[-2000:]}")
         return done.stdout
 
@@ -103,7 +103,7 @@ class Checkout:
 
 
 class Report:
-    """Prints what was compared, and counts what differs."""
+    """Prints comparisons and counts differences."""
 
     def __init__(self) -> None:
         self.different = 0
@@ -118,10 +118,10 @@ class Report:
 
 
 def document_differences(before: Any, after: Any, at: str = "") -> tuple[list[str], list[str]]:
-    """(what is gone or changed, what was added) of a JSON value, as its places."""
+    """Return paths of a JSON value that were removed or changed, and paths that were added."""
     if not (isinstance(before, dict) and isinstance(after, dict)):
         return ([] if before == after else [f"{at or '/'}: {_short(before)} | {_short(after)}"]), []
-    changed = [f"{at}/{key} is gone" for key in before if key not in after]
+    changed = [f"{at}/{key} was removed" for key in before if key not in after]
     added = [f"{at}/{key}" for key in after if key not in before]
     for key in before:
         if key in after:
@@ -137,7 +137,7 @@ def text_differences(before: str, after: str) -> list[str]:
 
 
 def shard_differences(before: Path, after: Path) -> list[str]:
-    """How two shards differ: datasets bit for bit, and attributes but those of the run."""
+    """Yield differences of two shards: datasets bit for bit, and attributes except those of the run."""
     if before.read_bytes() == after.read_bytes():
         return []
     with h5py.File(before) as one, h5py.File(after) as two:
@@ -165,7 +165,7 @@ def _node_differences(one: Any, two: Any) -> Iterator[str]:
 
 
 def compare_interfaces(before: Checkout, after: Checkout, report: Report) -> None:
-    """The OpenAPI document and the help of all commands."""
+    """Compare the OpenAPI document and the help of all commands."""
     documents = [json.loads(side.run("-c", DOCUMENT, str(side.work / "data"))) for side in (before, after)]
     report.tell("OpenAPI document", *document_differences(*documents))
     report.tell("help of every command", text_differences(*(side.run("-c", HELP) for side in (before, after))))
@@ -183,7 +183,7 @@ def compare_synth(before: Checkout, after: Checkout, methods: list[str], report:
 
 
 def compare_job(before: Checkout, after: Checkout, report: Report) -> None:
-    """All that a small job leaves in its store."""
+    """Compare the stores of a small job."""
     left, right = (_store_of_demo(side) for side in (before, after))
     gone = [f"only in one: {name}" for name in sorted(left.keys() ^ right.keys())]
     report.tell(f"names of {len(left)} objects in the store", gone)
@@ -210,7 +210,7 @@ def _store_of_demo(side: Checkout) -> dict[str, Path]:
 
 
 def _lasting(value: Any) -> Any:
-    """A JSON value without what tells of its run."""
+    """Return a JSON value without fields that depend on the run."""
     if isinstance(value, dict):
         kept = {key: inner for key, inner in value.items() if key not in PASSING and not key.endswith("_seconds")}
         return {key: _lasting(inner) for key, inner in kept.items()}
@@ -226,9 +226,9 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("before", type=Path)
     parser.add_argument("after", type=Path)
-    parser.add_argument("--work", type=Path, default=Path("compare-revisions"), help="folder for what both make")
-    parser.add_argument("--methods", default="fast_graspd", help="planners to run, with commas between")
-    parser.add_argument("--no-job", action="store_true", help="leave out the job through the whole service")
+    parser.add_argument("--work", type=Path, default=Path("compare-revisions"), help="folder for the results of both")
+    parser.add_argument("--methods", default="fast_graspd", help="planners to run, separated by commas")
+    parser.add_argument("--no-job", action="store_true", help="skip the job through the whole service")
     wanted = parser.parse_args(argv)
     sides = []
     for name in ("before", "after"):

@@ -1,4 +1,4 @@
-"""Figure 3 of the Fast-Grasp'D paper with our grasps: epsilon, wrench volume and contact area by contact threshold.
+"""Figure 3 of the Fast-Grasp'D paper with graspd's grasps: epsilon, wrench volume, contact area by threshold.
 
 usage: python -m benchmarks.contact_threshold DATA_DIR [--work DIR] [--hands allegro ...] [--out DIR]
 DATA_DIR holds hands/ and objects/. Writes contact-threshold.json and contact-threshold.png to `--out`. Values are means
@@ -24,21 +24,21 @@ from graspd.worker.quality.table import measure
 
 THRESHOLDS_MM = tuple(range(1, 11))
 FRICTIONS = (1.0, 0.5)
-#: Thresholds of the literature, drawn as lines: ContactOpt's, the paper's, DDGC's.
+#: Thresholds of the literature, drawn as lines: those of ContactOpt, of the paper and of DDGC.
 MARKED_MM = {2: "ContactOpt", 5: "table 2", 9: "DDGC"}
 PANELS = {
     "epsilon": ("ε", "epsilon", "radius of the largest ball in the wrench space"),
     "wrench_volume": ("Vol", "wrench_volume", "volume of the wrench space"),
     "ca_cm2": ("CA  [cm²]", "contact_area_cm2", "hand surface in contact"),
 }
-#: Okabe and Ito's colours: told apart by every eye.
+#: Colours of Okabe and Ito, suitable for colour blindness.
 COLOURS = {"allegro": "#0072B2", "barrett": "#D55E00", "shadow": "#009E73"}
 SHIFT = {"allegro": -0.13, "barrett": 0.0, "shadow": 0.13}
 INK, FAINT = "#333333", "#9a9a9a"
 
 
 def sweep(cell: Cell) -> dict[str, Any]:
-    """Metrics of the cell's best grasps at every threshold, means over the grasps; by friction."""
+    """Return means of metrics over the cell's best grasps at every threshold, by friction."""
     quality = cell.kept("metrics", lambda: metrics(cell))
     top = np.argsort(-np.array(quality["epsilon"]))[:TOP]
     parts = [
@@ -57,7 +57,7 @@ def sweep(cell: Cell) -> dict[str, Any]:
 
 
 def collect(args: argparse.Namespace) -> dict[str, Any]:
-    """hand -> friction -> metric -> {mean, low, high}: each a list over the thresholds; low and high are quartiles."""
+    """Return hand -> friction -> metric -> {mean, low, high}: lists over thresholds; low and high are quartiles."""
     out: dict[str, Any] = {}
     for hand in args.hands:
         found = []
@@ -106,7 +106,7 @@ def panel(axis: Axes, key: str, found: dict[str, Any]) -> None:
                 continue
             values = by_friction[friction][key]
             axis.plot(THRESHOLDS_MM, values["mean"], color=COLOURS[hand], linestyle=style, linewidth=2)
-        # Two hands have the same values in the paper: side by side both are seen.
+        # Two hands have the same values in the paper: markers side by side show both.
         axis.plot(
             5 + SHIFT[hand],
             PAPER[hand][key],

@@ -1,10 +1,10 @@
-"""Table lifts of a box beside a wall, in a corner, in a slot and among neighbours, by the gap between them, per hand.
+"""Table lifts of a box beside a wall, in a corner, in a slot and among neighbours, by hand and gap.
 
 usage: python -m benchmarks.corners DATA_DIR [--hands allegro ...] [--places wall ...] [--gaps 5 10 20 30 40]
            [--grasps 16] [--seed 1400] [--page OUT.md]
        DATA_DIR holds hands/
 
-Shares are of candidates of fidelity standard on a box of 50 x 60 x 80 mm that stands, with a density of 700 kg/m3.
+Shares are of candidates at fidelity standard on an upright box of 50 x 60 x 80 mm with a density of 700 kg/m3.
 Walls are 150 mm high, those of a slot 80 mm; neighbours are four boxes of the same size.
 """
 
@@ -23,10 +23,10 @@ from graspd.service.model.errors import InputError
 from graspd.service.model.scene_spec import Box, HalfSpace, NeighbourSpec, SceneSpec
 from graspd.worker.files.synthesis import synthesized
 
-#: Not a seed that any setting was chosen with.
+#: Seed that was not used to choose any setting.
 SEED = 1400
 SIZE: Final = (0.05, 0.06, 0.08)
-#: Directions in which something stands, as signs of x and y.
+#: Directions of obstacles, as signs of x and y.
 PLACES: Final = {
     "wall": ((1, 0),),
     "corner": ((1, 0), (0, 1)),
@@ -38,9 +38,9 @@ WALL: Final = (0.02, 0.15)
 HEAD = """# Lifts beside walls and among neighbours
 
 `python -m benchmarks.corners DATA`: shares of {grasps} candidates on a box of 50 x 60 x 80 mm that are clear of
-obstacles, that lift, and that lift at half friction, by the gap; seed {seed}, density 700 kg/m3. Slot:
-walls on both sides along x, as high as the box; neighbours: boxes of the same size on all four sides. No grasp lifts
-out of gaps narrower than a fingertip (Allegro 24 mm, Barrett 19 mm, Shadow 15 mm) on every axis.
+obstacles, that lift, and that lift at half friction, by the gap to the obstacles. Seed {seed}, density 700 kg/m3.
+*Slot*: walls on both sides along x, as high as the box. *Neighbours*: boxes of the same size on all four sides. No
+grasp lifts if the gaps on every axis are narrower than a fingertip (Allegro 24 mm, Barrett 19 mm, Shadow 15 mm).
 
 """
 
@@ -85,7 +85,7 @@ def main() -> None:
 
 
 def lifts(given: Any, hand: str, name: str, gap: float, mesh: str) -> str:
-    """Shares of candidates, or why there is none."""
+    """Return shares of candidates, or the reason why there are no candidates."""
     request = JobOptions(
         grasps=given.grasps, want="candidates", rechecks=0, seed=given.seed, scene="table", density=700.0
     )

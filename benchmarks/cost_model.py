@@ -1,11 +1,10 @@
-"""What a dataset costs: workers, Redis operations, objects, bytes, index rows and money, from measured inputs.
+"""Cost of a dataset in workers, Redis operations, objects, bytes, index rows and money, from measured inputs.
 
 usage: python -m benchmarks.cost_model [--grasps 1000000] [--grasps 100000000] [--days 7] [--scenes 2] [--views 3]
                                        [--core-hour 0.04] [--from-data DIR] [--json]
 
-`docs/explanation/scaling.md` has the formulas, where each input comes from, and what the model leaves out. Prices are
-examples to be replaced by your own; nothing here is anybody's offer. `--from-data` measures the sizes in a data folder
-of yours.
+`docs/explanation/scaling.md` has the formulas, the origin of each input, and the limits of the model. Prices are
+examples; replace them by your own. `--from-data` measures the sizes in your data folder.
 """
 
 from __future__ import annotations
@@ -22,28 +21,28 @@ from typing import Any, Final
 
 _DAY_S: Final = 86_400.0
 _GB: Final = 1e9
-#: Field of `Measured`, the shards it is measured on, and what is counted in them (grasps, scenes, pictures).
+#: Field of `Measured`, kind of the measured shards, and axis of their counts (grasps, scenes, pictures).
 _SIZES: Final = {"base_bytes_per_grasp": ("base", "N"), "scene_bytes": ("scene", "S"), "picture_bytes": ("views", "V")}
 
 
 @dataclass(frozen=True)
 class Work:
     grasps: int
-    """Grasps in the dataset; valid ones, as jobs give them by default."""
+    """Number of valid grasps in the dataset."""
     days: float = 7.0
-    """Time to make them in [days]."""
+    """Time limit [days]."""
     batch: int = 32
-    """Grasps of a batch."""
+    """Grasps per batch."""
     scenes: int = 2
-    """Scenes of a batch."""
+    """Scenes per batch."""
     views: int = 3
-    """Camera placements of a scene."""
+    """Camera placements per scene."""
     eyes: int = 2
-    """Pictures of a placement: 2 is stereo."""
+    """Pictures per placement; 2: stereo."""
     job: int = 3200
-    """Grasps of a job."""
+    """Grasps per job."""
     span: int = 1
-    """Batches of a task; 1 with pictures."""
+    """Batches per task; 1 with pictures."""
 
     @property
     def batches(self) -> int:
@@ -51,7 +50,7 @@ class Work:
 
     @property
     def stages(self) -> int:
-        """Tasks of a batch: synthesis, then scenes, then pictures."""
+        """Tasks per batch: synthesis, then scenes, then pictures."""
         return 1 + (self.scenes > 0) + (self.scenes > 0 and self.views > 0)
 
     @property
@@ -61,51 +60,51 @@ class Work:
 
 @dataclass(frozen=True)
 class Measured:
-    """Inputs that were measured; `docs/explanation/scaling.md` says with which commands."""
+    """Measured inputs; `docs/explanation/scaling.md` has the commands."""
 
     core_s_per_grasp: float = 0.194
-    """A worker's time on one core for a valid grasp, standard fidelity: plan, validate, postures, quality [core s]."""
+    """Time per valid grasp at fidelity standard: planning, validation, postures, metrics [core s]."""
     core_s_per_scene: float = 0.073
-    """The same of a scene with the grasps of its batch [core s]."""
+    """Time per scene with the grasps of its batch [core s]."""
     core_s_per_picture: float = 0.186
-    """The same of a picture 320 x 240 with all channels [core s]."""
+    """Time per picture of 320 x 240 with all channels [core s]."""
     busy: float = 0.9
-    """Share of a worker's time in which it computes: the rest is starts, ends of jobs, waiting."""
+    """Share of a worker's time spent in computation; the rest is starts, ends of jobs and waiting."""
     base_bytes_per_grasp: float = 1496.0
     scene_bytes: float = 7837.0
-    """Of one scene with the grasps of its batch."""
+    """Size of one scene with the grasps of its batch."""
     picture_bytes: float = 106_246.0
     manifest_bytes: float = 6000.0
     """Mean over the manifests of the stages."""
     index_bytes_per_grasp: float = 869.0
-    """Of all tables and their indexes on SQLite, jobs, tasks and shards included."""
+    """Size of all tables and their indexes on SQLite, including jobs, tasks and shards."""
     redis_ops_per_task: float = 109.0
     redis_bytes_per_task: float = 19_500.0
-    """Over the wire, both ways."""
+    """Network traffic in both directions."""
     redis_ops_controller: float = 34.0
-    """Of the controller while nothing happens [1/s]."""
+    """Operations of the idle controller [1/s]."""
     redis_ops_worker: float = 9.0
-    """Signs of life of one busy worker [1/s]."""
+    """Heartbeats of one busy worker [1/s]."""
     controller_core_s_per_task: float = 0.0013
     """CPU time of the controller from queueing a task to its rows in the index [core s]."""
     store_reads_per_task: float = 4.0
-    """Objects a task reads or asks for: its inputs, whether its output is there."""
+    """Store requests of a task: for its inputs, and for the existence of its output."""
 
 
 @dataclass(frozen=True)
 class Prices:
-    """Examples, in whichever currency; put in your own."""
+    """Example prices in any currency; replace them by your own."""
 
     core_hour: float = 0.04
     gpu_hour: float = 2.0
     gb_month: float = 0.023
-    """Of object storage."""
+    """Price of object storage."""
     months: float = 1.0
-    """For how long the dataset is kept."""
+    """Storage time of the dataset."""
     thousand_writes: float = 0.005
     thousand_reads: float = 0.0004
     service_hour: float = 0.25
-    """Redis, database, two APIs and controller, while the dataset is made."""
+    """Price of Redis, database, two APIs and controller during the work."""
 
 
 @dataclass(frozen=True)
@@ -117,12 +116,12 @@ class Estimate:
     pictures: int
     core_hours: float
     cores: int
-    """To be done in time."""
+    """Number of cores for the time limit."""
     tasks_per_second: float
     redis_ops_per_second: float
     redis_megabits_per_second: float
     controller_cores: float
-    """Share of a core that the one controller needs; near 1 it is the bottleneck."""
+    """Share of a core that the controller needs; near 1 it is the bottleneck."""
     objects: int
     writes: int
     reads: int
@@ -138,10 +137,10 @@ class Estimate:
 
 
 def estimate(work: Work, measured: Measured, prices: Prices, *, cores_per_worker: int = 4) -> Estimate:
-    """The cost of a dataset made by CPU workers.
+    """Return the cost of a dataset made by CPU workers.
 
     Args:
-        cores_per_worker: threads of one worker; each worker gives its own signs of life.
+        cores_per_worker: threads of one worker; each worker sends heartbeats.
     """
     scenes = work.batches * work.scenes
     core_s = (
@@ -206,10 +205,10 @@ def gpu_hours(work: Work, grasps_per_second: float) -> float:
 
 
 def sizes(data: Path) -> dict[str, float]:
-    """Bytes in a data folder with a file store, as fields of `Measured`.
+    """Return sizes in a data folder with a file store, as fields of `Measured`.
 
     Raises:
-        SystemExit: the folder holds no shard.
+        SystemExit: the folder has no shard.
     """
     files = sorted((data / "store" / "shards").glob("*/*.json"))
     if not files:
@@ -242,8 +241,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--grasps", type=int, action="append")
     parser.add_argument("--cores-per-worker", type=int, default=4)
-    parser.add_argument("--gpu-grasps-per-second", type=float, help="measured on your GPU; adds its hours and price")
-    parser.add_argument("--from-data", type=Path, help="data folder whose shards are measured")
+    parser.add_argument("--gpu-grasps-per-second", type=float, help="rate of your GPU; adds its hours and price")
+    parser.add_argument("--from-data", type=Path, help="data folder with shards to measure")
     parser.add_argument("--json", action="store_true")
     for group in (Work, Measured, Prices):
         for field in dataclasses.fields(group):

@@ -1,11 +1,11 @@
-"""How long the server takes for each page of the dashboard, and the browser until its first paint.
+"""Server time of each page of the dashboard, and time to the first paint in a browser.
 
 usage: python -m benchmarks.large_index --data-dir DIR
        python -m benchmarks.dashboard_pages --data-dir DIR [--repeats 20] [--paint]
 
-Milliseconds of the server, warm, one request at a time, over whatever index stands in DIR; `cpu` is what a request
-takes of the processor, client included, which a busy machine does not change. With --paint also the time from opening
-a page in headless Chromium until its first contentful paint, over loopback.
+Times are in milliseconds, for sequential requests to a warm server with the index in DIR. `cpu` is the processor time
+of a request including the client, which is independent of other load. --paint adds the time from opening a page in
+headless Chromium to its first contentful paint, over loopback.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def say(line: str) -> None:
 
 
 def pages(services: Services) -> list[str]:
-    """One address of each kind of page that the index can show."""
+    """Return one address for each kind of page that the index can show."""
     jobs = [job.id for job in services.index.jobs.page(limit=3).items]
     pairs = services.index.overview.matrix()[:1]
     found = ["/", "/?state=failed", "/datasets", *(f"/jobs/{job}" for job in jobs), "/grasps", "/grasps?view=table"]
@@ -73,7 +73,7 @@ def pages(services: Services) -> list[str]:
 
 
 def server_times(address: str, paths: Sequence[str], repeats: int) -> dict[str, tuple[float, float, float]]:
-    """Median and slowest answer of each page, and the processor's time for one [ms], after one that is not counted."""
+    """Return median and slowest time of each page and its CPU time [ms], after an untimed request."""
     rows = {}
     with httpx.Client(base_url=address, trust_env=False, timeout=60) as client:
         for path in paths:
@@ -88,7 +88,7 @@ def server_times(address: str, paths: Sequence[str], repeats: int) -> dict[str, 
 
 
 def first_paints(address: str, paths: Sequence[str]) -> dict[str, float]:
-    """Time until the first contentful paint of each page [ms], the fonts and styles already known to the browser."""
+    """Return the time to the first contentful paint of each page [ms], with cached fonts and styles."""
     from playwright.sync_api import sync_playwright
 
     program = shutil.which("chromium") or shutil.which("google-chrome")

@@ -1,7 +1,8 @@
-"""How different standard candidates are: near pairs, types, directions of approach.
+"""Diversity of standard candidates: similar pairs, grasp types, approach directions.
 
 usage: python -m benchmarks.diversity DATA_DIR [--work DIR] [--hands allegro ...] [--objects NAME ...] [--grasps 64]
-DATA_DIR holds hands/ and objects/. Prints Markdown. Stopped runs go on, grasps of other studies serve (see cells.py).
+DATA_DIR holds hands/ and objects/. Prints Markdown. Interrupted runs resume; grasps are shared with other studies (see
+cells.py).
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ NEAR_MM = (5, 10, 20)
 
 
 def line(cell: Cell) -> tuple[str, list[int]]:
-    """A row of the table, and how many pairs are nearer than each of `NEAR_MM`, then all pairs."""
+    """Return a table row, and the numbers of pairs closer than each of `NEAR_MM` and of all pairs."""
     grasp = cell.grasps.grasp
     rows, others = np.triu_indices(len(grasp), 1)
     apart = 1e3 * distances(hand_points(cell.hand, grasp), rows, others)
@@ -40,8 +41,11 @@ def main() -> None:
     parser = cell_parser(__doc__)
     args = parser.parse_args()
     sys.stdout.write(
-        f"| hand | object | nearest, mm | {' | '.join(f'< {n} mm' for n in NEAR_MM)} | power | precision | lateral "
-        "| types, bit | directions | directions, bit |\n|" + " --- |" * 2 + " --: |" * (7 + len(NEAR_MM)) + "\n"
+        f"| hand | object | least distance, mm | {' | '.join(f'pairs < {n} mm' for n in NEAR_MM)} | power | precision "
+        "| lateral | entropy of types, bit | directions used | entropy of directions, bit |\n|"
+        + " --- |" * 2
+        + " --: |" * (7 + len(NEAR_MM))
+        + "\n"
     )
     sums = np.zeros(len(NEAR_MM) + 1, int)
     for hand in args.hands:
@@ -50,8 +54,8 @@ def main() -> None:
             sys.stdout.write(text + "\n")
             sys.stdout.flush()
             sums += counts
-    near = ", ".join(f"{n} mm: {s}" for n, s in zip(NEAR_MM, sums, strict=False))
-    sys.stdout.write(f"\n{sums[-1]} pairs; nearer than {near}.\n")
+    near = ", ".join(f"{s} closer than {n} mm" for n, s in zip(NEAR_MM, sums, strict=False))
+    sys.stdout.write(f"\n{sums[-1]} pairs of grasps: {near}.\n")
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 """Remaining failures: the worst objects of each hand, outcomes of their grasps, and pictures of some.
 
 usage: python -m benchmarks.failures DATA_DIR [--work DIR] [--hands allegro ...] [--objects NAME ...] [--out FOLDER]
-DATA_DIR holds hands/ and objects/. Candidates at fidelity standard are validated at level standard; stopped runs go on
-(cells.py). Writes failures.md, failures.json and a picture for each of the worst objects under `--out`/failures.
+DATA_DIR holds hands/ and objects/. Candidates at fidelity standard are validated at level standard; interrupted runs
+resume (cells.py). Writes failures.md, failures.json and a picture for each of the worst objects under `--out`/failures.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ from graspd.worker.rendering.pictures import grasp_pictures
 from graspd.worker.rendering.sheets import contact_sheet
 from graspd.worker.validation.validator import validate
 
-#: Objects of a hand that are shown, and failures of each beside one that holds.
+#: Largest numbers of objects per hand, and of failed grasps per object.
 WORST, SHOWN = 3, 3
 EDGE = 260
-#: A body whose volume over half its surface is less is a shell [mm]; the engine's pieces stand out 0.85 mm at most.
+#: A body is a shell if its volume over half its surface is less [mm]; convex pieces are at most 0.85 mm too thick.
 THIN_MM = 8.0
-#: An object is wide for a hand whose pads face one another at no more than so many times its least extent.
+#: An object is wide for a hand if its pads open to less than this multiple of its least extent.
 ROOMY = 1.25
-#: Lost grasps that are so much deeper in the engine, beyond the mesh, than those that hold were pushed off [mm].
+#: Excess of penetration in MuJoCo over the mesh, relative to held grasps, that counts as the cause of a failure [mm].
 PUSHED_MM = 0.3
 
 
 def found_out(cell: Cell) -> dict[str, Any]:
-    """Verdict and figures of each grasp, and what of the object and the hand decides them."""
+    """Return verdict and figures of each grasp, and properties of object and hand that affect them."""
     grasps, hand, obj = cell.grasps, cell.hand, cell.obj
     verdicts = validate(hand, obj, grasps)
     columns = measure(hand, obj, grasps, thresholds_m=[0.005])
@@ -71,34 +71,34 @@ def kind(reason: str) -> str:
 
 
 def why(found: dict[str, Any]) -> str:
-    """What the figures say of a pair, the strongest first."""
+    """Return likely causes of a pair's failures, from its figures."""
     held = np.array(found["success"]) == 1
     lost = ~held
     said = []
     if found["least_extent_mm"] * ROOMY > found["widest_mm"]:
         said.append(
-            f"does not fit well: {found['least_extent_mm']:.0f} mm at its narrowest, the pads face one another at "
-            f"{found['widest_mm']:.0f} mm at most"
+            f"the object is {found['least_extent_mm']:.0f} mm wide at its narrowest, and opposed pads open to at most "
+            f"{found['widest_mm']:.0f} mm"
         )
     if found["thickness_mm"] < THIN_MM:
         said.append(
-            f"a thin shell, {found['thickness_mm']:.1f} mm: pieces stand out {found['excess_mm']:.2f} mm a side"
+            f"the object is a shell of {found['thickness_mm']:.1f} mm, and its convex pieces are "
+            f"{found['excess_mm']:.2f} mm too thick per side"
         )
     deeper = np.array(found["engine_mm"]) - np.array(found["mesh_mm"])
     if held.any() and np.median(deeper[lost]) > np.median(deeper[held]) + PUSHED_MM:
         said.append(
-            f"hands are {np.median(deeper[lost]):.1f} mm deeper in the engine than on the mesh "
-            f"({_median(deeper[held], 1)} where it holds) and push the object off as they close"
+            f"penetration in MuJoCo is {np.median(deeper[lost]):.1f} mm ({_median(deeper[held], 1)}) larger than on "
+            "the "
+            "mesh, so the closing hand pushes the object away"
         )
     for name, text, unit, digits in (
-        ("residual", "contact forces that do not balance at μ = 0.3, residual", "", 3),
-        ("uneven_mm", "fingers that touch one after another, distance between first and last", " mm", 1),
+        ("residual", "residual of the contact force balance at μ = 0.3 is", "", 3),
+        ("uneven_mm", "distance between first and last finger contact", " mm", 1),
     ):
         values = np.array(found[name])
         if held.any() and np.median(values[lost]) > 1.5 * np.median(values[held]) + 1e-3:
-            said.append(
-                f"{text} {_median(values[lost], digits)}{unit} ({_median(values[held], digits)} where it holds)"
-            )
+            said.append(f"{text} {_median(values[lost], digits)}{unit} ({_median(values[held], digits)})")
     return "; ".join(said) or "no figure distinguishes failed from held grasps"
 
 
@@ -107,7 +107,7 @@ def _median(values: NDArray[np.float64], digits: int) -> str:
 
 
 def chosen(found: dict[str, Any]) -> list[int]:
-    """Rows of failures of the commonest kinds, one of each, then more of the first; last one that holds."""
+    """Return rows of failures, one of each common kind, then more of the first kind; last a held grasp."""
     kinds = [kind(reason) for reason in found["reasons"]]
     order = [name for name, _ in Counter(kinds).most_common() if name != "held"]
     rows = [kinds.index(name) for name in order[:SHOWN]]
@@ -133,11 +133,14 @@ def main() -> None:
     args = parser.parse_args()
     lines = [
         "# Remaining failures\n",
-        f"{args.grasps} candidates on each object at fidelity `standard`, seed {SEED}, validated at level `standard` "
-        f"(revision {STAGE_REVISIONS['synthesize']} of synthesize). For each hand the up to {WORST} objects with most "
-        f"failures, of {len(args.objects or []) or 'all'} objects. Made by `python -m benchmarks.failures DATA "
-        "--objects ...`. A margin is the worst motion over its limit. The pictures show the moment of contact: up to "
-        "three grasps that fail, then one that holds. Figures of a pair are medians over its failed grasps.\n",
+        f"{args.grasps} candidates on each of {len(args.objects or []) or 'all'} objects at fidelity `standard`, seed "
+        f"{SEED}, validated at level `standard` (revision {STAGE_REVISIONS['synthesize']} of synthesize). For each "
+        "hand, "
+        f"up to {WORST} objects with most failures are shown. Pictures show the moment of contact: up to three failed "
+        "grasps, then one that holds. Their *margin* is the worst motion over its limit. Figures of a pair are medians "
+        "over failed grasps; those in brackets are medians over held grasps. Made by `python -m benchmarks.failures "
+        "DATA "
+        "--objects ...`.\n",
     ]
     told: list[dict[str, Any]] = []
     drawn: set[Path] = set()
@@ -150,7 +153,7 @@ def main() -> None:
         order = np.argsort([np.mean(found["success"]) for found in figures], kind="stable")
         lines += [
             f"## {hand}\n",
-            "| object | hold | lost while closing | turns | slips | too deep | other |",
+            "| object | held | lost while closing | rotated | displaced | penetration | other |",
             "| --- | --: | --: | --: | --: | --: | --: |",
         ]
         for at in order:
@@ -171,8 +174,8 @@ def main() -> None:
             picture(cell, found, args.out / name)
             drawn.add(args.out / name)
             lines += [
-                f"**{cell.object_name}**, {np.mean(found['success']):.0%} hold: {why(found)}.\n",
-                f"![{hand} on {cell.object_name}: grasps that fail, one that holds]({name})\n",
+                f"**{cell.object_name}**, {100 * np.mean(found['success']):.0f} % hold: {why(found)}.\n",
+                f"![{hand} on {cell.object_name}: failed grasps, then a held one]({name})\n",
             ]
     for older in set((args.out / "failures").glob("*.png")) - drawn:
         older.unlink()

@@ -1,10 +1,10 @@
-"""Table lifts of what is flat or thin: boxes 5 to 20 mm high and a screwdriver, per hand.
+"""Table lifts of flat and thin objects, per hand: boxes 5 to 20 mm high and a screwdriver.
 
 usage: python -m benchmarks.flat DATA_DIR [--hands allegro ...] [--things 60x60x10 ...] [--grasps 16] [--scenes 4]
            [--seed 1300] [--page OUT.md] [--keep FOLDER]
-       DATA_DIR holds hands/; grasps are kept as FOLDER/HAND-THING.h5 where it is given
+       DATA_DIR holds hands/; --keep writes grasps to FOLDER/HAND-THING.h5
 
-Shares are of candidates of fidelity standard. Boxes and screwdriver are built here; their density is 700 kg/m3.
+Shares are of candidates at fidelity standard. This module builds the objects; their density is 700 kg/m3.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ from benchmarks.cells import HANDS
 from benchmarks.masses import on_table
 from graspd.service.store.shards import write_shard
 
-#: Not a seed that any setting was chosen with.
+#: Seed that was not used to choose any setting.
 SEED = 1300
 DENSITY: Final = 700.0
-#: Extents [mm]: what lies flat, and a bar.
+#: Extents of flat boxes and of bars [mm].
 BOXES: Final = (
     (60, 60, 5), (60, 60, 10), (60, 60, 15), (60, 60, 20), (100, 20, 5), (100, 20, 10), (100, 20, 20),
 )  # fmt: skip
 HEAD = """# Table lifts of flat and thin objects
 
 `python -m benchmarks.flat DATA`: shares of candidates that are clear of the table, that lift, and that lift at half
-the friction. {grasps} candidates per pair, {scenes} scenes, seed {seed}, density 700 kg/m3. Boxes are named by their
-extents in mm; the screwdriver has a handle of 28 x 100 mm and a shaft of 6 x 100 mm.
+the friction. {grasps} candidates per pair of hand and object, {scenes} scenes, seed {seed}, density 700 kg/m3. Boxes
+are named by their extents in mm; the screwdriver has a handle of 28 x 100 mm and a shaft of 6 x 100 mm.
 
 """
 
 
 def screwdriver() -> trimesh.Trimesh:
-    """A handle with a shaft, along x [m]."""
+    """Return a handle with a shaft, along x [m]."""
     handle = trimesh.creation.cylinder(radius=0.014, height=0.1, sections=48)
     shaft = trimesh.creation.cylinder(radius=0.003, height=0.102, sections=24)
     shaft.apply_translation([0, 0, 0.1])
@@ -48,7 +48,7 @@ def screwdriver() -> trimesh.Trimesh:
 
 
 def things() -> dict[str, trimesh.Trimesh]:
-    """Meshes by name, metres."""
+    """Return meshes by name [m]."""
     boxes = {"x".join(map(str, size)): trimesh.creation.box(1e-3 * np.array(size)) for size in BOXES}
     return {**boxes, "screwdriver": screwdriver()}
 

@@ -1,14 +1,13 @@
-"""How many workers a controller serves: real Redis, PostgreSQL, store and controller, and workers that do no work.
+"""Number of workers that a controller serves, with real Redis, PostgreSQL and store, and simulated workers.
 
 usage: python -m benchmarks.fleet [--workers 64 512 4096] [--seconds 20] [--tasks 6000]
                                   [--sqlite] [--s3] [--json FILE]
 
-For each number of workers two runs. First all workers hold tasks that end at --rate a second in all,
-beat and tell their progress: how old is the oldest event that is not in the index, and how long does it take to read
-all leases? Then their tasks take no time: how many a second come through controller and index? Everything shares this
-machine, the workers too; the processor time of each part is counted beside its clock.
-What the workers do is in
-`benchmarks.fleet_workers`.
+Each number of workers has two runs. In the first, all workers hold tasks, send heartbeats and report progress; in
+total --rate tasks end per second. Measured are the age of the oldest event that is not in the index, and the time to
+read all leases. In the second, tasks take no time; measured is the number of tasks per second through controller and
+index. All processes share this machine, so the processor time of each part is also counted. `benchmarks.fleet_workers`
+simulates the workers.
 """
 
 from __future__ import annotations
@@ -43,10 +42,10 @@ from graspd.service.settings import Settings
 from tests.fakes import add_assets, request
 from tests.servers import PostgresServer, S3Server
 
-#: Batches of a job, as a dataset's cell of 3,200 grasps has them.
+#: Batches of a job, as in a dataset's cell of 3,200 grasps.
 _BATCHES_A_JOB: Final = 100
 _LOOK_EVERY_S: Final = 0.1
-#: A fleet that takes longer than this is not measured [s].
+#: Time limit of each step [s].
 _PATIENCE_S: Final = 240.0
 
 
@@ -54,23 +53,23 @@ _PATIENCE_S: Final = 240.0
 class Result:
     workers: int
     lag_s: float
-    """Age of the oldest event that was not in the index: 95th of 100 looks."""
+    """Age of the oldest event that was not in the index: 95th percentile of the samples."""
     worst_lag_s: float
     sweep_ms: float
-    """Median time in which all leases are read."""
+    """Median time to read all leases."""
     tasks_per_s: float
     controller_ms: float
-    """Processor time of the controller for a task."""
+    """Processor time of the controller per task."""
     database_ms: float
     redis_ms: float
     events: float
-    """Events of the second run for a task."""
+    """Events per task in the second run."""
     objects: float
-    """Objects that the controller reads of the store for a task: manifests."""
+    """Objects of the store that the controller reads per task: manifests."""
 
 
 class Machine:
-    """The services of a fleet without workers, each a process of its own."""
+    """Services of a fleet without workers; each runs in its own process."""
 
     def __init__(self, settings: Settings, services: Services, pids: dict[str, int]) -> None:
         self.settings, self.services, self._pids = settings, services, pids
@@ -89,11 +88,11 @@ class Machine:
             tasks -= some
 
     def cpu(self) -> dict[str, float]:
-        """Processor time of each part so far, with its children [s]."""
+        """Return the processor time of each part and its children so far [s]."""
         return {name: _tree_cpu(pid) for name, pid in self._pids.items()}
 
     def lag_s(self) -> float:
-        """Age of the oldest event that its controller has not acknowledged."""
+        """Return the age of the oldest event that the controller has not acknowledged."""
         connection = self.queue.connection
         groups = connection.xinfo_groups(EVENTS)
         if not groups:
@@ -107,7 +106,7 @@ class Machine:
         return 0.0 if oldest is None else max(0.0, seconds + micros / 1e6 - int(oldest.split(b"-")[0]) / 1000)
 
     def sweep_s(self) -> float:
-        """Time in which all leases are read."""
+        """Return the time to read all leases."""
         begun = time.perf_counter()
         self.queue.leases()
         return time.perf_counter() - begun
@@ -115,7 +114,7 @@ class Machine:
 
 @contextmanager
 def machine(*, sqlite: bool, s3: bool) -> Iterator[Machine]:
-    """A service of real processes that ends with the block."""
+    """Start a service of real processes; stop it after the block."""
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="graspd-fleet-")))
         options: dict[str, Any] = {
@@ -146,7 +145,7 @@ def machine(*, sqlite: bool, s3: bool) -> Iterator[Machine]:
 
 @contextmanager
 def fleet(settings: Settings, workers: int, task_s: float) -> Iterator[None]:
-    """Workers that live for the block."""
+    """Start workers; stop them after the block."""
     with ExitStack() as stack:
         command = [sys.executable, "-m", "benchmarks.fleet_workers", str(workers), str(task_s)]
         _started(stack, command, environment(settings))
@@ -154,7 +153,7 @@ def fleet(settings: Settings, workers: int, task_s: float) -> Iterator[None]:
 
 
 def environment(settings: Settings) -> dict[str, str]:
-    """The settings as a process of its own takes them."""
+    """Return the settings as environment variables of a process."""
     given = {name: getattr(settings, name) for name in settings.model_fields_set}
     plain = {
         name: value.get_secret_value() if hasattr(value, "get_secret_value") else str(value)
@@ -227,7 +226,7 @@ def _answers(services: Services) -> bool:
 
 
 def _started(stack: ExitStack, command: Sequence[str], environment: dict[str, str]) -> int:
-    # The benchmark itself may be run politely; what it measures must not be.
+    # The benchmark may run at low priority, but the measured services must not.
     process = subprocess.Popen(command, env=os.environ | environment, stdout=subprocess.DEVNULL)
     stack.callback(process.wait)
     stack.callback(process.terminate)
@@ -250,16 +249,16 @@ def _tree_cpu(pid: int) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--workers", type=int, nargs="+", default=[64, 512, 4096])
-    parser.add_argument("--seconds", type=float, default=20.0, help="how long the lag is watched")
-    parser.add_argument("--rate", type=float, default=100.0, help="tasks that end a second while it is watched")
+    parser.add_argument("--seconds", type=float, default=20.0, help="duration of the first run")
+    parser.add_argument("--rate", type=float, default=100.0, help="tasks that end per second in the first run")
     parser.add_argument("--tasks", type=int, default=6000, help="tasks of the second run")
-    parser.add_argument("--sqlite", action="store_true", help="the index in a file instead of PostgreSQL")
-    parser.add_argument("--s3", action="store_true", help="the store on an S3 server instead of files")
-    parser.add_argument("--json", type=Path, help="keep the figures there")
+    parser.add_argument("--sqlite", action="store_true", help="index in a SQLite file instead of PostgreSQL")
+    parser.add_argument("--s3", action="store_true", help="store on an S3 server instead of files")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     given = parser.parse_args()
     say(
-        "| workers | lag of events, p95 | worst | lease sweep | tasks/s "
-        "| controller, of a task | database | Redis | events | objects |"
+        "| workers | event lag, p95 | event lag, largest | reading all leases | tasks/s | controller CPU per task "
+        "| database CPU per task | Redis CPU per task | events per task | store reads per task |"
     )
     say(f"|{' --: |' * 10}")
     results = []

@@ -1,11 +1,11 @@
-"""N workers in one process that do no work: Redis sees from them what it sees from real ones, at the same rates.
+"""N simulated workers in one process: they send Redis the same commands as real workers, at the same rates.
 
 usage: python -m benchmarks.fleet_workers WORKERS TASK_S      (settings from the environment)
 
-A worker that holds a task beats, tells its progress, and after `TASK_S` seconds puts the manifest of its shard and says
-that it finished. Manifests are those of one true shard under other names; the shard's own file, which no controller
-reads, is not put. Commands of many workers share a pipeline: a thousand interpreters do not fit a machine that is to be
-measured, and Redis is asked as much.
+A worker that holds a task sends heartbeats and progress. After `TASK_S` seconds it writes the manifest of its shard
+and reports the end of the task. Manifests are copies of one real manifest under other names. Shards are not written,
+because no controller reads them. Commands of many workers share a pipeline, because a thousand interpreters do not fit
+on the measured machine; the load on Redis is the same.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Held:
 
 
 class Fleet:
-    """Workers that take tasks from Redis and end them after a while."""
+    """Workers that take tasks from Redis and end them after a fixed time."""
 
     def __init__(self, queue: RqQueue, store: Store, *, workers: int, task_s: float, lease_s: float) -> None:
         self._queue, self._store, self._connection = queue, store, queue.connection
@@ -109,7 +109,7 @@ class Fleet:
         self._first = self._first and not self._held
 
     def _hold(self, pipe: Any, job: str, message: dict[str, Any], queue: str, now: float) -> None:
-        # The first tasks end evenly over the time of one: workers of a fleet do not work in step.
+        # The first tasks end evenly over the time of one task: workers of a fleet are not synchronous.
         length = self._task_s * (random.random() if self._first else 1.0)
         held = Held(self._idle.popleft(), message, queue, f"{job}:{uuid.uuid4().hex}", now, now + length)
         self._held[held.worker] = held

@@ -1,4 +1,4 @@
-"""Forearms in something: the links above the hand's root in grasps that were planned in scenes.
+"""Collisions of forearms (the links above the hand's root) in grasps planned in scenes.
 
 usage: python -m benchmarks.forearm DATA_DIR [--hand shadow/shadow_hand_right.urdf] [--objects 025_mug ...]
            [--grasps 16] [--scenes 4] [--seed 31] [--scene table] [--beside 048_hammer ...] [--json OUT]
@@ -6,9 +6,8 @@ usage: python -m benchmarks.forearm DATA_DIR [--hand shadow/shadow_hand_right.ur
 
 Candidates of each object are planned and validated as `graspd synth --want candidates --threads 1` does. The collision
 meshes of all links above the root are then placed by yourdfpy, which shares no code with graspd, at the stored wrist
-angles (0 where none are stored). Two findings count on approach, grasp and lift: the lowest height of their vertices,
-and the volume that manifold3d finds common to them and to supports or neighbours. Seconds are CPU time of planning and
-validating a candidate.
+angles (0 if none are stored). Results on approach, grasp and lift are the lowest height of their vertices, and their
+common volume with supports or neighbours, by manifold3d. Seconds are CPU time of planning and validation per candidate.
 """
 
 from __future__ import annotations
@@ -32,9 +31,9 @@ from graspd.worker.hands.load import hand_from_path
 
 OBJECTS = ("005_tomato_soup_can", "006_mustard_bottle", "025_mug", "011_banana", "035_power_drill", "077_rubiks_cube")
 
-#: Postures of a grasp that are looked at besides its approach.
+#: Checked postures of a grasp besides its approach.
 POSES = ("pregrasp/hand_pose", "grasp/hand_pose", "grasp/lift")
-#: Less in common is rounding [m^3].
+#: Smaller common volumes are rounding errors [m^3].
 COMMON_M3 = 1e-9
 
 
@@ -69,7 +68,7 @@ class Upstream:
         return found
 
     def _link(self, node: str) -> str:
-        """The link that a geometry of the collision scene hangs on."""
+        """Return the link of a geometry in the collision scene."""
         links, parents = {link.name for link in self.robot.robot.links}, self.robot.collision_scene.graph.transforms
         while node not in links:
             node = parents.parents[node]
@@ -84,16 +83,16 @@ def matrices(poses: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Found:
-    """What N grasps have of the links above their roots, on approach, grasp and lift."""
+    """Results of N grasps for the links above the root, on approach, grasp and lift."""
 
     lowest: np.ndarray
     """(N,) lowest heights [mm]."""
     inside: np.ndarray
-    """(N,) whether they are in something."""
+    """(N,) whether they collide with a support or neighbour."""
 
 
 def look(upstream: Upstream, made: SynthesisResult, beside: list[trimesh.Trimesh]) -> Found:
-    """The links above the root of each grasp, among supports and neighbours."""
+    """Return the results for the links above the root of each grasp, among supports and neighbours."""
     columns, lowest, inside = made.arrays, [], []
     names = list(made.attributes.get("wrist_joint_names", []))
     supports = [solid(one) for one in supports_in(made.place)]
@@ -113,14 +112,14 @@ def look(upstream: Upstream, made: SynthesisResult, beside: list[trimesh.Trimesh
 
 
 def solid(support: Any) -> trimesh.Trimesh:
-    """A support; of a half-space, which is level in scenes that have a kind, the uppermost metre."""
+    """Return the solid of a support; for a horizontal half-space, its uppermost metre."""
     if isinstance(support, Box):
         return trimesh.creation.box(support.size, transform=matrix(np.asarray(support.pose)))
     return trimesh.creation.box((6.0, 6.0, 1.0), transform=matrix(np.array([0, 0, support.offset - 0.5, 1, 0, 0, 0])))
 
 
 def meets(a: trimesh.Trimesh, b: trimesh.Trimesh) -> bool:
-    """Whether two solids have more than `COMMON_M3` in common."""
+    """Return whether the common volume of two solids exceeds `COMMON_M3`."""
     if (a.bounds[0] > b.bounds[1]).any() or (b.bounds[0] > a.bounds[1]).any():
         return False
     return float(trimesh.boolean.intersection([a, b], engine="manifold").volume) > COMMON_M3
@@ -184,7 +183,7 @@ def planned(urdf: Path, given: argparse.Namespace, name: str, count: int) -> Syn
 
 
 def ready(urdf: Path, given: argparse.Namespace) -> None:
-    """Kernels, pieces and postures that are made once and kept, so that they cost no candidate."""
+    """Prepare cached kernels, pieces and postures before the timed run."""
     for name in given.objects:
         planned(urdf, given, name, 1)
 

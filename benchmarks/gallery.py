@@ -1,12 +1,11 @@
-"""A page of real hands as their makers and others publish them: what each holds, and a picture of its best grasp.
+"""Page of published hands: self-test of each, and a picture of its best grasp.
 
     pip install --no-deps --target /tmp/hands airo-models example-robot-data robosuite robosuite-models robopianist
     python -m benchmarks.gallery --sources /tmp/hands
 
-Nothing of the packages is run: their files are read as a user's folder is. Each hand goes through
-`graspd hands check`; what is done is kept in `docs/results/hands-gallery.json` under the hand's content and
-the planner's revision, so a broken run goes on where it was, and a hand that is read in another way, or that another
-planner would use, is tested again. `--out FOLDER` takes another folder than docs/.
+The packages' code is not run; their files are read like uploads. Each hand is tested by `graspd hands check`. Results
+are cached in `docs/results/hands-gallery.json` by the hand's digest and the planner's revision, so an interrupted run
+resumes and a changed hand or planner is tested again. `--out FOLDER` replaces docs/.
 """
 
 from __future__ import annotations
@@ -31,26 +30,26 @@ from graspd.worker.rendering.pictures import grasp_pictures
 from graspd.worker.stages.hand_self_test import GRASPS, READY, BestGrasp, failed, self_test
 
 PACKAGES = "airo-models example-robot-data robosuite robosuite-models robopianist"
-#: Under the folder of the docs.
+#: Paths under the folder of the docs.
 RESULTS, PAGE, PICTURES = "results/hands-gallery.json", "results/hands-gallery.md", "images/hands-gallery"
-#: Two sides of the best grasp [px, rad].
+#: Size of the pictures [px] and directions of the camera [rad].
 EDGE, SIDES = 220, (-0.6, 2.6)
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A hand: where it lies in the sources, and what had to be said of it."""
+    """A hand: its file in the sources, and its necessary options."""
 
     name: str
     title: str
     source: str
     path: str = ""
-    """Below the sources; empty: built in."""
+    """Path below the sources; empty: built in."""
     options: dict[str, Any] = field(default_factory=dict)
     said: str = ""
-    """The options as the command line has them."""
+    """Options of the command line."""
     sides: tuple[float, float] = SIDES
-    """Where its picture is taken from."""
+    """Direction of the camera."""
 
 
 _AIRO = ("airo-models, MIT", "airo_models/grippers")
@@ -59,7 +58,7 @@ _MODELS = ("robosuite-models, BSD-3", "robosuite_models/assets/grippers")
 _DATA = ("example-robot-data, BSD-3", "cmeel.prefix/share/example-robot-data/robots")
 
 
-#: Every joint turns as far as the one that is driven, so the pads stay parallel.
+#: All joints rotate by the angle of the driven joint, so the pads stay parallel.
 _LINKAGE_140 = {
     joint: {"of": "finger_joint", "multiplier": multiplier}
     for joint, multiplier in {
@@ -139,7 +138,7 @@ HANDS = (
     _of(_SUITE, "inspire", "Inspire RH56", "inspire_right_hand.xml"),
     _of(
         _MODELS, "ability", "PSYONIC Ability", "ability_right_hand.xml", sides=(-1.4, -3.1)
-    ),  # elsewhere the fingers hide what they hold
+    ),  # from other sides the fingers hide the object
     _of(
         _DATA,
         "unitree-dex3",
@@ -161,7 +160,7 @@ HANDS = (
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sources", type=Path, required=True, help="where the packages were installed to")
+    parser.add_argument("--sources", type=Path, required=True, help="folder into which the packages were installed")
     parser.add_argument("--only", help="names of hands, comma-separated")
     parser.add_argument("--grasps", type=int, default=GRASPS)
     parser.add_argument("--out", type=Path, default=Path("docs"))
@@ -184,7 +183,7 @@ def main() -> None:
 def candidates(
     entry: Entry, sources: Path, grasps: int, before: dict[str, Any] | None, picture: Path
 ) -> dict[str, Any]:
-    """The row of a hand: from before where hand and planner are the same and it has a picture."""
+    """Return the row of a hand, cached if hand and planner are unchanged and the picture exists."""
     try:
         hand = hand_from_path(sources / entry.path if entry.path else entry.name, entry.options)
         key = f"{hand.content[:16]}-{grasps}-{STAGE_REVISIONS['synthesize']}"
@@ -208,7 +207,7 @@ def candidates(
 
 
 def draw(hand: HandModel, best: BestGrasp, picture: Path, azimuths: tuple[float, float]) -> None:
-    """The grasp from two sides, beside each other, in few colours: pages of many pictures stay light."""
+    """Draw the grasp from two sides in few colours, so that the file is small."""
     sides = grasp_pictures(
         hand, best.obj, best.grasp.hand_pose, best.grasp.joint_positions, (EDGE, EDGE), azimuths=azimuths
     )[0]
@@ -230,7 +229,7 @@ def page(done: dict[str, Any]) -> str:
         "",
         "Real hands and grippers, read from the files in which they are published. Each was tested as",
         "by `graspd hands check HAND`: 64 candidates on a sphere, a box and a cylinder of suitable size,",
-        f"validated at level standard; from {100 * READY:.0f} % on a hand is *ready*. The picture shows the",
+        f"validated at level *standard*. A hand is *ready* if at least {100 * READY:.0f} % hold. The picture shows the",
         "best candidate from two sides.",
         "",
         "```sh",

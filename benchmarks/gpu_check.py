@@ -1,10 +1,10 @@
-"""What can be shown of the CUDA path without a GPU: every kernel compiles for each architecture, and fits it.
+"""Check of the CUDA kernels without a GPU: each compiles for each architecture within the limits of registers.
 
 usage: python -m benchmarks.gpu_check [--arch 80 --arch 90 --arch 100] [--json OUT]       (make gpu-check)
 
-Warp makes PTX of every module; `ptxas` (PyPI: nvidia-cuda-nvcc, the extra `gpu-check`) makes machine code of it and
-tells registers, stack and spilled bytes of each kernel. Ends with 1 if one spills, has a stack above `STACK_BYTES`, or
-a hot one more than `HOT_REGISTERS` registers.
+Warp compiles every module to PTX. `ptxas` (PyPI: nvidia-cuda-nvcc, the extra `gpu-check`) compiles it to machine code
+and reports registers, stack and spilled bytes of each kernel. The exit code is 1 if a kernel spills, has a stack above
+`STACK_BYTES`, or is hot (runs in every iteration) with more than `HOT_REGISTERS` registers.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from graspd.worker.engines.backend import ARCHITECTURES, modules
 
 STACK_BYTES = 512
 HOT_REGISTERS = 128
-#: What a kernel takes where fewer registers would spill: the 6 x 6 system and its factor stay in registers.
+#: Registers of a kernel that would spill with fewer: the 6 x 6 system and its factor stay in registers.
 KNOWN = {("simulation.kernels.contact.direct", 100): 135}
-#: Kernels of every iteration of the planner: they decide how many grasps a second a GPU makes.
+#: Kernels of every iteration of the planner, which determine the speed on a GPU.
 HOT = ("gather", "object_in_pieces", "pieces_in_pieces", "direct", "obstacle")
 
 
@@ -45,7 +45,7 @@ class Kernel:
 
     @property
     def is_hot(self) -> bool:
-        """Whether it runs in every iteration."""
+        """Whether the kernel runs in every iteration."""
         return self.name.startswith(HOT)
 
     @property
@@ -64,10 +64,10 @@ def ptx_of(name: str, arch: int, folder: Path) -> Path:
 
 
 def kernels(name: str, arch: int, assembler: Path) -> list[Kernel]:
-    """What the assembler says of a module's kernels."""
+    """Return the report of the assembler on a module's kernels."""
     with tempfile.TemporaryDirectory() as folder:
         path = ptx_of(name, arch, Path(folder))
-        text = path.read_bytes().rstrip(b"\0")  # Warp ends it as C does; the assembler takes that for a character
+        text = path.read_bytes().rstrip(b"\0")  # the assembler rejects the trailing NUL
         path.write_bytes(text)
         done = subprocess.run(
             [assembler, "-v", f"-arch=sm_{arch}", path, "-o", Path(folder) / "out.cubin"],
@@ -102,7 +102,7 @@ def _told(text: str, module: str, arch: int) -> Iterator[Kernel]:
 
 
 def ptxas() -> Path | None:
-    """The assembler of the installed wheel."""
+    """Return the path of the assembler in the installed wheel."""
     spec = find_spec("nvidia")
     places = list(spec.submodule_search_locations or []) if spec else []
     return next((path for place in places for path in Path(place).glob("**/bin/ptxas")), None)
@@ -120,7 +120,7 @@ def main() -> None:
     found: list[Kernel] = []
     for arch in given.arch or ARCHITECTURES:
         names = modules()
-        # Warp's code generation holds the interpreter; the assembler is a program of its own.
+        # Warp's code generation holds Python's lock, but the assembler is a separate process.
         with ThreadPoolExecutor(2) as pool:
             for part in pool.map(lambda name, arch=arch: kernels(name, arch, assembler), names):
                 found += part
@@ -131,7 +131,7 @@ def main() -> None:
 
 
 def report(found: list[Kernel]) -> None:
-    """A table of the largest kernel of each module and architecture, and every fault."""
+    """Print a table of the largest kernels per architecture, and all faults."""
     print(
         f"{'architecture':14}{'kernels':>8}{'most registers':>16}{'of hot ones':>13}{'largest stack':>15}{'spills':>8}"
     )

@@ -1,10 +1,10 @@
-"""What grippers hold of objects that they were not tuned on: candidates of each object that fits, validated.
+"""Success of grippers on objects that fit and that were not used for tuning.
 
     python -m benchmarks.grippers DATA --sources /tmp/hands
 
-DATA holds objects/ (YCB and others); the sources are those of `benchmarks.gallery`. A cell that is done is kept in
-`docs/results/grippers.json` under the gripper's content and the planner's revision, so a broken run goes on where it
-was. `--out FOLDER` takes another folder than docs/results/.
+DATA holds objects/ (YCB and others); the sources are those of `benchmarks.gallery`. Results are cached in
+`docs/results/grippers.json` by the gripper's digest and the planner's revision, so an interrupted run resumes. `--out
+FOLDER` replaces docs/results/.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.prepare import object_from_path
 
 GRIPPERS = ("franka", "robotiq-2f-85", "schunk-egk40", "umi", "robotiq-2f-140", "rethink", "robotiq-3f")
-#: Not a seed that any setting was chosen with.
+#: Seed that was not used to choose any setting.
 SEED = 404
 
 
@@ -68,7 +68,7 @@ def main() -> None:
 
 
 def cell(hand: HandModel, mesh: Path, grasps: int) -> float | str:
-    """Share of candidates that hold at level standard, or why there are none."""
+    """Return the share of candidates that hold at level standard, or the reason for a refusal."""
     obj = object_from_path(str(mesh), face_error_m=3e-4)
     request = JobOptions(want="candidates", grasps=grasps, seed=SEED, validation="standard")
     try:
@@ -91,10 +91,11 @@ def page(done: dict[str, Any]) -> str:
     rows = [
         "# Grippers on objects that fit",
         "",
-        "`python -m benchmarks.grippers DATA --sources /tmp/hands`: share of candidates that hold at level standard, "
-        f"{done[names[0]]['grasps']} per cell, standard fidelity, seed {SEED}; no setting was tuned on these objects. "
-        "Column titles have the opening of each gripper; *too wide*: refused before planning. The mean is over objects "
-        "that fit.",
+        "`python -m benchmarks.grippers DATA --sources /tmp/hands`: share of candidates that hold at level *standard*; "
+        f"{done[names[0]]['grasps']} candidates per cell, fidelity *standard*, seed {SEED}. No setting was tuned on "
+        "these "
+        "objects. Column titles have the opening of each gripper. *Too wide*: the gripper does not open far enough; "
+        "*none*: refused for another reason. The mean is over objects that fit.",
         "",
         "| object | " + " | ".join(titles) + " |",
         "| --- |" + " --: |" * len(names),

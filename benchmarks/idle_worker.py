@@ -1,8 +1,8 @@
-"""What a worker on a CPU holds while it waits for tasks, and when it is there, of two checkouts; prints Markdown.
+"""Memory and start time of an idle CPU worker, for two checkouts; prints Markdown.
 
 usage: python -m benchmarks.idle_worker BEFORE AFTER [--runs 3]
 
-Memory is what is the processes' own (private pages); the least of the runs, which take turns.
+Memory is the private pages of the processes, the least of the runs. Runs of both checkouts alternate.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ def family(pid: int) -> Iterator[int]:
 
 
 def private_mb(pid: int) -> float:
-    """Memory of a process that it shares with no other [MiB]."""
+    """Return the private memory of a process [MiB]."""
     lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
     return sum(int(line.split()[1]) for line in lines if line.startswith("Private_")) / 1024
 
 
 def measure(checkout: Path) -> tuple[float, list[float]]:
-    """Time until a worker of a checkout is idle [s], and the memory of each of its processes [MiB]."""
+    """Return the time until a worker of a checkout is idle [s], and the memory of each process [MiB]."""
     with tempfile.TemporaryDirectory() as folder:
         settings = Settings(data_dir=Path(folder))  # type: ignore[call-arg]
         redis = subprocess.Popen(server_command(settings), stdout=subprocess.DEVNULL)
@@ -55,7 +55,7 @@ def measure(checkout: Path) -> tuple[float, list[float]]:
                     raise TimeoutError(f"the worker of {checkout} does not get ready")
                 time.sleep(0.02)
             seconds = time.monotonic() - began
-            time.sleep(2.0)  # until what the start left is gone
+            time.sleep(2.0)  # until temporary memory of the start is released
             return seconds, sorted(private_mb(pid) for pid in family(worker.pid))
         finally:
             worker.terminate()

@@ -1,8 +1,8 @@
-"""An index of a million grasps in a minute, of rows as the pipeline would leave them; no files stand behind the shards.
+"""Fill an index with a million grasps in a minute, with rows as from the pipeline but without shard files.
 
 usage: python -m benchmarks.large_index --data-dir DIR [--grasps 1000000] [--jobs 1000] [--index-url URL]
 
-Afterwards `GRASPD_DATA_DIR=DIR graspd api` (or `graspd up`, without workers) shows it. In Python:
+`GRASPD_DATA_DIR=DIR graspd api` (or `graspd up`, without workers) then shows it. In Python:
 `fill(index, store, grasps=..., jobs=...)` on an empty index.
 """
 
@@ -38,20 +38,20 @@ from graspd.service.store.manifests import ShardManifest
 from graspd.service.store.store import Store, open_store
 
 _CHUNK: Final = 20_000
-#: Of a hundred jobs so many are in each state; the running ones are half done.
+#: Number of jobs per hundred in each state; running jobs are half done.
 _MIX: Final = {State.SUCCEEDED: 88, State.RUNNING: 4, State.QUEUED: 3, State.FAILED: 3, State.CANCELLED: 2}
-#: Metrics that every grasp has.
+#: Metrics of every grasp.
 _NAMES: Final = tuple(metric.name for metric in indexed(IndexLevel.SORTED) if not metric.optional)
 _SCALES: Final = dict(zip(_NAMES, (0.25, 0.8, 9.0, 0.3, 0.8, 0.1, 0.05), strict=True))
 
 
 def fill(index: Index, store: Store, *, grasps: int = 1_000_000, jobs: int = 1000, seed: int = 0) -> dict[str, int]:
-    """Publish the built-in hands and objects and insert jobs of them with about `grasps` grasps in all.
+    """Publish the built-in hands and objects, and insert jobs of them with about `grasps` grasps in total.
 
-    One job in ten has scenes and views. The jobs were submitted over the last 30 days, one after the other.
+    One job in ten has scenes and views. Submission times are spread over the last 30 days.
 
     Returns:
-        number of rows of each table.
+        the number of rows per table.
     """
     if index.jobs.page(limit=1).items:
         raise SystemExit("the index is not empty; give another data folder or database")
@@ -61,15 +61,15 @@ def fill(index: Index, store: Store, *, grasps: int = 1_000_000, jobs: int = 100
     with index.database.writing() as connection:
         maker.insert(connection)
     with index.database.reading() as connection:
-        if connection.dialect.name == "postgresql":  # which does so by itself in a while
-            own = ", ".join(metadata.tables)  # not all that is in the database
+        if connection.dialect.name == "postgresql":  # which otherwise does so later
+            own = ", ".join(metadata.tables)  # only the tables of the index
             connection.execution_options(isolation_level="AUTOCOMMIT").exec_driver_sql(f"VACUUM ANALYZE {own}")
     return maker.counts
 
 
 class _Maker:
     def __init__(self, index: Index, grasps_a_job: int, jobs: int, random: np.random.Generator) -> None:
-        # Unfinished jobs have fewer grasps than they asked for; the others make up for it.
+        # Unfinished jobs have fewer grasps than requested; the others have more.
         share = sum(_MIX[state] * _done_share(state) for state in _MIX) / sum(_MIX.values())
         self._grasps_a_job = max(1, round(grasps_a_job / share))
         self._jobs, self._random = jobs, random
@@ -218,7 +218,7 @@ def _done_share(state: State) -> float:
 
 
 def _done(record: JobRecord, state: State) -> int:
-    """Number of batches of which all stages are done; of a failed job all but the last."""
+    """Return the number of batches with all stages done; of a failed job, all but the last."""
     batches = -(-record.request.grasps // 32)
     return batches - 1 if state is State.FAILED else int(batches * _done_share(state))
 
@@ -234,7 +234,7 @@ def _chunks(rows: Iterable[dict[str, Any]]) -> Iterator[list[dict[str, Any]]]:
 
 
 def _copy(connection: Connection, table: Table, rows: Sequence[dict[str, Any]]) -> None:
-    """PostgreSQL's bulk load: ten times as quick as INSERT."""
+    """Insert rows by PostgreSQL's bulk load, ten times as fast as INSERT."""
     columns = [column.name for column in table.columns if column.name in rows[0]]
     process = {
         name: table.c[name].type.dialect_impl(connection.dialect).bind_processor(connection.dialect) for name in columns
@@ -247,7 +247,7 @@ def _copy(connection: Connection, table: Table, rows: Sequence[dict[str, Any]]) 
 
 
 class _without_indexes:  # noqa: N801
-    """A table without its secondary indexes for a while: they are made anew at the end, which is much quicker."""
+    """Drop the secondary indexes of a table and recreate them after the block, which is much faster."""
 
     def __init__(self, connection: Connection, table: Table) -> None:
         self._connection, self._table = connection, table
@@ -272,7 +272,9 @@ def main() -> None:
     start = time.perf_counter()
     index = Index(settings.resolved_index_url)
     counts = fill(index, open_store(settings.resolved_store_url), grasps=given.grasps, jobs=given.jobs)
-    sys.stdout.write(f"{counts} in {time.perf_counter() - start:.0f} s\n")
+    sys.stdout.write(
+        f"{', '.join(f'{n} {name}' for name, n in counts.items())} in {time.perf_counter() - start:.0f} s\n"
+    )
     index.close()
 
 

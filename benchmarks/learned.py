@@ -1,12 +1,12 @@
-"""Seeds from a network against fast_graspd's own: processor time to the first valid grasp, and valid grasps a second.
+"""Planner seeds from a network compared with fast_graspd's own: time to the first valid grasp, and rate.
 
 usage: python -m benchmarks.learned --network NET.npz [OTHER.npz ...] [--data DATA_DIR] [--objects NAME ...]
            [--many 32] [--seeds 5] [--starts 4 ...] [--out FOLDER]
        DATA_DIR holds objects/; without it objects are files or names of built-in ones
 
-On a table, at standard fidelity, certified: both methods get the same scenes, seeds and convex pieces, in turn, on one
-thread. A second is one of processor time, validator and metrics included; what a pair is made ready with once is none
-of it. Whether a network has seen the objects is for whoever chooses them to say. Hands are the built-in ones.
+Grasps are planned on a table at fidelity standard and validated. Both methods get the same scenes, seeds and convex
+pieces, alternately, on one thread. Times are processor time, including validator and metrics, without one-time
+preparation of a pair. Choose objects that were not in a network's training set. Hands are the built-in ones.
 """
 
 from __future__ import annotations
@@ -38,28 +38,28 @@ from graspd.worker.scenes.placement import scenes_of
 from graspd.worker.simulation.environment import Scenes
 from graspd.worker.validation.decomposition import decompose
 
-#: Not a seed that any setting was chosen with.
+#: Seed that was not used to choose any setting.
 SEED = 404
 FIDELITY = FIDELITIES["standard"]
-#: Tries for a grasp before it counts as not found.
+#: Largest number of candidates per grasp.
 BUDGET = 16.0
 HELD_OUT = ("006_mustard_bottle", "025_mug", "035_power_drill", "061_foam_brick")
 TITLES = {
     "hand": "hand",
     "object": "object",
     "method": "method",
-    "found": "first found",
+    "found": "seeds with a valid grasp",
     "first": "CPU s to the first",
-    "valid": "valid share of candidates",
+    "valid": "valid share",
     "rate": "valid per CPU s",
-    "gain": "rate over fast_graspd",
+    "gain": "relative to fast_graspd",
 }
 
 
 def study(
     hand: HandModel, obj: ObjectModel, methods: dict[str, dict[str, Any]], *, many: int, seeds: int
 ) -> list[dict[str, Any]]:
-    """A row for each method: the first valid grasp of each seed, and of one batch of `many`, in the same scenes."""
+    """Return a row per method: the first valid grasp of each seed, and one batch of `many`, in the same scenes."""
     pieces = decompose(obj)
     tables = [scenes_of(SceneSpec(kind="table"), obj, [], count=4, seed=SEED + k)[0] for k in range(seeds)]
     found: dict[str, list[Any]] = {name: [] for name in methods}
@@ -82,7 +82,7 @@ def study(
         return int(done.columns["quality/valid"].sum()), done.candidates, time.process_time() - began
 
     for name in methods:
-        made(name, 1, tables[0], SEED - 1, "candidates")  # makes ready what is kept
+        made(name, 1, tables[0], SEED - 1, "candidates")  # fills the caches
     for number, scenes in enumerate(tables):
         for name in methods:
             found[name].append(made(name, 1, scenes, SEED + number))
@@ -117,15 +117,20 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def page(rows: Sequence[dict[str, Any]], networks: dict[str, str], command: str) -> str:
-    """The table as a page of the docs, with what each network says of itself."""
+    """Return the table as a page of the docs, with the description of each network."""
     many, seeds = rows[0]["many"], rows[0]["seeds"]
     lines = [
         "# Seeds from a network",
         "",
-        f"graspd {PACKAGE_VERSION}, `{command}`: a table, {FIDELITY.name} fidelity, validated by lifts, one thread. "
-        f"CPU s to the first: processor time until one grasp is valid, median over {seeds} seeds, including those that "
-        f"stopped after {BUDGET:g} candidates. Valid share and rate: one batch of {many}. Times include planning, "
-        "validation and metrics, but not loading.",
+        f"graspd {PACKAGE_VERSION}, `{command}`: a table, fidelity *{FIDELITY.name}*, validated by lifts, one thread. "
+        "Rows of a pair were measured alternately.",
+        "",
+        f"- *CPU s to the first*: processor time until one grasp is valid, median over {seeds} seeds, including those "
+        f"that stopped after {BUDGET:g} candidates.",
+        f"- *Valid share* and *valid per CPU s*: of one batch of {many} candidates.",
+        "- Times include planning, validation and metrics, but not loading.",
+        "",
+        "Networks:",
         "",
         *(f"- `{digest}`: {about or 'no description'}" for digest, about in networks.items()),
         "",

@@ -1,10 +1,10 @@
-"""Table lifts of objects with their published masses, beside the same at 0.1 kg, per hand and object.
+"""Table lifts of objects with their published masses and with 0.1 kg, per hand and object.
 
 usage: python -m benchmarks.masses DATA_DIR [--hands allegro ...] [--objects 025_mug ...] [--grasps 16] [--scenes 4]
            [--seed 1200] [--page OUT.md]
-       DATA_DIR holds hands/ and objects/; objects without a mass in their meta.json are left out
+       DATA_DIR holds hands/ and objects/; objects need a mass in their meta.json
 
-Shares are of candidates of fidelity standard on the faces that drops end on, planned for that mass.
+Shares are of candidates at fidelity standard, planned for that mass, on the resting faces of drops.
 """
 
 from __future__ import annotations
@@ -20,12 +20,13 @@ from graspd.service.model.matter import MASS_KG
 from graspd.service.model.scene_spec import parse_scene
 from graspd.worker.files.synthesis import SynthesisResult, synthesized
 
-#: Not a seed that any setting was chosen with.
+#: Seed that was not used to choose any setting.
 SEED = 1200
 HEAD = """# Table lifts of objects with their own masses
 
-`python -m benchmarks.masses DATA`: shares of candidates that lift an object of its published mass off a table, at
-full and at half friction, and the same shares for 0.1 kg. {grasps} candidates per pair, {scenes} scenes, seed {seed}.
+`python -m benchmarks.masses DATA`: shares of candidates that lift an object of its published mass off a table, at full
+and at half friction, and the same shares for 0.1 kg. {grasps} candidates per pair of hand and object, {scenes} scenes,
+seed {seed}.
 
 """
 
@@ -33,7 +34,7 @@ full and at half friction, and the same shares for 0.1 kg. {grasps} candidates p
 def main() -> None:
     given = arguments(__doc__, SEED).parse_args()
     rows = [
-        "| hand | object | mass [kg] | lift | half friction | lift at 0.1 kg | half friction |",
+        "| hand | object | mass [kg] | lift | half friction | lift at 0.1 kg | half friction at 0.1 kg |",
         "|---|---|---|---|---|---|---|",
     ]
     for hand in given.hands:
@@ -70,13 +71,13 @@ def masses(data: Path) -> dict[str, float]:
 
 
 def lifts(given: Any, hand: str, name: str, mass: float) -> tuple[float, float]:
-    """Shares of candidates that lift the object, and that do at half the friction."""
+    """Return the shares of candidates that lift the object, at full and at half friction."""
     told = on_table(given, hand, given.data / "objects" / name / "clean.stl", mass=mass).summary()
     return told["lift_share"], told["lift_hard_share"]
 
 
 def on_table(given: Any, hand: str, mesh: Path, **matter: float) -> SynthesisResult:
-    """Candidates of a hand on an object of this mass or density on a table."""
+    """Return candidates of a hand on an object with this mass or density on a table."""
     common: dict[str, Any] = {"grasps": given.grasps, "want": "candidates", "rechecks": 0, "seed": given.seed}
     request = JobOptions(**common, scene="table", scenes=given.scenes, **matter)
     urdf = str(given.data / "hands" / HANDS[hand])

@@ -1,10 +1,10 @@
-"""Real hands x real objects through a whole service that is killed in the middle and started again.
+"""Hands x objects through a whole service that is killed in the middle and restarted.
 
     python -m benchmarks.matrix DATA --data-dir /tmp/matrix --out docs/results/matrix.md
 
 DATA holds `hands/*/*.urdf` and `objects/*/clean.stl`. At a third of the work every process is killed with -9; then the
-same two commands, `graspd up` and `graspd datasets create`, go on. The page says what came out of each cell, what was
-repeated, and how far the estimate was off.
+same two commands, `graspd up` and `graspd datasets create`, resume. The page has the result of each cell, the repeated
+work, and the error of the estimate.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from graspd.service.index.views import CellView, DatasetView
 from graspd.service.model.cores import available_cores
 from graspd.service.model.version import PACKAGE_VERSION
 
-#: Name in the service and URDF of each hand.
+#: Name of each hand in the service, and its URDF.
 HANDS: Final = {
     "wonik_allegro": "allegro/allegro_hand_right.urdf",
     "barrett_8dof": "barrett/bhand_model.urdf",
@@ -42,7 +42,7 @@ _POLL_S: Final = 2.0
 
 @dataclass
 class ExecutionContext:
-    """A service that can be killed, and what was seen of it."""
+    """A service that can be killed, and its measurements."""
 
     folder: Path
     environment: dict[str, str]
@@ -102,14 +102,14 @@ class ExecutionContext:
 
 @dataclass
 class Kept:
-    """What a run that is gone on with later must know of its beginning."""
+    """State that a resumed run needs from its start."""
 
     estimate_s: float = 0.0
     killed_at: float = 0.0
     up_again_s: float = 0.0
     seconds: float = 0.0
     shards: dict[str, tuple[str, str]] = field(default_factory=dict)
-    """Those in the store when all was killed."""
+    """Shards in the store when the processes were killed."""
 
     @classmethod
     def load(cls, file: Path) -> Kept:
@@ -128,10 +128,10 @@ def main(
     out: Annotated[Path, typer.Option(help="Page to write.")],
     grasps: Annotated[int, typer.Option(help="Valid grasps of each cell.")] = 32,
     fidelity: Annotated[str, typer.Option(help="draft, standard or fine.")] = "standard",
-    kill_at: Annotated[float, typer.Option(help="Share of the work at which all is killed.")] = 0.33,
-    minutes: Annotated[float, typer.Option(help="Write the page after so many minutes, done or not.")] = math.inf,
+    kill_at: Annotated[float, typer.Option(help="Share of the work at which all processes are killed.")] = 0.33,
+    minutes: Annotated[float, typer.Option(help="Write the page after this time, even if work remains.")] = math.inf,
 ) -> None:
-    """Run it and write the page. What is not done after so many minutes is gone on with by the same command."""
+    """Run the matrix and write the page; the same command resumes work that is unfinished after `minutes`."""
     data_dir.mkdir(parents=True, exist_ok=True)
     run = ExecutionContext(data_dir, {k: v for k, v in os.environ.items() if not k.startswith("GRASPD_")})
     kept = Kept.load(data_dir / "run.json")
@@ -170,8 +170,8 @@ def main(
     check = run.graspd("admin", "index", "rebuild", "--check", "--data-dir", str(data_dir / "data"))
     run.stop()
     facts = {
-        "killed at": f"{100 * kept.killed_at:.0f} % of the tasks, {len(kept.shards)} shards in the store",
-        "up again after": f"{kept.up_again_s:.1f} s",
+        "progress when killed": f"{100 * kept.killed_at:.0f} % of the tasks, {len(kept.shards)} shards in the store",
+        "restart": f"{kept.up_again_s:.1f} s",
         "shards made again": str(sum(after.get(name) != made for name, made in kept.shards.items())),
         "differences between index and store": str(len(check["differences"])),
         "wall time": duration(kept.seconds),
@@ -184,7 +184,7 @@ def main(
 
 
 def follow(run: ExecutionContext, *, until: float, end: float) -> float:
-    """Wait until a share of the tasks is done, the dataset has ended, or the time is over; returns the share."""
+    """Wait until a share of the tasks is done, the dataset has ended, or time is up; return the share."""
     said = 0.0
     while True:
         found = run.client().dataset(DATASET)
@@ -201,11 +201,11 @@ def page(found: DatasetView, cells: list[CellView], facts: dict[str, str], optio
     lines = [
         "# Four hands, fourteen objects",
         "",
-        f"`python -m benchmarks.matrix DATA --data-dir DIR --out docs/results/matrix.md`, {options}",
+        f"`python -m benchmarks.matrix DATA --data-dir DIR --out docs/results/matrix.md {options}`",
         "",
         f"graspd {PACKAGE_VERSION}, {platform.machine()}, {available_cores()} CPU cores, {found.created[:10]}. URDFs",
-        "and meshes were used unchanged, without options. Every process was killed with -9 in the middle; then the",
-        "same commands resumed the work.",
+        "and meshes were used unchanged, without options. At a third of the work every process was killed with -9;",
+        "then the same commands resumed the work.",
         "",
         "| what | |",
         "| --- | --- |",

@@ -1,11 +1,10 @@
-"""A GPU against the CPU of the same machine: the grasps must be as good, and how fast they are made; prints Markdown.
+"""Quality and speed of grasps on a GPU, compared with the CPU of the same machine; prints Markdown.
 
 usage: python -m benchmarks.on_gpu DATA_DIR [--device cuda:0] [--batches 32 256 1024] [--grasps 64]
            [--json OUT] [--page OUT]
 
-DATA_DIR holds hands/ and objects/. Accuracy: grasps of both devices from the same seeds, validated by the same
-validator and measured by the same table, on the CPU. Speed: wall time of each stage of a launch, after one that is not
-timed.
+DATA_DIR holds hands/ and objects/. For accuracy, both devices plan grasps from the same seeds; the CPU validates
+and measures them. Speed is the wall time of each stage of a launch, after an untimed one.
 """
 
 from __future__ import annotations
@@ -42,12 +41,12 @@ from graspd.worker.validation.validator import validate
 
 T = TypeVar("T")
 OBJECTS: Final = ("025_mug", "006_mustard_bottle", "003_cracker_box", "024_bowl", "077_rubiks_cube", "048_hammer")
-#: Not a seed that any setting was chosen with.
+#: Seed that was not used to choose any setting.
 SEED: Final = 808
 FIDELITY: Final = FIDELITIES["standard"]
-#: Grasps of a launch that are validated and measured.
+#: Largest number of grasps per launch that are validated and measured.
 VALIDATED: Final = 128
-#: What both devices are compared by, a mean over the grasps each, and its digits in the report.
+#: Compared metrics (means over the grasps), with their digits in the report.
 COLUMNS: Final = {"epsilon": 3, "penetration_depth_mm": 2, "contact_area_cm2": 1}
 SHOWN: Final = {"gsr": 2, **COLUMNS}
 
@@ -58,7 +57,7 @@ def say(line: str) -> None:
 
 
 def timed(work: Callable[[], T]) -> tuple[T, float]:
-    """What `work` gives, and its wall time [s]."""
+    """Return the result of `work`, and its wall time [s]."""
     began = time.perf_counter()
     made = work()
     return made, time.perf_counter() - began
@@ -74,8 +73,10 @@ def quality(hand: HandModel, obj: ObjectModel, device: str, count: int) -> dict[
 
 
 def stages(hand: HandModel, obj: ObjectModel, device: str, batch: int) -> dict[str, float]:
-    """Wall milliseconds of each stage for one of `batch` grasps, the share that holds, and how far a hand is moved when
-    the same launch is made again [mm]."""
+    """Return wall ms of each stage per grasp of a launch, the held share, and the largest shift of a hand [mm].
+
+    The shift is the distance between the hands of two equal launches.
+    """
     run, wanted = ExecutionContext(device), PlanRequest(batch, FIDELITY, SEED)
     parts = planner.optimise_batch(hand, obj, wanted, run)
     again, planned = timed(lambda: planner.optimise_batch(hand, obj, wanted, run))
@@ -85,7 +86,7 @@ def stages(hand: HandModel, obj: ObjectModel, device: str, batch: int) -> dict[s
     planner.grasps_of(hand, obj, parts, 0.0, device=device)
     grasps, around = timed(lambda: planner.grasps_of(hand, obj, again, 0.0, device=device))
     few, pieces = grasps.take(np.arange(min(batch, VALIDATED))), decompose(obj)
-    # Compiled models of the validator and kernels of the table are kept: a first call makes them.
+    # An untimed call compiles the models of the validator and the kernels of the metrics, which are cached.
     warm = grasps.take(np.arange(min(batch, 16)))
     validate(hand, obj, warm, pieces=pieces)
     measure(hand, obj, warm)
@@ -112,11 +113,13 @@ def page(result: dict[str, Any]) -> str:
         f"    {result['command']}",
         "",
         f"{result['date']}: {result['device']}, {result['cores']} cores, {result['versions']}. Fidelity *standard*, "
-        f"seed {SEED}. Wall milliseconds per grasp of a launch on {result['hands_object']}, in one process, then "
-        f"of validation and metrics on the CPU for at most {VALIDATED} grasps. *Moved*: distance between the hands of "
-        "two equal launches.",
+        f"seed {SEED}. Times are wall milliseconds per grasp on {result['hands_object']}, in one process. One launch "
+        "plans the number of grasps in the second column. Validator and metrics run on the CPU, for at most "
+        f"{VALIDATED} grasps. *Moved*: largest distance between the hands of two equal launches.",
         "",
-        "| hand | a launch | planner ms | postures ms | candidates/s | validate ms | table ms | hold | moved mm |",
+        "| hand | grasps per launch | planner ms | postures ms | candidates/s | validator ms | metrics ms | held | "
+        "moved mm "
+        "|",
         "| --- | --: | --: | --: | --: | --: | --: | --: | --: |",
     ]
     for hand, rows in result["speed"].items():
@@ -128,10 +131,10 @@ def page(result: dict[str, Any]) -> str:
             )
     lines += [
         "",
-        "Quality of grasps on GPU / CPU for equal seeds, validated and measured by the same code "
-        f"({result['grasps']} grasps per pair; a share has an error of {1.96 * (0.25 / result['grasps']) ** 0.5:.2f}).",
+        "Grasps on GPU / CPU for equal seeds, validated and measured by the same code. Each pair has "
+        f"{result['grasps']} grasps, so a share has an error of up to {1.96 * (0.25 / result['grasps']) ** 0.5:.2f}.",
         "",
-        "| hand | object | hold | ε | depth mm | contact cm² |",
+        "| hand | object | held | ε | penetration mm | contact cm² |",
         "| --- | --- | --: | --: | --: | --: |",
     ]
     for hand, meshes in result["accuracy"].items():
@@ -154,8 +157,8 @@ def main() -> None:
     parser.add_argument("data", type=Path)
     parser.add_argument("--device", default="auto")
     parser.add_argument("--batches", type=int, nargs="+", default=[32, 256, 1024])
-    parser.add_argument("--grasps", type=int, default=64, help="of each pair whose quality is compared")
-    parser.add_argument("--json", type=Path, help="all figures, written as they come")
+    parser.add_argument("--grasps", type=int, default=64, help="grasps of each pair for the comparison of quality")
+    parser.add_argument("--json", type=Path, help="file for all figures, rewritten after each step")
     parser.add_argument("--page", type=Path, help="the report")
     wanted = parser.parse_args()
     device = Device(wanted.device).resolve()

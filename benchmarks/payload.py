@@ -1,12 +1,12 @@
-"""Error and price of a grasp's payload against whole lifts of ever other masses, and how far its bound is above it.
+"""Error and CPU time of the payload against full tests of each mass, and ratio of its bound to the payload.
 
 usage: python -m benchmarks.payload DATA_DIR [--hands allegro ...] [--objects 025_mug ...] [--grasps 8] [--scenes 4]
            [--seed 1500] [--free] [--page OUT.md]
-       DATA_DIR holds hands/ and objects/; free: objects are pushed six ways instead of lifted off a table
+       DATA_DIR holds hands/ and objects/; --free: six pushes instead of a lift off a table
 
-Grasps are valid for objects of their published masses. The whole lift rises and holds as the validator's, or holds
-under each push, for each mass of a bisection to 3 %. The bound is the largest load capacity of a pair's grasps over the
-largest payload of them, squeezed with 50 to 1000 N.
+Grasps are valid for objects of their published masses. The full test repeats the validator's rise and hold, or each of
+its pushes, for each mass of a bisection to 3 %. The bound is the largest load capacity of a pair's grasps over their
+largest payload, squeezed with 50 to 1000 N.
 """
 
 from __future__ import annotations
@@ -40,15 +40,19 @@ from graspd.worker.validation.payload import LIFTING, LiftPayload, PushPayload, 
 from graspd.worker.validation.protocol import DIRECTIONS, Outcome, Rollout
 
 SEED: Final = 1500
-#: Sums of normal forces [N].
+#: Total normal forces of the stronger squeezes [N].
 FORCES_N: Final = (100.0, 200.0, 400.0, 1000.0)
 OBJECTS: Final = ("005_tomato_soup_can", "006_mustard_bottle", "025_mug", "061_foam_brick")
 HEAD: Final = """# Payload of grasps: error and cost
 
-`python -m benchmarks.payload DATA{option}`: ratio of the payload of valid grasps to the payload by full tests of each
-mass, and CPU time per grasp of both. Last column, smallest value over the pairs: largest load capacity of a pair's
-grasps over their largest payload, squeezed as planned and with 100 to 1000 N. {grasps} grasps wanted per pair,
-{objects}, seed {seed}.
+`python -m benchmarks.payload DATA{option}`: payload of valid grasps, compared with full tests of each mass.
+
+- *Ratio*: payload over the payload by full tests; *error*: deviation of the ratio from 1.
+- *CPU ms*: mean time per grasp, of the payload and of the full tests.
+- *Bound*: largest load capacity of a pair's grasps over their largest payload, squeezed as planned and with 100 to
+  1000 N; smallest value over the pairs.
+
+{grasps} grasps wanted per pair of hand and object; objects {objects}; seed {seed}.
 
 """
 Floats = NDArray[np.float64]
@@ -102,7 +106,8 @@ def main() -> None:
     parser.set_defaults(grasps=8, objects=list(OBJECTS))
     given = parser.parse_args()
     rows = [
-        "| hand | grasps | median ratio | median error | error of nine in ten | CPU ms | of whole tests | bound |",
+        "| hand | grasps | median ratio | median error | 90th percentile of error | CPU ms | CPU ms of full tests | "
+        "bound |",
         "|---|--:|--:|--:|--:|--:|--:|--:|",
     ]
     for name in given.hands:
@@ -122,11 +127,13 @@ def main() -> None:
 
 
 def of_pair(given: Any, hand: HandModel, name: str, mass: float) -> tuple[Floats, Floats, Floats, float]:
-    """Of each valid grasp of a pair: ratio of the payload to that by whole tests, and CPU time of both [ms]; and the
-    bound of all of them over the largest payload."""
+    """Return for each valid grasp of a pair the payload over that of full tests, and the CPU time of both [ms].
+
+    The last value is the bound of all grasps over their largest payload.
+    """
     grasps, obj, placed = valid_grasps(given, hand, given.data / "objects" / name / "clean.stl", mass)
     around = (placed.supports,) if placed is not None else ()
-    # Where the root is not fixed the weld gives way, and the object with its hand.
+    # The weld of a root that is not fixed yields, which moves the object and the hand.
     whole = LIFTING if placed is None else MujocoOptions()
     scenes = [scene_of(hand, obj, decompose(obj), physics, *around) for physics in (LIFTING, whole)]
     tests: list[LiftPayload | PushPayload]
@@ -140,7 +147,7 @@ def of_pair(given: Any, hand: HandModel, name: str, mass: float) -> tuple[Floats
             began = time.process_time()
             kilograms[k, row] = test.payload(grasps, row)
             milliseconds[k, row] = 1e3 * (time.process_time() - began)
-    # Told are valid grasps: what they lift at least is the object.
+    # Grasps are valid, so they lift at least the object.
     kilograms = np.nan_to_num(kilograms, nan=obj.mass)
     strongest = limit_of(
         hand,
@@ -155,7 +162,7 @@ def of_pair(given: Any, hand: HandModel, name: str, mass: float) -> tuple[Floats
 
 
 def squeezed(hand: HandModel, obj: ObjectModel, grasps: GraspSet) -> GraspSet:
-    """Grasps as they are, then with the squeezes of `FORCES_N`."""
+    """Return the grasps unchanged, then with the squeezes of `FORCES_N`."""
     stronger = [squeeze(hand, obj, grasps.grasp, total_normal_force=force) for force in FORCES_N]
     return joined([grasps, *(replace(grasps, squeeze=one) for one in stronger)])
 
@@ -167,7 +174,7 @@ def every(grasps: GraspSet) -> NDArray[np.intp]:
 def valid_grasps(
     given: Any, hand: HandModel, mesh: Path, mass: float
 ) -> tuple[GraspSet, ObjectModel, PlacedGrasps | None]:
-    """Grasps of an object about its centre, and their scenes; None: the object is free."""
+    """Return valid grasps in the frame of the object's centre, and their scenes; None: the object is free."""
     obj = object_from_path(str(mesh), face_error_m=FIDELITIES["standard"].face_error_m).weighing(mass=mass)
     request = JobOptions(grasps=given.grasps, rechecks=0, seed=given.seed)
     scenes = None

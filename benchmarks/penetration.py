@@ -1,4 +1,4 @@
-"""Penetration, contact and variety of the planner's grasps with and without the final projection, as Markdown.
+"""Penetration, contact and diversity of grasps with and without the final projection, as Markdown.
 
 usage: python -m benchmarks.penetration DATA_DIR [--objects NAME ...] [--grasps 32]
 
@@ -31,7 +31,7 @@ PLATE = "plate of 1 mm"
 
 
 def nearest_mm(hand: HandModel, poses: np.ndarray, joints: np.ndarray) -> float:
-    """Smallest mean distance between the same surface points of two grasps [mm]."""
+    """Return the smallest mean distance between equal surface points of two grasps [mm]."""
     points = sample_surface(hand, 200)
     bodies = body_poses(hand, poses, joints)
     world = apply(bodies[:, points.body], points.position)
@@ -65,7 +65,9 @@ def main() -> None:
     given = parser.parse_args()
     hand = hand_from_path(given.data / "hands" / "allegro" / "allegro_hand_right.urdf")
     sys.stdout.write(
-        "| object | projection | mean depth mm | max | below 1 mm | self mean mm | contact cm2 | ε | nearest two mm |\n"
+        "| object | projection | penetration mm, mean | penetration mm, largest | below 1 mm | self-penetration mm, "
+        "mean "
+        "| contact cm² | ε | two most similar, mm |\n"
         "| --- | --- | --: | --: | --: | --: | --: | --: | --: |\n"
     )
     for name in given.objects:

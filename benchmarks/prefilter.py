@@ -1,11 +1,11 @@
-"""How often the prefilter says what the standard level says, and how many grasps it validates a second.
+"""Agreement of the prefilter with level standard, and its speed.
 
 usage: python -m benchmarks.prefilter DATA_DIR [--work DIR] [--device cuda:0] [--hands ...] [--objects ...]
-           [--grasps 48] [--speed 256 1024] [--worlds 256 1024] [--out docs/results/prefilter]
-DATA_DIR holds hands/ and objects/. The prefilter and the standard level validate the same candidates; agreement is that
-of the prefilter's clear verdicts. `--speed N` times N grasps (those of the first cell of each hand, moved at random by
-up to a tenth of a millimetre) in pools of `--worlds`. Prints Markdown; `--out` gets .json and .md. Stopped
-runs go on (see cells.py); the prefilter's own verdicts are made anew.
+[--grasps 48] [--speed 256 1024] [--worlds 256 1024] [--out docs/results/prefilter] DATA_DIR holds hands/ and objects/.
+The prefilter and level standard validate the same candidates; agreement refers to the prefilter's clear verdicts.
+`--speed N` times N grasps in pools of `--worlds`: those of the first cell of each hand, moved at random by up to 0.1
+mm. Prints Markdown; `--out` receives .json and .md. Interrupted runs resume (see cells.py), but the prefilter's
+verdicts are not cached.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from graspd.worker.validation.model import MujocoOptions, build
 from graspd.worker.validation.prefilter.prefilter import PrefilterOutcomes, WorldPool, mujoco_warp
 
 OBJECTS = ("005_tomato_soup_can", "025_mug", "011_banana", "035_power_drill")
-#: Largest shift of a grasp that is validated again for its time [m].
+#: Largest random shift of repeated grasps in speed tests [m].
 JITTER_M = 1e-4
 
 
@@ -74,7 +74,7 @@ def together(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def many(grasps: GraspSet, count: int) -> GraspSet:
-    """`count` grasps: these again and again, each moved a little."""
+    """Return `count` grasps: copies of these, each with a small shift."""
     rng, rows = np.random.default_rng(7), np.arange(count) % len(grasps)
     shift = np.zeros((count, 7))
     shift[len(grasps) :, :3] = rng.uniform(-JITTER_M, JITTER_M, (max(0, count - len(grasps)), 3))
@@ -86,7 +86,7 @@ def many(grasps: GraspSet, count: int) -> GraspSet:
 
 
 def speeds(cell: Cell, device: str, counts: list[int], worlds: list[int]) -> Iterator[dict[str, Any]]:
-    """Grasps a second, kernels loaded; the pool's making is told beside it."""
+    """Yield grasps per second with loaded kernels, and separately the time to build the pool."""
     for size in worlds:
         began = time.perf_counter()
         pool = pool_of(cell, device, size)
@@ -94,7 +94,7 @@ def speeds(cell: Cell, device: str, counts: list[int], worlds: list[int]) -> Ite
         made = time.perf_counter() - began
         for count in counts:
             grasps = many(cell.grasps, count)
-            pool.validate(grasps)  # arrays and graph of this number of grasps
+            pool.validate(grasps)  # prepares arrays and graph for this number of grasps
             began = time.perf_counter()
             found: PrefilterOutcomes = pool.validate(grasps)
             seconds = time.perf_counter() - began
@@ -116,9 +116,13 @@ def speeds(cell: Cell, device: str, counts: list[int], worlds: list[int]) -> Ite
             }
 
 
+ABOUT = """\
+Verdicts of the prefilter, compared with level *standard*. A verdict is clear if its margin to the
+limits is large and no contacts overflowed their memory."""
 AGREEMENT = (
-    "| hand | grasps | hold | agreement of all | clear | agreement of clear ones (95 %) | false accepts, refusals "
-    "| overflows |\n| --- | --: | --: | --: | --: | --- | --- | --: |"
+    "| hand | grasps | held at level standard | agreement of all verdicts | clear verdicts "
+    "| agreement of clear verdicts (95 %) | false accepts, false rejections | overflows |\n| --- | --: | --: | --: | "
+    "--: | --- | --- | --: |"
 )
 SPEED = (
     "| hand | object | worlds | grasps | grasps/s | world steps/s | ms a tick |\n"
@@ -172,7 +176,9 @@ def main() -> None:
     sys.stdout.write("\n".join([f"{engine}", "", *text]))
     if args.out:
         write_json(args.out.with_suffix(".json"), {"engine": engine, "cells": rows, "hands": totals, "speed": timed})
-        args.out.with_suffix(".md").write_text("\n".join([f"# The prefilter\n\n{engine}\n", *text]).rstrip() + "\n")
+        args.out.with_suffix(".md").write_text(
+            "\n".join([f"# The prefilter\n\n{ABOUT} Engine: {engine}.\n", *text]).rstrip() + "\n"
+        )
 
 
 if __name__ == "__main__":

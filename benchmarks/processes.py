@@ -2,13 +2,12 @@
 
 usage: python -m benchmarks.processes DATA_DIR [--grasps 256] [--hand allegro] [--object mug] [--ways 1t 2t 2p]
 
-DATA_DIR holds hands/. A way is a number of threads (t) or processes (p). Candidates of a pair are planned once, and
-validated and measured in each way, the processes started and the models built before. Told are wall and processor time
-for a candidate, of all processes together, the memory of a process, and whether all came out bit for bit as by one
-thread.
+DATA_DIR holds hands/. A way is a number of threads (t) or processes (p). Candidates of a pair are planned once, then
+validated and measured in each way, with running processes and compiled models. The table has wall and processor time
+per candidate over all processes, the memory of a process, and whether results equal those of one thread bit for bit.
 
-How much of its time one thread holds Python's lock: the samples of `py-spy record --gil -f raw`, over those without
-`--gil`, of `--ways 1t --only validate` or `table`.
+The share of time in which one thread holds Python's lock is the number of samples of `py-spy record --gil -f raw` over
+the number without `--gil`, with `--ways 1t --only validate` or `table`.
 """
 
 from __future__ import annotations
@@ -36,14 +35,14 @@ from graspd.worker.quality.table import measure
 from graspd.worker.validation.decomposition import decompose
 from graspd.worker.validation.validator import validate
 
-#: Clock ticks and bytes as /proc tells them.
+#: Units of /proc: clock ticks and bytes.
 _TICK_S: Final = 1 / os.sysconf("SC_CLK_TCK")
 _FIELDS: Final = ("VmRSS", "RssAnon")
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Threads of this process, or processes beside it."""
+    """A number of threads of this process, or of further processes."""
 
     name: str
 
@@ -65,14 +64,14 @@ def processor_s(pids: Sequence[int]) -> float:
 
 
 def memory_mib(pid: int) -> list[float]:
-    """Resident memory of a process, and what of it is not of files, which others share [MiB]."""
+    """Return the resident memory of a process, and its part that is not backed by shared files [MiB]."""
     status = Path(f"/proc/{pid}/status").read_text()
     found = [re.search(rf"^{name}:\s+(\d+) kB", status, re.MULTILINE) for name in _FIELDS]
     return [int(one.group(1)) / 1024 for one in found if one is not None]
 
 
 class Pair:
-    """Candidates of a hand on an object, and what is made of them."""
+    """Candidates of a hand on an object, with functions that validate and measure them."""
 
     def __init__(self, data: Path, hand: str, obj: str, count: int) -> None:
         (urdf, *_) = sorted((data / "hands" / hand).glob("*.urdf"))

@@ -1,12 +1,12 @@
-"""Whether the verdict of the self-test tells what published hands lift of objects that it does not try.
+"""Self-tests of published hands, compared with lifts of objects that the self-test does not use.
 
     pip install --no-deps --target DIR airo-models example-robot-data robosuite robosuite-models robopianist
     pip install --no-deps --target DIR mani-skill dexmate-urdf gymnasium-robotics
     python -m benchmarks.published_hands DIR --data DATA
 
-DATA holds objects/ (YCB and others). Hands that are not in DIR are left out. A hand that is done is kept in
-`docs/results/published_hands.json` under its content and the planner's revision, so a broken run goes on where it was.
-`--out FOLDER` takes another folder than docs/results/.
+DATA holds objects/ (YCB and others). Hands that are not in DIR are skipped. Results are cached in
+`docs/results/published_hands.json` by the hand's digest and the planner's revision, so an interrupted run resumes.
+`--out FOLDER` replaces docs/results/.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from graspd.worker.planners.fast_graspd.antipodal_starts import crossings_of
 from graspd.worker.scenes.placement import scenes_of
 from graspd.worker.stages.hand_self_test import TABLE_READY, tried_softly
 
-#: Beside those of the gallery; LEAP stands in DIR as MuJoCo Menagerie has it.
+#: Hands besides those of the gallery; DIR has LEAP in the folders of MuJoCo Menagerie.
 _SKILL, _MATE = "mani_skill/assets/robots", "dexmate_urdf/robots/hands/f5d6_hand"
 MORE = (
     Entry("leap", "LEAP", "MuJoCo Menagerie, MIT", "leap/right_hand.xml"),
@@ -59,12 +59,12 @@ MORE = (
     ),
 )
 OBJECTS = ("025_mug", "005_tomato_soup_can", "011_banana")
-#: Share of an object's pairs of opposite places that a hand must open to: one that takes it by a rim or a handle alone
-#: tells little of the hand.
+#: Least share of an object's antipodal pairs that the open hand must fit. Grasps of a rim or handle alone say little
+#: about the hand.
 FITTING = 0.1
-#: Not a seed that any setting was chosen with.
+#: Seed that was not used to choose any setting.
 SEED, SCENES = 404, 4
-#: What a row is of, at the end of its key.
+#: Revisions at the end of the key of a row.
 REVISIONS = f"{STAGE_REVISIONS['synthesize']}-{STAGE_REVISIONS['scene']}"
 
 
@@ -72,7 +72,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sources", type=Path)
     parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--grasps", type=int, default=16, help="of each object")
+    parser.add_argument("--grasps", type=int, default=16, help="candidates per object")
     parser.add_argument("--only", help="names of hands, comma-separated")
     parser.add_argument("--out", type=Path, default=Path("docs/results"))
     asked = parser.parse_args()
@@ -106,7 +106,7 @@ def main() -> None:
 
 
 def lift_share(hand: HandModel, folder: Path, grasps: int) -> float | None:
-    """Share of candidates that lift an object off a table; None where it does not fit, see `FITTING`."""
+    """Return the share of candidates that lift an object off a table; None if it does not fit, see `FITTING`."""
     obj, jaws = object_from_path(folder / "clean.stl"), jaws_of(hand)
     widest = oppositions_of(hand).widest if jaws is None else jaws.opening
     if np.mean(crossings_of(obj).width <= widest) < FITTING:
@@ -138,13 +138,16 @@ def page(done: dict[str, Any]) -> str:
     earlier = sum(not row["key"].endswith(f"-{REVISIONS}") for row in done.values())
     return (
         "# Published hands: self-test and lifts\n\n"
-        "`python -m benchmarks.published_hands DIR --data DATA`: self-test of each hand as published (*free* "
-        "and *table*: shares that hold and that lift), and share of candidates that lift each object "
-        f"off a table, {grasps} candidates per object, standard fidelity, seed {SEED}. *Too wide*: the hand opens "
-        "wide enough "
-        f"for less than {FITTING:.0%} of the antipodal pairs. The verdict agrees if a hand is "
-        f"ready and lifts {TABLE_READY:.0%} or more, or neither: {agreeing} of {len(done)} agree. Of earlier "
-        f"revisions than today's: {earlier} rows (their keys are in the JSON).\n\n"
+        "`python -m benchmarks.published_hands DIR --data DATA`: self-test of each hand as published, and lifts of "
+        "objects "
+        "that the self-test does not use.\n\n"
+        "- *Free*, *table*: shares of the self-test's candidates that hold, and that lift.\n"
+        f"- Columns with an object: share of {grasps} candidates that lift it off a table, fidelity *standard*, seed "
+        f"{SEED}; *mean*: over the objects.\n"
+        f"- *Too wide*: the hand opens wide enough for less than {FITTING:.0%} of the antipodal pairs.\n"
+        f"- *Agrees*: the hand is ready and lifts {TABLE_READY:.0%} or more on average, or neither; {agreeing} of "
+        f"{len(done)} agree.\n\n"
+        f"{earlier} of the rows are from revisions before today's; the JSON has their keys.\n\n"
         f"| hand | from | dofs | verdict | free | table | {' | '.join(OBJECTS)} | mean | agrees | self-test [s] |\n"
         f"| --- | --- | --: | --- | --: | --: | {'--: | ' * len(OBJECTS)}--: | --- | --: |\n" + "\n".join(rows) + "\n"
     )

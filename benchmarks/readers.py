@@ -1,9 +1,9 @@
 """Samples per second of the readers against plain HDF5: `python -m benchmarks.readers SHARDS [--json]`.
 
-SHARDS is a folder with base, scene and views shards, `demo-out/shards` say. One run, warm: all ways in turn, five
-times; of each the best pass counts, by the clock and by processor time. A ratio is to plain h5py that reads the same
-samples as many at a time; pictures one by one, in an order drawn at random, are held against plain h5py in bulk.
-With `--s3` pictures alone: from an S3 server of this machine by ranges of bytes, against the same from its disk.
+SHARDS is a folder with base, scene and views shards, for example `demo-out/shards`. Each reader makes five warm passes,
+alternating with the others; the best pass counts, by wall time and by processor time. Ratios are to plain h5py with the
+same samples and the same number per read. Single pictures in random order are compared with plain h5py in bulk.
+`--s3` reads only pictures: by byte ranges from an S3 server on this machine, compared with the local disk.
 """
 
 from __future__ import annotations
@@ -36,34 +36,34 @@ PICTURE = ("image/rgb", "image/depth", "image/segmentation", "camera/intrinsics"
 
 @dataclass(frozen=True)
 class Trajectory:
-    """A way to read: a pass that counts its samples, and the name of the plain way it is held against."""
+    """A reader: a pass that counts its samples, and the name of the plain reader for comparison."""
 
     work: Callable[[], int]
     against: str
 
 
 def plain_columns(shards: Shards) -> int:
-    """Every column of the default sample, whole, by h5py."""
+    """Read every column of the default sample at once with h5py."""
     return _whole(shards, "base", DEFAULT_COLUMNS)
 
 
 def plain_rows(shards: Shards) -> int:
-    """The same grasp by grasp, each file opened once."""
+    """Read the same columns grasp by grasp; open each file once."""
     return _row_by_row(shards, "base", DEFAULT_COLUMNS)
 
 
 def plain_pictures(shards: Shards) -> int:
-    """Colour, depth, labels and camera of every picture, one by one, each file opened once."""
+    """Read colour, depth, labels and camera of every picture one by one; open each file once."""
     return _row_by_row(shards, "views", PICTURE)
 
 
 def plain_bulk(shards: Shards) -> int:
-    """The same, every file's columns whole: as fast as h5py goes."""
+    """Read the same columns of each file at once, the fastest way with h5py."""
     return _whole(shards, "views", PICTURE)
 
 
 def plain_drawn(shards: Shards, order: Sequence[int], places: Sequence[PictureAddress]) -> int:
-    """The same pictures in a drawn order: each opens its file."""
+    """Read the same pictures in random order; each read opens its file."""
     for index in order:
         with h5py.File(shards.path(places[index].file), "r") as opened:
             for name in PICTURE:
@@ -103,12 +103,12 @@ def ways(shards: Shards) -> dict[str, Trajectory]:
     try:
         return found | loaders(shards)
     except ModuleNotFoundError:
-        typer.echo("torch is not installed: its loaders are left out", err=True)
+        typer.echo("torch is not installed: its loaders are skipped", err=True)
         return found
 
 
 def of_pictures(shards: Shards) -> dict[str, Trajectory]:
-    """Ways to read pictures without PyTorch."""
+    """Return readers of pictures without PyTorch."""
     pictures = Pictures(shards, PICTURE)
     order = np.random.default_rng(0).permutation(len(pictures)).tolist()
     bulk = "h5py, pictures in bulk"
@@ -128,7 +128,7 @@ def loaders(shards: Shards) -> dict[str, Trajectory]:
 
     from graspd.service.readers.torch_data import Samples, ShuffledShards, collate
 
-    torch.set_num_threads(1)  # on a busy machine the threads of one copy wait for one another
+    torch.set_num_threads(1)  # under other load, threads of one copy would wait for one another
     found = {}
     for processes in (0, 2):
         streams = [
@@ -145,7 +145,7 @@ def loaders(shards: Shards) -> dict[str, Trajectory]:
 
 
 def by_hand(shards: Shards) -> list[Shards]:
-    """The shards of each hand: hands differ in their joints, so that their grasps fit into no common array."""
+    """Return the shards of each hand: hands differ in their joints, so grasps have no common array."""
     return [shards.only(hands=[hand]) for hand in dict.fromkeys(file.hand for file in shards)]
 
 
@@ -154,13 +154,12 @@ def arrays_of(shards: Shards) -> int:
 
 
 def rows_of(loaders: list[Any]) -> Callable[[], int]:
-    """A pass over loaders that counts their samples."""
+    """Return a pass over loaders that counts their samples."""
     return lambda: sum(len(batch["row"]) for batch in itertools.chain.from_iterable(loaders))
 
 
 def streamed(local: Shards, url: str, scratch: Path) -> dict[str, Trajectory]:
-    """Pictures of a store, read ahead by four threads, against the same on disk; of the store nothing is held when a
-    pass begins."""
+    """Return readers of pictures from a store with four prefetch threads, and from disk; passes start uncached."""
     store = open_store(url)
     files = []
     for file in local:
@@ -189,12 +188,12 @@ def streamed(local: Shards, url: str, scratch: Path) -> dict[str, Trajectory]:
 class Rate:
     by_clock: float
     by_processor: float
-    """Of the processor time of this process alone."""
+    """Samples per second of processor time of this process."""
 
 
 def run(chosen: dict[str, Trajectory]) -> dict[str, Rate]:
     for way in chosen.values():
-        way.work()  # warms the files
+        way.work()  # fills the file cache
     best = dict.fromkeys(chosen, Rate(0.0, 0.0))
     for _ in range(ROUNDS):
         for name, way in chosen.items():

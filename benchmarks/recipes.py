@@ -1,9 +1,9 @@
-"""What parts of the recipe buy: success of Allegro grasps with one thing changed at a time, as Markdown.
+"""Effect of the planner's settings: success of Allegro grasps with one setting changed, as Markdown.
 
 usage: python -m benchmarks.recipes DATA_DIR [--objects NAME ...] [--grasps 32]
 
-DATA_DIR holds hands/ and objects/. Hands are planned without a trial: what is measured is what the merit chooses.
-Seconds are processor time of all threads, postures included.
+DATA_DIR holds hands/ and objects/. Candidates are planned without rollouts, so the planner's merit alone selects them.
+Seconds are processor time of all threads, including postures.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ SEED = 101
 CHANGES: dict[str, dict[str, Any]] = {
     "standard": {},
     "one start, no selection": {"starts": 1, "finalists": 1},
-    "two starts, both finish": {"starts": 2, "finalists": 2},
-    "four starts, one finishes": {"starts": 4, "finalists": 1},
+    "two starts, both refined": {"starts": 2, "finalists": 2},
+    "four starts, one refined": {"starts": 4, "finalists": 1},
     "no projection": {"polish_iterations": 0},
-    "first dilation where it touches": {"dilation": "touch"},
+    "initial dilation at first contact": {"dilation": "touch"},
     "13 velocities": {"velocities": 13},
-    "contacts by averaged Jacobi": {"contact_solver": "jacobi"},
-    "contacts by Gauss-Seidel": {"contact_solver": "gauss_seidel"},
+    "contact solver: averaged Jacobi": {"contact_solver": "jacobi"},
+    "contact solver: Gauss-Seidel": {"contact_solver": "gauss_seidel"},
 }
 
 
@@ -42,8 +42,8 @@ def recipes() -> dict[str, Fidelity]:
     standard = FIDELITIES["standard"]
     found = {name: standard.model_copy(update=change) for name, change in CHANGES.items()}
     return found | {
-        "attraction alone, no simulation": FIDELITIES["control"],
-        "the paper's, as written": FIDELITIES["paper"],
+        "attraction term only, no simulation": FIDELITIES["control"],
+        "settings of the Fast-Grasp'D paper": FIDELITIES["paper"],
     }
 
 
@@ -58,11 +58,11 @@ def main() -> None:
     objects = [
         object_from_path(given.data / "objects" / name / "clean.stl", face_error_m=error) for name in given.objects
     ]
-    # Kernels and pieces are there before anything is timed.
+    # Prepare kernels and pieces before the timed runs.
     validate(
         hand, objects[0], synthesize(hand, objects[0], PlanRequest(count=2, fidelity=FIDELITIES["standard"], seed=1))
     )
-    sys.stdout.write(f"| recipe | success | core seconds for {given.grasps} grasps |\n| --- | --: | --: |\n")
+    sys.stdout.write(f"| setting | success | core-seconds for {given.grasps} grasps |\n| --- | --: | --: |\n")
     for name, fidelity in recipes().items():
         rates, seconds = [], 0.0
         for obj in objects:

@@ -1,8 +1,8 @@
 """Quality of standard candidates of the three hands on all objects, under the unmodified DexGraspBench protocol.
 
 usage: python -m benchmarks.results_tables DATA_DIR [--work DIR] [--hands allegro ...] [--objects NAME ...] [--out DIR]
-DATA_DIR holds hands/ and objects/. Writes quality-HAND.json and quality-HAND.md to `--out`. Stopped runs go on: every
-cell (hand, object) is kept under `--work` (see cells.py); a whole run takes some hours of one core.
+DATA_DIR holds hands/ and objects/. Writes quality-HAND.json and quality-HAND.md to `--out`. An
+interrupted run resumes: `--work` caches every pair of hand and object (see cells.py). A run takes some core-hours.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from graspd.worker.validation.displacement import simulated_displacement_cm
 from graspd.worker.validation.robust import reaches, robust
 
 FRICTION, THRESHOLD_M, TOP, CORES = 1.0, 0.005, 10, 2
-#: Share of the models that many certified grasps should reach.
+#: Share of perturbed models that a robust grasp must hold in.
 SHARE = 0.75
 #: Fast-Grasp'D, table 2 (YCB): means over the top 10 by epsilon of each object.
 PAPER = {
@@ -66,7 +66,7 @@ def metrics(cell: Cell) -> dict[str, Any]:
 
 
 def in_models(cell: Cell) -> dict[str, Any]:
-    """Of each grasp that the standard level holds: the share of models around the nominal one in which it does."""
+    """Return, for each grasp held at level standard, the share of perturbed models in which it holds."""
     held = np.array(cell.verdicts("standard", False)["success"])
     found = robust(
         cell.hand, cell.obj, cell.grasps, held=held, models=ROBUST_MODELS, seed=SEED, pieces=decompose(cell.obj)
@@ -105,7 +105,7 @@ def row(cell: Cell) -> dict[str, Any]:
 
 
 def whole(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """All objects in one row: rates over all grasps, means of the objects' medians."""
+    """Return one row over all objects: rates over all grasps, means of the objects' medians."""
     n, held = sum(r["n"] for r in rows), sum(r["held"] for r in rows)
     made, validated = sum(r["seconds"] for r in rows), sum(r["validation_seconds"] for r in rows)
     out = {key: float(np.mean([r[key] for r in rows])) for key, _, _ in PRINTED if key != "robust"}
@@ -148,26 +148,36 @@ def markdown(hand: str, rows: list[dict[str, Any]], total: dict[str, Any], comma
             f"# Quality of {hand.capitalize()} grasps",
             "",
             f"graspd {PACKAGE_VERSION}, `{command}`: {rows[0]['n']} candidates on each of {len(rows)} objects, "
-            f"real URDF, standard fidelity, seed {SEED}. Validator: MuJoCo, level *dexgraspbench*.",
+            f"real URDF, fidelity *standard*, seed {SEED}. Validator: MuJoCo, level *dexgraspbench*.",
             "",
-            f"**GSR {total['gsr']:.3f}, hard {total['gsr_hard']:.3f}; OSR {total['osr']:.2f}, hard "
-            f"{total['osr_hard']:.2f}; {total['sgs']:.1f} holding grasps per second of two cores, "
-            f"{total['sgs_without_validation']:.1f} without validation. {total['robust_many']} of {total['robust_n']} "
-            f"that hold at level standard do in {SHARE} of {ROBUST_MODELS} models around the nominal one.**",
+            f"- Grasps that hold (GSR): **{total['gsr']:.3f}**; at half friction (*hard*): {total['gsr_hard']:.3f}.",
+            f"- Objects with at least one such grasp (OSR): **{total['osr']:.2f}**; at half friction: "
+            f"{total['osr_hard']:.2f}.",
+            f"- Held grasps per second of two cores (SGS): **{total['sgs']:.1f}**; without the time of validation: "
+            f"{total['sgs_without_validation']:.1f}.",
+            f"- Of {total['robust_n']} grasps held at level *standard*, {total['robust_many']} hold in at least "
+            f"{SHARE} "
+            f"of {ROBUST_MODELS} perturbed models.",
             "",
             head,
             "| --- |" + " --: |" * len(PRINTED),
             *body,
             "",
-            f"GSR: share that holds, at full and at half friction. robust: share of {ROBUST_MODELS} models around "
-            "the "
-            "nominal one in which a valid grasp holds, on average. SGS: holding grasps per second, "
-            "made and validated (*standard*), seconds being CPU time over two cores. PD, SPD: penetration, "
-            "self-penetration mm. CDC: contact distance consistency mm. CA cm², ε, Vol at a contact threshold of 5 mm "
-            "and μ = 1. IV cm³. SD: simulated displacement cm. D: variance explained by the first component. Medians; "
-            "the last row has rates over all grasps and means of the medians.",
+            "Medians over the grasps of an object; the last row has rates over all grasps and means of the medians.",
             "",
-            f"Best {TOP} by ε of each object, means, as in table 2 of the paper (YCB objects there):",
+            "- *GSR*: share of grasps that hold; *hard*: the same at half friction.",
+            f"- *robust*: mean share of {ROBUST_MODELS} perturbed models in which a grasp holds that holds at level "
+            "*standard*.",
+            "- *SGS*: held grasps per second of planning and validation at level *standard*; seconds are CPU time over "
+            "two cores.",
+            "- *PD*, *SPD*: penetration and self-penetration [mm]; *CDC*: contact distance consistency [mm].",
+            "- *CA*: contact area [cm²]; *CA*, *ε* and *Vol* have a contact threshold of 5 mm and μ = 1; *IV*: "
+            "intersection [cm³].",
+            "- *SD*: simulated displacement [cm]; *D*: variance explained by the first principal component.",
+            "",
+            f"Means over the best {TOP} grasps of each object by ε, as in table 2 of the Fast-Grasp'D paper, which "
+            "also "
+            "has YCB objects:",
             "",
             "| | graspd | Fast-Grasp'D |",
             "| --- | --: | --: |",

@@ -1,9 +1,9 @@
-"""How far a verdict can be trusted: what each way in which a hand's model may be wrong costs in success.
+"""Robustness of verdicts: effect of each error of a hand's model on success.
 
 usage: python -m benchmarks.robust DATA_DIR [--work DIR] [--hands allegro ...] [--objects NAME ...] [--out FOLDER]
-DATA_DIR holds hands/ and objects/. Raw standard grasps are validated at level standard; those that hold are validated
-again in models that differ along one axis (`--draws` for each), along all axes at once, and as a job does it. `--out`
-gets robust.json and robust.md. Stopped runs go on (see cells.py).
+DATA_DIR holds hands/ and objects/. Standard candidates are validated at level standard. Those that hold are validated
+again in models that differ along one axis (`--draws` models each), along all axes at once, and as in a job. `--out`
+receives robust.json and robust.md. Interrupted runs resume (see cells.py).
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from graspd.worker.validation.robust import reaches, robust
 from graspd.worker.validation.variant import SHAPES, Models, Variant, axes_of, couplings_of, draw, together
 
 OBJECTS = ["003_cracker_box", "005_tomato_soup_can", "011_banana", "025_mug"]
-#: Of the draws; jobs of these seeds have other models.
+#: Seed of the random models; jobs with this seed have other models.
 SEED = 9102
 SHARES = (0.75, 0.9)
 ALL = "all at once"
-WORDS = {"hull": "one hull a link", "primitive": "primitives", "capsule": "capsules", "own": ""}
+WORDS = {"hull": "one hull per link", "primitive": "primitives", "capsule": "capsules", "own": ""}
 
 
 def kinds(cell: Cell, draws: int) -> dict[str, list[Callable[[np.random.Generator], Variant]]]:
-    """Rows of the table: how to draw the variants that a grasp is validated in."""
+    """Return, for each row of the table, functions that draw the variants in which a grasp is validated."""
     hand = cell.hand
     found: dict[str, list[Callable[[np.random.Generator], Variant]]] = {}
     for fit, grown in SHAPES:
@@ -53,8 +53,7 @@ def kinds(cell: Cell, draws: int) -> dict[str, list[Callable[[np.random.Generato
 
 
 def study(cell: Cell, draws: int) -> dict[str, Any]:
-    """Of one cell: for each row how often a grasp that holds nominally holds, and what validating as a job does
-    costs."""
+    """Return for one cell, per row, how many held grasps hold again, and the cost of validation as in a job."""
     pieces = decompose(cell.obj)
     held = np.array(cell.verdicts("standard", False)["success"]) == 1
     around = Models(cell.hand, cell.obj, pieces, MujocoOptions())
@@ -132,12 +131,12 @@ def page(done: list[dict[str, Any]], objects: list[str], draws: int) -> str:
         "# Robustness of verdicts",
         "",
         f"Made by `python -m benchmarks.robust`. Standard candidates on {', '.join(objects)}, "
-        f"{done[0]['candidates'] // len(objects)} on each; those that hold in the nominal model ({held}) "
-        f"were validated again in models with one difference, {draws} draws of each difference per grasp "
-        "(collision shapes and couplings: each kind once). Cells: share that still holds, with the 95 % interval of "
-        "Wilson as for independent verdicts.",
+        f"{done[0]['candidates'] // len(objects)} on each. Those that hold at level *standard* in the nominal model "
+        f"({held}) were validated again in models with one difference. Each grasp was tested in {draws} random models "
+        "per difference, but once in each kind of collision shapes and couplings. Cells: share that still holds, with "
+        "its 95 % interval (Wilson, for independent verdicts).",
         "",
-        f"| what differs | {' | '.join(hands)} |",
+        f"| difference | {' | '.join(hands)} |",
         f"| --- |{' --- |' * len(hands)}",
     ]
     names = list(dict.fromkeys(name for one in done for name in one["rows"]))
@@ -145,8 +144,8 @@ def page(done: list[dict[str, Any]], objects: list[str], draws: int) -> str:
     lines += [f"| {name} | {' | '.join(_cell(one['rows'].get(name)) for one in done)} |" for name in names]
     lines += [
         "",
-        f"Validation as by `--robust`: {ROBUST_MODELS} models per grasp, each along one axis, axes in random order. "
-        "*First failure*: difference of the first model in which a grasp failed.",
+        f"Validation as by `--robust`: {ROBUST_MODELS} models per grasp, each with one difference, in random order. "
+        "*First failure*: differences in the first model in which a grasp failed, with numbers of grasps.",
         "",
         "| | " + " | ".join(hands) + " |",
         f"| --- |{' --- |' * len(hands)}",
@@ -167,7 +166,7 @@ def page(done: list[dict[str, Any]], objects: list[str], draws: int) -> str:
         what = "all models" if wanted == "0" else f"until {wanted} is decided"
         each = " | ".join(f"{one['cpu_ms'][wanted]:.0f} ({one['validated'][wanted]:.1f} models)" for one in done)
         lines.append(f"| core-ms per held grasp, {what} | {each} |")
-    return "\n".join([*lines, "", "CPU time was measured under other load; its error is about 10 %.", ""])
+    return "\n".join([*lines, "", "CPU times were measured under other load; their error is about 10 %.", ""])
 
 
 def _cell(counts: list[int] | None) -> str:
@@ -179,7 +178,7 @@ def _cell(counts: list[int] | None) -> str:
 
 def main() -> None:
     parser = cell_parser(__doc__, objects=OBJECTS, grasps=16)
-    parser.add_argument("--draws", type=int, default=2, help="models of each axis for each grasp")
+    parser.add_argument("--draws", type=int, default=2, help="models per axis and grasp")
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     done = []

@@ -1,11 +1,11 @@
-"""Rest poses that roll or topple under 1 mm of change: what geometry says, and a simulation of changed convex pieces.
+"""Rest poses that roll or topple if the surface changes by 1 mm: by geometry, and in simulation of changed pieces.
 
 usage: python -m benchmarks.rolling DATA_DIR [--objects 011_banana ...] [--variants 8] [--page OUT.md]
        DATA_DIR holds objects/
 
-Stable faces that drops end on if none is left out; those that drops leave out say why. Simulated: the physics of the
-lift test without a hand, for as long as a hand closes, with the object's own pieces and with pieces whose corners moved
-by up to 1 mm.
+The drops exclude no stable face; for a face that scenes do not use, the table has the reason. The simulation has the
+physics of the lift test without a hand and lasts as long as a hand closes. It uses the object's own pieces, and pieces
+whose corners are moved by up to 1 mm.
 """
 
 from __future__ import annotations
@@ -30,9 +30,14 @@ from graspd.worker.validation.model import FRICTION, MujocoOptions, add_object
 SEED, DROPS, SECONDS = 5, 64, 0.8
 HEAD: Final = """# Rest poses that roll or topple
 
-`python -m benchmarks.rolling DATA`: for each object its resting faces in {drops} drops; the largest rotation that a
-change of the surface by 1 mm allows by geometry; whether the face is used, or the reason why not; and the largest
-rotation in simulation, with the object's own convex pieces and with {variants} changes of these by up to 1 mm.
+`python -m benchmarks.rolling DATA`: resting faces of each object after {drops} drops. A turn is a rotation of the
+object.
+
+- *Drops*: number of drops that end on the face.
+- *Turn by geometry*: largest turn that a change of the surface by 1 mm allows.
+- *Pose*: kept, or the reason why scenes do not use the face.
+- *Own pieces*: turn in simulation with the object's convex pieces; *changed*: largest turn with {variants} changes of
+  these pieces by up to 1 mm.
 
 """
 
@@ -60,7 +65,7 @@ def main() -> None:
 
 
 def poses_of(obj: ObjectModel, variants: int) -> list[str]:
-    """Cells of each resting face, the most frequent first."""
+    """Return the table cells of each resting face, the most frequent face first."""
     faces = resting_faces(obj)
     table = simulate._build(obj.centred)
     with patch.object(RestingFaces, "topples", lambda self, face: False):
@@ -76,14 +81,14 @@ def poses_of(obj: ObjectModel, variants: int) -> list[str]:
 
 
 def turns(obj: ObjectModel, pose: Floats, variants: int) -> Floats:
-    """(1 + variants,) angles by which an object turns by itself at a pose (7,) on a table [rad]."""
+    """Return (1 + variants,) angles by which an object rotates from a pose (7,) on a table [rad]."""
     pieces, rng = decompose(obj).vertices, np.random.default_rng(0)
     changed = [[p + CHANGE_M * rng.uniform(-1, 1, p.shape) / np.sqrt(3) for p in pieces] for _ in range(variants)]
     return np.array([turn(obj, some, pose) for some in (pieces, *changed)])
 
 
 def turn(obj: ObjectModel, pieces: Sequence[Floats], pose: Floats) -> float:
-    """The angle with these pieces [rad]."""
+    """Return the angle with these pieces [rad]."""
     physics, friction, spec = MujocoOptions(), [*FRICTION, 1e-4], mujoco.MjSpec()
     option: Any = spec.option
     option.timestep, option.impratio, option.noslip_iterations = physics.timestep, 10.0, physics.noslip_iterations

@@ -28,17 +28,17 @@ from graspd.worker.validation.decomposition import decompose
 from graspd.worker.validation.prescreening import push_rollout
 from graspd.worker.validation.validator import validate
 
-#: Neither a seed that any setting was chosen with.
+#: Seeds that were not used to choose any setting.
 SEED, WARM_SEED = 2027, 1
 FIDELITY = FIDELITIES["standard"]
 WAYS: Final = {"merit": "by merit", "rollout": "by rollout"}
-#: Friction and threshold of ε as in the paper's table 2; its best ten are a third of these at most.
+#: Friction and contact threshold of ε as in table 2 of the paper.
 FRICTION, THRESHOLD_M = 1.0, 0.005
 ONE = ExecutionContext(threads=1)
 
 
 def found_of(hand: HandModel, mesh: Path, count: int) -> dict[str, dict[str, Any]]:
-    """Of each of `WAYS`: counts, and seconds of all grasps."""
+    """Return, for each of `WAYS`, counts and seconds of all grasps."""
     obj = object_from_path(mesh, face_error_m=FIDELITY.face_error_m)
     pieces = decompose(obj)
     rollouts = {"merit": None, "rollout": push_rollout(hand, obj, lambda: pieces)}
@@ -84,12 +84,12 @@ def page(done: dict[str, dict[str, dict[str, Any]]], count: int) -> str:
         "hand",
         "selection",
         "GSR",
-        "worst object",
+        "GSR of worst object",
         "hard",
         "planner ms",
         "validator ms",
-        "ms per held grasp",
-        "ms per hard one",
+        "ms per held",
+        "ms per hard",
         "PD mm",
         "CA cm²",
         "ε",
@@ -100,10 +100,19 @@ def page(done: dict[str, dict[str, dict[str, Any]]], count: int) -> str:
             "# Candidates selected by rollouts",
             "",
             f"`python -m benchmarks.rollouts DATA --out docs/results`: {count} candidates of each hand on each "
-            f"of {objects} objects, seed {SEED}, free, validated at level standard, both selections in one run. "
-            "*By merit*: the hand with the best contact balance; *by rollout*: the first that holds in a short test. "
-            "*hard*: also holds at half friction. Times are core-ms per candidate, then per held candidate. PD: median "
-            "of objects' medians; CA and ε: means of the best third by ε.",
+            f"of {objects} objects without a scene, seed {SEED}, validated at level *standard*. One run has both "
+            "selections.",
+            "",
+            "- *By merit*: selects the candidate with the best contact balance; *by rollout*: the first that holds "
+            "in a "
+            "short test.",
+            "- *GSR*: share that holds; *hard*: share that also holds at half friction.",
+            "- *Planner*, *validator*: core-ms per candidate; the next two columns: core-ms of both per held "
+            "candidate, "
+            "and per",
+            "  candidate that also holds at half friction.",
+            "- *PD*: penetration, median over the objects' medians; *CA* and *ε*: means over the best third of "
+            "candidates by ε.",
             "",
             f"| {' | '.join(titles)} |",
             f"| --- | --- |{' --: |' * (len(titles) - 2)}",

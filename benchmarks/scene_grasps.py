@@ -4,11 +4,11 @@ usage: python -m benchmarks.scene_grasps DATA_DIR [--work W] [--hands allegro ..
            [--per-face 0] [--filtered 0] [--touch 0] [--seed 404] [--json OUT] [--page OUT.md]
        DATA_DIR holds hands/ and objects/
 
-Scenes: each stable resting face of the object that at least 3 % of drops end on, on a table: `--grasps` a pair, or
-`--per-face` for each face if that is more. Free grasps are put into the same scenes and validated alike: as many, or
-`--filtered` a pair if that is more, for few of them lift.
-A second is one of CPU time of one thread: other programs on the machine change the ratios little. What a pair has found
-lies under W: a run that was stopped goes on, and several may run beside one another with other hands.
+Scenes have the object on a table, on each stable resting face on which at least 3 % of drops end. Each pair has at
+least `--grasps` grasps and at least `--per-face` per face. Free grasps are placed into the same scenes and validated
+alike; there are at least `--filtered` per pair, because few of them lift. A second is one of CPU time of one thread,
+so other load changes the ratios little. W caches the results of each pair: an interrupted run resumes, and several
+runs with different hands may run at the same time.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ COMMAND = (
     "python -m benchmarks.scene_grasps DATA --work W --grasps 16 --per-face 2 --filtered 96 "
     "--page docs/results/scenes-grasps.md --json docs/results/scenes-grasps.json"
 )
-#: Not a seed that any setting was chosen with.
+#: Seed that was not used to choose any setting.
 SEED = 404
 FIDELITY = FIDELITIES["standard"]
 TITLES = {
@@ -64,9 +64,9 @@ TITLES = {
     "reach": "faces in reach",
     "reach_held": "with a lift, of faces in reach",
     "filter_lift": "free, filtered: lift",
-    "price": "CPU time over free",
-    "gain": "valid/s over filtered",
-    "of_free": "valid/s over free valid/s",
+    "price": "CPU time / free",
+    "gain": "valid/s / filtered",
+    "of_free": "valid/s / free",
 }
 
 
@@ -81,14 +81,14 @@ def study(
     touch: float = TOUCH,
     seed: int = SEED,
 ) -> dict[str, Any]:
-    """The numbers of one pair; shares are of all candidates."""
+    """Return the numbers of one pair; shares are of all candidates."""
     spec = SceneSpec(kind="table", faces="all", touch=touch)
     poses = rest_poses(spec, obj, count=1, seed=seed)["scene/object_pose"]
     count = max(least, per_face * len(poses))
     placed = Scenes(supports_of(spec), poses).placed(np.arange(count) % len(poses))
     wanted, run = PlanRequest(count, FIDELITY, seed), ExecutionContext(threads=1)
     lifts, pushes = (rollout_on(run, hand, obj, lambda: pieces, in_scenes=where) for where in (True, False))
-    # What a pair is made ready with once is none of a grasp's cost, on either side.
+    # Untimed preparation, which every pair needs once.
     for where, rollout in ((placed.take(slice(0, 1)), lifts), (None, pushes)):
         synthesize(hand, obj, PlanRequest(1, FIDELITY, SEED, placed=where, rollout=rollout), run)
     planned, seconds = _timed(lambda: synthesize(hand, obj, replace(wanted, placed=placed, rollout=lifts), run))
@@ -167,7 +167,7 @@ def _cell(value: Any) -> str:
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """The pairs of one hand as Markdown, their means last; ratios as medians."""
+    """Return the pairs of one hand as Markdown, then their means (of ratios: medians)."""
     counts = ("count", "faces", "reach")
     whole: dict[str, Any] = {"object": "mean; ratios: median", **{n: sum(row[n] for row in rows) for n in counts}}
     for name in [name for name in TITLES if name not in ("object", *counts)]:
@@ -184,15 +184,20 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 
 def page(results: dict[str, list[dict[str, Any]]]) -> str:
-    """The tables of all hands as a page of the docs."""
+    """Return the tables of all hands as a page of the docs."""
     lines = [
         "# Grasps planned in scenes",
         "",
-        f"graspd {PACKAGE_VERSION}, `{COMMAND}`: real URDFs, {FIDELITY.name} fidelity, seed {SEED}; a table, each "
-        "stable resting face that at least 3 % of drops end on. Shares are of all candidates unless stated otherwise; "
-        "seconds are CPU time of planning. A face is in reach if the object then has an antipodal pair of points 4 mm "
-        "clear of the table, less than 30 degrees from level, and no wider than the hand's opposed fingers open. If "
-        "no filtered grasp lifts, the gain is a lower bound, computed with one lifted grasp.",
+        f"graspd {PACKAGE_VERSION}, `{COMMAND}`: real URDFs, fidelity *{FIDELITY.name}*, seed {SEED}. Scenes: a table, "
+        "with each stable resting face on which at least 3 % of drops end.",
+        "",
+        "- Shares are of all candidates unless stated otherwise; seconds are CPU time of planning.",
+        "- *Faces in reach*: faces with an antipodal pair of points 4 mm clear of the table, less than 30 degrees from",
+        "  level, and not wider than the opposed fingers open.",
+        "- *Free, filtered*: grasps of a free object, placed into the same scenes.",
+        "- *CPU time / free*: CPU time per grasp, relative to free grasps.",
+        "- *valid/s / filtered*, *valid/s / free*: valid grasps per second, relative to filtered and to free grasps.",
+        "  With >, no filtered grasp lifts; the ratio is then a lower bound, computed with one lifted grasp.",
     ]
     for name, rows in results.items():
         lines += ["", f"## {name}", "", table(rows)]
@@ -206,10 +211,10 @@ def page(results: dict[str, list[dict[str, Any]]]) -> str:
     free_seconds = sum(row["free_seconds"] * row["filter_count"] for row in every)
     lines += [
         "",
-        f"Of grasps planned in their scenes, {lifted} of {raw} lift, {lifted / seconds:.2f} per second. Of free "
-        "grasps, "
-        f"filtered, {filtered} of {sum(row['filter_count'] for row in every)} lift, {filtered / free_seconds:.3f} per "
-        f"second. The ratio is {lifted / seconds * free_seconds / max(filtered, 1):.0f}.",
+        f"Of grasps planned in their scenes, {lifted} of {raw} lift, {lifted / seconds:.2f} per second. Of filtered "
+        f"free grasps, {filtered} of {sum(row['filter_count'] for row in every)} lift, {filtered / free_seconds:.3f} "
+        "per "
+        f"second. The ratio of these rates is {lifted / seconds * free_seconds / max(filtered, 1):.0f}.",
     ]
     return "\n".join(
         [*lines, "", "## All pairs", "", *table(every).splitlines()[:2], table(every).splitlines()[-1], ""]
@@ -219,8 +224,8 @@ def page(results: dict[str, list[dict[str, Any]]]) -> str:
 def main() -> None:
     parser = cell_parser(__doc__, grasps=32)
     parser.add_argument("--per-face", type=int, default=0)
-    parser.add_argument("--filtered", type=int, default=0, help="free grasps a pair that are filtered, at least")
-    parser.add_argument("--touch", type=float, default=TOUCH, help="mm that fingertips keep from the table")
+    parser.add_argument("--filtered", type=int, default=0, help="least number of filtered free grasps per pair")
+    parser.add_argument("--touch", type=float, default=TOUCH, help="least distance of fingertips from the table [mm]")
     parser.add_argument("--seed", type=int, default=SEED)
     parser.add_argument("--json", type=Path)
     parser.add_argument("--page", type=Path)

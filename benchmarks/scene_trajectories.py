@@ -1,9 +1,9 @@
-"""What stands in the way of grasps planned in bins, on shelves and among neighbours: contact, closing, coming or lift.
+"""Obstacles of grasps planned in bins, on shelves and among neighbours, by phase of the trajectory.
 
     python -m benchmarks.scene_trajectories [--count 24] [--json]
 
-Prints Markdown. A hand comes straight over 10 cm. The last column counts grasps for which that alone is not free: what
-an approach that bends could save at most.
+Prints Markdown. The approach is a straight line of 10 cm. The last column counts grasps of which only the approach is
+not clear; a curved approach could save at most these.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from graspd.worker.scenes.placement import scenes_of
 from graspd.worker.scenes.trajectory import Trajectory, plan_way
 
 HANDS: Final = ("barrett", "allegro", "shadow")
-#: Target, kind of its scene, and what stands beside it.
+#: Target, kind of its scene, and its neighbours.
 PLACES: Final = (
     ("block", "bin", ("mug", "bottle", "block")),
     ("bottle", "bin", ("block", "mug")),
@@ -38,13 +38,15 @@ SCENES: Final = 4
 SEEDS: Final = (11, 3)  # of the scenes, of the grasps
 COUNTS: Final = ("grasps", "clear", "contact", "closing", "lift", "coming")
 COLUMNS: Final = ("hand", "object", "scene", "beside", *COUNTS)
-ABOUT: Final = """Candidates of the built-in hands at fidelity `draft`. *Beside*: neighbours in the scene. *Clear*: at
-least 2 mm from all obstacles on the whole trajectory. Other grasps are too close to an obstacle at contact, while
-closing, on the lift, or only on the straight approach of 10 cm; a curved approach could save at most the last ones."""
+HEADS: Final = ("hand", "object", "scene", "neighbours", *COUNTS[:-1], "approach")
+ABOUT: Final = """\
+Candidates of the built-in hands at fidelity `draft`. *Clear*: at least 2 mm from all obstacles on the whole
+trajectory. Other grasps are too close to an obstacle at contact, while closing, on the lift, or only on the straight
+approach of 10 cm. A curved approach could save at most the last group."""
 
 
 def blocked(way: Trajectory) -> dict[str, int]:
-    """How many grasps are clear, and how many are blocked in each part of their way."""
+    """Return the numbers of clear grasps, and of grasps blocked in each phase of the trajectory."""
     parts = {"contact": way.contact, "closing": way.closing, "lift": way.lifting}
     near = {name: distance < MARGIN_M for name, distance in parts.items()}
     elsewhere = np.any(list(near.values()), axis=0)
@@ -56,7 +58,7 @@ def blocked(way: Trajectory) -> dict[str, int]:
 
 
 def run(count: int) -> list[dict[str, Any]]:
-    """A row for each hand and place; `count` draft candidates each."""
+    """Return a row for each hand and scene, with `count` draft candidates each."""
     fidelity = resolve_fidelity("draft")
     names = {name for target, _, beside in PLACES for name in (target, *beside)}
     things = {name: object_from_path(name, face_error_m=fidelity.face_error_m) for name in names}
@@ -76,7 +78,7 @@ def run(count: int) -> list[dict[str, Any]]:
 
 
 def page(rows: list[dict[str, Any]], total: dict[str, int]) -> str:
-    lines = [COLUMNS, ["---"] * 3 + ["--:"] * (len(COLUMNS) - 3)]
+    lines = [HEADS, ["---"] * 3 + ["--:"] * (len(COLUMNS) - 3)]
     lines += [[str(row[name]) for name in COLUMNS] for row in rows]
     lines += [["**all**", "", "", "", *(f"**{count}**" for count in total.values())]]
     return ABOUT + "\n\n" + "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
@@ -84,7 +86,7 @@ def page(rows: list[dict[str, Any]], total: dict[str, int]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--count", type=int, default=24, help="candidates for each hand and place")
+    parser.add_argument("--count", type=int, default=24, help="candidates for each hand and scene")
     parser.add_argument("--json", action="store_true")
     given = parser.parse_args()
     rows = run(given.count)

@@ -1,12 +1,12 @@
-"""A second opinion on table grasps that are called valid: lifted by a test that shares no code with the validator.
+"""Second lift of valid table grasps, by a test that shares no code with the validator.
 
 usage: python -m benchmarks.second_lift DATA_DIR [--hands allegro ...] [--objects 025_mug ...] [--grasps 16]
            [--scenes 4] [--seed 1400] [--mass KG] [--page OUT.md]
-       DATA_DIR holds hands/ and objects/; objects without a mass in their meta.json are left out
+       DATA_DIR holds hands/ and objects/; objects need a mass in their meta.json
 
-The model is text of its own: real gravity, MuJoCo's default contacts at 1 ms, CoACD pieces of another threshold, the
-hand on a stiff vertical slide. The hand closes and squeezes in 1 s, rises 10 cm in 1 s and holds for 2 s. A grasp lifts
-if its object is then above 5 cm.
+The model has real gravity, MuJoCo's default contacts at 1 ms, CoACD pieces of another threshold, and the hand on a
+stiff vertical slide. The hand closes and squeezes in 1 s, rises 10 cm in 1 s and holds for 2 s. A grasp lifts if the
+object is then above 5 cm.
 """
 
 from __future__ import annotations
@@ -31,9 +31,10 @@ from graspd.worker.hands.model import HandModel, JointType
 SEED: Final = 1400
 HEAD: Final = """# A second lift of valid grasps
 
-`python -m benchmarks.second_lift DATA`: share of the grasps valid for objects of published mass on a table that
-also lift in another test: real gravity, MuJoCo's default contacts at 1 ms, other convex pieces, a
-stiff slide, 1 s up and 2 s of hold at friction 0.6. {grasps} grasps wanted per pair, {scenes} scenes, seed {seed}.
+`python -m benchmarks.second_lift DATA`: second lift test of grasps that are valid for an object of its published mass
+on a table. It has real gravity, MuJoCo's default contacts at 1 ms, other convex pieces and a stiff vertical slide. It
+lifts for 1 s and holds for 2 s at friction 0.6. *Share*: part of the valid grasps that lift again. {grasps} grasps
+wanted per pair of hand and object, {scenes} scenes, seed {seed}.
 
 """
 FRICTION: Final = "0.6 0.01 0.0001"
@@ -43,7 +44,7 @@ CLOSE_S, RISE_S, HOLD_S = 1.0, 1.0, 2.0
 
 def main() -> None:
     parser = arguments(__doc__, SEED)
-    parser.add_argument("--mass", type=float, help="of every object [kg]; by default its published one")
+    parser.add_argument("--mass", type=float, help="mass of every object [kg]; by default the published masses")
     given = parser.parse_args()
     rows = ["| hand | object | mass [kg] | valid | lifted again | share |", "|---|---|---|---|---|---|"]
     for name in given.hands:
@@ -67,7 +68,7 @@ def line(hand: str, obj: str, mass: str, valid: int, lifted: int) -> str:
 
 
 def again(given: Any, name: str, hand: HandModel, obj: str, mass: float) -> tuple[int, int]:
-    """Valid grasps of a pair, and those of them that this test lifts."""
+    """Return the number of valid grasps of a pair, and of those that this test lifts."""
     mesh_file = given.data / "objects" / obj / "clean.stl"
     request = JobOptions(
         grasps=given.grasps, rechecks=0, seed=given.seed, scene="table", scenes=given.scenes, mass=mass
@@ -87,7 +88,7 @@ def again(given: Any, name: str, hand: HandModel, obj: str, mass: float) -> tupl
 
 
 def lift_model(hand: HandModel, mesh: trimesh.Trimesh, mass: float) -> Any:
-    """Compile the test of a hand and an object [kg], meshes given as text."""
+    """Compile the test of a hand and an object with this mass [kg]; meshes are given as text."""
     root = ET.Element("mujoco")
     ET.SubElement(root, "compiler", angle="radian")
     ET.SubElement(root, "option", timestep="0.001", integrator="implicitfast", cone="elliptic", impratio="10")
@@ -114,7 +115,7 @@ def lift_model(hand: HandModel, mesh: trimesh.Trimesh, mass: float) -> Any:
             ratio = hand.multiplier[b] / hand.multiplier[first]
             shift = hand.offset[b] - ratio * hand.offset[first]
             poly = said([shift, ratio, 0, 0, 0])
-            # Gears and tendons give as little as the smallest time step allows.
+            # Gears and tendons are as stiff as the smallest time step allows.
             stiff = {"solref": ".004 1", "solimp": ".99 .999 .001"}
             ET.SubElement(equality, "joint", joint1=f"j{b}", joint2=f"j{first}", polycoef=poly, **stiff)
         else:
@@ -154,12 +155,12 @@ def lift_model(hand: HandModel, mesh: trimesh.Trimesh, mass: float) -> Any:
 
 
 def lifts(model: Any, hand: HandModel, made: Any, row: int) -> bool:
-    """Whether the object of a grasp is above 5 cm at the end."""
+    """Return whether the object is above 5 cm at the end."""
     data = mujoco.MjData(model)
     pose = np.asarray(made["scene/object_pose"][made["grasp/scene_index"][row]], float)
     base = compose(pose, np.asarray(made["grasp/hand_pose"][row], float))
     start = compose(pose, np.asarray(made["pregrasp/hand_pose"][row], float))
-    # The slide rises only: the palm's way from pregrasp to grasp is gone before the fingers close.
+    # The slide only rises: the palm moves from pregrasp to grasp before the fingers close.
     model.body("b0").pos[:], model.body("b0").quat[:] = start[:3], start[3:]
     ways = [hand.reduce(np.asarray(made[f"{name}/joint_positions"][row], float)) for name in WAYS]
     data.qpos[model.joint("object").qposadr[0] :][:7] = pose
@@ -193,7 +194,7 @@ def lifts(model: Any, hand: HandModel, made: Any, row: int) -> bool:
     return bool(data.body("object").xipos[2] - low > RISE_M / 2)
 
 
-#: Postures that the hand is commanded to, one after the other.
+#: Postures commanded one after the other.
 WAYS: Final = ("pregrasp", "grasp", "squeeze")
 
 

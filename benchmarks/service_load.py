@@ -1,9 +1,9 @@
-"""What the service costs around the engine: queue, indexer, workers, API at a million grasps; prints Markdown.
+"""Cost of the service besides the engine: queue, indexer, workers, API with a million grasps; prints Markdown.
 
 usage: python -m benchmarks.service_load queue|workers|indexer|api|beside [--index-url URL] [--data-dir DIR]
 
 `api` needs a filled index: python -m benchmarks.large_index --data-dir DIR [--index-url URL].
-Workers do no work here (tests.fakes): what is measured is everything else.
+Workers are simulated (tests.fakes), so only the service is measured.
 """
 
 from __future__ import annotations
@@ -42,15 +42,15 @@ from tests.memory_queue import MemoryQueue
 BATCH_S: Final = 1.0
 
 
-#: Requests of each kind.
+#: Number of requests of each kind.
 REPEATS: Final = 100
-#: Jobs of one key, and grasps of each, beside which another key submits.
+#: Number of large jobs of one key, and their grasps, while another key submits small jobs.
 LARGE_JOBS: Final = 5
 LARGE: Final = 1_000_000
 
 
 def cpu_s(pid: int) -> float:
-    """Processor time a process has used [s]; on a machine that others use too it says more than the clock."""
+    """Return the processor time of a process [s], which depends less on other load than wall time."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
@@ -62,14 +62,14 @@ def say(line: str) -> None:
 
 @contextmanager
 def service(*, workers: int, task_s: float = 0.0, **settings: Any) -> Iterator[Services]:
-    """Services of `running`, for one that needs no API."""
+    """Start `running` without an API and yield its services."""
     with running(workers=workers, task_s=task_s, api=False, **settings) as (_, services):
         yield services
 
 
 @contextmanager
 def running(*, workers: int, task_s: float, api: bool, **settings: Any) -> Iterator[tuple[Supervisor, Services]]:
-    """A whole service of real processes with workers that wait `task_s` for each task."""
+    """Start a whole service of real processes, with workers that wait `task_s` per task."""
     os.environ["FAKE_SECONDS"] = str(task_s)
     with tempfile.TemporaryDirectory(prefix="graspd-bench-") as folder:
         wanted = Settings(data_dir=Path(folder), port=0, device="cpu", log_level="WARNING", **settings)
@@ -91,7 +91,7 @@ def run(services: Services, batches: int, seed: int) -> float:
 
 
 def queue() -> None:
-    """What a task costs beyond its work: the queue alone, then with its shard, manifest and place in the index."""
+    """Measure the overhead of a task: of the queue alone, then with shard, manifest and index."""
     spent: list[float] = []
 
     class Timed(engine.Runner):
@@ -109,16 +109,16 @@ def queue() -> None:
         worker_main.run_worker(services.settings, start=engine_of(fake_stages()), max_tasks=400)
         whole = (time.perf_counter() - start) / len(spent)
     alone = whole - statistics.fmean(spent)
-    say("| what | measured | beside |\n| --- | --: | --: |")
-    say(f"| queue, lease and events | {1000 * alone:.1f} ms | {alone / BATCH_S:.1%} of a batch of {BATCH_S:g} s |")
-    say(f"| with shard, manifest, index | {1000 * whole:.1f} ms | {whole / BATCH_S:.1%} |")
+    say(f"| what | measured | share of a batch of {BATCH_S:g} s |\n| --- | --: | --: |")
+    say(f"| queue, lease and events | {1000 * alone:.1f} ms | {alone / BATCH_S:.1%} |")
+    say(f"| the same with shard, manifest and index | {1000 * whole:.1f} ms | {whole / BATCH_S:.1%} |")
 
 
 def workers() -> None:
-    """Tasks a second by N workers, each task a wait of half a second."""
+    """Measure tasks per second of N workers; each task waits half a second."""
     task_s = 0.5
     first = 0.0
-    say("| workers | tasks a second | of N times one |\n| --: | --: | --: |")
+    say("| workers | tasks/s | share of linear scaling |\n| --: | --: | --: |")
     for count in (1, 2, 4, 8):
         with service(workers=count, task_s=task_s) as services:
             run(services, 2 * count, 0)
@@ -128,7 +128,7 @@ def workers() -> None:
 
 
 def indexer(url: str | None) -> None:
-    """Shards of 32 grasps a second that the controller can index, a hundred in a transaction."""
+    """Measure shards of 32 grasps that the controller indexes per second, a hundred per transaction."""
     with tempfile.TemporaryDirectory(prefix="graspd-bench-") as folder:
         index = Index(url or f"sqlite:///{folder}/index.sqlite")
         services = Services(Settings(data_dir=Path(folder)), open_store("memory://"), index, MemoryQueue())
@@ -146,7 +146,7 @@ def indexer(url: str | None) -> None:
 
 
 def api(data_dir: Path, url: str | None) -> None:
-    """Latency of the API, one request after the other, on an index that is full."""
+    """Measure the latency of sequential API requests with a filled index."""
     settings = Settings(
         data_dir=data_dir,
         port=0,
@@ -177,10 +177,10 @@ def _requests(http: httpx.Client, pid: int) -> None:
         "status of a job": get(f"/v1/jobs/{job}"),
         "list 50 jobs": get("/v1/jobs"),
         "list 50 grasps, best first": get("/v1/grasps"),
-        "of one hand, least penetration first": get(
+        "list 50 grasps of one hand, least penetration first": get(
             "/v1/grasps", hand="allegro", sort="penetration_depth_mm", order="asc"
         ),
-        "valid, by three bounds": get(
+        "list 50 valid grasps within three bounds": get(
             "/v1/grasps", valid="true", min_epsilon=0.2, min_contact_area_cm2=10, max_penetration_depth_mm=0.5
         ),
         "page: home": get("/"),
@@ -202,7 +202,7 @@ def _requests(http: httpx.Client, pid: int) -> None:
 
 
 def beside(url: str | None) -> None:
-    """How long small jobs of one key wait for an answer and for the queue, while large ones of another are entered."""
+    """Measure how long small jobs of one key wait while another key's large jobs are queued."""
     with running(workers=2, task_s=1.0, api=True, **({"index_url": url} if url else {})) as (supervisor, services):
         keys = KeyFile(supervisor.settings.resolved_keys_file)
         large, small = (keys.add(name, Scope.SUBMIT) for name in ("large", "small"))
@@ -222,16 +222,19 @@ def beside(url: str | None) -> None:
             while not answers or services.index.write.entering():
                 job, answered = post(http, small, 32)
                 began, task = time.perf_counter(), task_id(job, Stage.SYNTHESIZE, 0)
-                # What a worker has is in the queue no more, and in the index no longer queued.
+                # A task that a worker has taken is no longer in the queue, nor queued in the index.
                 while task not in services.queue.waiting() and services.index.jobs.task(task).state is State.QUEUED:
                     time.sleep(0.01)
                 answers.append(answered)
                 queued.append(answered + time.perf_counter() - began)
                 time.sleep(1.0)
             took = time.perf_counter() - start
-    say(f"{LARGE_JOBS} jobs of {LARGE:,} grasps, each answered within {max(of_large):.2f} s, entered in {took:.0f} s;")
-    say(f"meanwhile {len(answers)} jobs of 32 grasps of another key:")
-    say("| a small job is | the first | median | the slowest |\n| --- | --: | --: | --: |")
+    say(
+        f"{LARGE_JOBS} jobs of {LARGE:,} grasps, each answered within {max(of_large):.2f} s, queued within "
+        f"{took:.0f} s;"
+    )
+    say(f"at the same time {len(answers)} jobs of 32 grasps of another key:")
+    say("| small job | first | median | slowest |\n| --- | --: | --: | --: |")
     for what, times in (("answered after", answers), ("in the queue after", queued)):
         say(f"| {what} | {times[0]:.2f} s | {statistics.median(times):.2f} s | {max(times):.2f} s |")
 

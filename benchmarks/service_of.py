@@ -1,4 +1,4 @@
-"""A service of a checkout in an empty folder, for a benchmark: jobs over HTTP, processor time of all its processes."""
+"""A service of a checkout in an empty folder: jobs over HTTP, processor time of all processes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from typing import Any, Final
 from benchmarks.chain import environment_of
 
 _PATIENCE_S: Final = 300.0
-#: Pause between two looks at a job [s]: each takes the API some milliseconds.
+#: Interval between status requests of a job [s]; each takes some milliseconds of the API.
 _LOOK_S: Final = 0.1
 
 
@@ -27,7 +27,7 @@ _LOOK_S: Final = 0.1
 class Service:
     url: str
     pid: int
-    """Of its supervisor."""
+    """Process identifier of the supervisor."""
     ready_s: float
     """Wall time until a worker waited for tasks."""
 
@@ -36,7 +36,7 @@ class Service:
             return json.load(answer)
 
     def job(self, **wanted: Any) -> dict[str, Any]:
-        """The document of a job that succeeded, from when it is submitted to when all of it is in the index."""
+        """Submit a job and wait until its results are in the index; return its document."""
         asked = urllib.request.Request(
             self.url + "/v1/jobs", json.dumps(wanted).encode(), {"Content-Type": "application/json"}
         )
@@ -50,7 +50,7 @@ class Service:
         return job
 
     def processor_s(self) -> float:
-        """Processor seconds of all its processes that live, and of their children that have ended."""
+        """Return processor seconds of all running processes and of their ended children."""
         parent, ticks = dict[int, int](), dict[int, int]()
         for stat in Path("/proc").glob("[0-9]*/stat"):
             with suppress(OSError):
@@ -67,7 +67,7 @@ class Service:
 
 @contextmanager
 def service_of(root: Path) -> Iterator[Service]:
-    """A service of the code of a checkout, with one worker on the CPU that waits for tasks."""
+    """Start a service from a checkout with one idle CPU worker."""
     with tempfile.TemporaryDirectory() as folder, (Path(folder) / "up.log").open("w") as log:
         up = [sys.executable, "-m", "graspd", "up", "--port", "0", "--data-dir", folder, "--json"]
         process = subprocess.Popen(
@@ -98,7 +98,7 @@ def _address(process: subprocess.Popen[str]) -> str:
         for word in line.split():
             if "http://" in word:
                 return "http://" + word.partition("http://")[2].strip('",/;')
-    sys.exit("the service has not said where it answers")
+    sys.exit("the service has not reported its address")
 
 
 def _worker_waits(service: Service) -> bool:

@@ -1,4 +1,4 @@
-"""Success of the planner's grasps in the independent engine and their quality, per hand and object, as Markdown.
+"""Success of candidates in the validator and their quality, per hand and object, as Markdown.
 
 usage: python -m benchmarks.success DATA_DIR [GRASPS [HAND ...]]     DATA_DIR holds hands/ and objects/
 The validator is MuJoCo with the DexGraspBench protocol, level `standard` (see worker/validation).
@@ -28,9 +28,9 @@ HANDS = {
     "Barrett": "barrett_bh280/bh280.urdf",
     "Shadow": "shadow/shadow_hand_right.urdf",
 }
-#: Not a seed that any setting was chosen with.
+#: Seed that was not used to choose any setting.
 SEED = 101
-#: As in the paper's table 2: friction and threshold of ε, and the grasps of each object that count, the best by ε.
+#: Friction and contact threshold of ε, and number of best grasps per object by ε, as in table 2 of the paper.
 FRICTION, THRESHOLD_M, BEST = 1.0, 0.005, 10
 COLUMNS = ("contact_area_cm2", "epsilon", "wrench_volume", "intersection_volume_cm3")
 
@@ -72,7 +72,18 @@ def main(data: Path, count: int, names: list[str]) -> None:
     for path in sorted((data / "objects").glob("*/clean.stl")):
         obj = object_from_path(path, face_error_m=FIDELITIES["standard"].face_error_m)
         _row(path.parent.name, *(results[name].add(hand, obj, count) for name, hand in hands.items()))
-    titles = ("success", "hard", "OSR", "median depth mm", "CA cm2", "ε", "Vol", "IV cm3", "raw/s", "valid/s")
+    titles = (
+        "success",
+        "hard",
+        "OSR",
+        "median penetration mm",
+        "CA cm²",
+        "ε",
+        "Vol",
+        "IV cm³",
+        "candidates/s",
+        "valid/s",
+    )
     sys.stdout.write("\n")
     _row("hand", *titles)
     _row("---", *["--:"] * len(titles))

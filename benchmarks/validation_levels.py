@@ -1,9 +1,9 @@
-"""What the cheap levels of the validator cost and how often they say what the unmodified DexGraspBench protocol says.
+"""Cost of the validator's levels, and their agreement with the unmodified DexGraspBench protocol.
 
 usage: python -m benchmarks.validation_levels DATA_DIR [--work DIR] [--hands allegro ...] [--objects NAME ...] [--out
-FILE] DATA_DIR holds hands/ and objects/. Prints Markdown; `--out` gets the same as JSON. Stopped runs go on (see
-cells.py). Certified per second are those of both cores: held grasps over half the CPU time, which other programs
-disturb less than wall time.
+FILE] DATA_DIR holds hands/ and objects/. Prints Markdown; `--out` writes the same as JSON. Interrupted runs resume (see
+cells.py). Valid grasps per second are for two cores: held grasps over half the CPU time, which depends less on other
+load than wall time.
 """
 
 from __future__ import annotations
@@ -70,11 +70,12 @@ def lines(one: dict[str, Any]) -> list[str]:
 
 def main() -> None:
     parser = cell_parser(__doc__)
-    parser.add_argument("--hard", action="store_true", help="the hard protocol too")
+    parser.add_argument("--hard", action="store_true", help="also at half friction")
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     sys.stdout.write(
-        "| hand | level | n | held | agreement (95 %) | false accepts, rejects | CPU ms per candidate | valid/s |\n"
+        "| hand | level | candidates | held | agreement with dexgraspbench (95 %) | false accepts, false rejections "
+        "| CPU ms per candidate | valid/s |\n"
         "| --- | --- | --: | --: | --: | --: | --: | --: |\n"
     )
     done = []

@@ -1,21 +1,22 @@
-"""A week of a thousand nodes that come and go, as discrete events: what is lost, what is done twice, what waits.
+"""Discrete-event simulation of a week on a thousand preemptible nodes: lost work, repeated tasks, idle time.
 
 usage: python -m benchmarks.week [--nodes 1000] [--days 7] [--cores 1] [--seed 0] [--rates cloud|harsh] [--json FILE]
 
-Costs are those of `benchmarks.cost_model` and `benchmarks.fleet`; rates are options of this file (`Rates`, `HARSH`),
-no cloud's promise. Events are what interrupts: nodes reclaimed with notice, killed, cut off, a zone that fails, and
-controller, Redis and store that are away. Between two of them nothing that a node does depends on another, so its tasks
-are drawn at once.
+Costs come from `benchmarks.cost_model` and `benchmarks.fleet`. Rates are assumptions of this module (`Rates`,
+`HARSH`). Events are interruptions: nodes that are reclaimed with notice, killed or cut off, a zone that fails, and
+outages of controller, Redis and store. Between two interruptions nodes are independent, so all tasks of this time are
+drawn at once.
 
-What the parts do about it is taken from what the tests of `tests/system` hold real processes to:
+The reactions to interruptions are those that `tests/system` tests on real processes:
 
-- a node with notice hands its task back: the work on it is lost, no attempt is used up;
-- one that is killed loses the work and an attempt; its task waits for `GRASPD_LEASE_S` and a look of the controller;
-- one that is cut off for longer than that goes on; another does the same task meanwhile, and one of both is work for
-  nothing. The second result is refused by the store (create-only), so there is one;
-- while the controller is away workers live on what waits; while Redis is away each ends its task and waits;
-- while the store is away a task that ends cannot put its result: it is handed back, and its work is lost. The next ones
-  are handed back before they begin.
+- a node with notice returns its task; the work on it is lost, but no attempt;
+- a killed node loses the work and an attempt; its task waits for `GRASPD_LEASE_S` and the next check of the controller;
+- a node that is cut off for longer continues, while another node does the same task; the work of one of them is lost,
+  because the store refuses the second result (create-only);
+- during an outage of the controller, workers take waiting tasks; during an outage of Redis, each ends its task and
+  waits;
+- during an outage of the store, a task that ends is returned and its work is lost; later tasks are returned before they
+  start.
 """
 
 from __future__ import annotations
@@ -36,37 +37,37 @@ from benchmarks.cost_model import Measured
 from benchmarks.service_load import say
 
 _DAY_S: Final = 86_400.0
-#: Waiting tasks that a controller that is away leaves behind for each worker, `service/pipeline/controller.py`.
+#: Waiting tasks per worker at the start of an outage of the controller, see `service/pipeline/controller.py`.
 _WAITING_A_WORKER: Final = 2
-#: Tasks a second through controller and index with 512 workers and more, `python -m benchmarks.fleet`.
+#: Tasks per second through controller and index with 512 or more workers, from `python -m benchmarks.fleet`.
 CONTROLLER_TASKS_PER_S: Final = 336.0
-#: Spread of the time of a task: batches of one pair differ by as much as their valid grasps do (log-normal sigma).
+#: Spread of the time of a task (log-normal sigma): batches of a pair differ in their number of valid grasps.
 _SPREAD: Final = 0.3
 _ATTEMPTS: Final = 3
 
 
 @dataclass(frozen=True)
 class Rates:
-    """How often things go wrong, and for how long."""
+    """Rates and durations of interruptions."""
 
     reclaimed_per_day: float = 1 / 3
-    """Of one node, with notice. Clouds that say how often they take spot nodes back name 5 to 20 % a month; this is 50
-    times as often."""
+    """Of one node, with notice. Clouds that publish rates reclaim 5 to 20 % of spot nodes a month; this is 50 times
+    as much."""
     killed_per_day: float = 1 / 30
-    """Of one node, without notice: memory, kernel, power."""
+    """Of one node, without notice: out of memory, kernel crash, power failure."""
     cut_off_per_day: float = 1 / 10
-    """Of one node: the network is away for up to `longest_cut_s`, evenly spread."""
+    """Of one node: loss of the network for up to `longest_cut_s`, uniformly distributed."""
     longest_cut_s: float = 120.0
     zone_per_week: float = 1.0
     """A third of all nodes killed at once."""
     replaced_after_s: float = 180.0
-    """Until a fresh node's worker takes tasks: boot, pull of images, check of its engine."""
+    """Time until the worker of a new node takes tasks: boot, pull of images, check of its engine."""
     controller_killed_per_day: float = 1.0
     redis_restarts_per_week: float = 2.0
     redis_away_s: float = 60.0
     store_outages_per_week: float = 2.0
     store_away_s: float = 300.0
-    """In a week together 99.9 % of the time there, which is what object stores promise."""
+    """In total an availability of 99.9 % in a week, as object stores promise."""
 
 
 HARSH: Final = Rates(
@@ -83,37 +84,37 @@ HARSH: Final = Rates(
 @dataclass
 class Told:
     node_s: float = 0.0
-    """Time that nodes were there."""
+    """Time in which nodes ran."""
     done: int = 0
-    """Tasks whose result is in the store."""
+    """Number of tasks with a result in the store."""
     useful_s: float = 0.0
-    """Time spent on those."""
+    """Time spent on these tasks."""
     lost_s: Counter[str] = field(default_factory=Counter)
-    """Time spent for nothing, by cause."""
+    """Time of lost work, by cause."""
     idle_s: Counter[str] = field(default_factory=Counter)
-    """Time in which a node that was there had nothing to do, by cause."""
+    """Time in which running nodes were idle, by cause."""
     interruptions: Counter[str] = field(default_factory=Counter)
     done_twice: int = 0
-    """Tasks that two nodes did to their end: the store refused the second result."""
+    """Tasks that two nodes completed; the store refused the second result."""
     attempts_lost: int = 0
     failed_for_good: float = 0.0
-    """Tasks expected to lose all their attempts, each as likely as any other."""
+    """Expected number of tasks that lose all their attempts, if all tasks are equally likely to lose one."""
     most_behind: float = 0.0
-    """Most events that waited for a controller."""
+    """Largest number of events that waited for a controller."""
     longest_catch_up_s: float = 0.0
     controller_busy: float = 0.0
-    """Share of its time that the controller works."""
+    """Share of time in which the controller is busy."""
 
     @property
     def lost(self) -> float:
-        """Share of the work that was for nothing."""
+        """Share of lost work."""
         work = self.useful_s + sum(self.lost_s.values())
         return sum(self.lost_s.values()) / work if work else 0.0
 
 
 @dataclass
 class _Node:
-    """A node at work since `since`, `into` seconds into a task that takes `task_s`."""
+    """A node that has worked since `since`, `into` seconds into a task of `task_s`."""
 
     since: float = 0.0
     task_s: float = 0.0
@@ -121,12 +122,12 @@ class _Node:
 
 
 class Week:
-    """Nodes, what they do, and what happens to them."""
+    """State of the simulation: nodes, their tasks and interruptions."""
 
     def __init__(
         self, *, nodes: int, days: float, task_s: float, rates: Rates, lease_s: float = 20.0, seed: int = 0
     ) -> None:
-        """`task_s` is the median time of a task [s]."""
+        """Create the nodes; `task_s` is the median time of a task [s]."""
         self._end = days * _DAY_S
         self._task_s, self._rates, self._lease_s = task_s, rates, lease_s
         self._rng = np.random.default_rng(seed)
@@ -139,7 +140,7 @@ class Week:
     def run(self) -> Told:
         for one in self._nodes:
             one.task_s = self._drawn()
-            # Nodes of a fleet do not work in step.
+            # Nodes of a fleet are not synchronous.
             one.into = self._rng.random() * one.task_s
         self._plan()
         while self._events:
@@ -152,7 +153,7 @@ class Week:
         for number in range(len(self._nodes)):
             self._work(number, self._end)
             node = self._nodes[number]
-            self.told.useful_s += node.into  # the week ends, the work does not
+            self.told.useful_s += node.into  # the task continues after the week
         per_s = self.told.done / self._end
         self.told.controller_busy = per_s / CONTROLLER_TASKS_PER_S
         self.told.failed_for_good = self.told.done * (self.told.attempts_lost / max(1, self.told.done)) ** _ATTEMPTS
@@ -174,7 +175,7 @@ class Week:
             "redis": rates.redis_restarts_per_week / 7,
             "store": rates.store_outages_per_week / 7,
         }.items():
-            # As many as there should be: of one or two a week none may be missing.
+            # Use the expected number, so that rare outages always occur.
             for at in self._times(round(per_day * self._end / _DAY_S)):
                 self._add(at, what, -1)
 
@@ -189,7 +190,7 @@ class Week:
         return float(self._task_s * math.exp(_SPREAD * self._rng.standard_normal()))
 
     def _work(self, who: int, until: float) -> None:
-        """A node does task after task until then; it is in the middle of one afterwards."""
+        """Let a node do tasks until the given time, at which it is in the middle of one."""
         node = self._nodes[who]
         if until <= node.since:
             return
@@ -215,7 +216,7 @@ class Week:
     def _interrupt(self, at: float, what: str, who: int) -> None:
         node = self._nodes[who]
         if at < node.since:
-            return  # it is not there at that time
+            return  # the node is not running at that time
         self._work(who, at)
         if what == "cut_off":
             self._cut_off(at, who)
@@ -228,13 +229,13 @@ class Week:
         self._nodes[who] = _Node(since=at + self._rates.replaced_after_s, task_s=self._drawn())
 
     def _cut_off(self, at: float, who: int) -> None:
-        """It ends its task, and cannot say so until the network is back."""
+        """Cut a node off: it ends its task but cannot report it until the network is back."""
         node = self._nodes[who]
         seconds = self._rng.random() * self._rates.longest_cut_s
         rest = node.task_s - node.into
         back = at + max(seconds, rest)
         if seconds > self._lease_s:
-            # Its lease is lost, and so is what it did: another node does the task.
+            # Its lease has expired: another node does the task, and this work is lost.
             self.told.attempts_lost += 1
             self.told.lost_s["cut_off"] += node.task_s if seconds > rest else node.into + min(seconds, rest)
             self.told.done_twice += seconds > rest
@@ -251,7 +252,7 @@ class Week:
                 self._interrupt(at, "killed", who)
 
     def _controller(self, at: float) -> None:
-        """Another takes over; workers live on what waits, and events wait for it."""
+        """Stop the controller until another takes over; workers take waiting tasks, and events wait."""
         away = self._lease_s * 4 / 3
         rate = self._rate()
         self._stall(at, "controller", at + _WAITING_A_WORKER * self._task_s, at + away)
@@ -264,7 +265,7 @@ class Week:
         self._stall(at, "redis", at, at + self._rates.redis_away_s)
 
     def _stall(self, at: float, what: str, empty: float, back: float) -> None:
-        """Nobody gets a task between `empty` and `back`: each node ends the one it has, then waits."""
+        """Hand out no task between `empty` and `back`: each node ends its task, then waits."""
         if empty >= back:
             return
         for who, node in enumerate(self._nodes):
@@ -298,7 +299,7 @@ class Week:
 
 
 def task_seconds(cores: int, measured: Measured | None = None) -> float:
-    """Time of a batch of 32 valid grasps on a node of so many cores [s]."""
+    """Return the time of a batch of 32 valid grasps on a node with this number of cores [s]."""
     found = measured or Measured()
     return 32 * found.core_s_per_grasp / cores / found.busy
 
@@ -307,10 +308,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--nodes", type=int, default=1000)
     parser.add_argument("--days", type=float, default=7.0)
-    parser.add_argument("--cores", type=int, default=1, help="of a node")
+    parser.add_argument("--cores", type=int, default=1, help="cores of a node")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--rates", choices=("cloud", "harsh"), default="cloud")
-    parser.add_argument("--json", type=Path, help="keep the figures there")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     given = parser.parse_args(arguments)
     rates = Rates() if given.rates == "cloud" else HARSH
     told = Week(
@@ -329,16 +330,22 @@ def table(told: Told) -> list[str]:
         ("node hours", f"{told.node_s / 3600:,.0f}"),
         ("tasks done", f"{told.done:,}"),
         ("valid grasps", f"{32 * told.done:,}"),
-        *((f"{what.replace('_', ' ')}, times", f"{times:,}") for what, times in sorted(told.interruptions.items())),
-        ("work lost", f"{100 * told.lost:.3f} %"),
-        *((f"of it by {what.replace('_', ' ')}", f"{100 * s / work:.4f} %") for what, s in sorted(told.lost_s.items())),
-        ("done by two nodes, one result kept", f"{told.done_twice:,}"),
-        ("attempts used up", f"{told.attempts_lost:,}"),
-        ("tasks expected to fail for good", f"{told.failed_for_good:.2g}"),
-        *((f"idle, {what.replace('_', ' ')}", f"{100 * s / told.node_s:.4f} %") for what, s in idle),
-        ("controller busy", f"{100 * told.controller_busy:.0f} %"),
-        ("events behind a controller that took over", f"{told.most_behind:,.0f}"),
-        ("they were made up for in", f"{told.longest_catch_up_s:.0f} s"),
+        *(
+            (f"interruptions: {what.replace('_', ' ')}", f"{times:,}")
+            for what, times in sorted(told.interruptions.items())
+        ),
+        ("work lost, all causes", f"{100 * told.lost:.3f} %"),
+        *(
+            (f"work lost: {what.replace('_', ' ')}", f"{100 * s / work:.4f} %")
+            for what, s in sorted(told.lost_s.items())
+        ),
+        ("tasks done by two nodes (the second result is refused)", f"{told.done_twice:,}"),
+        ("attempts lost", f"{told.attempts_lost:,}"),
+        ("tasks expected to lose all attempts", f"{told.failed_for_good:.2g}"),
+        *((f"idle time: {what.replace('_', ' ')}", f"{100 * s / told.node_s:.4f} %") for what, s in idle),
+        ("controller, busy share of its time", f"{100 * told.controller_busy:.0f} %"),
+        ("most events that waited for a new controller", f"{told.most_behind:,.0f}"),
+        ("longest time to process waiting events", f"{told.longest_catch_up_s:.0f} s"),
     ]
     return ["| what | |", "| --- | --: |", *(f"| {name} | {value} |" for name, value in rows)]
 

@@ -1,9 +1,9 @@
-"""What an install weighs and how long its imports take; prints Markdown.
+"""Sizes of installs and times of imports; prints Markdown.
 
 usage: python -m benchmarks.weight [--runs 5] [--no-wheel] [--json OUT]
 
-Sizes are those of the files of this environment: of an extra, its packages with all that they require. Times are
-processor seconds of a fresh process, the least of the runs; its parts come from `python -X importtime`.
+Sizes are of the files in this environment; an extra includes all required packages. Times are processor seconds of a
+new process, the least of the runs; `python -X importtime` gives the parts.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ LARGEST: Final = 6
 _COMMAND: Final = "import sys; sys.argv = ['graspd', {}]; import graspd.cli; graspd.cli.main()"
 _OURS: Final = "from graspd.service.model.libraries import imports, own_process; own_process()\nwith imports(): {}"
 _ENGINE: Final = "import graspd.worker.generation, graspd.worker.planners.fast_graspd.planner"
-#: What somebody waits for, and what does it.
+#: Starts that users wait for, with their code.
 STARTS: Final = {
     "Python alone": "pass",
     "`import graspd`": "import graspd",
@@ -47,7 +47,7 @@ STARTS: Final = {
 
 
 def closure(extra: str) -> set[str]:
-    """Names of the installed packages that `graspd[extra]` requires, directly or not."""
+    """Return the names of all packages that `graspd[extra]` requires, directly or indirectly."""
     return pin.closure([Requirement(f"graspd[{extra}]" if extra else "graspd")]).keys() - {"graspd"}
 
 
@@ -58,7 +58,7 @@ def size_mb(name: str) -> float:
 
 
 def import_seconds(code: str, runs: int) -> float:
-    """Processor seconds of a fresh process that runs some code: the least of the runs, after one that counts not."""
+    """Return processor seconds of a new process that runs the code: the least of the runs, after an untimed one."""
     times = []
     for _ in range(runs + 1):
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -69,7 +69,7 @@ def import_seconds(code: str, runs: int) -> float:
 
 
 def parts_ms(code: str) -> list[tuple[str, float]]:
-    """Milliseconds that a start spends in the modules of each package, most first."""
+    """Return milliseconds of a start in the modules of each package, slowest first."""
     done = subprocess.run(
         [sys.executable, "-X", "importtime", "-c", code], cwd=REPOSITORY, check=True, capture_output=True, text=True
     )
@@ -94,8 +94,8 @@ def lines(found: dict[str, Any]) -> Iterator[str]:
         largest = ", ".join(f"{name} {mb:.0f}" for name, mb in told["largest"])
         yield f"| {extra} | {told['packages']} | {told['mb']:.0f} | {largest} |"
     wheel = found["wheel_kb"]
-    yield f"\nThe wheel: {f'{wheel:.0f} kB' if wheel else 'not built here'}.\n"
-    yield "| start | processor s | most of it in, ms |\n| --- | --: | --- |"
+    yield f"\nSize of the wheel: {f'{wheel:.0f} kB' if wheel else 'not built here'}.\n"
+    yield "| start | CPU s | slowest imports, ms |\n| --- | --: | --- |"
     for name, told in found["starts"].items():
         parts = ", ".join(f"{package} {ms:.0f}" for package, ms in told["parts_ms"])
         yield f"| {name} | {told['seconds']:.2f} | {parts} |"

@@ -1,1 +1,1 @@
-"""What graspd leaves out, priced: the cost of modelling it and what it would change (docs/explanation/modelling.md)."""
+"""Cost and influence of effects that graspd does not model (docs/explanation/modelling.md)."""

@@ -1,4 +1,4 @@
-"""What the studies share: subjects with grasps and verdicts' terms, CPU clock, rates with intervals, ranking power."""
+"""Shared parts of the studies: subjects with grasps, CPU clock, rates with intervals, ranking power."""
 
 from __future__ import annotations
 
@@ -32,23 +32,23 @@ Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Row = dict[str, Any]
 
-#: Not a seed that any setting was chosen with.
+#: Seed that was not used to choose any setting.
 SEED = 9109
 ALLEGRO = "hands/allegro/allegro_hand_right.urdf"
-#: One descent a grasp, nothing chosen: about half of them hold, so that a predictor has both kinds to tell apart.
+#: One descent per grasp, without selection: about half of the grasps hold, so predictors see both outcomes.
 PLAIN = FIDELITIES["standard"].model_copy(update={"starts": 1, "finalists": 1})
 
 
 @dataclass
 class Spent:
-    """CPU seconds of a block: neighbours on the machine move them less than wall time."""
+    """CPU seconds of a block, which depend less on other load than wall time."""
 
     seconds: float = 0.0
 
 
 @contextmanager
 def cpu() -> Iterator[Spent]:
-    """Clock of this process's CPU time, all threads."""
+    """Measure the CPU time of a block over all threads of this process."""
     spent, began = Spent(), time.process_time()
     yield spent
     spent.seconds = time.process_time() - began
@@ -56,7 +56,7 @@ def cpu() -> Iterator[Spent]:
 
 @dataclass
 class Subject:
-    """A hand and an object with plain grasps of it."""
+    """A hand, an object, and unselected grasps."""
 
     hand: HandModel
     obj: ObjectModel
@@ -83,26 +83,26 @@ def object_of(data: Path | None, name: str, face_error_m: float = FIDELITIES["st
 
 
 def verdicts(scene: Scene, grasps: GraspSet) -> Bools:
-    """(N,) whether each grasp holds, at level standard in any physics; one thread."""
+    """Return (N,) whether each grasp holds at level standard in this scene; one thread."""
     test = Test(scene)
     return np.array([test.standard(grasps, row).success for row in range(len(grasps))], bool)
 
 
 def share(good: int, total: int) -> Row:
-    """A rate with its 95 % interval (Wilson)."""
+    """Return a rate with its 95 % interval (Wilson)."""
     low, high = wilson(int(good), total)
     return {"value": good / total, "low": low, "high": high, "n": total}
 
 
 def mean(values: Floats) -> Row:
-    """A mean with its 95 % interval (normal)."""
+    """Return a mean with its 95 % interval (normal)."""
     half = 1.96 * float(np.std(values, ddof=1)) / np.sqrt(len(values)) if len(values) > 1 else 0.0
     middle = float(np.mean(values))
     return {"value": middle, "low": middle - half, "high": middle + half, "n": len(values)}
 
 
 def auc(score: Floats, held: Bools) -> float:
-    """Chance that a grasp that holds scores higher than one that does not (Mann-Whitney); 0.5 is a coin."""
+    """Return the probability that a held grasp scores higher than a failed one (Mann-Whitney); 0.5: no information."""
     good, bad = int(held.sum()), int((~held).sum())
     if not good or not bad:
         return float("nan")
@@ -110,9 +110,10 @@ def auc(score: Floats, held: Bools) -> float:
 
 
 def ranking(scores: list[Floats], held: list[Bools], draws: int = 400) -> Row:
-    """Mean AUC over objects with a 95 % bootstrap interval over grasps; objects where all grasps end alike say nothing.
+    """Return the mean AUC over objects with a 95 % bootstrap interval over grasps.
 
-    Ranked within each object, as the planner does: between objects the scales differ.
+    Objects whose grasps all have the same outcome are omitted. Grasps are ranked within each object, as in the planner,
+    because scales differ between objects.
     """
     pairs = [(s, h) for s, h in zip(scores, held, strict=True) if 0 < h.sum() < len(h)]
     rng = np.random.default_rng(0)
@@ -120,7 +121,7 @@ def ranking(scores: list[Floats], held: list[Bools], draws: int = 400) -> Row:
     for _ in range(draws):
         rows = [rng.integers(len(h), size=len(h)) for _, h in pairs]
         each = np.array([auc(s[r], h[r]) for (s, h), r in zip(pairs, rows, strict=True)])
-        # A draw of an object may hold one kind of grasp only.
+        # A bootstrap sample may contain a single outcome.
         if (known := each[~np.isnan(each)]).size:
             found.append(known.mean())
     low, high = np.percentile(found, [2.5, 97.5])

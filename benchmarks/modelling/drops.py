@@ -1,4 +1,4 @@
-"""Drops with the hull against drops with convex pieces; and what an arm behind the hand would forbid."""
+"""Drops of the convex hull compared with drops of convex pieces, and grasps that a forearm would block."""
 
 from __future__ import annotations
 
@@ -17,15 +17,14 @@ from graspd.worker.scenes.clearance import transfer
 from graspd.worker.scenes.rest import RestingFaces, same_face
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 
-#: A forearm: a straight round rod from the palm through the Allegro's flange, which looks along -z of its root [m].
+#: Forearm: a straight round rod from the palm through the Allegro's flange, along -z of its root [m].
 AWAY: Final = np.array([0.0, 0.0, -1.0])
 FOREARM_RADIUS_M: Final = 0.04
 FOREARM_M: Final = 0.3
 
 
 def drops(objects: list[ObjectModel], count: int) -> list[Row]:
-    """The same releases with either collision model: shares of resting faces, and CPU time of the pieces' over the
-    hull's."""
+    """Return shares of resting faces for equal releases with both collision models, and the ratio of CPU times."""
     rows = []
     for obj in objects:
         pieces = decompose(obj)
@@ -57,7 +56,7 @@ def drops(objects: list[ObjectModel], count: int) -> list[Row]:
 
 
 def _in_pieces(obj: ObjectModel, pieces: ConvexPieces, hull: Any) -> Any:
-    """The scene of a drop with the object's pieces as collision shapes; masses, friction and table as in `hull`."""
+    """Return a drop's scene with the object's pieces as collision shapes; the rest is as in `hull`."""
     spec = simulate.spec_above_table([obj])
     body = spec.body("0")
     spec.delete(body.geoms[0])
@@ -68,7 +67,7 @@ def _in_pieces(obj: ObjectModel, pieces: ConvexPieces, hull: Any) -> Any:
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
         geom = body.add_geom(condim=6, friction=[0.8, 0.005, 0.002], solref=[0.006, 1.0])
         geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, f"piece{i}"
-        # The table alone is touched: pieces of one body never touch each other.
+        # The pieces touch only the table: pieces of one body do not collide.
     model = spec.compile()
     assert np.isclose(model.body_mass[1], hull.body_mass[1])
     return model
@@ -79,7 +78,7 @@ def _same(faces: RestingFaces, a: int, b: int) -> bool:
 
 
 def _distance(faces: RestingFaces, a: Any, b: Any) -> float:
-    """Total variation of the shares of resting faces: 0 the same, 1 nothing in common."""
+    """Return the total variation distance of the shares of resting faces: 0 equal, 1 disjoint."""
     left, total = list(b), 0
     for face in a:
         match = next((k for k, other in enumerate(left) if _same(faces, face, other)), None)
@@ -90,15 +89,15 @@ def _distance(faces: RestingFaces, a: Any, b: Any) -> float:
 
 
 def forearm(root: Floats, palm: Floats) -> tuple[Floats, Floats]:
-    """Lowest height (K,) of the far end of forearms on hands with poses (K, 7), and the sine (K,) of their slopes."""
+    """Return the lowest height (K,) of the ends of forearms at poses (K, 7), and the sine (K,) of their slopes."""
     far = quat_rotate(root[:, 3:], np.tile(palm + FOREARM_M * AWAY, (len(root), 1)))[:, 2]
     slope = quat_rotate(root[:, 3:], np.tile(AWAY, (len(root), 1)))[:, 2]
-    # The lowest point of the end's rim.
+    # Lowest point on the rim of the end.
     return root[:, 2] + far - FOREARM_RADIUS_M * np.sqrt(np.maximum(0.0, 1 - slope**2)), slope
 
 
 def arm(subjects: list[Subject], scenes: int) -> Row:
-    """Share of the grasps kept on a table through which a forearm would run, at contact."""
+    """Return the share of clear grasps on a table whose forearm would collide with the table at contact."""
     kept, hit, down, candidates, distinct = 0, 0, 0, 0, 0
     for s in subjects:
         poses = simulate.drop(s.obj, count=scenes, seed=SEED)["scene/object_pose"]

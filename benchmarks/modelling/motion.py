@@ -1,7 +1,7 @@
-"""How much of the hand's and the object's motion must be simulated, and how stiff, to say whether a grasp holds.
+"""Influence of simulated motion and stiffness of hand and object on the verdict.
 
-Reference is the standard level: fingers driven by actuators, hand root on a weld, rigid bodies. Everything is asked of
-the same plain grasps.
+The reference is level standard: fingers driven by actuators, hand root on a weld, rigid bodies. All variants use the
+same unselected grasps.
 """
 
 from __future__ import annotations
@@ -27,22 +27,22 @@ from graspd.worker.validation.displacement import simulated_displacement_cm
 from graspd.worker.validation.model import MujocoOptions, Scene, build
 
 STEPS = (1, 3, 10)
-#: Hand points of the rollouts: between the planner's coarse and fine phase.
+#: Hand points of the rollouts: between those of the planner's coarse and fine phase.
 POINTS = 800
-#: Contact thresholds that stand in for pads that give so far [m].
+#: Contact thresholds that represent pads which yield by this distance [m].
 PADS_M = (0.0005, 0.001, 0.002, 0.005)
-#: Torsional friction [m] of hard points, which touch on no patch.
+#: Torsional friction of point contacts without a patch [m].
 NO_PATCH = 1e-4
 
 
 def predictors(subjects: list[Subject], held: list[Bools], spent: float) -> list[Row]:
-    """Cheap figures of a hand that stands still, by how well they rank grasps; costs relative to the standard level."""
+    """Return the AUC of cheap predictors with a fixed hand, and their costs relative to level standard."""
     rows = []
     rolled, seconds = _rollouts(subjects)
     for k, count in enumerate(STEPS):
         scores = [-r[:, k] for r in rolled]
         rows.append(_row(f"static hand, {count} step{'s' * (count > 1)} (L_stable)", scores, held, None, spent))
-        # The first step is the planner's and costs nothing more; the price of others is their number.
+        # The first step is part of the planner; the cost of others is their number.
         rows[-1]["steps_ratio"] = float(count)
     with cpu() as clock:
         balance = [-hold_forces(s.hand, s.obj, s.grasps.grasp, friction=FRICTION).residual for s in subjects]
@@ -77,7 +77,7 @@ def _rollouts(subjects: list[Subject]) -> tuple[list[Floats], float]:
 
 def _soft(width_m: float) -> Callable[[Scene], None]:
     def soften(scene: Scene) -> None:
-        # The harder side of a contact would win by half: the hand's word counts alone.
+        # Use the hand's parameters alone; MuJoCo would average those of both geometries.
         scene.model.geom_priority[scene.hand_geoms] = 1
         scene.model.geom_solimp[scene.hand_geoms] = (0.05, 0.95, width_m, 0.5, 2.0)
 
@@ -91,21 +91,20 @@ def _hull(subject: Subject) -> ConvexPieces:
 
 
 def engines() -> dict[str, tuple[MujocoOptions, Callable[[Scene], None] | None, bool]]:
-    """Variants of the validator: physics, what is done to the compiled scene, whether the object is one hull."""
+    """Return variants of the validator: physics, change of the compiled scene, whether the object is one hull."""
     base = MujocoOptions()
     slide, _ = base.friction
     return {
         "standard": (base, None, False),
         "hand root fixed": (replace(base, root="fixed"), None, False),
-        "pads that give 2 mm": (base, _soft(2e-3), False),
+        "pads that yield by 2 mm": (base, _soft(2e-3), False),
         "no contact patch": (replace(base, friction=(slide, NO_PATCH)), None, False),
         "object as one hull": (base, None, True),
     }
 
 
 def validated(subjects: list[Subject]) -> tuple[list[Row], list[Bools], float]:
-    """Each variant's rate, agreement with the standard level, cost over the standard level's; the standard level's
-    verdicts."""
+    """Return each variant's rate, agreement and cost relative to level standard, then the verdicts of that level."""
     rows: list[Row] = []
     reference: list[Bools] = []
     spent = 0.0
@@ -135,7 +134,7 @@ def validated(subjects: list[Subject]) -> tuple[list[Row], list[Bools], float]:
 
 
 def pads(subjects: list[Subject]) -> list[Row]:
-    """Contact area and epsilon if all hand surface within a distance of the object touched it."""
+    """Return contact area and epsilon if all hand surface within a distance of the object were in contact."""
     tables = [
         measure(
             s.hand,
@@ -158,7 +157,7 @@ def pads(subjects: list[Subject]) -> list[Row]:
 
 def study(subjects: list[Subject]) -> dict[str, Any]:
     for subject in subjects:
-        # Grasps, pieces and kernels are there before a clock starts.
+        # Prepare grasps, pieces and kernels before the timed runs.
         assert len(subject.grasps) and len(subject.pieces)
         simulated_displacement_cm(
             subject.hand,

@@ -1,4 +1,4 @@
-"""What rays a picture needs: shadows, samples, back faces, faces; and how exactly depth lies on the mesh."""
+"""Influence of shadows, samples, back faces and mesh faces on pictures, and error of depth against the mesh."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from graspd.worker.scenes.simulate import drop
 
 SCENES, VIEWS = 2, 2
 SAMPLES = (2, 4, 12, 24)
-#: Rays per pixel of a picture that others are held against, and the default.
+#: Rays per pixel of the reference, and of the default.
 MANY, RAYS = 96, SAMPLES_DEFAULT
 
 
 def study(data: Path | None, name: str, width: int = 160) -> dict[str, Any]:
-    """Costs over those of `RAYS` rays, and root mean square difference of colours.
+    """Return costs relative to `RAYS` rays, and root mean square differences of colours.
 
-    Numbers of rays are held against `MANY` of them; everything else against the same number of rays.
+    The reference of other numbers of rays has `MANY` rays; the reference of other settings has `RAYS`.
     """
     obj, full = object_of(data, name), object_of(data, name, 0.0)
     poses = drop(obj, count=SCENES, seed=SEED)["scene/object_pose"]
@@ -41,16 +41,16 @@ def study(data: Path | None, name: str, width: int = 160) -> dict[str, Any]:
         pictures, seconds = _shoot(setting, samples)
         rows.append(_row(f"{samples} rays per pixel", pictures, best, seconds / base))
     config = setting.stage("cpu")._config
-    for what, flag in (("no shadows", "enable_shadows"), ("back faces too", "enable_backface_culling")):
+    for what, flag in (("without shadows", "enable_shadows"), ("with back faces", "enable_backface_culling")):
         before = getattr(config, flag)
         setattr(config, flag, False)
-        # Another setting is another kernel: compiled before the clock starts.
+        # Compile the kernel of this setting before the timed run.
         _shoot(setting, 2)
         pictures, seconds = _shoot(setting, RAYS)
         setattr(config, flag, before)
         rows.append(_row(what, pictures, plain, seconds / base))
     other = Setting([full], poses[:, None], plan, seed=SEED, samples=RAYS)
-    # The cameras look where they looked before, whatever the hull's rounding.
+    # Keep the cameras: those computed from the other hull differ by rounding.
     other.shot = replace(other.shot, extrinsics=setting.shot.extrinsics)
     _shoot(other, 2)
     pictures, seconds = _shoot(other, RAYS)
@@ -85,7 +85,7 @@ def _row(name: str, pictures: Pictures, reference: Pictures, ratio: float) -> Ro
 
 
 def depth_error_mm(setting: Setting, pictures: Pictures, vertices: Any, faces: Any) -> dict[str, float]:
-    """Distance of the object's pixels, carried by depth, K, E and object pose into the object frame, from a mesh."""
+    """Return distances of the object's pixels, unprojected by depth, K, E and object pose, from a mesh."""
     shot = setting.shot
     points = Cameras(shot.width, shot.height, shot.intrinsics, shot.extrinsics).unproject(pictures.depth)
     local = [

@@ -1,7 +1,7 @@
-"""How much of a scene must be modelled to say whether a grasp comes out of it.
+"""Influence of the scene's model on the verdict of the lift test.
 
-Reference is the lift test: a rigid table with friction, the way in, closing, lift and hold. Everything is asked of the
-same grasps, planned on a table, that come in clear.
+The reference is the lift test: a rigid table with friction, approach, closing, lift and hold. All variants use the same
+grasps, planned on a table, with a clear approach.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ SOFT_M = 5e-3
 
 @dataclass
 class OnTable:
-    """Grasps of a subject's hand on its object, planned on a table."""
+    """Grasps of a subject, planned on a table."""
 
     subject: Subject
 
@@ -61,14 +61,14 @@ class OnTable:
 
     @cached_property
     def clear(self) -> tuple[GraspSet, PlacedGrasps]:
-        """The grasps that come in clear, with their ways, and their scenes."""
+        """Grasps with clear trajectories, and their scenes."""
         way, rows = self.way, np.flatnonzero(self.way.clear)
         ready = replace(self.grasps, approach=way.approach, coming=way.open, lift=way.lift)
         return ready.take(rows), self.placed.take(rows)
 
 
 def _supports(scene: Scene, friction: float | None = None, width_m: float | None = None) -> None:
-    """The supports' word counts alone: on friction, or on the depth at which they are hard."""
+    """Set friction or softness of contacts with supports, independent of the other geometry."""
     rows = scene.support_geoms
     scene.model.geom_priority[rows] = 1
     if friction is not None:
@@ -86,7 +86,7 @@ def _no_hold(test: Lift, grasps: GraspSet, row: int) -> bool:
 
 
 def variants() -> dict[str, tuple[Callable[[Scene], None], Callable[[Lift, GraspSet, int], bool]]]:
-    """What is done to the compiled scene, and how a grasp is validated in it."""
+    """Return variants: change of the compiled scene, and function that validates a grasp in it."""
 
     def lift(test: Lift, grasps: GraspSet, row: int) -> bool:
         return test.lift(grasps, row).success
@@ -100,14 +100,14 @@ def variants() -> dict[str, tuple[Callable[[Scene], None], Callable[[Lift, Grasp
     return {
         "lift": (same, lift),
         "a table without friction": (lambda scene: _supports(scene, friction=1e-6), lift),
-        "a table that gives 5 mm": (lambda scene: _supports(scene, width_m=SOFT_M), lift),
-        "no hold of 2 s": (same, _no_hold),
-        "under the DexGraspBench protocol: no way in, no hold": (same, dexgraspbench),
+        "a table that yields by 5 mm": (lambda scene: _supports(scene, width_m=SOFT_M), lift),
+        "without the hold of 2 s": (same, _no_hold),
+        "DexGraspBench protocol: no approach, no hold": (same, dexgraspbench),
     }
 
 
 def validated(tables: list[OnTable]) -> list[Row]:
-    """Each variant's rate, agreement with the lift test, cost over the lift test's."""
+    """Return each variant's rate, and its agreement and cost relative to the lift test."""
     rows: list[Row] = []
     reference: Bools | None = None
     spent = 0.0
@@ -137,7 +137,7 @@ def validated(tables: list[OnTable]) -> list[Row]:
 
 
 def straight(tables: list[OnTable]) -> Row:
-    """Grasps that only a bent way could save: clear at contact, closing and lifting, but not on any straight one."""
+    """Return the share of grasps that are clear except on every straight approach."""
     lost = [
         (np.minimum(np.minimum(one.way.contact, one.way.closing), one.way.lifting) >= MARGIN_M) & ~one.way.clear
         for one in tables
@@ -147,7 +147,7 @@ def straight(tables: list[OnTable]) -> Row:
 
 
 def slabs(tables: list[OnTable]) -> Row:
-    """Planning on a half-space against planning on a slab of six planes."""
+    """Compare planning on a half-space with planning on a slab of six planes."""
     half, slab = 0.0, 0.0
     clear = []
     for one in tables:
@@ -170,6 +170,6 @@ def slabs(tables: list[OnTable]) -> Row:
 def study(subjects: list[Subject], count: int) -> dict[str, Any]:
     tables = [OnTable(replace(subject, count=count)) for subject in subjects]
     for one in tables:
-        _ = (one.clear, one.subject.pieces)  # grasps, ways and pieces are there before a clock starts
+        _ = (one.clear, one.subject.pieces)  # prepares grasps, trajectories and pieces before the timed runs
     rows = validated(tables)
     return {"variants": rows, "straight_only": straight(tables), "slab": slabs(tables)}

@@ -1,4 +1,4 @@
-"""How finely the object's faces and the hand's points must be, told on the unsimplified object by other points."""
+"""Influence of the resolution of object and hand, measured on the unsimplified object with other points."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ STANDARD = FIDELITIES["standard"]
 SETTINGS: dict[str, dict[str, Any]] = {
     "standard": {},
     "all faces": {"face_error_m": 0.0},
-    "faces to 1 mm": {"face_error_m": 1e-3},
-    "faces to 3 mm": {"face_error_m": 3e-3},
+    "face error up to 1 mm": {"face_error_m": 1e-3},
+    "face error up to 3 mm": {"face_error_m": 3e-3},
     "500 hand points": {"fine_points": 500},
     "4000 hand points": {"fine_points": 4000},
 }
 
 
 def study(data: Path | None, objects: list[str], count: int) -> dict[str, Any]:
-    """Success, penetration and CPU time of a setting, the same seeds for all."""
+    """Return success, penetration and CPU time of a setting; all settings have the same seeds."""
     hand = hand_of(data)
     true = {name: object_of(data, name, 0.0) for name in objects}
     scenes = {}
     for name in objects:
-        # One validate for all settings: pieces of the standard object, whose digest is in the cache.
+        # All settings are validated with the pieces of the standard object.
         standard = object_of(data, name)
         scenes[name] = build(hand, standard, decompose(standard), MujocoOptions())
     rows: list[Row] = []

@@ -1,7 +1,7 @@
-"""Several steps of the contact simulation instead of one: the object moves on, contacts are found anew.
+"""Several steps of the contact simulation instead of one; the object moves and contacts are recomputed.
 
-The planner's own step (worker/simulation/kernels/contact.py, `direct`) in float64, for one grasp and one velocity at a
-time, with distances of the flat mesh. The hand stands still, as in the loss.
+The step is the planner's (worker/simulation/kernels/contact.py, `direct`) in float64, for one grasp and one velocity
+at a time, with distances to the mesh. The hand is fixed, as in the loss.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ VELOCITIES = 7
 
 
 def forward_simulation(probe: Probe, grasp: Posture, world: World, steps: tuple[int, ...]) -> Floats:
-    """(N, K) L_stable of N grasps after each of K numbers of steps: the mean over the velocities of the whole motion.
+    """Return (N, K) L_stable of N grasps after each of K numbers of steps, as means over the velocities.
 
-    The motion counts in units of what one free step is, whatever the number of steps; ranks do not depend on that.
+    Motions are in units of the free motion of one step, for any number of steps; this does not affect ranks.
     """
     weight = probe.points.area * (REFERENCE_POINTS / probe.points.area.sum())
     hands = probe.posed_points(body_poses(probe.hand, grasp.hand_pose, grasp.joint_positions))
@@ -40,7 +40,7 @@ def forward_simulation(probe: Probe, grasp: Posture, world: World, steps: tuple[
 def _follow(
     probe: Probe, points: Floats, weight: Floats, motion: Floats, world: World, steps: tuple[int, ...]
 ) -> list[float]:
-    """Losses after each of `steps`; the object starts at rest's pose with the free motion `motion` of one step."""
+    """Return losses after each of `steps`; the object starts in its pose with free motion `motion` of one step."""
     place, rotation, turned = np.zeros(3), np.eye(3), np.zeros(3)
     losses = []
     for number in range(1, max(steps) + 1):
@@ -75,11 +75,11 @@ def step(
     inertia: Floats,
     passes: int = PASSES,
 ) -> Floats:
-    """(6,) motion of the object under all contacts at once: compliant, with Coulomb friction."""
+    """Return the (6,) motion of the object under all contacts: compliant, with Coulomb friction."""
     mass = np.eye(6)
     mass[3:, 3:] = inertia
     rows = np.concatenate([normals, np.cross(points, normals)], axis=1)
-    # (n, 3, 6): motion of the object's material at each point.
+    # (n, 3, 6): motion of the object's surface at each point.
     at = np.concatenate([np.tile(np.eye(3), (len(points), 1, 1)), -_skew(points)], axis=2)
     s = s0
     for _ in range(passes):

@@ -1,10 +1,19 @@
-"""The numbers of the studies as Markdown."""
+"""Results of the studies as Markdown."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Final
 
 Row = dict[str, Any]
+TITLES: Final = {
+    "engines": "Validation with changed models, compared with level standard",
+    "predictors": "Predictors of the verdict",
+    "pads": "Contact by the distance that counts as contact",
+    "shape": "Resolution of object and hand",
+    "drops": "Drops with convex pieces, compared with drops of the convex hull",
+    "scenes": "Lift test with changed models",
+    "pictures": "Pictures with changed settings",
+}
 
 
 def tables(found: dict[str, Any]) -> dict[str, str]:
@@ -12,32 +21,35 @@ def tables(found: dict[str, Any]) -> dict[str, str]:
     if "motion" in found:
         study = found["motion"]
         out["engines"] = _table(
-            "model|holds|same verdict (95 %)|holds only here / only at level standard|cost",
+            "model|held|same verdict (95 %)|held only here / only at level standard|cost",
             map(_engine, study["engines"]),
         )
         out["predictors"] = _table("model|AUC (95 %)|cost", map(_predictor, study["predictors"]))
         out["pads"] = _table(
-            "hand surface that touches|contact area cm²|ε",
+            "hand surface in contact|contact area cm²|ε",
             (
                 (f"within {r['give_mm']:g} mm", f"{r['contact_area_cm2']:.1f}", f"{r['epsilon']:.2f}")
                 for r in study["pads"]
             ),
         )
     if "shape" in found:
-        out["shape"] = _table("setting|faces|success (95 %)|depth mm|cost", map(_shape, found["shape"]["settings"]))
+        out["shape"] = _table(
+            "setting|faces|success (95 %)|penetration mm|cost", map(_shape, found["shape"]["settings"])
+        )
     if "drops" in found:
         out["drops"] = _table(
-            "object|pieces|same face from the same release|face shares apart|of two seeds|cost",
+            "object|pieces|same face from the same release|distance of face shares|the same for two seeds|cost",
             map(_drop, found["drops"]["drops"]),
         )
     if "scenes" in found:
         out["scenes"] = _table(
-            "model|comes out|same verdict (95 %)|only here / only by the lift test|cost",
+            "model|lifted|same verdict (95 %)|only here / only by the lift test|cost",
             map(_lift, found["scenes"]["variants"]),
         )
     if "pictures" in found:
         out["pictures"] = _table(
-            "picture|cost|colour off, of 255|labels changed|depth off mm", map(_rays, found["pictures"]["rays"])
+            "picture|cost|RMS colour error, of 255|changed labels|mean depth error, mm",
+            map(_rays, found["pictures"]["rays"]),
         )
     return out
 

@@ -1,11 +1,11 @@
-"""Every figure and picture of the docs, made again; what is recorded in the manifest and still holds is not run.
+"""Make all figures and pictures of the docs; skip studies whose recorded results are current.
 
 usage: python -m benchmarks.results [--quick] [--data DIR] [--sources DIR] [--before CHECKOUT] [--only NAME ...]
        python -m benchmarks.results --list | --stale | --pages | --enter NAME ...
 
-Results go to docs/, with `--quick` those of little runs to results-quick/; each finished study is in
-results/MANIFEST.json there before the next one begins. `--enter` records files of docs/ that were made by other means,
-from what they and the history tell. Ends with 1 if a study failed, or if `--stale` found one.
+Results go to docs/, those of quick runs (`--quick`) to results-quick/; results/MANIFEST.json there records each study
+when it ends. `--enter` records files of docs/ that were made by other means, from their contents and the git history.
+The exit code is 1 if a study failed, or if `--stale` found a stale study.
 """
 
 from __future__ import annotations
@@ -70,19 +70,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def parser() -> argparse.ArgumentParser:
     told = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    told.add_argument("--quick", action="store_true", help="little of everything, 20 minutes of two cores")
+    told.add_argument("--quick", action="store_true", help="small runs, 20 minutes of two cores")
     told.add_argument("--data", type=Path, help="folder with hands/ and objects/")
     told.add_argument("--sources", type=Path, help="folder with the packages of benchmarks.gallery")
-    told.add_argument("--before", type=Path, help="checkout that costs are compared with")
+    told.add_argument("--before", type=Path, help="checkout for comparisons of costs")
     told.add_argument("--only", nargs="+", metavar="NAME")
-    told.add_argument("--again", action="store_true", help="also what is recorded and holds")
-    told.add_argument("--one-revision", action="store_true", help="again what another commit made")
-    told.add_argument("--out", type=Path, help="folder in the place of docs/ or results-quick/")
-    told.add_argument("--work", type=Path, default=Path("results-work"), help="keeps what studies have found so far")
-    told.add_argument("--list", action="store_true", help="studies, what they need, their commands")
-    told.add_argument("--stale", action="store_true", help="which are of older algorithms")
-    told.add_argument("--pages", action="store_true", help="only write results/README.md and tables in the docs")
-    told.add_argument("--enter", nargs="+", metavar="NAME", help="record files that are there")
+    told.add_argument("--again", action="store_true", help="also run studies with current results")
+    told.add_argument("--one-revision", action="store_true", help="also run studies recorded at another commit")
+    told.add_argument("--out", type=Path, help="folder instead of docs/ or results-quick/")
+    told.add_argument("--work", type=Path, default=Path("results-work"), help="folder for intermediate results")
+    told.add_argument("--list", action="store_true", help="list studies, requirements and commands")
+    told.add_argument("--stale", action="store_true", help="list studies with results of older algorithms")
+    told.add_argument("--pages", action="store_true", help="only write results/README.md and the tables in the docs")
+    told.add_argument("--enter", nargs="+", metavar="NAME", help="record existing files")
     return told
 
 

@@ -1,4 +1,4 @@
-"""`MANIFEST.json`: of each study what command made its files, when, where, from which revision, with their digests."""
+"""`MANIFEST.json`: command, date, machine, revision and file digests of each study."""
 
 from __future__ import annotations
 
@@ -15,20 +15,19 @@ from graspd.service.model.version import STAGE_REVISIONS
 
 REPOSITORY: Final = Path(__file__).resolve().parents[2]
 DOCS: Final = REPOSITORY / "docs"
-#: Under the folder of the docs; what says what is there is not itself a figure.
+#: Paths under the folder of the docs; these two files are not results.
 MANIFEST, INDEX = "results/MANIFEST.json", "results/README.md"
 _REVISIONS: Final = re.compile(r"^STAGE_REVISIONS[^=]*= (\{[^}]*\})", re.MULTILINE)
 
 #: Studies of the smallest and largest objects, and of hands of all kinds.
 EXTREMES: Final = frozenset({"stability", "scenes-stability"})
 ALL_HANDS: Final = frozenset({"hands-stability"})
-#: Studies of grasps that are all planned in scenes.
+#: Studies whose grasps are all planned in scenes.
 SCENES_ONLY: Final = frozenset({"clutter", "scene-ways", "tables", "lift", "scene-pictures", "learned"})
-#: Revisions that make, of the hands and objects in all studies but those named, what another one before made, bit for
-#: bit, by stage and revision; tests/front/test_same_figures.py says why. Synthesize 19 differs where an object is too
-#: small or too wide for the hand's pads, 20 where more than two digits close a gripper around a place, 21 to 23 where
-#: objects are free. Pictures of render 4 are those of 3, which Newton traced, to rounding
-#: (tests/worker/rendering/test_tracer.py).
+#: By stage and revision: an earlier revision with equal results bit for bit, except in the named studies.
+#: tests/front/test_same_figures.py has the reasons. Synthesize 19 differs for objects that are too small or too wide
+#: for the hand's pads, 20 for grippers with more than two digits, 21 to 23 for free objects. Pictures of render 4 equal
+#: those of render 3 (traced by Newton) except for rounding (tests/worker/rendering/test_tracer.py).
 SAME: Final[dict[tuple[str, int], tuple[int, frozenset[str]]]] = {
     ("synthesize", 23): (22, frozenset(BY_NAME) - SCENES_ONLY),
     ("synthesize", 22): (21, frozenset(BY_NAME) - SCENES_ONLY),
@@ -42,7 +41,7 @@ Manifest = dict[str, dict[str, Any]]
 
 
 def load(docs: Path) -> Manifest:
-    """Records by name of the study; none where there is no manifest."""
+    """Return records by study; empty if there is no manifest."""
     file = docs / MANIFEST
     return json.loads(file.read_text())["studies"] if file.is_file() else {}
 
@@ -55,7 +54,7 @@ def save(docs: Path, records: Manifest) -> None:
 
 
 def write(file: Path, text: str) -> None:
-    """Write so that a run that is killed leaves no half file."""
+    """Write atomically, so that a killed run leaves no partial file."""
     file.parent.mkdir(parents=True, exist_ok=True)
     partial = file.with_suffix(".part")
     partial.write_text(text)
@@ -63,25 +62,25 @@ def write(file: Path, text: str) -> None:
 
 
 def digests(study: Study, docs: Path) -> dict[str, str]:
-    """SHA-256 of each file of a study that git keeps, by its path under the folder of the docs."""
+    """Return the SHA-256 of each file of a study in git, by path under the folder of the docs."""
     paths = {str(file.relative_to(docs)): file for file in files_of(study, docs)}
     return {path: _sha256(file) for path, file in paths.items() if not is_raw(path)}
 
 
 def faults(docs: Path, records: Mapping[str, dict[str, Any]]) -> list[str]:
-    """What does not agree: files that no record holds, digests that differ, files that are gone."""
+    """Return disagreements: files without a record, different digests, missing files."""
     held = {path: digest for record in records.values() for path, digest in record["files"].items()}
-    found = [f"{path}: not held" for path in sorted(there(docs) - held.keys())]
+    found = [f"{path}: not recorded" for path in sorted(there(docs) - held.keys())]
     for path, digest in held.items():
         if not (docs / path).is_file():
-            found.append(f"{path}: gone")
+            found.append(f"{path}: missing")
         elif _sha256(docs / path) != digest:
             found.append(f"{path}: changed since it was recorded")
     return found + [f"{name}: no such study" for name in records if name not in BY_NAME]
 
 
 def there(docs: Path) -> set[str]:
-    """All figures and pictures under a folder of the docs, and what else the studies write there; raw results aside."""
+    """Return all results, pictures and other files of studies under a folder of the docs, except raw results."""
     files = [file for place in ("results", "images") for file in (docs / place).rglob("*") if file.is_file()]
     files += [file for study in STUDIES for file in files_of(study, docs)]
     paths = {str(file.relative_to(docs)) for file in files} - {MANIFEST, INDEX}
@@ -89,7 +88,7 @@ def there(docs: Path) -> set[str]:
 
 
 def staleness(study: Study, record: Mapping[str, Any] | None) -> str:
-    """Why a study should be made again; empty where its record is of the revisions of today."""
+    """Return why a study is stale; empty if its record has the current revisions."""
     if record is None:
         return "not made yet"
     made = record["stage_revisions"]
@@ -109,9 +108,9 @@ def _holds(study: Study, stage: str, made: int | None) -> bool:
 
 
 def entered(study: Study, docs: Path) -> dict[str, Any]:
-    """A record of files as they lie there, from what they and the history tell; what nobody tells is null.
+    """Return a record of existing files from their contents and the git history; unknown fields are null.
 
-    The revision is the oldest of the commits that last changed one of the files: they were made at that one or earlier.
+    The revision is the oldest of the commits that last changed one of the files.
     """
     files = digests(study, docs)
     commits = [_git("log", "-1", "--format=%cI %h", "--", f"docs/{path}") for path in files]
@@ -133,14 +132,14 @@ def entered(study: Study, docs: Path) -> dict[str, Any]:
 
 
 def stage_revisions_at(revision: str) -> dict[str, int] | None:
-    """`STAGE_REVISIONS` as a commit has them; None where it has none or is not there."""
+    """Return `STAGE_REVISIONS` of a commit; None if the commit or the constant does not exist."""
     text = _git("grep", "-h", "-A4", "^STAGE_REVISIONS.*= {", revision, "--", "*.py")
     found = _REVISIONS.search(text)
     return json.loads(found[1].replace(",}", "}").replace("'", '"')) if found else None
 
 
 def _said_by(files: Any) -> dict[str, Any]:
-    """What the first of some JSON files that tells of its making says."""
+    """Return the first JSON file with facts about its origin."""
     for file in files:
         if file.suffix == ".json":
             found = json.loads(file.read_text())
@@ -154,7 +153,7 @@ def _sha256(file: Path) -> str:
 
 
 def _git(*arguments: str) -> str:
-    """What git says of this checkout; empty where it is none, or says nothing."""
+    """Return the output of git in this checkout; empty on failure."""
     try:
         done = subprocess.run(["git", *arguments], cwd=REPOSITORY, capture_output=True, text=True, check=False)
     except FileNotFoundError:
@@ -163,6 +162,6 @@ def _git(*arguments: str) -> str:
 
 
 def revision_of_today() -> str:
-    """The commit that stands there, with `+` where files differ from it."""
+    """Return the current commit, with `+` if files differ from it."""
     changed = _git("status", "--porcelain", "--untracked-files=no", "--", ":!docs")
     return (_git("rev-parse", "--short", "HEAD") or "unknown") + ("+" if changed else "")

@@ -1,6 +1,6 @@
-"""What readers see of the manifest: `docs/results/README.md`, and figures that pages show from files it holds.
+"""Pages from the manifest: `docs/results/README.md`, and tables of results in other pages.
 
-A page holds the first table of a file between `<!-- results/FILE -->` and `<!-- /results/FILE -->`.
+A page has the first table of a file between `<!-- results/FILE -->` and `<!-- /results/FILE -->`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any, Final
 from benchmarks.results.manifest import DOCS, INDEX, REPOSITORY, load, staleness
 from benchmarks.results.studies import STUDIES
 
-#: All pages but those that the studies themselves write.
+#: All pages except those that the studies write.
 PAGES: Final = (
     REPOSITORY / "README.md",
     *sorted(page for page in DOCS.rglob("*.md") if not page.is_relative_to(DOCS / "results")),
@@ -23,18 +23,19 @@ _CITED: Final = re.compile(r"(?:\]\(|src=\")(?:\.\./)*(?:docs/)?((?:results|imag
 
 
 def index(records: Mapping[str, dict[str, Any]]) -> str:
-    """The page of all studies: files, date, revision, and whether today's algorithms would give the same."""
+    """Return the page of all studies: files, date, revision, and whether the algorithms have changed since."""
     lines = [
         "# Where figures come from",
         "",
-        "`make results DATA=DIR` makes every file here and in `docs/images` again, study by study (`SOURCES=DIR`, "
-        "`BEFORE=DIR` where a study needs them; `QUICK=1`: small runs in `results-quick/`). Recorded files that still "
-        "hold are kept. `python -m benchmarks.results --list` has the commands. Raw numbers (JSON, CSV, SVG) "
-        "are not in git; `--again --only NAME` makes those of a study.",
+        "`make results DATA=DIR` makes all files here and in `docs/images`, study by study. Some studies also need "
+        "`SOURCES=DIR` (packages with published hands) or `BEFORE=DIR` (an earlier checkout). With `QUICK=1` it makes "
+        "small runs in `results-quick/`. A study with current files is skipped. `python -m benchmarks.results --list` "
+        "shows the commands. Raw numbers (JSON, CSV, SVG) are not in git; `--again --only NAME` makes those of a "
+        "study.",
         "",
-        "*Older* figures were measured before the algorithms of the named stages changed: today's may differ. A dash: "
-        "the study depends on no stage. Date, version and commit are those of the run ([manifest](MANIFEST.json)); *or "
-        "earlier* marks files from before the manifest was kept.",
+        "State *older*: the algorithms of the named stages have changed since the measurement, so new figures may "
+        "differ. A dash: the study does not depend on a stage. Date, version and commit are those of the run "
+        "([manifest](MANIFEST.json)). *Or earlier*: no run is recorded; the commit is that of the files.",
         "",
         "| study | what | files | date | version | commit | state |",
         "| --- | --- | --- | --- | --- | --- | --- |",
@@ -55,14 +56,14 @@ def index(records: Mapping[str, dict[str, Any]]) -> str:
 
 
 def _version(record: Mapping[str, Any]) -> str:
-    """graspd's among the versions that a record tells; empty where it tells none."""
+    """Return the version of graspd in a record; empty if it has none."""
     told = record["versions"]
     found = re.search(r"[\d.]+", told.get("graspd", "") if isinstance(told, dict) else told or "")
     return found[0] if found else ""
 
 
 def _files(record: Mapping[str, Any]) -> str:
-    """The files of a record as links, a folder of many as one."""
+    """Return the files of a record as links; a folder with many files is one link."""
     by_folder: dict[str, list[str]] = {}
     for path in record["files"]:
         by_folder.setdefault(str(Path(path).parent), []).append(path)
@@ -81,12 +82,12 @@ def _from_here(path: str) -> str:
 
 
 def renewed(text: str, docs: Path) -> str:
-    """A page with the tables that it shows from files under a folder of the docs."""
+    """Return a page with its tables renewed from files under a folder of the docs."""
     return _BLOCK.sub(lambda found: f"{found[1]}{first_table(docs / found[2])}\n{found[3]}", text)
 
 
 def first_table(file: Path) -> str:
-    """The first Markdown table of a file."""
+    """Return the first Markdown table of a file."""
     found = re.search(r"^\|.*?(?=\n[^|]|\n\n|\Z)", file.read_text(), re.DOTALL | re.MULTILINE)
     if found is None:
         raise ValueError(f"{file.name} has no table")
@@ -94,7 +95,7 @@ def first_table(file: Path) -> str:
 
 
 def cited(page: Path) -> Iterator[str]:
-    """Paths under docs/ of the figures and pictures that a page links to, shows or copies; folders without a slash."""
+    """Yield paths under docs/ of the results that a page links to, shows or copies; folders without a slash."""
     text = page.read_text()
     for path in _CITED.findall(text):
         yield path.rstrip("/")
@@ -103,7 +104,7 @@ def cited(page: Path) -> Iterator[str]:
 
 
 def write_pages(docs: Path) -> None:
-    """Renew the index, and every page that shows a table of a figures file."""
+    """Renew the index, and all pages with tables from results."""
     (docs / INDEX).write_text(index(load(docs)))
     if docs == DOCS:
         for page in PAGES:

@@ -1,4 +1,4 @@
-"""Studies run one after another; what is recorded and still holds is not run again."""
+"""Runs studies one after another; skips studies with current results."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from graspd.service.run.supervisor import Supervisor
 from graspd.service.settings import Settings
 from graspd.worker.rendering.sheets import png
 
-#: Mean difference of a channel, of 255, from which on a palette shows steps in what fades, a depth image say.
+#: Mean difference of a channel, of 255, above which a palette shows steps in gradients, as in depth images.
 STEPS: Final = 0.45
 _PACKAGES: Final = ("graspd", "numpy", "warp-lang", "mujoco", "newton")
 _TEXTS: Final = {".json", ".md", ".csv", ".svg"}
@@ -41,7 +41,7 @@ _PROGRAMS: Final = {"graspd": (sys.executable, "-m", "graspd"), "python": (sys.e
 
 @dataclass
 class Runner:
-    """How studies are run: `out` is the folder of the docs to write, `places` where DATA, SOURCES and BEFORE are."""
+    """Runs studies; `out` is the folder of the docs, `places` has the folders DATA, SOURCES and BEFORE."""
 
     out: Path
     work: Path
@@ -60,18 +60,18 @@ class Runner:
         return study.quick if self.quick else study.run
 
     def missing(self, study: Study) -> str:
-        """Why a study cannot be run here; empty where it can."""
+        """Return why a study cannot run here; empty if it can."""
         if not study.run:
             return "a page written by hand"
         if not self.lines(study):
-            return "has no little run"
+            return "has no quick run"
         words = " ".join(self.lines(study))
         wants = [name for name in study.wants() if name in words or name not in {"DATA", "SOURCES", "BEFORE"}]
         gone = [name for name in wants if not self._has(name)]
         return f"needs {', '.join(gone)}" if gone else ""
 
     def holds(self, study: Study) -> bool:
-        """Whether a record says that this very study made the files that are there."""
+        """Return whether the files are current: recorded for this study, its commands and the current revisions."""
         record = self.records.get(study.name)
         return (
             record is not None
@@ -83,7 +83,7 @@ class Runner:
         )
 
     def run(self, study: Study) -> str:
-        """Run one study and record it. Returns what became of it."""
+        """Run one study and record it; return the outcome."""
         if reason := self.missing(study):
             return f"left out: {reason}"
         if self.holds(study) and not self.again:
@@ -118,7 +118,7 @@ class Runner:
         return f"made in {time.time() - began:.0f} s"
 
     def _commands(self, study: Study) -> str:
-        """Run the commands of a study; returns what failed."""
+        """Run the commands of a study; return the failure, if any."""
         log = self.work / "logs" / f"{study.name}.log"
         log.parent.mkdir(parents=True, exist_ok=True)
         for glob in (*study.files, study.prints):
@@ -150,7 +150,7 @@ class Runner:
 
     @contextmanager
     def _service(self, study: Study) -> Iterator[Mapping[str, str]]:
-        """The environment of the commands; with a service of their own for those who need one."""
+        """Yield the environment of the commands; start a service if the study needs one."""
         environment = {name: value for name, value in os.environ.items() if not name.startswith("GRASPD_")}
         environment["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{environment.get('PATH', '')}"
         if SERVICE not in study.needs:
@@ -175,7 +175,7 @@ class Runner:
         return [line.replace("OUT/", "docs/") for line in self.lines(study)]
 
     def _without_places(self, file: Path) -> None:
-        """Folders of this machine are called in texts as everybody may call them."""
+        """Replace folders of this machine by their general names in text files."""
         if file.suffix in _TEXTS:
             text = before = file.read_text()
             places = {self.out: "docs", self.work: "WORK", **{path: name for name, path in self.places.items()}}
@@ -187,7 +187,7 @@ class Runner:
                 write(file, text)
 
     def _without_raw(self, page: Path) -> Callable[[re.Match[str]], str]:
-        """What a link of a page becomes: its words alone where it leads to a raw result, which git does not keep."""
+        """Return a function that replaces links to raw results, which are not in git, by their text."""
 
         def replaced(link: re.Match[str]) -> str:
             target = (page.parent / link[2]).resolve()
@@ -198,7 +198,7 @@ class Runner:
 
 
 def slim(file: Path) -> None:
-    """Give a PNG a palette of 256 colours where that takes fewer bytes, about a third of them, and shows no steps."""
+    """Give a PNG a palette of 256 colours if that saves bytes (about two thirds) and shows no steps."""
     if file.suffix != ".png":
         return
     with Image.open(file) as picture:
@@ -217,7 +217,7 @@ def machine() -> str:
 
 
 def versions() -> dict[str, str]:
-    """Of Python and of the packages that a figure may follow from."""
+    """Return the versions of Python and of the packages that may affect results."""
     found = {"python": platform.python_version()}
     for name in _PACKAGES:
         try:

@@ -1,8 +1,8 @@
-"""What makes the figures and pictures of the docs: the studies, their commands and the files that they write.
+"""Studies that make the figures and pictures of the docs: their commands and files.
 
-In a command `DATA` is a folder with hands/ and objects/ (real URDFs, YCB meshes), `SOURCES` one with the packages of
-`benchmarks.gallery`, `BEFORE` a checkout to compare with, `WORK` a folder that keeps what a study has found so far and
-`OUT` the folder of the docs (docs/, or another one for quick runs).
+In a command `DATA` is a folder with hands/ and objects/ (real URDFs, YCB meshes), `SOURCES` a folder with the packages
+of `benchmarks.gallery`, `BEFORE` a checkout for comparison, `WORK` a folder for intermediate results, and `OUT` the
+folder of the docs (docs/, or another one for quick runs).
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from typing import Final
 PLANS: Final = ("synthesize",)
 IN_SCENES: Final = ("synthesize", "scene")
 ALL: Final = ("synthesize", "scene", "render")
-#: Beside DATA, SOURCES and BEFORE: what a study may need.
+#: Requirements of studies besides DATA, SOURCES and BEFORE.
 SERVICE, BROWSER, GPU, TORCH, PREFILTER = "a service", "a browser", "a GPU", "PyTorch", "mujoco-warp"
-#: What is written beside the pages and pictures that readers see: not in git, made again by the study.
+#: Suffixes of raw results, which are not in git.
 RAW: Final = frozenset({".json", ".csv", ".svg", ".sha256"})
-#: Written by hand, so kept.
+#: Files written by hand, which are in git.
 NOT_RAW: Final = frozenset({"results/pilot/assets.json"})
 #: Files that the study `predictor` leaves in WORK.
 NETWORK = "trained networks"
@@ -56,11 +56,10 @@ def _on_its_way(hand: str, obj: str, scene: str) -> tuple[str, str]:
 
 @dataclass(frozen=True)
 class Study:
-    """One entry of the list: `files` are globs under the folder of the docs.
+    """A study; `files` are globs under the folder of the docs.
 
-    A study without `quick` has no little run; one without `run` is a page that somebody writes from another's figures.
-
-    `stages` are those whose revision its figures follow from; times follow from all code and have none.
+    A study without `quick` has no quick run. A study without `run` is a page written by hand. `stages` are the stages
+    whose revisions affect its figures; times depend on all code and have no stages.
     """
 
     name: str
@@ -72,10 +71,10 @@ class Study:
     seeds: tuple[int, ...] = ()
     needs: tuple[str, ...] = ()
     prints: str = ""
-    """File under the folder of the docs that gets what the commands print."""
+    """File under the folder of the docs for the output of the commands."""
 
     def wants(self) -> list[str]:
-        """Everything that must be there: what the commands name, then `needs`."""
+        """Return all requirements: places in the commands, then `needs`."""
         words = " ".join(self.run)
         return [name for name in ("DATA", "SOURCES", "BEFORE") if name in words] + list(self.needs)
 
@@ -109,7 +108,7 @@ STUDIES: Final = (
     ),
     Study(
         "chart",
-        "speed against accuracy: methods, fidelities, knobs",
+        "speed against accuracy: methods, fidelities, settings",
         ("results/chart.*", "results/sweeps.png"),
         (
             f"graspd chart --hands {_ALLEGRO},{_BARRETT} --objects {_mesh('006_mustard_bottle')},{_mesh('025_mug')},"
@@ -120,7 +119,7 @@ STUDIES: Final = (
     ),
     Study(
         "scenes-chart",
-        "planned in a scene, or filtered",
+        "grasps planned in scenes, compared with filtered free grasps",
         ("results/scenes-chart/*",),
         (
             f"graspd chart --scene table --hands {_ALLEGRO},{_BARRETT} --objects {_mesh('025_mug')},"
@@ -135,7 +134,7 @@ STUDIES: Final = (
     ),
     Study(
         "stability",
-        "where integrators, gradients, starts and rates break",
+        "failures of integrators, gradients, starts and rates",
         ("results/stability/*",),
         (
             "graspd stability --only time_step --only stiffness --only contact_count --only gradient --only shapes "
@@ -145,7 +144,7 @@ STUDIES: Final = (
     ),
     Study(
         "hands-stability",
-        "where hands, wrong models and other methods break",
+        "failures with difficult hands, model errors and baselines",
         ("results/hands-stability/*",),
         ("graspd stability --only hands --only model_errors --only baselines --out OUT/results/hands-stability",),
         (
@@ -155,7 +154,7 @@ STUDIES: Final = (
     ),
     Study(
         "scenes-stability",
-        "where planning in scenes breaks",
+        "failures of planning in scenes",
         ("results/scenes-stability/*",),
         (
             "graspd stability --only scene_height --only scene_wall --only scene_neighbours --only scene_size "
@@ -174,7 +173,7 @@ STUDIES: Final = (
     ),
     Study(
         "validation-levels",
-        "what the validator's cheap levels cost and say",
+        "cost and agreement of the validator's levels",
         ("results/validation-levels.*",),
         (
             f"python -m benchmarks.validation_levels DATA --work WORK/cells --objects {_EIGHT} "
@@ -189,7 +188,7 @@ STUDIES: Final = (
     ),
     Study(
         "prefilter",
-        "what the prefilter says beside the standard level",
+        "agreement of the prefilter with level standard",
         ("results/prefilter.*",),
         ("python -m benchmarks.prefilter DATA --work WORK/cells --out OUT/results/prefilter",),
         (f"python -m benchmarks.prefilter DATA --work WORK/cells {_LITTLE} --out OUT/results/prefilter",),
@@ -198,7 +197,7 @@ STUDIES: Final = (
     ),
     Study(
         "robust",
-        "verdicts in hands that differ from the nominal one",
+        "verdicts in models that differ from the nominal one",
         ("results/robust.*",),
         ("python -m benchmarks.robust DATA --work WORK/cells --out OUT/results",),
         (f"python -m benchmarks.robust DATA --work WORK/cells {_LITTLE} --draws 1 --out OUT/results",),
@@ -206,7 +205,7 @@ STUDIES: Final = (
     ),
     Study(
         "foreign",
-        "planned with one model of a hand, validated in another",
+        "grasps planned with one model of a hand, validated in another",
         ("results/foreign.*",),
         (
             f"python -m benchmarks.foreign DATA --sources SOURCES --work WORK --objects {_SEVEN} "
@@ -229,7 +228,7 @@ STUDIES: Final = (
     ),
     Study(
         "penetration",
-        "how deep hands are, with and without the projection",
+        "penetration with and without the final projection",
         ("results/penetration.md",),
         ("python -m benchmarks.penetration DATA",),
         ("python -m benchmarks.penetration DATA --objects 056_tennis_ball --grasps 4",),
@@ -238,7 +237,7 @@ STUDIES: Final = (
     ),
     Study(
         "recipes",
-        "what each part of the recipe buys",
+        "effect of the planner's settings",
         ("results/recipes.md",),
         ("python -m benchmarks.recipes DATA",),
         ("python -m benchmarks.recipes DATA --objects 077_rubiks_cube --grasps 4",),
@@ -247,7 +246,7 @@ STUDIES: Final = (
     ),
     Study(
         "rollouts",
-        "hands chosen by merit, and by a short test",
+        "candidates selected by merit, and by rollouts",
         ("results/rollouts.*",),
         ("python -m benchmarks.rollouts DATA --work WORK --out OUT/results",),
         (f"python -m benchmarks.rollouts DATA --work WORK {_LITTLE} --out OUT/results",),
@@ -255,7 +254,7 @@ STUDIES: Final = (
     ),
     Study(
         "failures",
-        "the failures that are left, with pictures",
+        "remaining failures, with pictures",
         ("results/failures.*", "results/failures/*"),
         (f"python -m benchmarks.failures DATA --work WORK/cells --objects {_EIGHT} --out OUT/results",),
         (f"python -m benchmarks.failures DATA --work WORK/cells {_LITTLE} --out OUT/results",),
@@ -263,7 +262,7 @@ STUDIES: Final = (
     ),
     Study(
         "diversity",
-        "how different candidates are",
+        "diversity of candidates",
         ("results/diversity.md",),
         (f"python -m benchmarks.diversity DATA --work WORK/cells --objects {_EIGHT}",),
         (f"python -m benchmarks.diversity DATA --work WORK/cells {_LITTLE}",),
@@ -280,7 +279,7 @@ STUDIES: Final = (
     ),
     Study(
         "published-picks",
-        "published picks beside our verdicts",
+        "published picks, compared with graspd's verdicts",
         ("results/published-picks.*",),
         ("python -m benchmarks.published_picks DATA --work WORK/picks --out OUT/results/published-picks",),
         (
@@ -291,7 +290,7 @@ STUDIES: Final = (
     ),
     Study(
         "scenes-grasps",
-        "planned in scenes, by hand and object",
+        "grasps planned in scenes, by hand and object",
         ("results/scenes-grasps.*",),
         (
             "python -m benchmarks.scene_grasps DATA --work WORK --grasps 16 --per-face 2 --filtered 96 "
@@ -306,7 +305,7 @@ STUDIES: Final = (
     ),
     Study(
         "clutter",
-        "grasps of a target among neighbours, within a time",
+        "grasps of a target among neighbours, in limited time",
         ("results/clutter.*",),
         ("python -m benchmarks.clutter DATA --json OUT/results/clutter.json",),
         (
@@ -354,7 +353,7 @@ STUDIES: Final = (
     ),
     Study(
         "week",
-        "a week of a thousand nodes that come and go",
+        "simulation of a week on a thousand preemptible nodes",
         ("results/week.*",),
         ("python -m benchmarks.week --json OUT/results/week.json",),
         ("python -m benchmarks.week --nodes 20 --days 1 --json OUT/results/week.json",),
@@ -383,16 +382,16 @@ STUDIES: Final = (
         stages=(),
         prints="results/service-tables.md",
     ),
-    Study("service-page", "the same with its conditions", ("results/service.md",), (), stages=()),
+    Study("service-page", "cost of the service with test conditions", ("results/service.md",), (), stages=()),
     Study(
         "matrix",
-        "four hands on fourteen objects, killed in the middle",
+        "four hands on fourteen objects, with a crash in the middle",
         ("results/matrix.md",),
         ("python -m benchmarks.matrix DATA --data-dir WORK/matrix --out OUT/results/matrix.md",),
     ),
     Study(
         "predictor",
-        "networks that learned from grasps on tables",
+        "proposals of networks trained on grasps on tables",
         ("results/predictor.json", "results/predictor-barrett.png", "results/predictor-allegro.png"),
         (
             "graspd datasets create --spec examples/tables/tables.toml --objects DATA/objects --yes --wait",
@@ -409,10 +408,12 @@ STUDIES: Final = (
         seeds=(0, 1, 2),
         needs=(SERVICE, TORCH),
     ),
-    Study("predictor-page", "the same with its conditions", ("results/predictor.md",), (), stages=ALL),
+    Study(
+        "predictor-page", "success of these networks, with test conditions", ("results/predictor.md",), (), stages=ALL
+    ),
     Study(
         "learned",
-        "seeds from a network against the planner's own",
+        "planner seeds from a network, compared with the planner's own",
         ("results/learned.*",),
         (
             "python -m benchmarks.learned --network WORK/barrett.npz WORK/allegro.npz --data DATA --seeds 3 "
@@ -424,7 +425,7 @@ STUDIES: Final = (
     ),
     Study(
         "modelling",
-        "what graspd leaves out: its cost and its effect",
+        "effects that graspd does not model: cost and influence",
         ("results/modelling.json",),
         ("python -m benchmarks.modelling --data DATA --out OUT/results",),
         ("python -m benchmarks.modelling --only drops --grasps 2 --out OUT/results",),
@@ -433,7 +434,7 @@ STUDIES: Final = (
     ),
     Study(
         "scene-ways",
-        "what stands in the way of grasps in scenes",
+        "obstacles of grasps in scenes, by phase",
         ("results/scene-ways.md",),
         ("python -m benchmarks.scene_trajectories",),
         ("python -m benchmarks.scene_trajectories --count 1",),
@@ -442,7 +443,7 @@ STUDIES: Final = (
     ),
     Study(
         "grippers",
-        "what grippers hold of objects that fit",
+        "success of grippers on objects that fit",
         ("results/grippers.*",),
         ("python -m benchmarks.grippers DATA --sources SOURCES --out OUT/results",),
         ("python -m benchmarks.grippers DATA --sources SOURCES --only robotiq-2f-85 --grasps 1 --out OUT/results",),
@@ -450,7 +451,7 @@ STUDIES: Final = (
     ),
     Study(
         "masses",
-        "table lifts of objects with their own masses",
+        "table lifts of objects with published masses",
         ("results/masses.md",),
         ("python -m benchmarks.masses DATA --page OUT/results/masses.md",),
         ("python -m benchmarks.masses DATA --hands barrett --objects 025_mug --grasps 2 --page OUT/results/masses.md",),
@@ -459,7 +460,7 @@ STUDIES: Final = (
     ),
     Study(
         "flat",
-        "table lifts of flat and thin things",
+        "table lifts of flat and thin objects",
         ("results/flat.md",),
         ("python -m benchmarks.flat DATA --page OUT/results/flat.md",),
         ("python -m benchmarks.flat DATA --hands barrett --things 60x60x10 --grasps 2 --page OUT/results/flat.md",),
@@ -489,7 +490,7 @@ STUDIES: Final = (
     ),
     Study(
         "second-lift",
-        "valid grasps in a lift test of its own",
+        "valid grasps in a second, independent lift test",
         ("results/second_lift.md",),
         ("python -m benchmarks.second_lift DATA --grasps 12 --page OUT/results/second_lift.md",),
         (
@@ -501,7 +502,7 @@ STUDIES: Final = (
     ),
     Study(
         "payload",
-        "payload of grasps: error and price",
+        "payload of grasps: error and cost",
         ("results/payload.md", "results/payload-free.md"),
         (
             "python -m benchmarks.payload DATA --page OUT/results/payload.md",
@@ -518,7 +519,7 @@ STUDIES: Final = (
     ),
     Study(
         "published-hands",
-        "the self-test's verdict, and what published hands lift",
+        "self-test and lifts of published hands",
         ("results/published_hands.*",),
         ("python -m benchmarks.published_hands SOURCES --data DATA --grasps 12 --out OUT/results",),
         ("python -m benchmarks.published_hands SOURCES --data DATA --only robotiq-2f-85 --grasps 2 --out OUT/results",),
@@ -624,7 +625,7 @@ STUDIES: Final = (
     ),
     Study(
         "lift",
-        "the film of README: a hand on its way to lift a mug",
+        "animation of README: a hand lifts a mug",
         ("images/lift.webp",),
         (
             f"graspd synth --hand {_ALLEGRO} --object {_mesh('025_mug')} --scene table --faces all --scenes 8 -n 24 "
@@ -640,14 +641,14 @@ STUDIES: Final = (
     ),
     Study(
         "grasp-pictures",
-        "grasps of all kinds of objects",
+        "pictures of grasps on many objects",
         ("images/grasps/*",),
         ("bash benchmarks/grasp_gallery.sh DATA OUT/images/grasps",),
         seeds=(4,),
     ),
     Study(
         "scene-pictures",
-        "scenes, hands on their way, neighbours",
+        "pictures of scenes, approaches and neighbours",
         ("images/scenes/*",),
         (
             *_on_its_way("shadow", "bottle", "table"),
@@ -666,7 +667,7 @@ STUDIES: Final = (
     ),
     Study(
         "asset-pictures",
-        "hands and objects as they are checked",
+        "pictures of `graspd hands check` and `graspd objects check`",
         ("images/hands-*.png", "images/objects-*.png"),
         (
             f"graspd hands check {_ALLEGRO} --no-self-test --picture OUT/images/hands-guess.png",
@@ -680,7 +681,7 @@ STUDIES: Final = (
     ),
     Study(
         "dashboard",
-        "the pages of the dashboard",
+        "pictures of the dashboard",
         ("images/dashboard-*.png",),
         ("python -m tests.browser.screenshots --out OUT/images",),
         ("python -m tests.browser.screenshots --out OUT/images",),
@@ -691,11 +692,11 @@ BY_NAME: Final = {study.name: study for study in STUDIES}
 
 
 def files_of(study: Study, docs: Path) -> list[Path]:
-    """What there is of a study's files under a folder of the docs, raw results too."""
+    """Return the existing files of a study under a folder of the docs, including raw results."""
     globs = (*study.files, study.prints) if study.prints else study.files
     return sorted({file for glob in globs for file in docs.glob(glob) if file.is_file()})
 
 
 def is_raw(path: str) -> bool:
-    """Whether a file, by its path under the folder of the docs, is a raw result that git does not keep."""
+    """Return whether a path under the folder of the docs is a raw result, which is not in git."""
     return Path(path).suffix in RAW and path not in NOT_RAW

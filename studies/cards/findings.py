@@ -69,7 +69,7 @@ def _yields(card: Row) -> str:
     low.sort(key=lambda cell: cell["of_validated"])
     each = _listed([f"{_pair(cell)} ({_percent(cell['of_validated'])})" for cell in low])
     return (
-        f"**Hard pairs**, with less than half of the hand's median yield: {each}. Their valid grasps are biased "
+        f"**Difficult pairs**, with less than half of the hand's median yield: {each}. Their valid grasps are biased "
         "towards easy ones."
     )
 
@@ -113,16 +113,17 @@ def _table(card: Row) -> list[str]:
         return []
     told = [
         f"**{_percent(1 - found['of_grasps']['share'])} of the valid grasps are not clear of the table in any scene** "
-        f"({found['clear']:,} of {found['grasps']:,} are; {_percent(found['of_pairs']['share'])} of all pairs of grasp "
-        "and scene): grasps are planned around a free object, from all directions."
+        f"({found['clear']:,} of {found['grasps']:,} are clear, in {_percent(found['of_pairs']['share'])} of all "
+        "pairs of "
+        "grasp and scene), because grasps are planned around a free object, from all directions."
     ]
     rows = {name: row["of_grasps"]["share"] for name, row in found["by_object"].items() if row["of_grasps"]}
     worst = sorted(rows, key=rows.__getitem__)[:3]
     if found["too_near"]:
-        why = [f"{_percent(count / found['pairs'])} {what}" for what, count in found["too_near"].items()]
-        told[0] += f" Too close to: {', '.join(why)}."
+        why = [f"{_percent(count / found['pairs'])} to {what}" for what, count in found["too_near"].items()]
+        told[0] += f" Pairs that are too close: {', '.join(why)}."
     if len(rows) > 3:
-        told[0] += f" Fewest on {_listed([f'{name} ({_percent(rows[name])})' for name in worst])}."
+        told[0] += f" Fewest clear grasps: {_listed([f'{name} ({_percent(rows[name])})' for name in worst])}."
     return [*told, *_elevations(card)]
 
 
@@ -140,7 +141,7 @@ def _elevations(card: Row) -> list[str]:
     for what, chosen in (("10° of the horizontal", middles < 10), ("20° of the vertical", middles > 70)):
         found, expected = every[chosen].sum() / every.sum(), even[chosen].sum()
         if found > _PEAKED * expected:
-            said.append(f"{_percent(found)} within {what} ({_percent(expected)} under uniform directions)")
+            said.append(f"{_percent(found)} approach within {what} ({_percent(expected)} under uniform directions)")
     if said:
         told.append(f"**Preferred directions**: of all palms over the table, {' and '.join(said)}.")
     if clear.sum():
@@ -163,10 +164,10 @@ def _directions(card: Row) -> str:
         most = max(some, key=lambda name: some[name]["empty"])
         low, high = (end(row["evenness"] for row in some.values()) for end in (min, max))
         return (
-            f"Hands approach from nearly all directions, not uniformly: of {rows['cells']} directions of equal "
-            "area, at "
-            f"most {some[most]['empty']} are empty per object ({most}). The spread equals that of {_percent(low)} to "
-            f"{_percent(high)} of the directions used uniformly, by object."
+            f"Hands approach from nearly all directions, but not uniformly. Of {rows['cells']} directions of equal "
+            "area, "
+            f"at most {some[most]['empty']} are empty per object ({most}). By object, the spread equals that of "
+            f"{_percent(low)} to {_percent(high)} of the directions used uniformly."
         )
     each = _listed([f"{name} ({empty[name]})" for name in sorted(empty, key=lambda name: -empty[name])])
     return f"**Unused directions**, of {rows['cells']} of equal area in the object's frame: {each}."

@@ -24,9 +24,9 @@ Row = dict[str, Any]
 #: Codes of `grasp/rejection`: the obstacle, and the phase of the motion.
 REJECTIONS: Final = {
     1: "the table at contact",
-    2: "the table on the way in",
+    2: "the table on the approach",
     3: "a neighbour at contact",
-    4: "a neighbour on the way in",
+    4: "a neighbour on the approach",
 }
 _PERCENTILES: Final = {"p5": 5, "p25": 25, "median": 50, "p75": 75, "p95": 95}
 _KINDS: Final = ("base", "scene", "views")

@@ -205,16 +205,16 @@ def _validity(card: Row, plots: Mapping[str, str]) -> str:
     )
     if card["making"]["scenes"] and card["making"]["levels"]:
         text = (
-            f"Grasps were planned{_places(card['making'])} and valid ones are lifted there: in MuJoCo the hand "
+            f"Grasps were planned{_places(card['making'])}, and valid ones are lifted there. In MuJoCo the hand "
             "moves along its approach without contact, closes, lifts the object 10 cm out of the scene and "
             "holds it. "
             f"Valid grasps also pass the geometric gate: {gate}.{_hard(card)}"
         )
     elif card["making"]["levels"]:
         text = (
-            f"A grasp is valid if the validator holds it and it passes the geometric gate: {gate}. "
-            'Rechecked grasps were validated again under the unmodified DexGraspBench protocol; "false valid" is the '
-            "share of rechecked grasps that this protocol drops."
+            f"A grasp is valid if it holds in the validator and passes the geometric gate: {gate}. "
+            'Rechecked grasps were validated again under the unmodified DexGraspBench protocol. "False valid" is the '
+            "share of rechecked grasps that fail there."
         )
     else:
         text = (
@@ -256,7 +256,9 @@ def _coverage(card: Row, plots: Mapping[str, str]) -> str:
     if table["grasps"]:
         clear = (
             f"\n\n{table['clear']:,} of {table['grasps']:,} valid grasps ({percent(table['of_grasps']['share'])}) are "
-            f"clear of the table in at least one of their scenes, {table['clear_pairs']:,} of {table['pairs']:,} pairs."
+            f"clear of the table in at least one of their scenes, and so are {table['clear_pairs']:,} of "
+            f"{table['pairs']:,} "
+            "pairs."
             " A pair is a grasp in a scene."
         )
     return f"## Coverage{clear}{shown}{note}"

@@ -104,7 +104,7 @@ def cells_table(card: Row) -> str:
         row = {
             "hand": cell["hand"],
             "object": cell["object"],
-            "asked": "-" if cell["asked"] is None else f"{cell['asked']:,}",
+            "wanted": "-" if cell["asked"] is None else f"{cell['asked']:,}",
             "candidates": f"{cell['candidates']:,}",
             "valid": f"{cell['valid']:,}",
             "valid of validated": percent(cell["of_validated"]),
@@ -162,7 +162,7 @@ def _spread(cell: Row | None, digits: int) -> str:
 
 def _rejected(rejected: Mapping[str, int] | None) -> str:
     words = {
-        "dropped": "dropped by the validator",
+        "dropped": "rejected by the validator",
         "gate": "failed the gate",
         "diverged": "diverged",
         "not_robust": "held in too few models",

@@ -216,7 +216,7 @@ def one_of_several(row: Row, rows: Sequence[Row]) -> str:
 
 
 def draw_sweeps(rows: Sequence[Row], file: Path) -> None:
-    """Plot a panel per knob: success over speed, a point per value."""
+    """Plot a panel per setting: success over speed, a point per value."""
     from matplotlib.figure import Figure
 
     knobs = list(dict.fromkeys(row["knob"] for row in rows))
@@ -243,7 +243,7 @@ def draw_sweeps(rows: Sequence[Row], file: Path) -> None:
     panels.flat[0].set_xlim(0, 1.35 * max(row["speedup"] for row in rows))
     for axes in panels.flat[len(knobs) - columns : len(knobs)]:
         axes.tick_params(labelbottom=True)
-    figure.supxlabel("speed against the default (full marker)", fontsize=10)
+    figure.supxlabel("speed relative to the default (filled marker)", fontsize=10)
     figure.supylabel("success in MuJoCo", fontsize=10)
     _save(figure, labels, [file])
 

@@ -77,15 +77,15 @@ def _page(chart: Row) -> str:
     parts += ["## Each hand and object", runs_table(chart["runs"])]
     parts += [
         "## The best ten by epsilon",
-        "Means over each pair's best ten grasps by ε (as in table 2 of the paper), then over objects.",
+        "Means over each pair's best ten grasps by ε, as in table 2 of the Fast-Grasp'D paper, then over objects.",
         best_table(chart["runs"]),
     ]
     if chart.get("sweeps"):
         one = chart["sweeps"][0]
         head = (
-            f"{one['hand']} on {one['object']}, {one['grasps']} grasps per value, fidelity standard with one "
-            "setting changed; "
-            "speed is relative to the default."
+            f"{one['hand']} on {one['object']}, {one['grasps']} grasps per value. Each row changes one setting of "
+            "fidelity *standard*; pairs of numbers are for the coarse and the fine phase. Speed is relative to the "
+            "default."
         )
         parts += ["## Cost and benefit of each setting", head, "![Settings](sweeps.png)", sweeps_table(chart["sweeps"])]
     return "\n\n".join(part for part in parts if part)
@@ -110,16 +110,16 @@ def _head(chart: Row) -> str:
         f"# Speed against accuracy\n\n{_command(chart)}{chart['device']}, {chart['threads']} threads, graspd "
         f"{chart['versions']['graspd']}, Warp {chart['versions']['warp']}, {chart['created']}. Hands: {hands}. "
         f"Objects: {objects}. Settings are warmed up; their repeats are interleaved.{_remark(chart)}\n\n"
-        f"- *valid*: holds in MuJoCo (DexGraspBench protocol, level *{chart['validation']['level']}*) and is feasible\n"
-        "- speeds are end to end, as in a job: planning, validation, and metrics of held grasps; *planner's*: "
-        "held grasps "
-        "over the seconds of planner and postures alone; on a CPU a second is one core-second\n"
-        "- *dexgraspbench*: holds under the unmodified protocol; *hard*: at half the friction; *robust*: mean share of "
-        f"{chart['models']} models around the nominal one in which a held grasp also holds\n"
-        f"- ε, contact: μ = {chart['friction']:g}, within {1e3 * chart['threshold_m']:g} mm; ε and penetration are "
-        "medians of a pair's grasps, then means over the pairs\n"
-        "- bars and ±: 95 % (Wilson for shares, else bootstrap); hollow: no valid grasp, upper bound of the speed; "
-        "bold: no faster setting is better\n\n"
+        f"- *valid*: held in MuJoCo (DexGraspBench protocol, level *{chart['validation']['level']}*) and feasible\n"
+        "- *valid/s* and *first valid s*: time includes planning, validation, and metrics of held grasps; on a CPU a "
+        "second is one core-second\n"
+        "- *held/s, planner only*: held grasps per second of planner and postures\n"
+        "- *dexgraspbench*: share held under the unmodified protocol; *hard*: the same at half friction\n"
+        f"- *robust*: mean share of {chart['models']} perturbed models in which a held grasp also holds\n"
+        f"- ε and contact area: μ = {chart['friction']:g}, within {1e3 * chart['threshold_m']:g} mm; ε and penetration "
+        "are medians of a pair's grasps, then means over the pairs\n"
+        "- bars and ±: 95 % (Wilson for shares, else bootstrap); hollow marker: no valid grasp, upper bound of the "
+        "speed; bold: no faster setting is better\n\n"
         "![Speed against accuracy](chart.png)"
     )
 
@@ -127,8 +127,9 @@ def _head(chart: Row) -> str:
 def summary_table(rows: Sequence[Row]) -> str:
     """Return a row per method and fidelity, the fastest first; bold: on the Pareto front."""
     lines = [
-        "| method | fidelity | batch | valid/s | first valid s | planner's/s | dexgraspbench | hard | robust | ε | "
-        "penetration mm | grasps |",
+        "| method | fidelity | batch | valid/s | first valid s | held/s, planner only | dexgraspbench | hard | "
+        "robust | "
+        "ε | penetration mm | grasps |",
         "| --- | --- | --: | --: | --: | --: | --: | --: | --: | --: | --: | --: |",
     ]
     for row in sorted(rows, key=lambda r: -r[SPEED]):
@@ -164,7 +165,7 @@ def _ratios(rows: Sequence[Row]) -> str:
         return ""
     best = max(own, key=lambda r: r[SPEED])
     lines = [
-        "fast_graspd at its default (standard) relative to each other method, same run:",
+        "fast_graspd at its default fidelity (*standard*), relative to each other method in the same run:",
         "",
         "| relative to | valid/s | dexgraspbench | ε | penetration mm |",
         "| --- | --: | --: | --: | --: |",
@@ -221,7 +222,7 @@ def _mean(values: Sequence[float | None]) -> float:
 
 
 def sweeps_table(sweeps: Sequence[Row]) -> str:
-    """Return a row per knob value: gain in speed and loss in accuracy relative to the default's row."""
+    """Return a row per value of a setting: speed and accuracy, and the speed relative to the default."""
     lines = [
         "| setting | value | s/grasp | speed | GSR | ε | penetration mm |",
         "| --- | --- | --: | --: | --: | --: | --: |",
@@ -263,29 +264,28 @@ def _scene_head(chart: Row) -> str:
     hands, objects = _names(chart)
     seconds = "core-seconds of the CPU" if second_of(chart) == "CPU second" else "wall-clock seconds"
     return (
-        f"# Planned in the scene, or filtered\n\n{_command(chart)}{chart['device']}, graspd "
+        f"# Grasps planned in scenes, compared with filtered free grasps\n\n{_command(chart)}{chart['device']}, graspd "
         f"{chart['versions']['graspd']}, "
         f"{chart['created']}. Scene: {chart['scene']['kind']}, faces {chart['scene']['faces']}. Hands: {hands}. "
         f"Objects: {objects}.{_remark(chart)}\n\n"
         f"- *{IN_SCENE}*: planned for the scene\n"
-        f"- *{FILTERED}*: planned around a free object and placed into the same scenes, grasp i into scene i in "
-        "turn; baselines have only this mode\n"
+        f"- *{FILTERED}*: planned around a free object and placed into the same scenes in turn; baselines have "
+        "only this mode\n"
         "- *clear*: no contact with supports or neighbours on the approach, while closing and on the lift\n"
         "- *lifted*: clear, and lifted by MuJoCo (level *lift*); *dexgraspbench*: lifted in DexGraspBench's test; "
         "*half friction*: also lifted at half friction; all are shares of all candidates\n"
-        f"- *robust*: mean share of {chart['models']} models around the nominal one in which a lifted grasp is also "
-        "lifted\n"
-        f"- speed: lifted grasps over {seconds}, end to end: planner, postures, trajectory, lift, and "
-        "metrics of lifted grasps; *planner's*: over the seconds of planner and postures\n"
-        "- bars: 95 % (Wilson); hollow: no lifted grasp, upper bound of the speed"
+        f"- *robust*: mean share of {chart['models']} perturbed models in which a lifted grasp is also lifted\n"
+        f"- *lifted per second*: time includes planner, postures, trajectory, lift, and metrics of lifted grasps, in "
+        f"{seconds}; *planner only*: planner and postures\n"
+        "- bars: 95 % (Wilson); hollow marker: no lifted grasp, upper bound of the speed"
     )
 
 
 def _summary(rows: Sequence[Row], second: str) -> str:
     lines = [
-        "| mode | method | fidelity | n | clear | lifted | dexgraspbench | half friction | robust | "
-        f"lifted per {second} | planner's | first, {second.removesuffix('econd')} | pairs with one | "
-        "× over filtered |",
+        "| mode | method | fidelity | candidates | clear | lifted | dexgraspbench | half friction | robust | "
+        f"lifted per {second} | planner only | {second}s to the first lift | pairs with a lift | "
+        "× filtered |",
         "| --- | --- | --- | --: | --: | --: | --: | --: | --: | --: | --: | --: | --: | --: |",
     ]
     for row in rows:
@@ -297,7 +297,8 @@ def _summary(rows: Sequence[Row], second: str) -> str:
             f"{row['pairs_with_one']} of {row['pairs']} | {gain} |"
         )
     note = (
-        "× over filtered: gain in the planner's speed, median over pairs with lifted filtered grasps. "
+        "× filtered: speed of the planner only, relative to filtered grasps of the same fidelity; median over pairs "
+        "with lifted filtered grasps. "
         "Bold: no faster setting is better."
     )
     return "\n".join(lines) + f"\n\n{note}"
@@ -309,8 +310,8 @@ def _bold(row: Row, key: str) -> str:
 
 def _runs(runs: Sequence[Row], second: str) -> str:
     lines = [
-        "| hand | object | mode | method | fidelity | n | clear | lifted | dexgraspbench | half friction | robust | "
-        f"lifted per {second} |",
+        "| hand | object | mode | method | fidelity | candidates | clear | lifted | dexgraspbench | half friction | "
+        f"robust | lifted per {second} |",
         "| --- | --- | --- | --- | --- | --: | --: | --: | --: | --: | --: | --: |",
     ]
     lines += [

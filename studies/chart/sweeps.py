@@ -88,7 +88,7 @@ def turns(quick: bool = False, knobs: Sequence[str] = ()) -> list[KnobValue]:
     ]
     known = list(dict.fromkeys(turn.knob for turn in found))
     if unknown := [name for name in knobs if name not in known]:
-        raise InputError(f"there is no knob {unknown[0]!r}; choose of {', '.join(map(repr, known))}")
+        raise InputError(f"there is no setting {unknown[0]!r}; choose of {', '.join(map(repr, known))}")
     if knobs:
         return [turn for turn in found if turn.knob in knobs]
     return [*found[:2], *(turn for turn in found if turn.knob == "queries")] if quick else found

@@ -1,4 +1,4 @@
-"""Hard objects and hands: thin, sharp, open, tiny, huge; few or many fingers, coupled drives.
+"""Difficult objects and hands: thin, sharp, open, tiny, huge; few or many fingers, coupled drives.
 
 All are ingested like uploads. The hands are a family: equal three-joint fingers in a ring, which lean outward when
 open.
@@ -29,9 +29,9 @@ from graspd.worker.objects.prepare import load_object
 
 MILLIMETRES: Final = 1e-3
 #: Text for maps of candidates: measure of a cell, bounds of bad values, and symptom for users.
-MEASURE: Final = "valid share of candidates: held by the validator and accepted by the geometric gate"
+MEASURE: Final = "share of valid candidates (held by the validator and accepted by the geometric gate)"
 BOUNDS: Final = "weak: below 0.5; broken: 0, or a value that is not finite"
-SHOWS: Final = "few or no valid grasps: a job ends with a note that its budget found fewer than wanted"
+SHOWS: Final = "few or no valid grasps; the job reports that its budget is used up"
 
 
 def sheet(thickness_mm: float) -> Any:
@@ -132,7 +132,7 @@ def shape_map(
         cells.append(cell)
     return StabilityMap(
         "shapes",
-        f"{options.count} grasps of {hand.name} on hard shapes",
+        f"{options.count} grasps of {hand.name} on difficult shapes",
         "the shape's parameter",
         "fidelity",
         MEASURE,
@@ -142,7 +142,7 @@ def shape_map(
         "ingest refuses meshes without an inside and reports `thin` walls; gate and validator reject grasps with "
         "deep penetration; a job with too few valid grasps reports it",
         "tests/studies/test_stability.py::test_a_shape_is_refused_or_its_grasps_are_sound",
-        reach="all: users have such shapes",
+        reach="all: uploaded objects can have such shapes",
     )
 
 
@@ -193,10 +193,10 @@ def refused(panel: str, x: float | str, y: float | str, error: GraspdError) -> M
     return MapCell(panel, x, y, float("nan"), "refused", str(error))
 
 
-Coupling = Literal["each joint", "distal follows", "a drive a finger", "one drive"]
+Coupling = Literal["each joint", "distal follows", "one drive per finger", "one drive"]
 
 FINGERS: Final = (1, 2, 3, 4, 5, 6, 8)
-COUPLINGS: Final[tuple[Coupling, ...]] = ("each joint", "distal follows", "a drive a finger", "one drive")
+COUPLINGS: Final[tuple[Coupling, ...]] = ("each joint", "distal follows", "one drive per finger", "one drive")
 #: Size relative to a human hand, whose fingers are about 10 cm long.
 SIZES: Final = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
 #: Rotation of the distal joint over that of the previous one.
@@ -254,7 +254,12 @@ def _finger(k: int, base: str, coupling: Coupling, size: float, ratio: float) ->
 
 def _mimic(k: int, j: int, coupling: Coupling, ratio: float) -> str:
     """Return the mimic element of a joint that follows another one; empty for driven joints."""
-    leads = {"each joint": (k, j), "distal follows": (k, min(j, 1)), "a drive a finger": (k, 0), "one drive": (0, 0)}
+    leads = {
+        "each joint": (k, j),
+        "distal follows": (k, min(j, 1)),
+        "one drive per finger": (k, 0),
+        "one drive": (0, 0),
+    }
     lead = leads[coupling]
     if lead == (k, j):
         return ""
@@ -278,11 +283,16 @@ def hand_map(
 ) -> StabilityMap:
     makes: list[tuple[str, float, str, Callable[[], HandModel]]] = []
     for way in couplings:
-        makes += [("fingers of a ring", n, way, partial(ring_hand, n, coupling=way)) for n in fingers]
-        makes += [("size, of three fingers", s, way, partial(ring_hand, 3, coupling=way, size=s)) for s in sizes]
+        makes += [("number of fingers in a ring", n, way, partial(ring_hand, n, coupling=way)) for n in fingers]
+        makes += [
+            ("size of a hand with three fingers", s, way, partial(ring_hand, 3, coupling=way, size=s)) for s in sizes
+        ]
     for n in (2, 3, 4):
         following = partial(ring_hand, n, coupling="distal follows")
-        makes += [("distal over middle joint", r, f"{n} fingers", partial(following, ratio=r)) for r in ratios]
+        makes += [
+            ("rotation of distal joint over middle joint", r, f"{n} fingers", partial(following, ratio=r))
+            for r in ratios
+        ]
     cells = []
     for panel, x, y, make in makes:
         try:
@@ -293,15 +303,15 @@ def hand_map(
         cells.append(cell)
     return StabilityMap(
         "hands",
-        f"{options.count} grasps of a cube of {CUBE_MM:g} mm with hard hands, {options.fidelity}",
+        f"{options.count} grasps of a cube of {CUBE_MM:g} mm with difficult hands, {options.fidelity}",
         "the hand's parameter",
         "joints per drive",
         MEASURE,
         BOUNDS,
         reachable(cells, lambda cell: True),
         "few or no valid grasps, and a low share in the hand's self-test",
-        "a hand without two opposed parts is refused; the self-test of a new hand reports the share of grasps that "
+        "a hand without two opposed parts is refused; the self-test of a new hand reports the share of its grasps that "
         "hold simple objects; a job with too few valid grasps reports it",
         "tests/studies/test_stability.py::test_palm_without_fingers_is_refused_and_three_of_them_hold",
-        reach="all: users have such hands",
+        reach="all: uploaded hands can have such structures",
     )

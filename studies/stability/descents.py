@@ -155,7 +155,7 @@ def length_map(hand: HandModel, obj: ObjectModel, *, lengths: Sequence[int], say
         _MEASURE + "; the largest deviation of a quaternion's norm from 1",
         _BOUNDS + "; drift: 1e-5, 1e-3",
         reachable(cells, lambda cell: True),
-        "poses with invalid rotations, hands that drift away",
+        "rotations of poses become invalid, or hands drift away",
         "quaternions are normalised in each step; a grasp that does not improve stops after `patience` iterations",
         "tests/studies/test_stability.py::test_a_long_run_does_not_drift",
         reach="all: a custom fidelity may have 100,000 iterations",
@@ -181,7 +181,7 @@ def _cells(pair: Pair, found: Descent, panel: str, x: float | str, y: float | st
     state = found.state
     finite = bool(np.isfinite(state.pivot).all() and np.isfinite(state.q).all() and np.isfinite(state.rotation).all())
     if not finite:
-        return [MapCell(panel, x, y, float("nan"), "broken", "hands are no numbers")]
+        return [MapCell(panel, x, y, float("nan"), "broken", "values are not finite")]
     residual = float(np.median(merits(pair.hand.model, pair.fine.obj.model, state, np.zeros(len(found.depths)))))
     depth = float(np.median(found.depths)) * 1e3
     held, deep = graded(residual, *RESIDUAL), graded(depth, *DEPTH_MM)

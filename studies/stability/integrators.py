@@ -38,7 +38,7 @@ FRICTION: Final = 0.8
 VISCOUS: Final = 10.0
 
 #: A ball's cell shows the worse of the two values.
-_BALL_MEASURE: Final = "× largest kinetic energy over the first (∞: it blew up), else how deep it sank [mm]"
+_BALL_MEASURE: Final = "with ×: largest kinetic energy over the initial one (∞: unstable); otherwise largest depth [mm]"
 
 TIME_STEPS: Final = (1e-5, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2)
 SPEEDS: Final = (0.01, 0.1, 0.3, 1.0, 3.0, 10.0)
@@ -182,8 +182,8 @@ def time_step_map(time_steps: Sequence[float], speeds: Sequence[float]) -> Stabi
         f"weak: energy × {ENERGY[0]:g} or {SINK_M[0] * 1e3:g} mm deep; broken: energy × {ENERGY[1]:g} or "
         f"{SINK_M[1] * 1e3:g} mm deep",
         cells,
-        "an object that is thrown out of the hand, or hands that penetrate it",
-        "the planner uses one step of 1 mm (time step x speed), where its integrators are good; the validator uses "
+        "the object is thrown out of the hand, or hands penetrate it",
+        "the planner uses one step of 1 mm (time step x speed), at which its integrators are good; the validator uses "
         "MuJoCo's implicit solver",
         "tests/studies/test_stability.py::test_planners_own_step_lies_where_its_integrators_are_good",
         reach=f"the offered solvers at a step of {1e3 * step:g} mm; the step is no option of a job",
@@ -211,7 +211,9 @@ def stiffness_map(stiffnesses: Sequence[float], masses: Sequence[float], time_st
         # Semi-implicit Euler on m x'' = -k x is stable for dt < 2 sqrt(m / k).
         lines[panel] = [(k, 2 * math.sqrt(mass / k)) for k in stiffnesses]
     cells += [
-        _ball_cell("direct (no such setting)", k, dt, position_based(SOLVERS["direct (default)"], dt=dt, speed=0.3))
+        _ball_cell(
+            "direct (has no stiffness setting)", k, dt, position_based(SOLVERS["direct (default)"], dt=dt, speed=0.3)
+        )
         for k in stiffnesses
         for dt in time_steps
     ]
@@ -221,7 +223,7 @@ def stiffness_map(stiffnesses: Sequence[float], masses: Sequence[float], time_st
         "contact stiffness [N/m]",
         "time step [s]",
         _BALL_MEASURE,
-        "as in time_step; the line is dt = 2 sqrt(m / k), above which one contact alone is unstable",
+        "as in the first map; the line is dt = 2 sqrt(m / k), above which one contact alone is unstable",
         cells,
         "soft contacts allow penetration, stiff ones throw the object; the range between them narrows with dt",
         "only `graspd2022` uses penalty forces, and only for a static balance without time steps",
@@ -244,7 +246,7 @@ def contact_count_map(counts: Sequence[int]) -> StabilityMap:
         "A step of 1 mm into a wall of contact points",
         "contact points",
         "initial depth [m]",
-        "remaining motion into or out of the wall, over the step",
+        "remaining motion into or out of the wall, as a share of the step",
         "weak: 0.25 of the step; broken: 1, more than the initial motion",
         cells,
         "more points on the same finger push harder; losses and gradients grow with the sampling",

@@ -66,35 +66,37 @@ def _lags(hand: HandModel, latest: float) -> tuple[float, ...]:
 
 
 ERRORS: Final[dict[str, _Error]] = {
-    "shapes of the hand stand out [mm]": _Error(
+    "collision shapes of the hand grown by [mm]": _Error(
         (-4, -2, -1, -0.5, 0.5, 1, 2, 4), (-GROWTH_M / _MM, GROWTH_M / _MM), lambda h, x, d: Variant(grown_m=x * _MM)
     ),
-    "friction over the model's": _Error(
+    "friction, relative to the model": _Error(
         (0.25, 0.5, 0.67, 0.8, 1.33, 2), FRICTIONS, lambda h, x, d: Variant(friction=x)
     ),
-    "mass over the model's": _Error((0.25, 0.5, 2, 4, 8), (1 / FACTOR, FACTOR), lambda h, x, d: Variant(mass=x)),
-    "gains over the model's": _Error((0.12, 0.25, 0.5, 2, 4, 8), (1 / FACTOR, FACTOR), lambda h, x, d: Variant(gain=x)),
+    "mass, relative to the model": _Error((0.25, 0.5, 2, 4, 8), (1 / FACTOR, FACTOR), lambda h, x, d: Variant(mass=x)),
+    "gains, relative to the model": _Error(
+        (0.12, 0.25, 0.5, 2, 4, 8), (1 / FACTOR, FACTOR), lambda h, x, d: Variant(gain=x)
+    ),
     "armature [1e-4 kg m²]": _Error(
         (1, 2, 4, 16, 64), (0.0, 1e4 * ARMATURE * FACTOR), lambda h, x, d: Variant(armature=1e-4 * x)
     ),
     "dry friction of joints [N m]": _Error(
         (0.005, 0.01, 0.02, 0.05, 0.1, 0.2), (0.0, DRY_FRICTION * FACTOR), lambda h, x, d: Variant(dry_friction=x)
     ),
-    "object stands off by [mm]": _Error(
+    "object displaced by [mm]": _Error(
         (1, 2, 4, 8, 16), (0.0, SHIFT_M / _MM), lambda h, x, d: Variant(object_shift_m=_along(d, x * _MM))
     ),
-    "object is turned by [°]": _Error(
+    "object rotated by [°]": _Error(
         (1, 2, 5, 10, 20),
         (0.0, float(np.degrees(TURN))),
         lambda h, x, d: Variant(object_turn=_along(d, float(np.radians(x)))),
     ),
-    "hand stands off by [mm]": _Error(
+    "hand displaced by [mm]": _Error(
         (1, 2, 4, 8, 16), (0.0, SHIFT_M / _MM), lambda h, x, d: Variant(hand_shift_m=_along(d, x * _MM))
     ),
-    "centre of mass is off by [mm]": _Error(
+    "centre of mass displaced by [mm]": _Error(
         (2, 5, 10, 20, 40), (0.0, CENTRE_M / _MM), lambda h, x, d: Variant(centre_m=_along(d, x * _MM))
     ),
-    "last finger begins later by [share of closing]": _Error(
+    "last finger delayed by [share of closing]": _Error(
         (0.1, 0.25, 0.5, 0.75), (0.0, LATEST), lambda h, x, d: Variant(lags=_lags(h, x))
     ),
 }
@@ -115,14 +117,14 @@ def model_error_map(
         f"{options.count} valid grasps of {obj.name}, validated in models with errors",
         "amount of the error",
         "hand",
-        "share of the grasps that also hold in this model",
+        "share of grasps that also hold in this model",
         f"weak: under {WEAK:g}; broken: under {BROKEN:g}",
         cells,
         "a valid grasp fails on a robot that differs from the model",
         "`--robust` selects grasps that hold in the wanted share of models with such errors; `robust_share` and "
         "`robust_weakest` are stored. For larger errors, test another hand model: `graspd evaluate --validation-hand`",
         "tests/studies/test_stability.py::test_amounts_within_reach_are_those_that_robust_draws",
-        reach="amounts that `--robust` draws",
+        reach="errors within the range of `--robust`",
     )
 
 

@@ -1,4 +1,4 @@
-"""Maps of failure as JSON, Markdown and plots."""
+"""Failure maps as JSON, Markdown and plots."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ def write(found: Stability, folder: Path) -> list[Path]:
 
 
 def markdown(found: Stability) -> str:
-    """Return the page: tests, failures, symptoms, guards, and remaining failures."""
+    """Return the page: remaining failures, then each map with symptom, guard and test."""
     said = ", ".join(f"{name} {value}" for name, value in found.versions.items())
     lines = ["# Failure maps", "", f"`{found.command}`; {said}.", "", *_still_breaks(found.maps)]
     for one in found.maps:
         lines += [f"## {one.title}", "", f"![{one.title}](stability-{one.name}.png)", ""]
-        lines += [f"Numbers in the cells: {one.measure}. {one.bounds[0].upper()}{one.bounds[1:]}.", ""]
+        lines += [f"Value of a cell: {one.measure}. {one.bounds[0].upper()}{one.bounds[1:]}.", ""]
         lines += ["| panel | good | weak | broken | refused |", "| --- | --: | --: | --: | --: |"]
         lines += [f"| {panel} | {_row(one.of(panel))} |" for panel in one.panels]
         lines += ["", f"- symptom: {one.shows}", f"- guard: {one.guard}"]
@@ -57,9 +57,8 @@ def markdown(found: Stability) -> str:
 def _still_breaks(maps: Sequence[StabilityMap]) -> list[str]:
     """Return broken cells that a job can reach: failures that no guard prevents."""
     lines = ["## What still breaks", ""]
-    lines += ["Only cells that some job can reach. The other cells of the maps need settings"]
-    lines += ["that jobs do not have, so no further guard is needed.", ""]
-    lines += ["| map | good | weak | broken | refused | remaining failures | symptom |"]
+    lines += ["Counts of cells that a job can reach. Other cells need settings that jobs do not have."]
+    lines += ["", "| map | good | weak | broken | refused | remaining failures | symptom |"]
     lines += ["| --- | --: | --: | --: | --: | --- | --- |"]
     for one in maps:
         broken = one.still_breaks()

@@ -1,4 +1,4 @@
-"""Hard scenes: flat and tall objects on a table, walls and neighbours, too small and too large ones."""
+"""Difficult scenes: flat and tall objects on a table, walls and neighbours, too small and too large objects."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def height_map(
         ("height [mm]", "side of the footprint [mm]"),
         cells,
         "test_a_plate_flat_on_a_table_ends_with_fewer_and_says_so",
-        "users have such objects",
+        "uploaded objects can have such shapes",
     )
 
 
@@ -122,7 +122,7 @@ def size_map(
         ("side of the cube over the hand's span", "scene"),
         cells,
         "test_a_cube_that_does_not_fit_its_bin_is_refused",
-        "users have such objects",
+        "uploaded objects can have such shapes",
         measure=f"{_MEASURE}; scene free: held in the six pushes; span: largest distance between fingertips: {spans}",
         guard=_FEWER + "; an object larger than the bin or the shelf is refused with a message",
     )

@@ -1,4 +1,4 @@
-"""Stability studies by name, full or quick; and the baselines on hard shapes."""
+"""Stability studies by name, full or quick; and the baselines on difficult shapes."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def run(
 
 #: Methods that plan around a free object; the first is graspd's own, the others are baselines.
 METHODS: Final = ("fast_graspd", "autograsp", "dfc", "graspit", "graspd2022")
-#: Parameters of each family of shapes: an easy one and hard ones.
+#: Parameters of each family of shapes: an easy one and difficult ones.
 SHAPES: Final[dict[str, tuple[float, ...]]] = {
     "plate": (1, 10),
     "wedge": (10, 80),
@@ -126,14 +126,14 @@ def baseline_map(
             cells.append(cell)
     return StabilityMap(
         "baselines",
-        f"{options.count} grasps of {hand.name} by each method on hard shapes",
+        f"{options.count} grasps of {hand.name} by each method on difficult shapes",
         "the shape's parameter",
         "method",
         MEASURE,
         BOUNDS,
         reachable(cells, lambda cell: True),
         SHOWS,
-        "grasps with deep penetration, or dropped by the validator, are never valid; a job with too few valid "
+        "grasps with deep penetration, or rejected by the validator, are never valid; a job with too few valid "
         "grasps reports it",
         "tests/studies/test_stability.py::test_a_job_whose_every_grasp_is_bad_ends_with_none",
         reach="all: a job may use any method",

@@ -159,4 +159,4 @@ def test_under_a_hundred_of_the_work_is_lost(rates: Rates, seed: int) -> None:
     assert 0 < told.lost < 0.01
     assert told.failed_for_good < 1e-2
     assert told.controller_busy < 1 and 30 / task_seconds(1) < CONTROLLER_TASKS_PER_S
-    assert any(row.startswith("| work lost |") for row in table_of_week(told))
+    assert any(row.startswith("| work lost, all causes |") for row in table_of_week(told))

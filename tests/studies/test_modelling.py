@@ -13,6 +13,7 @@ import trimesh
 from benchmarks.modelling.common import auc, ranking
 from benchmarks.modelling.drops import drops, forearm
 from benchmarks.modelling.steps import forward_simulation, step
+from benchmarks.modelling.tables import TITLES
 from graspd.service.store.shards import write_shard
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import Posture
@@ -26,9 +27,12 @@ from tests.conftest import REPOSITORY
 
 PAGE = (REPOSITORY / "docs" / "explanation" / "modelling.md").read_text()
 #: Each table of the study by its title.
-MEASURED = dict(
-    re.findall(r"^(\w+)\n\n((?:\|.*\n)+)", (REPOSITORY / "docs" / "results" / "modelling.md").read_text(), re.MULTILINE)
-)
+RESULTS = (REPOSITORY / "docs" / "results" / "modelling.md").read_text()
+MEASURED = {
+    name: table
+    for name, title in TITLES.items()
+    for table in re.findall(rf"^\*\*{title}\*\*\n\n((?:\|.*\n)+)", RESULTS, re.MULTILINE)
+}
 
 
 def test_a_step_is_that_of_the_reference() -> None:

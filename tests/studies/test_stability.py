@@ -187,7 +187,7 @@ def tips(hand: HandModel, joints: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("coupling", "dofs"), [("each joint", 12), ("distal follows", 8), ("a drive a finger", 4), ("one drive", 1)]
+    ("coupling", "dofs"), [("each joint", 12), ("distal follows", 8), ("one drive per finger", 4), ("one drive", 1)]
 )
 def test_a_ring_has_as_many_dofs_as_its_drives(coupling: Coupling, dofs: int) -> None:
     assert ring_hand(4, coupling=coupling).dofs == dofs
@@ -220,7 +220,7 @@ def test_palm_without_fingers_is_refused_and_three_of_them_hold() -> None:
     ]
 
 
-FRICTION, MASS = "friction over the model's", "mass over the model's"
+FRICTION, MASS = "friction, relative to the model", "mass, relative to the model"
 
 
 def validated(monkeypatch: pytest.MonkeyPatch, name: str, amounts: tuple[float, ...]) -> list[MapCell]:
@@ -238,17 +238,17 @@ def test_the_models_friction_keeps_what_holds_ice_keeps_nothing(monkeypatch: pyt
 
 #: What of a variant stands for an error's amount.
 AMOUNTS = {
-    "shapes of the hand stand out [mm]": (Axis.SHAPES, lambda v: 1e3 * v.grown_m),
+    "collision shapes of the hand grown by [mm]": (Axis.SHAPES, lambda v: 1e3 * v.grown_m),
     FRICTION: (Axis.FRICTION, lambda v: v.friction),
     MASS: (Axis.MASS, lambda v: v.mass),
-    "gains over the model's": (Axis.JOINTS, lambda v: v.gain),
+    "gains, relative to the model": (Axis.JOINTS, lambda v: v.gain),
     "armature [1e-4 kg m²]": (Axis.JOINTS, lambda v: 1e4 * (v.armature or 0.0)),
     "dry friction of joints [N m]": (Axis.JOINTS, lambda v: v.dry_friction or 0.0),
-    "object stands off by [mm]": (Axis.POSE, lambda v: 1e3 * np.linalg.norm(v.object_shift_m)),
-    "object is turned by [°]": (Axis.POSE, lambda v: np.degrees(np.linalg.norm(v.object_turn))),
-    "hand stands off by [mm]": (Axis.CALIBRATION, lambda v: 1e3 * np.linalg.norm(v.hand_shift_m)),
-    "centre of mass is off by [mm]": (Axis.CENTRE, lambda v: 1e3 * np.linalg.norm(v.centre_m)),
-    "last finger begins later by [share of closing]": (Axis.ORDER, lambda v: max(v.lags)),
+    "object displaced by [mm]": (Axis.POSE, lambda v: 1e3 * np.linalg.norm(v.object_shift_m)),
+    "object rotated by [°]": (Axis.POSE, lambda v: np.degrees(np.linalg.norm(v.object_turn))),
+    "hand displaced by [mm]": (Axis.CALIBRATION, lambda v: 1e3 * np.linalg.norm(v.hand_shift_m)),
+    "centre of mass displaced by [mm]": (Axis.CENTRE, lambda v: 1e3 * np.linalg.norm(v.centre_m)),
+    "last finger delayed by [share of closing]": (Axis.ORDER, lambda v: max(v.lags)),
 }
 
 

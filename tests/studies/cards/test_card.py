@@ -314,7 +314,8 @@ def test_what_stands_out_in_the_figures_is_told(kitchen: Case) -> None:
     assert "allegro: half of them hold in at most 62 % of the models around the nominal one" in told
     # two bins of 5 degrees hold 160 of 200; those within 10 degrees of the horizontal, sin(10 deg) of the sphere
     assert (
-        "**Preferred directions**: of all palms over the table, 80 % within 10° of the horizontal (17 % under" in told
+        "**Preferred directions**: of all palms over the table, 80 % approach within 10° of the horizontal (17 %"
+        in told
     )
     assert (
         "In 20 % of the pairs that are clear of the table, the palm approaches from 45° or more" in told
