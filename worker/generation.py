@@ -81,7 +81,7 @@ class ValidatedBatch:
     outcomes: dict[str, int]
     """Rejected candidates, by `service.model.planning.OUTCOMES`: validator outcome or failed gate."""
     verdict_key: str | None
-    """Digest of the terms of the verdicts; None: not validated."""
+    """Digest of all settings that affect verdicts; None: not validated."""
     planned: int
     seconds: dict[str, float] = field(default_factory=dict)
     shares: dict[str, float] = field(default_factory=dict)
@@ -169,7 +169,7 @@ def scored(
 
 
 class Scoring:
-    """Verdicts and metrics of a job's grasps; those of a grasp are independent of the other grasps."""
+    """Verdicts and metrics of a job's grasps; each grasp is scored independently of the others."""
 
     def __init__(
         self,
@@ -235,8 +235,8 @@ class Scoring:
         prefilter: PrefilterVerdicts | None = None,
     ) -> Round:
         """Validate and measure grasps, and select the wanted ones, near-duplicates included.
-        Grasps with numbers that are not finite are rejected. `known` has verdicts on candidates, `prefilter` those of
-        the GPU."""
+        Grasps with numbers that are not finite are rejected. `known` has verdicts on candidates, `prefilter` has
+        verdicts of the GPU prefilter."""
         fates = np.where(planned.finite, "kept", "diverged").astype(object)
         seconds = {"planner": 0.0, "validation": 0.0, "quality": 0.0}
         finite = np.flatnonzero(fates == "kept")
@@ -307,7 +307,7 @@ class Scoring:
     def _further_tests(
         self, grasps: GraspSet, in_models: NDArray[np.bool_], valid: NDArray[np.bool_], run: ExecutionContext
     ) -> Arrays:
-        """Return columns of the further tests that are wanted.
+        """Return columns of the further tests that the request specifies.
         Grasps `in_models` (N,) get robustness (exact for candidates), `valid` ones (N,) payload and shake."""
         request, columns = self.request, dict[str, NDArray[Any]]()
         if not (request.models or request.measures_payload or request.shake):
@@ -333,7 +333,7 @@ class Scoring:
             # A valid grasp has lifted at least the object's own mass.
             columns["quality/payload_kg"] = np.where(valid & np.isnan(found), self.obj.mass, found)
         if request.shake:
-            assert placed is not None, "shake goes with a scene"
+            assert placed is not None, "a shake test needs a scene"
             columns["quality/shake_margin"] = shake_margins(self.hand, self.obj, grasps, placed, held=valid, **common)
         return columns
 

@@ -67,7 +67,7 @@ def object_to_pieces(
     # Data out:
     near_inout: wp.array2d(dtype=wp.float32),
 ):
-    """Reduce these distances by object samples within `margin`, for edges between hand points. Over (B, P)."""
+    """Lower the distances to those of object samples within `margin`, for object edges. Over (B, P)."""
     b, piece = wp.tid()
     if active_in[b] == 0:
         return
@@ -126,7 +126,7 @@ def nearest_of(
     near: wp.array2d(dtype=wp.float32),
     pair: wp.array3d(dtype=wp.float32),
 ):
-    """Return the distance of a body from obstacles to dof d; of a gap between two fingers, each gets one half."""
+    """Return the least gap of a body that dof d moves; gaps to bodies that d does not move count half."""
     least = near[b, body]
     for other in range(near.shape[1]):
         if closing.moves[d, other] == 0:
@@ -170,7 +170,7 @@ def close(
         if stopped_inout[b, d] == 0:
             open_dofs += 1
             step = float(largest_in)
-            # The slowest dof of a finger limits all of them: joints close at equal speed.
+            # Joints close at equal speed, so the slowest dof of a finger limits all its dofs.
             for e in range(dofs):
                 if stopped_inout[b, e] == 0 and closing_in.finger[e] == closing_in.finger[d]:
                     for body in range(near_in.shape[1]):

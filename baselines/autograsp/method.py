@@ -70,16 +70,16 @@ METHOD: Final = Method(
 
 #: Largest distance of a contact: GraspIt!'s threshold layer [m].
 TOUCH_M: Final = 2e-4
-#: Larger distances count as this [m].
+#: Distances are capped at this [m].
 REACH_M: Final = 0.03
 #: Fingers with a smaller gap reduce each other's steps [m].
 MARGIN_M: Final = 0.005
-#: Share of a gap that is crossed in one step: large distances come from a grid with errors up to a third.
+#: Share of a gap that is crossed in one step. Large distances come from a grid with errors up to a third.
 SHARE: Final = 0.6
 #: Longest closing step [rad], and largest number of steps.
 LARGEST: Final = 0.1
 STEPS: Final = 400
-#: Largest number of approach steps: each crosses more than half of the remaining distance.
+#: Largest number of approach steps. Each step crosses more than half of the remaining distance.
 ADVANCES: Final = 40
 
 

@@ -36,7 +36,7 @@ COOL = wp.constant(0.95)
 MU = wp.constant(0.98)
 #: Probability of a new contact.
 SWAP = wp.constant(0.5)
-#: Larger distances count as this [m].
+#: Distances are capped at this [m].
 FAR = wp.constant(1.0)
 
 
@@ -72,8 +72,8 @@ def propose(
 ):
     """Step down the gradient, redraw each contact with probability 1/2, reset energies. Launch over B.
 
-    The published code divides by the root mean square over its batch. Here it is the one over translation, rotation and
-    joints of each grasp (columns 0 to 2 of `moment`), so that grasps of a batch are independent.
+    The published code divides by the root mean square over its batch. Here each grasp has root mean squares of its
+    own, for translation, rotation and joints (columns 0 to 2 of `moment`), so that grasps of a batch are independent.
     """
     b = wp.tid()
     it = iteration_in[0]

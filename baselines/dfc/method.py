@@ -42,7 +42,7 @@ from graspd.worker.simulation.record import add_poses, add_root_gradient
 
 #: Bounds of the published code on force closure, distance and penetration.
 PASSES: Final = (0.3, 0.005, 0.001)
-#: Distance of the palm from the hull [m]: the published code puts the root, one palm length behind, at 0.2 to 0.3.
+#: Distance of the palm from the hull [m]. The published code puts the root, one palm length behind it, at 0.2 to 0.3.
 DISTANCE: Final = (0.1, 0.2)
 #: Largest tilt of the approach from the hull's normal [rad].
 TILT: Final = np.pi / 6

@@ -33,7 +33,7 @@ SCALE = wp.constant(1e-6)
 TRIES = wp.constant(11)
 #: Most draws of one variable for a value inside its bounds.
 REDRAWS = wp.constant(100)
-#: Larger distances count as this [m].
+#: Distances are capped at this [m].
 FAR = wp.constant(1.0)
 vec8 = wp.types.vector(length=8, dtype=wp.float32)
 

@@ -33,10 +33,10 @@ from graspd.worker.simulation.model import Model
 
 
 class LearnedOptions(Options):
-    """Network and number of its proposals."""
+    """Options of the method `learned`."""
 
     network: Digest = Field(description="digest of the network; on the command line its file, in a job its name")
-    starts: int = Field(4, ge=1, le=32, description="proposals of each grasp that set out")
+    starts: int = Field(4, ge=1, le=32, description="starts of each grasp")
 
 
 @dataclass(frozen=True)

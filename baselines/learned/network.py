@@ -112,7 +112,7 @@ def cloud_inputs(points: ArrayLike, normals: ArrayLike, table_height: float) -> 
     if p.ndim != 2 or p.shape[1:] != (3,) or not len(p) or n.shape != p.shape:
         raise InputError(f"a cloud has points and normals (P, 3), not {p.shape} and {n.shape}")
     if not (np.isfinite(p).all() and np.isfinite(n).all() and np.isfinite(table_height)):
-        raise InputError("a number of the cloud is not finite")
+        raise InputError("a number in the cloud is not finite")
     anchor = p.mean(axis=0)
     height = (p[:, 2:] - table_height) / LENGTH_M
     return np.concatenate([(p - anchor) / LENGTH_M, n, height], axis=1).astype(np.float32), anchor

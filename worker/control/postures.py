@@ -1,6 +1,6 @@
 """Postures around a grasp: the open pregrasp without contact, and the squeeze, which presses.
 
-They affect a grasp's success more than the optimiser does (Dexonomy, table VI).
+Both affect a grasp's success more than the optimiser does (Dexonomy, table VI).
 
 A finger that rests on the table would sweep through it when it opens: such hands have a slightly higher pregrasp.
 """
@@ -27,22 +27,23 @@ from graspd.worker.simulation.obstacles import body_room, obstacle_room
 
 #: Clearance of opening fingers from obstacles [m].
 ROOM_M: Final = 0.0025
-#: Further opening of a joint on the approach, as a share of its range beyond the pregrasp: otherwise fingers that reach
-#: around the object would sweep it away.
+#: Further opening of a joint on the approach, as a share of its range beyond the pregrasp. Without it, fingers that
+#: reach around the object would sweep it away.
 WIDE: Final = 0.4
 
 #: Hand points that check a posture; those within this distance of the object press on it [m], at most this many.
 _POINTS: Final = 600
 PRESSING_M: Final = 0.003
 MAX_PRESSING: Final = 16
-#: Points of a finger that stands off press within this distance [m]. The command must close this finger, or else the
-#: other fingers push a free object past it.
+#: Points of a finger near the object but without contact press within this distance [m]. The command must close this
+#: finger, or else the other fingers push a free object past it.
 CLOSING_M: Final = 0.009
 #: A finger stands off if its distance is in this range [m]: it could touch but does not. Fingers farther away are not
 #: part of the grasp.
 STANDS_OFF_M: Final = (0.005, 0.02)
-#: Sum of the contact forces' normal components [N] and the Coulomb coefficient for their balance. It is smaller than
-#: the object's, because forces at the edge of their friction cones slip after a small displacement of the contact.
+#: Sum of the contact forces' normal components [N] and the Coulomb coefficient for their balance. The coefficient is
+#: smaller than the object's, because forces at the edge of their friction cones slip after a small displacement of the
+#: contact.
 TOTAL_NORMAL_FORCE: Final = 50.0
 FRICTION: Final = 0.3
 #: Least and largest ratio of that sum to the object's weight. A sum of 50 N pushes a light flat object out from between
@@ -129,7 +130,7 @@ def touching_links(hand: HandModel, obj: ObjectModel, grasp: Posture, *, device:
 
 
 def standing_off(hand: HandModel, obj: ObjectModel, grasp: Posture, *, device: str = "cpu") -> NDArray[np.bool_]:
-    """Check (N,) whether a finger stands off the object, see `STANDS_OFF_M`."""
+    """Check (N,) whether a finger could touch the object but does not: its distance is in `STANDS_OFF_M`."""
     near, far = STANDS_OFF_M
     gap = posing_of(hand, obj, points=_POINTS, device=device).finger_gaps(grasp, 2 * far)
     return np.asarray(((gap > near) & (gap < far)).any(axis=1))

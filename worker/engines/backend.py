@@ -85,11 +85,11 @@ def kernel_cache() -> Path | None:
         wanted.mkdir(parents=True, exist_ok=True)
         if os.access(wanted, os.W_OK | os.X_OK):
             return None
-        trouble = "it cannot be written"
+        trouble = "not writable"
     except OSError as error:
         trouble = error.strerror or str(error)
     folder = user_cache.folder("warp")
-    log.warning("no kernels can be kept in %s (%s); they are kept in %s", wanted, trouble, folder)
+    log.warning("kernels cannot be cached in %s (%s); they are cached in %s", wanted, trouble, folder)
     return folder
 
 

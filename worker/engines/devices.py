@@ -1,7 +1,7 @@
 """Warp devices: their names, the default GPU of a process, and GPU errors.
 
 Worker number k takes the k-th GPU that `CUDA_VISIBLE_DEVICES` shows, cyclically; a process without a number takes the
-one with the fewest processes. Processes are counted by file locks, which the kernel releases with the process: lock n
+GPU with the fewest processes. Processes are counted by file locks, which the kernel releases with the process: lock n
 of a GPU is held by the n-th process on it, in the user's cache, which the containers of one machine share.
 
 After an illegal access, a reset or a bus error Warp only writes a line to stderr and continues with undefined memory,
@@ -105,7 +105,7 @@ class Gpu:
 def take(gpus: Sequence[Gpu], folder: Path, *, number: int | None = None) -> Gpu:
     """Select one of the GPUs (at least one): that of worker `number`, else one with the fewest processes.
 
-    It counts as taken until this process ends. Without a writable folder the first is selected.
+    The GPU counts as taken until this process ends. Without a writable folder it is that of `number`, else the first.
     """
     eligible = [gpus[number % len(gpus)]] if number is not None else list(gpus)
     try:
@@ -117,7 +117,7 @@ def take(gpus: Sequence[Gpu], folder: Path, *, number: int | None = None) -> Gpu
                         log.info("%s (%s) is shared by %d processes", gpu.name, gpu.model, place + 1)
                     return gpu
     except OSError as error:
-        log.warning("GPUs are not told apart: no locks can be kept in %s (%s)", folder, error.strerror)
+        log.warning("processes per GPU are not counted: no lock files can be made in %s (%s)", folder, error.strerror)
     return eligible[0]
 
 
@@ -165,4 +165,4 @@ def check_device(device: str) -> None:
         wp.synchronize_device(device)
     except RuntimeError as error:
         if not is_out_of_memory(error):
-            raise DeviceLost(f"{error}; nothing runs there any more in this process") from error
+            raise DeviceLost(f"{error}; nothing runs on this device any more in this process") from error

@@ -8,13 +8,13 @@ from typing import Final
 from graspd.service.model.cores import ROOT, available_cores, available_memory
 from graspd.service.model.domain import BATCH_SIZE
 
-#: Grasps per multiprocessor of a GPU: 7 simulations for each of 2 finalists are four warps, one for each scheduler. The
-#: kernels of a hand's points fill the GPU long before.
+#: Grasps per multiprocessor of a GPU. With 2 finalists of 7 simulations each, 8 grasps fill four warps, one for each
+#: scheduler. Kernels over hand points fill the GPU with fewer grasps.
 GRASPS_PER_MULTIPROCESSOR: Final = 8
 #: Most memory of a grasp, that of the fidelity `paper` [bytes], and the share of the free memory to use.
 BYTES_PER_GRASP: Final = 2.5 * 2**20
 MEMORY_SHARE: Final = 0.5
-#: Largest number of batches: more of one pair are seldom in the queue.
+#: Largest number of batches. More batches of one pair are seldom in the queue.
 MOST: Final = 64
 #: Most memory of a process with the models of its cached pairs [bytes]; see docs/explanation/performance.md.
 BYTES_PER_PROCESS: Final = 400 * 2**20
@@ -24,7 +24,7 @@ PROCESS_SHARE: Final = 0.25
 
 def batches_at_once(device: str, join: int | None) -> int:
     """Return the batches per launch on a Warp device: `join` if given, else 1 on the CPU.
-    On a GPU as many as fill it and fit its free memory; on the CPU larger launches gain nothing."""
+    On a GPU the default fills the GPU within its free memory. On the CPU larger launches gain nothing."""
     if join is not None or not device.startswith("cuda"):
         return join or 1
     import warp as wp
@@ -43,8 +43,8 @@ def fitting(multiprocessors: int, free_bytes: int) -> int:
 def processes_at_once(device: str, wanted: int, *, threads: int = 0, workers: int = 1, root: Path = ROOT) -> int:
     """Return the number of processes that validate and measure: `wanted`, if not 0; 1: the worker's own, with threads.
 
-    By default one of some `workers` on a GPU has one per core except its own, within a quarter of the memory. On a CPU
-    the planner uses the same cores at other times, and threads (0: one per core) suffice.
+    By default a worker on a GPU has one process fewer than its share of the cores. All `workers` together use at most a
+    quarter of the memory. On a CPU the planner uses the same cores, and threads (0: one per core) suffice.
     """
     if wanted or not device.startswith("cuda"):
         return wanted or 1

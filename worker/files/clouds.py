@@ -32,7 +32,7 @@ def write_clouds(clouds: Clouds, folder: Path, said: Mapping[str, Any]) -> dict[
     concatenated cloud by cloud; `grasp/count` (C,) is the number of rows of each cloud.
     Raises ConflictError: the folder exists and is not empty."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise ConflictError(f"{folder} is there already; name another folder")
+        raise ConflictError(f"{folder} exists already; name another folder")
     folder.mkdir(parents=True, exist_ok=True)
     done = {"files": 0, "clouds": 0, "empty": 0}
     for _, samples in groupby(clouds, key=lambda sample: sample["shard_id"]):

@@ -41,9 +41,9 @@ class Balance:
 
     def __post_init__(self) -> None:
         if unknown := [one for one in self.by if one not in KINDS]:
-            raise InputError(f"grasps cannot be balanced by {unknown[0]!r}; choose of {one_of(unknown[0], KINDS)}")
+            raise InputError(f"grasps cannot be balanced by {unknown[0]!r}; choose from {one_of(unknown[0], KINDS)}")
         if not self.by:
-            raise InputError(f"say what to balance by: {', '.join(KINDS)}")
+            raise InputError(f"choose categories to balance: {', '.join(KINDS)}")
 
     def __call__(self, shards: list[Shard]) -> list[NDArray[np.bool_]]:
         """Return masks of selected grasps: valid, drawn at random by the seed, limited per category.
@@ -69,7 +69,7 @@ class Balance:
                 columns.append(faces(np.concatenate([_down(shard) for shard in shards])))
                 continue
             if old := [shard for shard in shards if _COLUMNS[name] not in shard.arrays]:
-                raise InputError(f"{old[0].path} does not tell the {name} of its grasps: an older graspd made it")
+                raise InputError(f"{old[0].path} does not record the {name} of its grasps: an older graspd made it")
             columns.append(np.concatenate([np.asarray(shard[_COLUMNS[name]], np.int64) for shard in shards]))
         return np.stack(columns, axis=1)
 
@@ -91,7 +91,7 @@ def _down(shard: Shard) -> NDArray[np.float64]:
 
 
 def faces(down: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Number the bottom faces (N,) of down directions (N, 3), one for all within 20 degrees of the first."""
+    """Return face numbers (N,) of down directions (N, 3); one covers 20 degrees about its first direction."""
     seen = np.zeros((0, 3))
     found = np.full(len(down), -1, np.int64)
     for row in np.flatnonzero(np.linalg.norm(down, axis=1) > 0):

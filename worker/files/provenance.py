@@ -151,8 +151,8 @@ def hand_of_shard(shard: Shard, given: str | None) -> HandModel:
     """Load the hand `given` (a file or a built-in); by default the shard's own, see `find`.
 
     Raises:
-        NotFoundError: there is no such file or built-in, or the hand is in none of the places.
-        ConflictError: it is not the hand of the shard.
+        NotFoundError: there is no such file or built-in, or `find` does not find the hand.
+        ConflictError: the given hand is not that of the shard.
     """
     if given:
         hand = hand_from_path(given)
@@ -210,8 +210,8 @@ def neighbours_of_shard(shard: Shard, given: Sequence[str]) -> Neighbours | None
     """Load the other objects of a scene shard with their poses; None if the object is alone.
 
     Raises:
-        NotFoundError: one is in none of the places.
-        ConflictError: they are not the objects of the shard.
+        NotFoundError: `find` does not find one of them.
+        ConflictError: the given objects are not those of the shard.
     """
     names, digests = (shard.attributes.get(key, []) for key in ("neighbours", "neighbour_digests"))
     if "scene/neighbour_pose" not in shard.arrays or not isinstance(names, list) or not isinstance(digests, list):
@@ -314,10 +314,10 @@ def base_attributes(
     verdict_key: str | None,
     outcomes: Mapping[str, int] = MappingProxyType({}),
 ) -> dict[str, Attribute]:
-    """Return the attributes of a base shard: joints, request, scene, candidates, terms of validation.
+    """Return the attributes of a base shard: joints, request, scene, candidates, settings of validation.
 
-    `candidates` counts up to the last selected one; `verdict_key` is the digest of the terms of the verdicts, None: not
-    validated; `outcomes` are the numbers of rejected candidates.
+    `candidates` counts up to the last selected one. `verdict_key` is the digest of all settings that affect verdicts;
+    None: not validated. `outcomes` are the numbers of rejected candidates.
     """
     said: dict[str, Attribute] = {
         "joint_names": list(hand.joint_names),

@@ -55,7 +55,7 @@ def write_subset(shards: Shards, choose: Chooser, out: Path, *, said: Mapping[st
     Shards without selected grasps are left out. All columns of a grasp, including its scene, are unchanged.
     Raises InputError: the folder contains files already or cannot be made; or nothing is selected."""
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(f"{out} is there already; choose a folder that is not")
+        raise InputError(f"{out} exists already; choose another folder")
     looked_at = kept = 0
     ready: list[tuple[PurePosixPath, bytes]] = []
     for together in base_shards(shards):
@@ -64,7 +64,7 @@ def write_subset(shards: Shards, choose: Chooser, out: Path, *, said: Mapping[st
             if mask.any():
                 ready.append((place_of(shard, {one for one, _ in ready}), part_of_shard(shard, mask)))
     if not ready:
-        raise InputError(f"none of {looked_at} grasps is chosen")
+        raise InputError(f"none of {looked_at} grasps is selected")
     files = [out / path for path, _ in ready]
     for path, (_, data) in zip(files, ready, strict=True):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -92,7 +92,7 @@ def choose(base: Shard, *, unvalidated: bool = False, every: bool = False) -> tu
         mask = validity.chosen(base.arrays, unvalidated=unvalidated)
         word = "feasible grasps that are not validated" if unvalidated else "valid grasps"
     if not mask.any():
-        raise InputError(f"{base.path or 'the shard'} holds no {word}; {_there_are(base, count)}")
+        raise InputError(f"{base.path or 'the shard'} contains no {word}; {_there_are(base, count)}")
     return mask, word
 
 
@@ -100,7 +100,7 @@ def _there_are(base: Shard, count: int) -> str:
     waiting = int(validity.chosen(base.arrays, unvalidated=True).sum())
     valid = int(validity.valid(base.arrays).sum())
     if waiting:
-        return f"{waiting} of its {count} are feasible and were validated by nobody: take them with --unvalidated"
+        return f"{waiting} of its {count} are feasible but not validated: select them with --unvalidated"
     if valid:
         return f"{valid} of its {count} are valid: leave out --unvalidated"
-    return f"all {count} failed: take them with --all" if count else "it has no grasp at all"
+    return f"all {count} failed: select them with --all" if count else "it has no grasps"

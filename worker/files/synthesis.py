@@ -71,7 +71,7 @@ class SynthesisResult:
         """Explain why there are fewer grasps than requested; None if there are enough."""
         request = self.request
         if self.interrupted:
-            return f"interrupted: {len(self.arrays['quality/valid'])} of {request.grasps} grasps were there"
+            return f"interrupted: {len(self.arrays['quality/valid'])} of {request.grasps} grasps were finished"
         limit, narrow = self.limit, self.narrow
         reason = shortfall(
             len(self.arrays["quality/valid"]),
@@ -215,7 +215,7 @@ def synthesized(
         threads: CPU threads; 0: one per core.
         prefilter: whether MuJoCo Warp rejects clear failures; auto: on a GPU, if installed.
         join: batches of 32 planned in one launch; None: as many as fill a GPU. The grasps are the same.
-        processes: number that validate and measure; 1: this one; 0: on a GPU one per core less one, else 1.
+        processes: number that validate and measure; 1: this one only; 0: on a GPU the cores less one, else 1.
         progress: receives the number of finished grasps and the total.
         cancelled: polled often; True: the work stops.
         partial: whether grasps validated before a stop are returned.

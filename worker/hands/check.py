@@ -91,20 +91,22 @@ def _tendons(hand: HandModel) -> list[str]:
 def _open(hand: HandModel) -> list[str]:
     chains = zip(hand.fingertips, chains_of(hand), strict=True)
     still = [hand.body_names[tip] for tip, chain in chains if not hand.closing[hand.dof[chain]].any()]
-    return [f"no joint closes the finger of {', '.join(still)}: say which does with --closing JOINT=1"] if still else []
+    return [f"no joint closes the finger of {', '.join(still)}: name one with --closing JOINT=1"] if still else []
 
 
 def _tie(hand: HandModel, settings: HandOptions) -> list[str]:
     stated = settings.approach or (settings.palm and settings.palm.approach)
     if stated or jaws_of(hand) is not None or not guess_approach(hand)[1]:
         return []
-    return ["the palm may face either way along its axis, a tie: say which with --approach"]
+    return ["the palm may face either way along its axis: state its direction with --approach"]
 
 
 def _limits(robot: Robot, settings: HandOptions) -> list[str]:
     tree = build_tree(robot, settings)
     passed = passed_limits(robot, tree, settings)
-    notes = [f"limits of {', '.join(passed)} are not used, as in ROS: they follow other joints"] if passed else []
+    notes = (
+        [f"limits of {', '.join(passed)} are not used, as in ROS, because these joints follow others"] if passed else []
+    )
     notes += cut_drives(robot, tree)
     return notes + ([f"{', '.join(tree.still)} cannot move: the limits leave one value"] if tree.still else [])
 

@@ -14,7 +14,7 @@ from graspd.worker.hands.model import HandModel
 FAR: Final = 1.99
 #: Shares of the range from open to closed at which fingertips are evaluated.
 _SHARES: Final = (0.25, 0.5, 0.75)
-#: Least cosine at which two joint axes, or an axis and the approach, are parallel: within 45 degrees, and 37.
+#: Least cosine at which two joint axes, or an axis and the approach, count as parallel: 45 and 37 degrees.
 _PARALLEL: Final = 0.707
 _ABOUT: Final = 0.8
 #: Least share of the largest tip motion by a joint of the finger at which a joint counts as moving the tip.

@@ -48,7 +48,7 @@ SQUARE: Final = 0.7
 
 def pinches_of(hand: HandModel, height: float) -> Oppositions:
     """Return postures for an object of this height [m], cached in memory and on this machine.
-    There are none if it reaches the pads or the hand has one finger.
+    The result is empty if the object reaches the pads or the hand has one finger.
 
     The palm's approach without its part along `axis` points at the plane. `middle` is half the height above it.
     """
@@ -86,7 +86,8 @@ class _Seen:
     middle: Floats
     width: Floats
     short: Floats
-    """(N,) height above the plane of the opposing end, or the others' mean, over what reaches the object."""
+    """(N,) height of the ends above the plane over the largest that reaches the object: the larger of the
+    opposing end's and the others' mean."""
     facing: Floats
     """(N,) cosine between the surface within the height and the line between the ends, for the worse side."""
     square: Floats

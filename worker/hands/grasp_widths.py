@@ -1,8 +1,8 @@
 """Postures in which any two parts of a hand face each other, for objects narrower than pads can grip, or wider.
 
-An object of 10 mm is held between the sides of two fingers or a finger and the palm; one as wide as the hand's span,
-between the sides of fingertips. Both are pairs of surface points with normals along the line between them and space for
-a cube of that width. They are found by sampling and random steps.
+An object of 10 mm is held between the sides of two fingers, or between a finger and the palm. An object as wide as the
+hand's span is held between the sides of fingertips. In both cases two surface points have normals along the line
+between them and space for a cube of that width. Sampling and random steps find such pairs.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ CLIMBS: Final = 80
 FACING: Final = {"small": 0.9, "wide": 0.8}
 TURNED_M: Final = 0.2
 DEEP: Final = 2.0
-#: Least closing motion of the hand on the object, by joints at least the lever away from it [m].
+#: Least closing motion of the hand on the object, by joints with at least this lever about it [m].
 CLOSES_M: Final = 0.04
 LEVER_M: Final = 0.02
 #: Radius within which flat parts cover the tangent plane [m], and the cost of parts that do not [m].

@@ -33,7 +33,7 @@ CONTRADICTING = 0.2
 SIDEWAYS = 0.3
 #: Angle below which two lines coincide, and below which a line is the root axis [degrees].
 SAME_LINE = 1.0
-#: Angle within which lines and root axes may refine a rough direction, and a good one [degrees].
+#: Angles within which lines and root axes may refine a rough and a precise direction [degrees].
 ROUGH, GOOD = 40.0, 10.0
 #: Largest number of joints whose axes are considered.
 _JOINTS = 64
@@ -143,8 +143,8 @@ def guess_approach(hand: HandModel) -> tuple[Floats, bool]:
 
     There are two estimates. The mean motion of the fingertips during closing points out of a human-like palm. The
     position of the tips of the half-closed hand is ahead of a gripper's palm, but also far along the fingers of a
-    human-like hand. Their sum errs least. If fingers oppose each other, the tip motions cancel to a sideways residual
-    or rounding noise: see `_between_fingers`.
+    human-like hand. The sum of both has the smallest error. If fingers oppose each other, the tip motions cancel to a
+    sideways residual or rounding noise: see `_between_fingers`.
     """
     ways, ahead = _ways(hand), _unit(_tips_ahead(hand))
     if _cancelling(ways, ahead) < OPPOSED:

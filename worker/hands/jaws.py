@@ -37,7 +37,7 @@ _FAST: Final = 0.5
 _PAD_DEPTH_M: Final = 0.003
 #: Shares of the limits at which the hand is checked for hidden surfaces.
 _LOOKS: Final = (0.5, 0.02, 0.98)
-#: Surfaces lead if they move along their normals with at least this share of the fastest point's speed.
+#: Surfaces move ahead if their speed along their normals is at least this share of the fastest point's speed.
 _LEADING: Final = 0.3
 #: A body carries a pad if the area that faced the other jaw is at least this share of the largest such area.
 _PAD_SHARE: Final = 0.4
@@ -70,7 +70,7 @@ class Jaws:
     points: SurfacePoints
     """Points on both pads."""
     first: NDArray[np.bool_]
-    """(P,) mask of those on the first pad."""
+    """(P,) mask of the points on the first pad."""
     length: float
     """Extent of the pads along the approach that was given [m]."""
 
@@ -129,8 +129,9 @@ _lock = threading.Lock()
 
 
 def find_jaws(hand: HandModel, approach: Floats | None = None) -> Jaws | None:
-    """Find the jaws of a hand with known `closing`; None if it is planned as a hand.
-    That is: more dofs close it, nothing opposes, or more than two digits close from more than two sides."""
+    """Find the jaws of a hand with known `closing`; None if it is no gripper.
+    A hand is no gripper if it has more than `MAX_DOFS` dofs, if no dof closes it, if no surfaces oppose, or
+    if more than two digits close from more than two sides."""
     closing = np.flatnonzero(hand.closing)
     if not 1 <= len(closing) <= MAX_DOFS or hand.dofs > MAX_DOFS:
         return None

@@ -107,14 +107,14 @@ def assemble(source: HandSource) -> HandModel:
 
 def mounting_of(source: HandSource, hand: HandModel) -> tuple[HandModel | None, str]:
     """Return the links above the hand's root, None if there are none, and why their shapes are unreadable.
-    Faults above a hand do not refuse it."""
+    A fault above a hand does not make the hand unusable."""
     tree = mounting_tree(source.robot, hand.root_link, source.options)
     if tree is None:
         return None, ""
     try:
         return body_model(replace(source, options=HandOptions(shapes=source.options.shapes)), tree), ""
     except HandError as error:
-        return None, f"what stands above {hand.root_link!r} is no obstacle in scenes: {error}"
+        return None, f"links above {hand.root_link!r} are no obstacles in scenes: {error}"
 
 
 def _drag(robot: Robot, hand: HandModel) -> Drag:
@@ -297,7 +297,7 @@ def with_drive(hand: HandModel, stated: Collection[str], assumed: Sequence[str])
     """Replace the defaults of revolute joints by those of sliding joints and jaws, unless stated.
 
     A dof that moves pads by v [m/rad or 1] along their line gets the gain k v^2, summed over the pads, and the limit
-    f v: at each pad that is k [N/m] and f [N], independent of the gearing.
+    f v. Each pad thus has the gain k [N/m] and the limit f [N], independent of the gearing.
     """
     slide, jaws = slides(hand), jaws_of(hand)
     if jaws is None and not slide.any():

@@ -24,7 +24,7 @@ from graspd.worker.hands.robot import UNLIMITED_M, Joint, Link, Robot, Shape, bu
 _FREE, _HINGE, _SLIDE = (
     int(kind) for kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 )
-#: Colour of a geom that states none: then its material's colour counts.
+#: Colour of a geom that states none; such a geom has its material's colour.
 _NAMED_COLOUR: Final = np.array([0.5, 0.5, 0.5, 1.0])
 #: First group that MuJoCo's viewer does not draw.
 _HIDDEN_GROUP: Final = 3
@@ -44,7 +44,7 @@ def read_mjcf(files: Mapping[str, bytes], main: str) -> Robot:
         model = mujoco.MjModel.from_xml_string(text, assets)
     except (ValueError, RuntimeError, OSError, mujoco.FatalError) as error:
         line = " ".join(str(error).replace("XML Error:", "").split())[:200]
-        raise HandError(f"{main}: MuJoCo does not take it ({line}); correct the model") from None
+        raise HandError(f"{main}: MuJoCo rejects it ({line}); correct the model") from None
     reader = _Reader(model, main, notes)
     roots = reader.roots()
     if len(roots) == 1 and not reader.joints_of(roots[0]):
@@ -83,7 +83,8 @@ class _Reader:
             raise HandError(f"{self.main}: no moving joint; a hand needs at least one hinge or slide joint")
         free = [j for j in range(model.njnt) if int(model.jnt_type[j]) == _FREE and int(model.jnt_bodyid[j]) in moving]
         self.notes += [
-            f"{self.body_name(int(model.jnt_bodyid[j]))!r} is free to float, and taken as fixed" for j in free
+            f"{self.body_name(int(model.jnt_bodyid[j]))!r} has a free joint, which is replaced by a fixed one"
+            for j in free
         ]
         return found
 

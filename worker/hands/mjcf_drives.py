@@ -105,8 +105,8 @@ class Couplings:
     def _couple_on_tendon(self, length: float, pulled: list[tuple[int, float]]) -> None:
         """Couple two joints on a fixed tendon: c1 (q1 - q1_0) + c2 (q2 - q2_0) = length; the unactuated follows.
 
-        Limits take precedence over the tendon: where they stop the follower it stays, as in a finger with a compliant
-        end.
+        Limits take precedence over the tendon: a follower at its limit does not move, as in a finger with a
+        compliant end.
         """
         free = [pair for pair in pulled if pair[0] not in self.follows and pair[0] not in self._actuated]
         if not free or abs(free[-1][1]) < 1e-9:
@@ -119,7 +119,7 @@ class Couplings:
         values = np.clip(line, *self._range(joint))
         if np.ptp(values) < 1e-6:
             self.follows[joint] = float(values[0])
-            stays = f"stays at {values[0]:.3g}: its limits stop what its tendon asks of it"
+            stays = f"stays at {values[0]:.3g}: its limits prevent the motion that its tendon requires"
             self.notes.append(f"{self.name(joint)!r} {stays}")
             return
         slope, constant, error = _line(at, values)
@@ -145,7 +145,7 @@ class Couplings:
             for joint, coefficient in others:
                 self.follows[joint] = Mimic(self.name(driver), coefficient / pull, 0.0)
             followers = ", ".join(self.name(joint) for joint, _ in others)
-            self.notes.append(f"{followers} taken to follow {self.name(driver)} on their tendon")
+            self.notes.append(f"{followers} assumed to follow {self.name(driver)} on their tendon")
 
     def _in_a_row(self, joints: list[int]) -> bool:
         """Check whether the joints form one chain."""
@@ -178,8 +178,8 @@ class Couplings:
         """Add the mimics of the passive joints in a group of loops.
 
         Raises:
-            HandError: it has no driver or several, does not close over its driver's range, or its joints are not
-                linear.
+            HandError: the group has no driver or several, does not close over its driver's range, or a joint depends
+                on the driver nonlinearly.
         """
         held = ", ".join(map(self.name, joints))
         if round_ones := [j for j in joints if int(self.model.jnt_type[j]) not in _ONE_VALUE]:
@@ -188,7 +188,7 @@ class Couplings:
                 "solved; write equalities of joints instead of the loop"
             )
         drivers = [j for j in joints if j in self._actuated and j not in self.follows]
-        # Without one, joints that follow others move with these.
+        # Without an actuator in the loop, a joint that follows a joint outside drives it.
         drivers = drivers or [j for j in joints if j in self.follows and not isinstance(self.follows[j], float)]
         if not drivers:
             raise HandError(f"the loop of {held} has no driver; give one of its joints an actuator")
@@ -206,7 +206,7 @@ class Couplings:
             slope, constant, error = _line(values, follower)
             if error > MAX_ERROR_RAD:
                 raise HandError(
-                    f"the loop of {driver!r} moves {self.name(joint)!r} by no line (off by {error:.2f}); "
+                    f"the loop of {driver!r} moves {self.name(joint)!r} nonlinearly (error {error:.2f}); "
                     "write an equality of the two joints instead"
                 )
             worst = max(worst, error)
@@ -336,8 +336,8 @@ def servos(model: Any, mimics: Mapping[int, Mimic | float], shared: Collection[i
 
     An actuator of gear g on a length l pulls with g F dl/dq at joint q. A position servo of gain k holds the joint with
     k (g dl/dq)^2. On a joint dl/dq is 1. On a fixed tendon it is the joint's coefficient plus those of its followers
-    times their rates. Each of n joints that share a tendon (`shared`) is as stiff as n such joints in series must be
-    for the tendon's gain.
+    times their rates. If n joints share a tendon (`shared`), each is so stiff that n of them in series have the
+    tendon's gain.
     """
     found: dict[int, Servo] = {}
     joint_of = {str(model.joint(j).name): j for j in range(model.njnt)}

@@ -74,7 +74,9 @@ def self_contained(files: Mapping[str, bytes], main: str) -> tuple[str, dict[str
     compiler.set("boundinertia", compiler.get("boundinertia", "1e-12"))
     if _means_radians(root):
         compiler.set("angle", "radian")
-        notes.append('angles read as radians: in degrees no joint would turn (say so: <compiler angle="degree"/>)')
+        notes.append(
+            'angles read as radians, since they are too small for degrees (if not: <compiler angle="degree"/>)'
+        )
     return ElementTree.tostring(root, encoding="unicode"), assets, notes
 
 
@@ -91,9 +93,9 @@ def _passed_over(root: Element) -> list[str]:
         or {one.get("tendon1"), one.get("tendon2")} & spatial - {None}
     ]
     told = (
-        (pulled, "on spatial tendons, which are passed over: joints are planned as if each had a drive of its own"),
-        (others, "passed over: only motors and servos of joints and fixed tendons are read"),
-        (held, "passed over: what it holds together is planned as free"),
+        (pulled, "on spatial tendons, which are ignored: joints are planned as if each had its own drive"),
+        (others, "ignored: only motors and servos of joints and fixed tendons are read"),
+        (held, "ignored: the bodies or tendons that it connects are planned as free"),
     )
     return [f"{_shown(elements)} {note}" for elements, note in told if elements]
 
@@ -108,8 +110,8 @@ def _is_read(actuator: Element) -> bool:
 
 
 def _means_radians(root: Element) -> bool:
-    """Check whether a model without an angle unit, so in degrees, was written for one in radians.
-    Then no joint would turn by more than 2 pi degrees, and no angle is larger."""
+    """Check whether angles of a model without an angle unit (MuJoCo: degrees) are meant as radians.
+    This is assumed if no joint limit and no other angle exceeds 2 pi."""
     if any("angle" in compiler.attrib for compiler in root.findall("compiler")):
         return False
     hinges = [e for e in root.iter("joint") if "range" in e.attrib and e.get("type", "hinge") != "slide"]
@@ -166,7 +168,7 @@ def _find(wanted: str, files: Mapping[str, bytes], folders: list[str], main: str
         return below[0]
     if found := next(filter(None, like), ""):
         return found
-    raise HandError(f"{main}: {does} {wanted[:80]!r}, which is not there; add the file")
+    raise HandError(f"{main}: {does} {wanted[:80]!r}, which is missing; add the file")
 
 
 def _mesh_folder(root: Element) -> tuple[str, bool]:
@@ -191,7 +193,7 @@ def _take_mesh(
     name = _find(posixpath.join(folder, wanted), files, [base, ""], main, "names the mesh")
     suffix = PurePosixPath(name).suffix.lower()
     if suffix not in _MESHES:
-        raise HandError(f"{main}: the mesh {name!r} is none of {', '.join(_MESHES)}, which MJCF takes; convert it")
+        raise HandError(f"{main}: the mesh {name!r} is no file of type {', '.join(_MESHES)}; convert it")
     # MuJoCo names a mesh after its file if the model does not name it.
     element.set("name", element.get("name", PurePosixPath(file.replace("\\", "/")).stem))
     refuse_stand_in(name, files[name], HandError)

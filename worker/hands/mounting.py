@@ -1,8 +1,8 @@
-"""Mounting of a hand: the links above its root that a grasp places, up to the angles of a wrist.
+"""Mounting of a hand: links above its root whose poses follow from a grasp, except for wrist angles.
 
 The mounting is its own kinematic tree that starts at the hand's root and runs up the robot. It passes fixed joints,
 joints with one value, and at most `MAX_WRIST_JOINTS` joints of a wrist: revolute ones of limited range near the root.
-The first other joint belongs to an arm, whose links a grasp does not place.
+The first other joint belongs to an arm, whose poses a grasp does not determine.
 """
 
 from __future__ import annotations

@@ -59,15 +59,15 @@ class HandOptions(_Options):
     source: str = ""
     facts: dict[str, Any] = Field(default_factory=dict)
     xacro: dict[str, str] = Field(default_factory=dict, description="values of the arguments of a xacro file")
-    root: str | None = Field(None, description="link that becomes the root; what is not below it is dropped")
-    drop: tuple[str, ...] = Field((), description="links to leave out, with all that hangs on them")
+    root: str | None = Field(None, description="link that becomes the root; only links below it remain")
+    drop: tuple[str, ...] = Field((), description="links to leave out, with all links below them")
     fix: dict[str, Finite] = Field(default_factory=dict, description="joints frozen at a value [rad or m]")
     couplings: dict[str, Coupling] = Field(default_factory=dict, description="couplings that the URDF lacks")
     tendons: dict[str, dict[str, Finite]] | None = Field(
         None, description="drives that pull several joints, and the coefficient of each joint; {}: none"
     )
     shapes: Literal["collision", "visual"] = Field(
-        "collision", description="what of a link touches: its collision elements, or what it looks like"
+        "collision", description="geometry in contact: collision or visual elements"
     )
     palm: Annotated[PalmOptions | None, BeforeValidator(_palm)] = None
     approach: Vector | None = Field(None, description="direction out of the palm, palm link frame")

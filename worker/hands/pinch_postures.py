@@ -88,7 +88,7 @@ _lock = threading.RLock()
 def cached_postures(
     kind: str, key: tuple[str, ...], code: tuple[ModuleType, ...], make: Callable[[], Oppositions]
 ) -> Oppositions:
-    """Return postures cached in memory and on this machine; `make` may ask for other kinds of them."""
+    """Return postures cached in memory and on this machine; `make` may request other kinds."""
     with _lock:
         if (kind, *key) not in _known:
             _known[kind, *key] = Oppositions(**arrays_kept_or_made(kind, key, code, lambda: vars(make())))

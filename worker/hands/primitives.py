@@ -253,7 +253,7 @@ def convex_edges(vertices: Floats, faces: NDArray[np.integer[Any]]) -> NDArray[n
     order = np.lexsort(sides.T)
     one, other = order[0::2], order[1::2]
     if len(one) != len(other) or (sides[one] != sides[other]).any():
-        return np.unique(sides, axis=0)  # not closed: rather an edge too many
+        return np.unique(sides, axis=0)  # an open solid may have more edges than needed
     count = len(faces)
     bends = (normal[one % count] * normal[other % count]).sum(axis=1) < COPLANAR
     return np.asarray(sides[one[bends]], np.intp)

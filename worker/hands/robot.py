@@ -76,7 +76,7 @@ class Joint:
     effort: float
     """[N m or N]; 0: not stated."""
     mimic: Mimic | None
-    """Mimic relation; a URDF follower's own limits are ignored, as in ROS: most published ones are junk."""
+    """Mimic relation; a URDF follower's own limits are ignored, as in ROS: most published ones are wrong."""
     velocity: float = 0.0
     """Limit [rad/s or m/s]; 0: not stated."""
     stiffness: float = 0.0
@@ -162,7 +162,7 @@ def _check_tree(links: dict[str, Link], joints: dict[str, Joint], filename: str)
     for joint in joints.values():
         for end, link in (("parent", joint.parent), ("child", joint.child)):
             if link not in links:
-                raise HandError(f"{filename}: joint {joint.name!r} names the {end} link {link!r}, which is not there")
+                raise HandError(f"{filename}: joint {joint.name!r} names the {end} link {link!r}, which does not exist")
         if joint.child in parent_of:
             raise HandError(f"{filename}: link {joint.child!r} has two parents, a kinematic loop; cut one joint")
         parent_of[joint.child] = joint.parent
@@ -173,7 +173,7 @@ def _check_tree(links: dict[str, Link], joints: dict[str, Joint], filename: str)
                 f"{filename}: it expands to no link at all: it only defines macros (give the file that calls them), or "
                 "an <include> lacks its xacro: prefix"
                 if filename.endswith(".xacro")
-                else f"{filename}: it holds no link; give the description of a hand"
+                else f"{filename}: it contains no link; give the description of a hand"
             )
         found = ", ".join(map(repr, roots[:3])) or "none: the joints form a cycle"
         raise HandError(f"{filename}: a hand needs exactly one root link; found {found}")

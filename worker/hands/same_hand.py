@@ -30,7 +30,7 @@ _FITTED: Final = 40
 #: Largest distance of corresponding fingertips in models of one hand [m].
 TOLERANCE_M: Final = 1e-3
 #: Weight of a prior on fingertip positions in the other model, for hands with insufficient motion: jaws of a gripper
-#: only translate. Over all postures it moves no fingertip by a nanometre.
+#: only translate. In no posture does this prior move a fingertip by a nanometre.
 _PRIOR: Final = 1e-3
 #: Most evaluations of a fit to another hand; a fit to the same hand converges earlier or is as good by then.
 _LOOKS: Final = 15
@@ -99,7 +99,7 @@ def same_hand(
         raise InputError(
             f"{theirs.name} is no model of {ours.name}: fingertip {ours.body_names[worst]!r} is up to "
             f"{1e3 * error.max():.2f} mm from where {ours.name} has it, {1e3 * tolerance_m:g} mm are allowed; "
-            "compare axes and zeros of the joints, or say which are the same: --joint-map OURS=THEIRS"
+            "compare axes and zeros of the joints, or name the pairs: --joint-map OURS=THEIRS"
         )
     return SameHand(ours, theirs, joints, base, float(error.max()))
 
@@ -126,8 +126,8 @@ def _matched(ours: HandModel, theirs: HandModel, joint_map: Mapping[str, str]) -
             if names
         ]
         raise InputError(
-            f"joints without a twin in the other model: {'; '.join(parts) or 'two are one'}; "
-            "say which are the same: --joint-map OURS=THEIRS,..., or leave them out by its asset.json (fix, root)"
+            f"joints without a counterpart in the other model: {'; '.join(parts) or 'two have the same one'}; "
+            "name the pairs: --joint-map OURS=THEIRS,..., or leave joints out by the model's asset.json (fix, root)"
         )
     return np.array(found, np.intp)
 

@@ -1,8 +1,8 @@
 """Collision shapes of a robot as convex pieces.
 Primitives stay exact; a mesh becomes one hull, or several where one would cover surface that can touch.
 
-The error of a mesh's pieces is the depth of its surface beneath them, along the shortest free direction out: the ninth
-decile over the surface visible from outside.
+The error of a mesh's pieces is the depth of the mesh surface beneath them, along the shortest free direction outward.
+It is the ninth decile over the surface that is visible from outside.
 """
 
 from __future__ import annotations
@@ -158,7 +158,7 @@ _MIN_EXTENT_M: Final = 1e-3
 
 
 def parts_of(vertices: Floats, faces: Ints) -> tuple[Floats, ...]:
-    """Return corners of the convex pieces of a mesh, which need not be closed; its own if its hull is near enough.
+    """Return corners of the convex pieces of a mesh, or all its corners if its hull is accurate.
 
     Raises:
         HandError: the decomposition exceeds its CPU time limit.
@@ -190,14 +190,14 @@ def _decomposed(vertices: Floats, faces: Ints) -> tuple[tuple[Floats, ...], bool
         try:
             made = coacd_parts(*light, {"threshold": threshold, **_COACD}, _CPU_S)
         except WorkLimitExceeded as limit:
-            # Other shapes than on a faster machine would be another hand.
-            raise HandError(f"taking the mesh apart into convex pieces needs {limit}; simplify it") from None
+            # A hand must have the same shapes as on a faster machine.
+            raise HandError(f"its convex decomposition needs {limit}; simplify it") from None
         sure &= bool(made)
         parts = tuple(part for part in made if len(part) > 3 and np.ptp(part, axis=0).min() > _MIN_EXTENT_M)
         if parts and (error := surface.error(parts)) < least:
             best, least = parts, error
         if len(made) >= MAX_PIECES:
-            # A finer threshold is merged back to as many pieces, at twice the time.
+            # With a finer threshold CoACD merges the result to the same number of pieces, in twice the time.
             break
     return best, sure
 
@@ -224,7 +224,7 @@ class _OpenSurface:
 
     def __init__(self, vertices: Floats, faces: Ints) -> None:
         corners, self._points = vertices[faces], _sample(vertices, faces)
-        # (D, P) whether a direction from a point is free of the mesh; along its own face a point sees nothing.
+        # (D, P) whether a direction from a point is free of the mesh.
         self._sees = np.array([~_hits(self._points, direction, corners) for direction in _DIRECTIONS])
 
     def error(self, parts: tuple[Floats, ...]) -> float:

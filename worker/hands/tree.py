@@ -127,7 +127,7 @@ def _check_names(robot: Robot, options: HandOptions) -> None:
             if name not in known:
                 raise HandError(f"the {robot.format} has no {kind} {name!r}{did_you_mean(name, known)}")
             if kind == "joint" and robot.joints[name].type == "fixed":
-                raise HandError(f"joint {name!r} is fixed; nothing can be said of how it moves")
+                raise HandError(f"joint {name!r} is fixed, so it cannot have a value or a coupling")
     check_tendons(robot, options.tendons or {})
 
 
@@ -192,7 +192,7 @@ def _fold_limits(dof: str, moving: dict[str, Drive], robot: Robot, options: Hand
         joint, drive = robot.joints[narrowest], moving[narrowest]
         raise HandError(
             f"joint {narrowest!r} may only go {joint.lower:g} .. {joint.upper:g}, but follows {dof!r} with "
-            f"{drive.multiplier:g}, which leaves {dof!r} no room; correct the coupling or its limits"
+            f"{drive.multiplier:g}, which leaves {dof!r} no range; correct the coupling or its limits"
         )
     _check_travel(dof, lower, upper, moving, robot)
     return lower, upper
@@ -211,7 +211,7 @@ def _check_travel(dof: str, lower: float, upper: float, moving: dict[str, Drive]
 
 
 def _binds(joint: Joint, drive: Drive, robot: Robot, options: HandOptions) -> bool:
-    """Check whether a joint's own limits bind it; a URDF follower's do not, as in ROS: most are junk."""
+    """Check whether a joint's own limits bind it; a URDF follower's do not, as in ROS: most are wrong."""
     return joint.name == drive.dof or robot.format != "URDF" or joint.name in options.couplings
 
 
@@ -234,7 +234,7 @@ def cut_drives(robot: Robot, tree: Tree) -> list[str]:
     for dof, lower, upper in zip(tree.dof_names, tree.lower, tree.upper, strict=True):
         own = robot.joints[dof]
         if upper - lower < (1 - _TOLD_CUT) * (own.upper - own.lower):
-            found.append(f"limits of what follows {dof} leave it {lower:.3g} .. {upper:.3g}")
+            found.append(f"joints that follow {dof} limit it to {lower:.3g} .. {upper:.3g}")
     return found
 
 

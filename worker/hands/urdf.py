@@ -133,7 +133,7 @@ def _moving(element: ElementTree.Element, still: Joint, what: str, notes: list[s
     try:
         lower, upper, effort = _limits(element, still.type, what)
     except HandError:
-        # Limits of a follower do not bind it, so junk among them does not matter.
+        # Limits of a follower do not bind it, so wrong limits of a follower do not matter.
         if mimic is None:
             raise
         most = UNLIMITED_M if still.type == "prismatic" else math.pi

@@ -25,7 +25,7 @@ from graspd.worker.objects.stand_ins import refuse_stand_in
 #: CPU time limit; the largest hands on arms take a tenth of it [s].
 CPU_LIMIT_S: Final = 10
 MEMORY_LIMIT_BYTES: Final = 2**30
-#: The limit above ends computation; this one ends a child that waits, on any busy machine [s].
+#: Wall time limit, which ends a child that waits without computing [s].
 _WALL_LIMIT_S: Final = 1800.0
 #: Files that an expansion may read; meshes are only named.
 _READ: Final = (".xacro", ".urdf", ".xml", ".yaml", ".yml")

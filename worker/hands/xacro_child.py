@@ -81,7 +81,7 @@ def _expand(given: dict[str, Any]) -> str:
         if name in texts and texts[name].startswith("version https://git-lfs."):
             raise Refused(f"includes {name!r}, which is a Git LFS pointer, not the file itself: git lfs pull")
         if name not in texts:
-            raise Refused(f"includes {name!r}, which is not there; add the file, or give the folder that holds it")
+            raise Refused(f"includes {name!r}, which is missing; add the file, or give the folder that holds it")
         return texts[name]
 
     def parse(source: Any, filename: str | None = None) -> minidom.Document:
@@ -128,7 +128,9 @@ def _expand(given: dict[str, Any]) -> str:
     if len(text) > given["limit"]:
         raise Refused(f"it expands to {len(text)} characters; at most {given['limit']} are taken")
     if _ADDRESS.search(text):
-        raise Refused("an expression gives an object where a text belongs, and another one each time; write list(...)")
+        raise Refused(
+            "an expression gives a Python object instead of text, with a new address each time; write list(...)"
+        )
     return text
 
 
@@ -198,7 +200,7 @@ def _told(error: BaseException) -> str:
         at = getattr(at, "exc", None) or at.__cause__ or at.__context__
     line = " ".join(str(error).split())[:200] or type(error).__name__
     if "Undefined substitution argument" in line:
-        return f'{line}; say its value: --xacro NAME=VALUE, or {{"xacro": {{"NAME": "VALUE"}}}} in asset.json'
+        return f'{line}; give its value: --xacro NAME=VALUE, or {{"xacro": {{"NAME": "VALUE"}}}} in asset.json'
     return f"cannot be expanded ({line}); correct it, or expand it yourself and give the URDF"
 
 

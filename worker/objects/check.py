@@ -54,7 +54,7 @@ def _facts(mesh: RepairedMesh, face_error_m: float, options: ObjectOptions) -> d
     away, extents = float(np.linalg.norm(mesh.centre)), np.ptp(mesh.vertices, axis=0)
     notes = list(mesh.notes)
     if away > FAR * extents.max():
-        notes.append(f"its origin lies {away:.4g} m from the middle of the mesh; poses of hands are told from there")
+        notes.append(f"its origin lies {away:.4g} m from the middle of the mesh; poses of hands refer to this origin")
     return {
         "faces": len(mesh.faces),
         "prepared_faces": len(model.faces),

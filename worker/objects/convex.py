@@ -35,8 +35,8 @@ def coacd_parts(vertices: Floats, faces: NDArray[Any], options: Mapping[str, Any
     busy machine gives the same pieces as an idle one.
 
     Raises:
-        WorkLimitExceeded: it needs more.
-        OSError: the machine did not let it start or end; pieces made without it would be another shape.
+        WorkLimitExceeded: CoACD needs more CPU time.
+        OSError: the machine did not let CoACD start or end. Substitute pieces would be another shape.
     """
     given = io.BytesIO()
     np.savez(given, vertices=vertices, faces=faces, options=np.array(json.dumps(dict(options))))

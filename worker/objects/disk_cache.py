@@ -56,8 +56,7 @@ def arrays_kept_or_made(
 def recalling(kind: str, terms: tuple[str | int, ...], code: tuple[ModuleType, ...]) -> Iterator[None]:
     """Cache the results of `recalled` inside this context in one entry, and load them the next time.
 
-    For small steps of a large computation, if loading their library is the most expensive part. The terms only
-    distinguish entries.
+    Use it for small steps of a large computation whose library is slow to load. The terms only distinguish entries.
     """
     file = _file(kind, terms, code)
     known = _read(file) or {}
@@ -72,7 +71,7 @@ def recalling(kind: str, terms: tuple[str | int, ...], code: tuple[ModuleType, .
 
 
 def recalled(what: str, given: Sequence[NDArray[Any]], make: Callable[[], Sequence[NDArray[Any]]]) -> Arrays:
-    """Return arrays that depend on others only, as "0", "1", ...: from `recalling`, or computed."""
+    """Return arrays that depend on `given` only, as "0", "1", ...: cached by `recalling`, or computed."""
     known = _recalled.get()
     if known is None:
         return {str(number): array for number, array in enumerate(make())}
@@ -166,4 +165,4 @@ def _parts(value: Any) -> Iterator[bytes]:
     elif isinstance(value, (str, int, float, np.generic)) or value is None:
         yield f"{type(value).__name__}{value!r}".encode()
     else:
-        raise TypeError(f"a model cannot be told by a {type(value).__name__}")
+        raise TypeError(f"a model with a {type(value).__name__} has no digest")

@@ -1,4 +1,4 @@
-"""Cache in memory of what follows from a hand or an object: models are compared by their content, not their name."""
+"""Cache in memory of results for hands and objects; models are compared by content, not by name."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ class ObjectModel:
     friction: float = field(default=FRICTION, metadata=TOLD_IF_SET)
     """Coulomb coefficient of its contacts in simulation."""
     about_centre: Floats | None = field(default=None, repr=False)
-    """(V + H + 1, 3) vertices, hull and centre of mass relative to the middle [m]; None: they are already."""
+    """(V + H + 1, 3) vertices, hull, centre of mass relative to the middle [m]; None: already centred."""
 
     @cached_property
     def content(self) -> str:
@@ -96,7 +96,7 @@ class ObjectModel:
         if mass is None:
             mass = self.mass if density is None else density * self.volume
         if mass > MOST_KG:
-            raise MeshError(f"the object would weigh {mass:.4g} kg; the most is {MOST_KG:g} kg: is its unit right?")
+            raise MeshError(f"the object would weigh {mass:.4g} kg, more than {MOST_KG:g} kg; check its unit")
         friction = self.friction if friction is None else friction
         return self if (mass, friction) == (self.mass, self.friction) else replace(self, mass=mass, friction=friction)
 

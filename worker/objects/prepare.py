@@ -69,7 +69,7 @@ def weighed(model: ObjectModel, options: ObjectOptions) -> ObjectModel:
 def main_file(files: Mapping[str, bytes], options: ObjectOptions) -> str:
     if options.file:
         if options.file not in files:
-            raise MeshError(f"asset.json names the file {options.file!r}, which is not there")
+            raise MeshError(f"asset.json names the file {options.file!r}, which is missing")
         return options.file
     found = sorted(name for name in files if Path(name).suffix.lower() in READERS)
     if len(found) == 1:
@@ -284,7 +284,7 @@ class ReferenceMesh:
 def _rollout(original: ReferenceMesh, target: int, error_m: float) -> Mesh | None:
     """Return a mesh of about `target` faces if it is valid and within the bound.
 
-    A collapse that broke the surface at one count often does not at the next, so a few counts are used.
+    A collapse that breaks the surface at one number of faces often succeeds at the next, so a few numbers are used.
     """
     for count in (target, int(target * 1.02) + 2, int(target * 1.05) + 4):
         mesh = _collapse(original.vertices, original.faces, count)

@@ -182,7 +182,7 @@ def _close(mesh: RepairedMesh) -> RepairedMesh:
     if crowded:
         split = topology.part_double_edges(*topology.split_edges(mesh.vertices, mesh.faces))
         if not topology.open_edges(split[1]) > topology.open_edges(mesh.faces):
-            mesh = mesh.but(*split, f"took {crowded} non-manifold edges apart")
+            mesh = mesh.but(*split, f"split {crowded} non-manifold edges")
     if topology.open_edges(mesh.faces):
         mesh = _fill_pinholes(mesh)
     return mesh
@@ -243,7 +243,7 @@ def _open(mesh: RepairedMesh, options: ObjectOptions) -> RepairedMesh:
     what = f"{holes} open edges" if holes else "faces that no winding makes consistent"
     raise MeshError.with_fixes(
         f"the mesh is not watertight ({what})",
-        "close it in your modelling tool, or take it as it is: --allow-open",
+        "close it in your modelling tool, or accept it as it is: --allow-open",
         {"allow_open": True},
     )
 
@@ -318,7 +318,7 @@ def _unite(
         how = "lie apart" if len(groups) > 1 else f"touch or lie within {1e3 * JOINED_M:g} mm"
         mesh = replace(mesh, notes=(*mesh.notes, f"{len(pieces)} parts that {how} are one rigid body"))
     before = sum(signed_volume(*p) for p in positives) - sum(signed_volume(*p) for p in holes)
-    # Parts that share a face have the same volume apart and united: their faces within the solid are removed.
+    # Parts that only share a face keep their volume when united; their faces inside the solid are removed.
     if abs(united.volume() - before) > 1e-6 * before or len(pieces) < len(positives):
         return mesh.but(
             *mesh_geometry.from_manifold(united), f"united {len(parts)} touching or intersecting components"

@@ -63,7 +63,7 @@ def refuse_stand_in(name: str, data: bytes, error: type[InputError]) -> None:
     if len(data) < 300 and _LINK.fullmatch(data):
         raise error(f"{name} is the text of a symbolic link, not the file itself: give the file that it names")
     if not head.strip(b"\0"):
-        raise error(f"{name} holds nothing but spaces or zeros: export or download it again")
+        raise error(f"{name} contains nothing but spaces or zeros: export or download it again")
     if head.startswith(b"PK\x03\x04") and zipfile.is_zipfile(io.BytesIO(data)):
         raise error(f"{name} is a ZIP archive, not the file itself: unpack it, or name it .zip")
 
@@ -73,5 +73,5 @@ def other_format(name: str, data: bytes) -> str | None:
     own, head = PurePosixPath(name).suffix.lower(), data[:4096].lstrip()
     for suffix, pattern in _MESHES.items():
         if suffix != own and pattern.match(head):
-            return f"it is a mesh of type {suffix}: name it so"
+            return f"it is a mesh of type {suffix}: rename it"
     return None

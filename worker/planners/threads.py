@@ -67,7 +67,7 @@ def _fitted(part: range, work: Callable[[range], T]) -> list[T]:
         if len(part) < 2 or not is_out_of_memory(error):
             raise
         log.warning(
-            "too little memory on the GPU for %d grasps in one launch; they are made in halves: %s", len(part), error
+            "too little memory on the GPU for %d grasps in one launch; two launches follow: %s", len(part), error
         )
     # The error is freed by now, and with it the stack frames that held earlier allocations.
     gc.collect()

@@ -72,7 +72,7 @@ def _answer(order: bytes, kept: dict[str, Any]) -> bytes:
 
 def _portable(error: Exception) -> Exception:
     """Return the error in a form that the peer can unpickle, with its traceback."""
-    error.add_note("in a process beside: " + "".join(traceback.format_tb(error.__traceback__)))
+    error.add_note("in a pool process: " + "".join(traceback.format_tb(error.__traceback__)))
     try:
         pickle.loads(pickle.dumps(error))
     except Exception:
@@ -81,5 +81,5 @@ def _portable(error: Exception) -> Exception:
 
 
 if __name__ == "__main__":
-    # By its full name: pickles name their module, and `__main__` is another one.
+    # Imported by its full name: pickles name their module, which `__main__` is not.
     import_module("graspd.worker.pool.child").serve(Connection(int(sys.argv[-1])), sys.argv[1:-1])

@@ -41,7 +41,7 @@ _NO_GPU: Final = {"CUDA_VISIBLE_DEVICES": ""}  # processes compute on the CPU an
 class ProcessLost(GraspdError):
     """A process of the pool ended during an item; a fresh one has replaced it."""
 
-    slug, title = "process-lost", "A process beside the worker ended in the middle of its work"
+    slug, title = "process-lost", "A process of the pool ended during its work"
 
 
 @dataclass(eq=False)
@@ -118,7 +118,7 @@ class Pool(AbstractContextManager["Pool"]):
             while True:
                 _, left = wait(futures, _LOOK_S, FIRST_EXCEPTION)
                 if self._closed or (left and cancelled()):
-                    raise TaskCancelled("stopped while other processes worked for it")
+                    raise TaskCancelled("stopped during work in the process pool")
                 for future in futures:
                     if future.done() and (error := future.exception()) is not None:
                         raise error
@@ -178,14 +178,12 @@ class _Place:
             self._connection.send_bytes(pickle.dumps(self._order(request, part)))
             while not self._connection.poll(_LOOK_S):
                 if (since := request.dropped_at) is not None and time.monotonic() - since > _PATIENCE_S:
-                    log.warning("a process does not end what was given up; it is killed")
+                    log.warning("a process does not end an abandoned item; it is killed")
                     self._stop()
                     raise TaskCancelled("stopped")
             succeeded, made = pickle.loads(self._connection.recv_bytes())
         except (EOFError, OSError) as error:
-            raise ProcessLost(
-                f"a process beside the worker ended in the middle of its work ({self._stop()})"
-            ) from error
+            raise ProcessLost(f"a process of the pool ended during its work ({self._stop()})") from error
         if not succeeded:
             raise made
         return made

@@ -1,7 +1,7 @@
 """Engine of a worker: the process that owns the device and runs tasks one by one.
 
 Its worker (`worker.process.main`) sends pairs of a word and its argument over a pipe, after the `Setup`. Orders are
-`service` (does the store belong to it?), `check` (answer: `ready`), `task` (`done`, then `idle`), `end`; the answer may
+`service` (compares store and Redis), `check` (answer: `ready`), `task` (`done`, then `idle`) and `end`. An answer may
 be an error, `refused`. `stop` with a reason is accepted at any time. The engine also sends `facts` for the list of
 workers (including progress) and `event`. It does not access Redis.
 """
@@ -107,8 +107,8 @@ class Engine:
         device.find_out(lambda: self.update(device=device.resolve(), device_name=device.name))
 
     def _admitted(self) -> bool:
-        """Check the engine before the first task; a patient one waits in quarantine until it passes."""
-        # The most expensive part only: other stages load with their first task, and are checked after failures.
+        """Check the engine before the first task; with `Setup.patient`, wait in quarantine until it passes."""
+        # Only the most expensive stage: others load with their first task, and are checked after failures.
         stages = self._setup.stages
         first = (Stage.SYNTHESIZE,) if Stage.SYNTHESIZE in stages else stages
         fit = self._fitness.try_engine(first) or (self._setup.patient and self._sit_out(first))
@@ -141,7 +141,7 @@ class Engine:
         if self._fitness.reason and self._reason is None and not self._sit_out(self._setup.stages):
             return "fit" if self._reason is StopReason.SHUTDOWN else "unfit"
         if why := self._surroundings.outgrown():
-            log.info("this worker ends for a fresh one to start: %s", why)
+            log.info("this worker ends, so that a fresh one starts: %s", why)
             return "outgrown"
         return "fit"
 
@@ -150,7 +150,7 @@ class Engine:
             try:
                 word, about = self._connection.recv()
             except (EOFError, OSError, TypeError):
-                # Nobody waits for the current task. TypeError: closed by the other thread between two reads.
+                # The worker is gone, so the task can stop. TypeError: closed by the other thread between two reads.
                 word, about = "end", StopReason.LEASE_LOST
             with self._changing:
                 if word in ("stop", "end"):
@@ -170,7 +170,7 @@ class Engine:
 
 
 class TaskResources:
-    """Resources of a task besides its message; a worker that grew too large, by leaks, is replaced."""
+    """Resources of a task besides its message; a worker that grew too large (leaks) is replaced."""
 
     def __init__(self, settings: Settings, store: Store, device: Device) -> None:
         self.settings = settings
@@ -181,7 +181,7 @@ class TaskResources:
     def outgrown(self) -> str:
         beside = sum(resident_mb(pid) for pid in pool.pids) if (pool := vars(self).get("_pool")) is not None else 0.0
         if (held := resident_mb() + beside) > self._memory_mb:
-            return f"it holds {held:.0f} MiB, over {self._memory_mb:.0f} (GRASPD_WORKER_MAX_MEMORY_MB)"
+            return f"it uses {held:.0f} MiB, more than {self._memory_mb:.0f} (GRASPD_WORKER_MAX_MEMORY_MB)"
         return ""
 
     @cached_property

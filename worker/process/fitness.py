@@ -41,7 +41,7 @@ _OF_THE_TASK: Final = (InputError, TaskRefused, DamagedError)
 
 def first_loss(task: str) -> bool:
     """Check whether this is the first loss of a GPU or pool process over a task on this machine.
-    It does not count against the task; later ones do, or a task that causes each loss would loop forever."""
+    The first loss is no failed attempt of the task. Later losses are, so that a task that causes them ends."""
     file = user_cache.folder("gpus") / f"{hashlib.sha256(task.encode()).hexdigest()[:32]}.lost"
     if user_cache.load(file) is not None:
         return False
@@ -87,7 +87,7 @@ class Fitness:
         return self.reason
 
     def sit_out(self, stages: Collection[Stage], update: Callable[..., None], told_to_stop: Callable[[], bool]) -> bool:
-        """Wait in quarantine and tell `update` so; return whether the worker is fit again, or False if it must stop."""
+        """Wait in quarantine, reported by `update`; return True once the worker is fit, False if it must stop."""
         log.warning("this worker takes no tasks: %s", self.reason)
         for pause in PAUSES_S:
             update(state="quarantined", reason=self.reason)

@@ -66,7 +66,7 @@ class Heartbeat:
             left = Event(kind=EventKind.LEFT, at=timestamp(), worker=self._facts["name"])
             unlist_worker(self._connection, left)
         except (RedisError, OSError) as error:
-            log.warning("Redis was away when the worker left: %s", error)
+            log.warning("Redis was unavailable when the worker ended: %s", error)
         self._connection.close()
 
     def _run(self) -> None:

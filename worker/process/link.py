@@ -71,7 +71,7 @@ class Link:
         self._connection.close()
 
     def _end(self) -> str:
-        return "its thread broke off" if self._process is None else end_child(self._process, _END_S)
+        return "its thread ended" if self._process is None else end_child(self._process, _END_S)
 
 
 StartEngine = Callable[[Setup], Link]

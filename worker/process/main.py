@@ -148,7 +148,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         try:
             self._queue.publish(event)
         except QueueUnavailable as error:
-            log.warning("what became of task %s is for the controller to find: %s", event.task_id, error)
+            log.warning("the outcome of task %s could not be sent: %s", event.task_id, error)
 
     def _keep_lease(self, job: Any) -> None:
         """Renew the lease of the current task, and stop the task if it is cancelled."""
@@ -170,7 +170,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
     def _give_back(self, job: Any) -> None:
         """Remove the task from Redis; waits while Redis refuses writes because its disk is full."""
         if not job.exists(job.id, self.connection):
-            log.info("task %s was taken from this worker meanwhile: it was slow", job.id.rpartition("-")[0])
+            log.info("task %s was taken from this worker, which was too slow", job.id.rpartition("-")[0])
         execution, told = self.execution, False
         while True:
             try:
@@ -182,7 +182,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
                 return
             except ResponseError as error:
                 if not told:
-                    log.warning("Redis takes no writes, and the end of a task waits for it: %s", error)
+                    log.warning("Redis refuses writes; the removal of a finished task waits: %s", error)
                 told = True
                 if self.told_to_stop:
                     return

@@ -78,7 +78,7 @@ class Runner:
         try:
             if lacking := own_ability().lacks(need_of(message)):
                 # For another worker: the controller reports tasks that no present worker can do.
-                return self._event(EventKind.DEFERRED, message, message=f"another version of worker does it: {lacking}")
+                return self._event(EventKind.DEFERRED, message, message=f"this worker cannot run it: {lacking}")
             return self._do(message, context)
         except TaskCancelled:
             return self._stopped(message, context, started)
@@ -90,10 +90,10 @@ class Runner:
                     EventKind.DEFERRED, message, message=f"{os.strerror(errno.ENOSPC)}: {_one_line(error)}"
                 )
             if (why := self._loss(error, context)) and first_loss(message.task_id):
-                log.error("the task is handed back: %s", why, exc_info=True)
+                log.error("the task is returned to the queue: %s", why, exc_info=True)
                 return self._event(EventKind.RETURNED, message, message=why)
             if not why and self._fitness is not None and (why := self._fitness.doubt(message, error)):
-                log.warning("the task is handed back; it failed because of this worker", exc_info=True)
+                log.warning("the task is returned to the queue; it failed because of this worker", exc_info=True)
                 return self._event(EventKind.RETURNED, message, message=why)
             return self._failed(message, error, context, started)
         finally:
@@ -119,8 +119,8 @@ class Runner:
             )
             if lost is not None and manifest.sha256 != lost.sha256:
                 raise DamagedShard(
-                    f"{lost.key} was made again and is not what it was: made on {lost.device} by graspd "
-                    f"{lost.code_version}, again on {context.device}; put a copy in its place"
+                    f"{lost.key} was made again with another content: first on {lost.device} by graspd "
+                    f"{lost.code_version}, now on {context.device}; restore a copy"
                 )
             publish_shard(context.store, manifest, data)
         if self._fitness is not None:
@@ -201,7 +201,7 @@ def parse_message(raw: Mapping[str, Any]) -> Message:
         known = {field.alias or name for name, field in model.model_fields.items()}
         return model.model_validate({key: value for key, value in renamed(dict(raw)).items() if key in known})
     except (ValidationError, AttributeError) as error:
-        raise TaskRefused(f"the queue holds something that is no task of graspd: {_one_line(error)}") from None
+        raise TaskRefused(f"an entry of the queue is no task of graspd: {_one_line(error)}") from None
 
 
 def _subjects(message: Message) -> dict[str, Any]:

@@ -32,7 +32,7 @@ HAND_POINTS: Final = 2000
 OBJECT_POINTS: Final = 3000
 #: Seed of a held-out sample: metrics must not be measured at the points of the optimisation.
 SEED: Final = 7919
-#: Larger distances count as this [m].
+#: Distances are capped at this [m].
 REACH_M: Final = 0.012
 #: Cells along the longest side of the grid by which points beyond reach are found.
 COARSE_CELLS: Final = 32

@@ -52,7 +52,7 @@ from graspd.worker.quality.wrench_space import measure_spaces, wrenches
 
 Columns = dict[str, NDArray[np.generic]]
 
-#: Contact thresholds [m]: the literature's tight one, the paper's (Table 2), and DDGC's.
+#: Contact thresholds [m]: a tight one from the literature, that of the paper (Table 2), and that of DDGC.
 DEFAULT_THRESHOLDS_M: Final = (0.002, 0.005, 0.009)
 DEFAULT_FRICTION: Final = 1.0
 #: Grasps per thread at a time: few enough for a quick cancellation, enough to fill a kernel launch.

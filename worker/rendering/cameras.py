@@ -72,7 +72,7 @@ def narrow_field(k: Floats, width: int, height: int) -> float:
     if min(slopes) <= 0:
         raise InputError(
             f"the principal point ({k[0, 2]:g}, {k[1, 2]:g}) lies outside the picture of {width} x {height} px, so no "
-            f"camera can be aimed; give the cameras' places too"
+            f"camera can be aimed; give the cameras' poses too"
         )
     return float(2 * np.arctan(min(slopes)))
 
@@ -209,7 +209,7 @@ def _place(path: Path, number: int, camera: _Camera) -> Floats:
     if camera.extrinsics is None:
         eye, target = np.array(camera.eye, float), np.array(camera.target, float)
         if np.linalg.norm(target - eye) < 1e-9:
-            raise InputError(f"{path}: camera {number} stands on its target")
+            raise InputError(f"{path}: camera {number} has its eye at its target")
         return look_at(eye, target)
     e = np.asarray(camera.extrinsics, float)
     u, _, v = np.linalg.svd(e[:3, :3])

@@ -37,9 +37,9 @@ def export_images(views: Shard, folder: Path, *, depth: DepthFormat = "exr") -> 
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{folder} cannot be made: {error.strerror}; give another folder as --output") from None
+        raise InputError(f"{folder} cannot be created: {error.strerror}; give another folder as --output") from None
     if any(folder.glob("view_*.json")):
-        raise InputError(f"{folder} holds exported views already; give another folder as --output")
+        raise InputError(f"{folder} contains exported views already; give another folder as --output")
     written = [_json(folder / "labels.json", _labels(views))]
     for view in range(len(views["camera/eye"])):
         written += _one(views, view, folder, depth)

@@ -31,7 +31,7 @@ _NEAR_M: Final = 0.14
 _TOGETHER: Final = 16  # grasps traced together: bounds the memory
 
 _FILL: Final = 0.86  # share of the picture's width or height that hand and object take up
-#: Left of the camera, above it, in front of the object: camera looks along -x of the turned world.
+#: Direction of the lamp: left of the camera, above it, in front of the object. The camera looks along -x.
 TOWARD_LAMP: Final = np.array([0.45, -0.45, 0.77]) / np.linalg.norm([0.45, -0.45, 0.77])
 FLOOR_SIZE: Final = (6.0, 6.0, 0.02)
 FLOOR: Final = Appearance((1.0, 1.0, 1.0), pattern=CATCHER)

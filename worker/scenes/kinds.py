@@ -105,7 +105,7 @@ def inside(obj: ObjectModel, pose: Floats, size: tuple[float, float], rng: np.ra
     if (high - low > 2 * room).any():
         need, have = 1e3 * (high - low), 1e3 * 2 * room
         raise SceneError(
-            f"{obj.name} lies {need[0]:.0f} x {need[1]:.0f} mm and there is room for {have[0]:.0f} x {have[1]:.0f} mm "
+            f"{obj.name} needs {need[0]:.0f} x {need[1]:.0f} mm and there is room for {have[0]:.0f} x {have[1]:.0f} mm "
             "between the walls; choose scene table, or a file with larger supports"
         )
     return np.concatenate([rng.uniform(-room - low, room - high), pose[2:]])
@@ -119,6 +119,5 @@ def check_free(obj: ObjectModel, poses: Floats, supports: tuple[Obstacle, ...]) 
             depth = -float(support.distance(corners).min())
             if depth > SUNK:
                 raise SceneError(
-                    f"{obj.name} stands {1e3 * depth:.1f} mm deep in support {number} of its scene; move it or the "
-                    "support"
+                    f"{obj.name} is {1e3 * depth:.1f} mm deep in support {number} of its scene; move it or the support"
                 )

@@ -73,7 +73,7 @@ class RestingFaces:
         return self.looseness(face)[1] > CHANGE_M
 
     def rolls(self, face: int) -> bool:
-        """Check whether such a change may turn the object by more than `ROLLS`: its surface is round there."""
+        """Check whether a change of the surface by `CHANGE_M` may turn the object by more than `ROLLS`."""
         return self.looseness(face)[0] > ROLLS
 
 
@@ -89,8 +89,8 @@ def rolling_note(rolling: int, scenes: int) -> str | None:
     if not rolling:
         return None
     return (
-        f"in {rolling} of {scenes} scenes the object lies on a round side: {1e3 * CHANGE_M:.0f} mm of change of its "
-        f"surface may roll it by more than {np.degrees(ROLLS):.0f} degrees"
+        f"in {rolling} of {scenes} scenes the object lies on a round side: a change of its surface by "
+        f"{1e3 * CHANGE_M:.0f} mm may roll it by more than {np.degrees(ROLLS):.0f} degrees"
     )
 
 

@@ -20,7 +20,7 @@ from graspd.worker.hands.surface import farthest_points
 from graspd.worker.simulation.environment import CLEAR_M, Environment
 from graspd.worker.simulation.obstacles import MARGIN_M, obstacle_room
 
-#: Points of a mounting: the outermost in so many directions, then so many corners spread over it.
+#: Numbers of points of a mounting: outermost ones in that many directions, then corners spread over it.
 OUTERMOST: Final = 20
 SPREAD: Final = 40
 TRIES: Final = 4  # wrist positions of a hand whose exact clearances are computed
@@ -35,8 +35,8 @@ def mounting_room(
     the first. The search ends at a clearance of `CLEAR_M`.
 
     Returns:
-        (N, K) wrist angles: the first of `wrist_positions` with enough clearance, among those whose points have it,
-        else the one whose points have the most; and (N,) least clearance of the mounting from obstacles at all poses
+        (N, K) wrist angles: the first of `wrist_positions` with enough clearance of points and mounting, else those
+        with the largest clearance of points; and (N,) least clearance of the mounting from obstacles at all poses
         [m]. Without a mounting K is 0 and the clearance inf.
     """
     mounting, count = hand.mounting, len(poses)
@@ -55,8 +55,8 @@ def mounting_lack(
     room: float = 0.0,
     exact: bool = True,
 ) -> Floats:
-    """Return the mountings' lack (N,) of the planners' clearance plus `room` at root poses (N, 7) [m].
-    It is at least 0, at the best wrist angles. It is that of the points; `exact`: or of the mounting itself."""
+    """Return the clearance (N,) missing at mountings for `MARGIN_M` + `room` [m], at root poses (N, 7).
+    It is at least 0, at the best wrist angles. `exact`: check the mounting itself, not only its points."""
     mounting, wanted = hand.mounting, MARGIN_M + room
     if mounting is None or not len(poses):
         return np.zeros(len(poses))
@@ -95,7 +95,7 @@ def _solved(
 
 def point_room(mounting: HandModel, poses: Floats, scenes: Sequence[Environment], which: NDArray[np.intp]) -> Floats:
     """Return the least clearance (N, W) of a mounting's points over root poses (N, P, 7) [m].
-    W wrist positions; scenes `which` (N,). At least the mounting's own, except near edges and corners of solids."""
+    W wrist positions; scenes `which` (N,). The mounting itself has no more, except near edges and corners of solids."""
     points = points_of(mounting)
     out = np.full((len(poses), len(points)), np.inf)
     for scene in np.unique(which):

@@ -55,7 +55,7 @@ class PosedFeatures:
 
 
 def _solid_distances(hand: HandModel, postures: Posture, scene: Environment) -> Floats:
-    """(P, L) as `body_room` without what fingertips may, in float32: coordinates of 0.3 m are known to 3e-8."""
+    """Return `body_room` (P, L) without the tolerance of fingertips, in float32 (3e-8 at 0.3 m)."""
     bodies = body_poses(hand, postures.hand_pose, postures.joint_positions)
     device = _device_hand(hand)
     obstacles = DeviceObstacles.create(hand, [scene], np.zeros(3), "cpu")
@@ -84,13 +84,12 @@ def _device_hand(hand: HandModel) -> DeviceHand:
 def body_room(
     hand: HandModel, postures: Posture, scenes: Sequence[Environment], which: NDArray[np.integer[Any]] | None = None
 ) -> Floats:
-    """(P, L) signed distance of each of the hand's bodies from the nearest obstacle [m], in the scene `which` (P,) of
-    each posture or else in the first; inf where there is none.
+    """Return signed distances (P, L) of the hand's bodies from the nearest obstacle [m]; inf: no obstacle.
 
-    Fingertips count as farther from supports that they may come near: by what makes `CLEAR_M` of the distance that they
-    are to keep. So a hand is clear where nothing of it is below `CLEAR_M`. Against half-spaces the distance is exact,
-    and against solids that the hand is apart from, but for links that are hulls near an edge or a corner: there it is a
-    lower bound. Farther than `FAR_M` from a solid counts as that.
+    Posture i is in the scene `which[i]`, by default in the first one. Fingertips may be closer to some supports than
+    `CLEAR_M`. Their distance from such a support is increased by the difference, so a hand is clear if no distance is
+    below `CLEAR_M`. Distances are exact from half-spaces, and from solids that the hand does not penetrate. Near edges
+    and corners of solids, distances of links with hulls are lower bounds. Distances from solids are at most `FAR_M`.
     """
     which = np.zeros(len(postures), np.int32) if which is None else np.asarray(which, np.int32)
     out = _half_space_room(hand, postures, scenes, which)

@@ -28,7 +28,7 @@ class ProjectionOptions:
 
     near: float = 2e-4  # hand points closer to the object than this are moved ...
     target: float = 3.5e-4  # ... to this distance
-    hold: float = 2e-3  # points closer than this are contacts, drawn to `hold_target` with weight `hold_weight`
+    hold: float = 2e-3  # points closer than this are contacts, moved to `hold_target` with weight `hold_weight`
     hold_target: float = 5e-4
     hold_weight: float = 0.02
     sample_near: float = 2.5e-4  # object samples closer to a link than this are moved to `target`

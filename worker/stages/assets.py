@@ -66,7 +66,7 @@ def object_of(store: Store, message: TaskMessage) -> ObjectModel:
     def load() -> ObjectModel:
         obj = prepared_object(store, digest, name=name, face_error_m=error)
         if not store.exists(names.asset_model(AssetKind.OBJECT, digest)):
-            # The same model for any fidelity that comes first.
+            # The model is the same, whichever fidelity comes first.
             shown = prepared_object(store, digest, name=name, face_error_m=SHOWN_ERROR_M)
             publish_model(store, AssetKind.OBJECT, shown)
         return as_asked(obj, request)

@@ -45,7 +45,7 @@ OF_OPENING: Final = 0.55
 OF_REACH: Final = 0.5
 WIDTH_M: Final = (0.012, 0.08)
 STRONG_N: Final = 1000.0  # sum of normal forces of a second squeeze, for the payload: actuators reach their limits [N]
-#: Servos that go from zero to their limit within less fingertip motion than this press by chance [m].
+#: A servo that goes from zero to its limit within less fingertip motion presses with arbitrary force [m].
 SOFT_M: Final = 0.0015
 log = logging.getLogger(__name__)
 
@@ -82,7 +82,7 @@ class SelfTest:
         if self.gsr >= READY and self.table >= TABLE_READY:
             return f"ready: {share}, {lifts}"
         if self.gsr >= READY:
-            return f"suspicious: {share}, but {lifts}: look at closing, pre-shape and palm"
+            return f"suspicious: {share}, but {lifts}: check closing, pre-shape and palm"
         worst = min(self.by_object, key=lambda name: self.by_object[name])
         weak = f"{100 * self.by_object[worst]:.0f} % of a {worst}; {self._weakness()}"
         if self.table >= TABLE_READY:
@@ -92,11 +92,11 @@ class SelfTest:
     def _weakness(self) -> str:
         """Return the likely reason why free grasps do not hold."""
         if self.lost > 0.5:
-            return "most are lost while it closes: look at palm, closing and pads"
+            return "most objects are lost while the hand closes: check palm, closing and pads"
         if self.give_m < SOFT_M:
-            give = f"{1e3 * self.give_m:.1f} mm of a fingertip's way"
+            give = f"{1e3 * self.give_m:.1f} mm of fingertip motion"
             return f"its servos reach their limits within {give}: give less stiffness in asset.json"
-        return "most slip when pushed: look at effort, stiffness and pads"
+        return "most objects slip when pushed: check effort, stiffness and pads"
 
     def facts(self) -> dict[str, Any]:
         limit = self.limit and self.limit.facts()

@@ -106,7 +106,7 @@ def check_in_child(
             code = _wait(child, context)
         complaint = errors.read_bytes()[-4000:].decode(errors="replace")
         if target.is_file() and target.stat().st_size > _FINDING_BYTES:
-            why = f"the check finds more to say than {_FINDING_BYTES >> 20} MiB; simplify it, or shorten its names"
+            why = f"the result of the check exceeds {_FINDING_BYTES >> 20} MiB; simplify it, or shorten its names"
             return _refused(kind, name, why), b""
         if target.is_file():
             # A complete result counts even if the model after it failed; a truncated one does not parse.
@@ -146,7 +146,7 @@ def _refusal(kind: AssetKind, name: str, code: int, complaint: str, memory_bytes
         why = f"reading it needs more than {memory_bytes / 2**30:.3g} GiB of memory; simplify it"
     else:
         last = complaint.strip().splitlines()[-1:] or [f"exit code {code}"]
-        why = f"reading it ended the checker ({last[0][:200]}); repair or re-export the file"
+        why = f"reading it crashed the checker ({last[0][:200]}); repair or re-export the file"
     return _refused(kind, name, why)
 
 

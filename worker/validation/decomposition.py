@@ -134,7 +134,9 @@ def _make(obj: ObjectModel) -> tuple[Floats, ...]:
         try:
             made = coacd_parts(obj.vertices, obj.faces, {"threshold": threshold, **_COACD}, CPU_S)
         except WorkLimitExceeded as error:
-            log.warning("%s: finer pieces than %d need %s; these stand", obj.name or "an object", len(best), error)
+            log.warning(
+                "%s: more than %d pieces need %s; the coarser ones are used", obj.name or "an object", len(best), error
+            )
             break
         parts = tuple(part for part in made if _solid(part))
         found = _excess(union_volume(parts), obj)

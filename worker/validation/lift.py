@@ -194,8 +194,8 @@ class Lift(Test):
     def _yielded(self) -> tuple[Floats, Floats] | None:
         """Return the root's position (3,) and its rotation (4,) relative to the command.
         None: the root is fixed, or the object is not in the hand.
-        The protocol's weld yields by 10 degrees under a hammer, unlike an arm. An object that only follows this
-        deviation has not moved in the hand."""
+        The protocol's weld yields by 10 degrees under the weight of a hammer, unlike an arm. An object that only
+        follows this deviation has not moved in the hand."""
         at = self.scene.root_qpos
         if at < 0 or not self._in_hand:
             return None

@@ -106,7 +106,7 @@ def robust(
     Args:
         held: (N,) verdicts of the nominal model; only grasps with 1 are tested. By default all.
         placed: their scenes, for the lift test; None: six pushes.
-        wanted: share of them; the validation of a grasp ends once the share is decided. 0: all are validated.
+        wanted: share of models in which a grasp must hold; its validation ends once that is decided. 0: validate all.
         seed: of the models, with the grasp's own numbers.
         hard: at the hard protocol's friction.
         pieces: convex pieces of the object; by default its CoACD pieces.
@@ -182,7 +182,7 @@ def robustness(
     """Return the share (N,) of `repeats` in which a grasp holds with noise on the object's pose; nan: not tested.
     The object is moved by `NOISE_M` in a random direction and turned by `NOISE_RAD` about a random axis through its
     centre of mass; a grasp's noise follows from `seed`, the repeat and its place in the set. Only grasps with `held`
-    (N,) 1 are tested, by default all, at level fast: it suffices, for a share is not a success rate."""
+    (N,) 1 are tested, by default all. Level fast is used, which suffices for a share."""
     out = np.full(len(grasps), np.nan)
     tried = np.arange(len(grasps)) if held is None else np.flatnonzero(np.asarray(held) == 1)
     if not len(tried) or repeats < 1:

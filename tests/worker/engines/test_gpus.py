@@ -62,7 +62,7 @@ def test_without_a_place_for_locks_it_is_the_first(tmp_path: Path, caplog: pytes
     (tmp_path / "file").write_text("")
     with caplog.at_level(logging.WARNING):
         assert take(FOUR, tmp_path / "file" / "gpus").name == "cuda:0"
-    assert "not told apart" in caplog.text
+    assert "processes per GPU are not counted" in caplog.text
 
 
 def test_a_number_decides_and_without_a_gpu_auto_is_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:

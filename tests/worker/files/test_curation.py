@@ -75,7 +75,7 @@ def test_a_subset_of_nothing_or_over_a_folder_is_refused(folder: Path, tmp_path:
     nothing = run("grasps", "where", "epsilon > 1e6", "--from", folder, "-o", out)
     assert nothing.exit_code == 2 and "none of 120 grasps" in nothing.stderr and not out.exists()
     again = run("grasps", "where", "valid", "--from", folder, "-o", folder)
-    assert again.exit_code == 2 and "is there already" in again.stderr
+    assert again.exit_code == 2 and "exists already" in again.stderr
 
 
 def test_no_kind_is_more_frequent_than_the_median_one(folder: Path, tmp_path: Path) -> None:
@@ -135,10 +135,10 @@ def test_valid_grasps_are_taken_unless_others_are_asked_for() -> None:
 @pytest.mark.parametrize(
     "base, wish, fix",
     [
-        (UNVALIDATED, {}, "take them with --unvalidated"),
+        (UNVALIDATED, {}, "select them with --unvalidated"),
         (VALIDATED, {"unvalidated": True}, "leave out --unvalidated"),
-        (base_of([0], [1], [0]), {}, "take them with --all"),
-        (base_of([], [], []), {"every": True}, "no grasp at all"),
+        (base_of([0], [1], [0]), {}, "select them with --all"),
+        (base_of([], [], []), {"every": True}, "it has no grasps"),
         (VALIDATED, {"unvalidated": True, "every": True}, "exclude each other"),
     ],
 )
@@ -176,7 +176,7 @@ def test_what_cannot_be_written_is_told_in_a_line(boxes: Path, tmp_path: Path) -
     (tmp_path / "none").mkdir()
     (tmp_path / "none" / "base.h5").write_bytes((boxes / "base.h5").read_bytes())
     for source, out, words in (
-        (boxes, tmp_path / "full", "is there already"),
+        (boxes, tmp_path / "full", "exists already"),
         (tmp_path / "none", tmp_path / "new", "has no pictures"),
         (tmp_path / "away", tmp_path / "new", "does not exist"),
     ):

@@ -160,23 +160,23 @@ _CORD = '<tendon><spatial name="cord"><site site="a"/><site site="b"/></spatial>
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
-        ({_THUMB: '<muscle name="pull" joint="thumb"/>'}, "pull passed over: only motors"),
-        ({_THUMB: '<adhesion body="thumb" ctrlrange="0 1"/>'}, "adhesion passed over"),
-        ({"<equality>": '<equality><weld name="glue" body1="thumb" body2="base"/>'}, "glue passed over: what it holds"),
+        ({_THUMB: '<muscle name="pull" joint="thumb"/>'}, "pull ignored: only motors"),
+        ({_THUMB: '<adhesion body="thumb" ctrlrange="0 1"/>'}, "adhesion ignored"),
+        ({"<equality>": '<equality><weld name="glue" body1="thumb" body2="base"/>'}, "glue ignored: the bodies"),
         (
             {
                 '<body name="thumb" pos="-0.02 0 0.01">': _SITES,
                 "<actuator>": _CORD,
                 _THUMB: '<motor name="pull" tendon="cord"/>',
             },
-            "pull on spatial tendons, which are passed over",
+            "pull on spatial tendons, which are ignored",
         ),
     ],
 )
 def test_drives_and_constraints_that_are_passed_over_are_told(changes: dict[str, str], told: str) -> None:
     found = check_hand({"h.xml": changed(FOUR_BAR, changes)}, "h")
     assert found["verdict"] == "accept" and any(told in note for note in found["facts"]["notes"])
-    assert not any("passed over" in note for note in check_hand({"h.xml": FOUR_BAR.encode()}, "h")["facts"]["notes"])
+    assert not any("ignored" in note for note in check_hand({"h.xml": FOUR_BAR.encode()}, "h")["facts"]["notes"])
 
 
 _WRIST = '<joint name="wrist" axis="0 1 0" range="-30 30"/>'
@@ -204,7 +204,7 @@ def test_what_a_model_has_beside_its_hand_does_not_matter(model: dict[str, str],
 
 def test_models_and_loops_are_passed_over_told_or_coupled() -> None:
     found = check_hand({"h.xml": changed(PLAIN_CLAW, {'euler="10 20 30">': 'euler="10 20 30"><freejoint/>'})}, "h")
-    assert "'mount' is free to float, and taken as fixed" in found["facts"]["notes"]
+    assert "'mount' has a free joint, which is replaced by a fixed one" in found["facts"]["notes"]
     again = '<equality><joint joint1="left_spread" joint2="right_curl" polycoef="0.2 -2 0 0 0"/>'
     found = check_hand({"h.xml": changed(PLAIN_CLAW, {"<equality>": again})}, "h")
     assert found["verdict"] == "accept", found["message"]
@@ -250,7 +250,7 @@ _FREE = '<link name="ball"/><joint name="loose" type="floating"><parent link="ba
         (jaws(), {"preshape": {"jll": 0}}, "'jll' is no joint of the hand (jl); did you mean jl?"),
         (jaws(), {"root": "left"}, "nothing below 'left' moves"),
         (WITHOUT_MIMIC, coupled(-1), "joint 'jr' may only go 0 .. 0.04, but follows 'jl' with -1"),
-        (WITHOUT_MIMIC.replace(b'"1 0 0"', b'"-1 0 0"'), coupled(2), "limits of what follows jl leave it 0 .. 0.02"),
+        (WITHOUT_MIMIC.replace(b'"1 0 0"', b'"-1 0 0"'), coupled(2), "joints that follow jl limit it to 0 .. 0.02"),
         (jaws().replace(b'"-1"', b'"-1000"'), {}, "with -1000 and offset 0, which moves it by 40 m"),
         (jaws(EMPTY, EMPTY), {}, "joint 'jl' has limits 0 .. 0: the exporter left them empty"),
         (

@@ -170,7 +170,7 @@ def test_fingers_that_meet_at_zero_close_to_it_unless_stated() -> None:
 def test_a_tie_is_told_and_one_that_is_settled_is_not() -> None:
     # Fingers that lie in the plane in which they begin, half closed: nothing tells its upper side.
     flat = claw(3, TURNS["upright"], lower=-np.pi)
-    told = "the palm may face either way along its axis, a tie: say which with --approach"
+    told = "the palm may face either way along its axis: state its direction with --approach"
     lying = flat.replace(b'lower="-3.141592653589793" upper="1.4"', b'lower="1.0707963" upper="2.0707963"').replace(
         b'multiplier="0.7"', b'multiplier="0"'
     )

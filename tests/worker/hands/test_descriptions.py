@@ -204,7 +204,7 @@ def test_a_urdf_is_read_as_programs_write_it(written: str) -> None:
 @pytest.mark.parametrize(
     ("data", "told"),
     [
-        (b" \r\n", "h.urdf holds nothing but spaces"),
+        (b" \r\n", "h.urdf contains nothing but spaces"),
         (claw().replace('name="test"', 'name="test" name="b"').encode(), "duplicate attribute"),
         (b"<sdf/>", "the XML root is <sdf>, a URDF begins with <robot>"),
         (b'<!DOCTYPE robot [<!ENTITY a "b">]><robot name="&a;"/>'.decode().encode("utf-16"), "entities are refused"),

@@ -49,7 +49,7 @@ def test_expand_and_reduce_are_inverse() -> None:
 def test_couplings_bound_what_they_follow_and_must_leave_it_room() -> None:
     hand = load(chain(*THREE), couplings={"j3": {"of": "j2", "multiplier": 3.0}})
     assert hand.upper[hand.dof_names.index("j2")] == pytest.approx(0.5)
-    with pytest.raises(HandError, match="no room"):
+    with pytest.raises(HandError, match="no range"):
         load(chain(*THREE), couplings={"j3": {"of": "j2", "multiplier": 1.0, "offset": 5.0}})
 
 
@@ -264,7 +264,7 @@ def test_bad_shapes_above_a_hand_are_told_and_do_not_refuse_it() -> None:
     hand = load(lost)
     assert hand.mounting is None and hand.dofs == 2
     report = check_hand({"r.urdf": lost}, "r")
-    (note,) = (note for note in report["facts"]["notes"] if "no obstacle in scenes" in note)
-    assert "what stands above 'hub'" in note and "lost.stl" in note
+    (note,) = (note for note in report["facts"]["notes"] if "no obstacles in scenes" in note)
+    assert "links above 'hub'" in note and "lost.stl" in note
     assert report["verdict"] == "accept" and note in report["message"]
-    assert "no obstacle in scenes" not in check_hand({"r.urdf": with_wrist()}, "r")["message"]
+    assert "no obstacles in scenes" not in check_hand({"r.urdf": with_wrist()}, "r")["message"]

@@ -185,7 +185,7 @@ def test_what_differs_from_expansion_to_expansion_is_refused(
 ) -> None:
     main = "urdf/claw.urdf.xacro"
     text = CLAW.replace("<robot", f'<robot note="${{{value}}}"', 1).encode()
-    with pytest.raises(HandError, match="another one each time"):
+    with pytest.raises(HandError, match="a new address each time"):
         expand({**FILES, main: text}, main, {})
     monkeypatch.chdir(tmp_path)
     text = CLAW.replace("<robot", '<robot note="$(cwd)"', 1).encode()

@@ -293,7 +293,7 @@ BOMB = (
         (b"<svg/>", "<COLLADA>"),
         (dae(SCENE.replace("<library_nodes>", f"<library_nodes>{BOMB}").replace("#part", "#n0")), "too deep"),
         (dae(SCENE.replace('<node id="part">', '<node id="part"><instance_node url="#part"/>')), "cyclic"),
-        (dae(SCENE.replace('url="#g"', 'url="other.dae#g"')), "not there"),
+        (dae(SCENE.replace('url="#g"', 'url="other.dae#g"')), "is missing"),
         (dae(SCENE.replace('meter="0.001"', 'meter="0"')), "unit"),
         (dae(SCENE.replace("<vcount>4</vcount>", "<vcount>400000000</vcount>")), "corners"),
         (dae(SCENE.replace("<p>0 1 4 2</p>", "<p>0 1 4 9</p>")), "outside the 10 vertices"),

@@ -261,7 +261,7 @@ def test_what_is_too_wide_or_too_low_is_told(barrett) -> None:
     assert f"opens to {1e3 * oppositions_of(barrett).widest:.0f} mm" in str(why_narrow(barrett, large, [table]))
     sheet = object_from_mesh(trimesh.creation.box([0.08, 0.08, 0.004]))
     table = Environment((Obstacle.half_space(UP, -0.002),), UP)
-    assert "lies 4 mm high" in str(why_narrow(hand_from_path("allegro"), sheet, [table]))
+    assert "is 4 mm high" in str(why_narrow(hand_from_path("allegro"), sheet, [table]))
 
 
 def test_a_ball_beside_a_pair_keeps_its_distance_from_a_wall() -> None:
@@ -292,5 +292,5 @@ def test_candidate_grasps_none_of_which_is_valid_come_with_the_reason(tmp_path) 
     made = synthesized("allegro", str(sheet), request, place=place, scenes=1)
     found = made.summary()
     assert (found["grasps"], found["valid"], found["reason"]) == (1, 0, None)
-    assert "lies 4 mm high" in found["narrow"]
+    assert "is 4 mm high" in found["narrow"]
     assert _said({"file": "g.h5", **found}).endswith(found["narrow"])

@@ -111,7 +111,7 @@ def test_export_and_pictures_take_grasps_that_nobody_validated_only_when_told(
     else:
         words = ["pictures", unvalidated[0], "-n", "1", "--size", "32", "--device", "cpu", "-o", tmp_path / "out.png"]
     refused = run(*words)
-    assert refused.exit_code == 2 and "take them with --unvalidated" in refused.output
+    assert refused.exit_code == 2 and "select them with --unvalidated" in refused.output
     assert not list(tmp_path.iterdir())
     assert run(*words, "--unvalidated").exit_code == 0
 

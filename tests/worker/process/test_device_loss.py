@@ -66,7 +66,7 @@ def test_a_task_that_takes_down_one_gpu_after_the_other_uses_up_its_attempts() -
 
 def test_a_task_over_which_a_process_beside_the_worker_ended_goes_back_once_and_the_worker_goes_on() -> None:
     def lost(message: TaskMessage, context: TaskContext) -> Any:
-        raise ProcessLost("a process beside the worker ended in the middle of its work (signal 9)")
+        raise ProcessLost("a process of the pool ended during its work (signal 9)")
 
     store, message = open_store("memory://"), message_for()
     event, runner = run(store, message, lost, lambda device: None)

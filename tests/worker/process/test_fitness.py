@@ -165,5 +165,5 @@ def test_an_engine_that_gives_nonsense_does_not_pass(monkeypatch: pytest.MonkeyP
         return found
 
     monkeypatch.setattr(generation, "validated_grasps", nonsense)
-    with pytest.raises(EngineError, match="no number"):
+    with pytest.raises(EngineError, match="not finite"):
         check_engine(lambda: "cpu", (Stage.SYNTHESIZE,))

@@ -421,7 +421,7 @@ def test_a_camera_file_says_the_same_as_the_arrays(tmp_path):
         ('{"fov": 40}', "fov"),
         ('{"cameras": []}', "at least 1"),
         ('{"cameras": [{"eye": [0, 0, 1]}]}', "either extrinsics or eye and target"),
-        ('{"cameras": [{"eye": [0, 0, 1], "target": [0, 0, 1]}]}', "stands on its target"),
+        ('{"cameras": [{"eye": [0, 0, 1], "target": [0, 0, 1]}]}', "has its eye at its target"),
         ('{"cameras": [{"extrinsics": [[2,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}]}', "no rigid motion"),
         ('{"cameras": [{"extrinsics": [[-1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}]}', "no rigid motion"),
         ('{"intrinsics": [[500, 2, 320], [0, 500, 240], [0, 0, 1]]}', "no skew"),

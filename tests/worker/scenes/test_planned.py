@@ -168,7 +168,7 @@ def test_dropped_neighbours_stand_apart_on_the_table() -> None:
     [
         ([(0.03, 0, 0.025)], "cube and cube overlap by 20.0 mm in scene 0"),
         ([(0.1, 0, 0.025), (0.12, 0, 0.025)], "overlap by 30.0 mm"),
-        ([(0.1, 0, 0.0)], "stands 25.0 mm deep in support 0"),
+        ([(0.1, 0, 0.0)], "is 25.0 mm deep in support 0"),
     ],
 )
 def test_things_that_stand_in_one_another_are_refused(places, words: str) -> None:

@@ -264,7 +264,7 @@ def test_all_faces_are_those_that_enough_drops_end_on() -> None:
 
 def test_object_too_large_for_a_bin_is_refused_with_both_sizes() -> None:
     plank = object_from_mesh(trimesh.creation.box((0.5, 0.05, 0.05)), "plank")
-    with pytest.raises(InputError, match=r"plank lies .* mm and there is room for 380 x 280 mm"):
+    with pytest.raises(InputError, match=r"plank needs .* mm and there is room for 380 x 280 mm"):
         rest_poses(SceneSpec(kind="bin"), plank, count=2, seed=0)
 
 

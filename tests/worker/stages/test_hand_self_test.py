@@ -58,10 +58,10 @@ def test_verdict_is_that_of_tables_and_tells_of_weak_free_grasps() -> None:
     held = SelfTest(0.91, 64, 0.04, {"box": 0.9, "sphere": 0.92}, 0.6, 16)
     assert held.line == "ready: 91 % hold, 60 % lift off a table"
     dropped = replace(held, gsr=0.5, by_object={"box": 0.1, "sphere": 0.9})
-    free = "ready for tables: 60 % lift off a table; of free grasps 50 % hold, 10 % of a box; most slip when pushed"
+    free = "ready for tables: 60 % lift off a table; of free grasps 50 % hold, 10 % of a box; most objects slip"
     assert dropped.line.startswith(free)
-    assert "lost while it closes" in replace(dropped, lost=0.8).line
-    assert "within 0.9 mm of a fingertip's way" in replace(dropped, give_m=0.9e-3).line
+    assert "lost while the hand closes" in replace(dropped, lost=0.8).line
+    assert "within 0.9 mm of fingertip motion" in replace(dropped, give_m=0.9e-3).line
     assert replace(held, table=0.55).line.startswith("suspicious: 91 % hold, but 55 % lift off a table")
     assert replace(dropped, table=0.55).line.startswith("suspicious: 50 % hold, 55 % lift off a table, 10 % of a box")
 

@@ -172,7 +172,7 @@ def test_finding_that_is_long_and_check_that_complains_are_told(
         patch.setattr(ingest, "_FINDING_BYTES", 10)
         found, _ = ingest.check_in_child(AssetKind.OBJECT, "t", OBJECT, context)
     assert found["verdict"] == "refuse"
-    assert "finds more to say" in found["message"] and "ended the checker" not in found["message"]
+    assert "the result of the check exceeds" in found["message"] and "crashed the checker" not in found["message"]
     environment = ingest._environment()
     # Python tells each import: more than a pipe holds.
     monkeypatch.setattr(ingest, "_environment", lambda: {**environment, "PYTHONVERBOSE": "1"})

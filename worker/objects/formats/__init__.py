@@ -62,7 +62,7 @@ def read_mesh(filename: str, data: bytes, nearby: Nearby = nothing_nearby) -> So
         # Readers rely on NumPy and json for malformed input: any error there is due to the file.
         kind = suffix[1:].upper()
         word = _NO_NUMBER.search(str(error))
-        what = f"{word[1]!r} is no number" if word else f"a number or word in it is none that {kind} has there"
+        what = f"{word[1]!r} is no number" if word else f"a number or word in it is not valid {kind}"
         raise MeshError(f"{filename}: not a readable {kind} file: {what}; export the mesh again") from None
 
 

@@ -84,7 +84,7 @@ class _Library:
     def named(self, reference: str | None) -> Element:
         found = self._known.get((reference or "").removeprefix("#"))
         if found is None:
-            raise MeshError(f"it names {(reference or 'nothing')[:40]!r}, which is not there; export it as one file")
+            raise MeshError(f"it names {(reference or 'nothing')[:40]!r}, which is missing; export it as one file")
         return found
 
     def primitives(self, geometry: str) -> list[_Primitive]:
@@ -134,7 +134,7 @@ class _Library:
         return self._colours[material]
 
     def _picture(self, effect: Element, sampler: str) -> str:
-        """Return the file of a sampler: it names a surface, and that an image."""
+        """Return the file of a sampler: it names a surface, which names an image."""
         name = sampler
         for _ in range(2):
             param = next((p for p in effect.iter("newparam") if p.get("sid") == name), None)

@@ -101,7 +101,7 @@ def _lines(data: bytes) -> Iterable[bytes]:
     for raw in data.splitlines():
         line = raw.strip()
         if not line.startswith((b"usemtl", b"mtllib")):
-            # A comment may end in a backslash, such as a path, but does not continue.
+            # A comment that ends in a backslash, as a path may, does not continue on the next line.
             line = line.partition(b"#")[0].rstrip()
         line = pending + line
         if line.endswith(b"\\"):

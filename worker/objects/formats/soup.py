@@ -64,7 +64,7 @@ def check_face_count(count: int) -> None:
 
 Ints = NDArray[np.int64]
 
-#: Limit on the sum of squared corner numbers of a file's re-entrant polygons: the triangulator takes up to 2 ns each.
+#: Limit on the sum of squared corner numbers of re-entrant polygons: triangulation takes up to 2 ns per unit of it.
 MAX_SQUARES: Final = 10**9
 #: Least area, relative to the polygon's, of a triangle that counts as against the polygon's winding.
 _AGAINST: Final = 1e-9

@@ -51,8 +51,8 @@ from graspd.worker.simulation.mounting import OUTERMOST, points_of
 from graspd.worker.simulation.obstacles import MARGIN_M
 
 #: Number of surface samples that form pairs, and the least cosine between a pair's line and its normals: inside the
-#: friction cones at half friction. With 0.9, Allegro lifts .39 of six objects at half friction and Shadow .30; with
-#: 0.96, .42 and .39.
+#: friction cones at half friction. At half friction, with a cosine of 0.9 Allegro lifts .39 of
+#: grasps on six objects and Shadow .30; with 0.96 Allegro lifts .42 and Shadow .39.
 SAMPLES: Final = 500
 ACROSS: Final = 0.96
 #: Least distance of the two points [m].
@@ -60,8 +60,8 @@ THINNEST_M: Final = 0.002
 #: Clearance between pad and object, on each side [m].
 ROOM_M: Final = (0.003, 0.015)
 #: At this horizontal distance from the centre of mass [m] the probability of a pair falls by a factor of e. It is at
-#: least `FAR` times that of the best pair. Steep pairs and pairs that are hard to reach have even lower probability.
-#: With 30 mm and 0.02 Allegro holds 0.28 of six objects at half friction, with these values 0.38.
+#: least `FAR` times that of the best pair, but lower for steep pairs and pairs that are hard to reach. With 30 mm and
+#: 0.02 for `FAR`, Allegro holds 0.28 of grasps on six objects at half friction; with these values it holds 0.38.
 BESIDE_M: Final = 0.02
 FAR: Final = 0.005
 STEEP: Final = 0.5
@@ -312,7 +312,7 @@ def outlines_of(hand: HandModel, q: Floats) -> PostureOutlines:
     return PostureOutlines(np.concatenate(points, axis=1) - hand.palm.centre, np.concatenate(tips), mounting)
 
 
-#: Wider gaps count as this wide; resolution of narrower gaps [m].
+#: Gaps are capped at this width; resolution of narrower gaps [m].
 WIDEST_M: Final = 0.064
 EXACT_M: Final = 0.0005
 
@@ -331,8 +331,8 @@ def why_narrow(hand: HandModel, obj: ObjectModel, scenes: Sequence[Environment])
     height = max(float(np.ptp(obj.hull_vertices @ scene.up)) for scene in scenes)
     if height <= HEIGHTS_M[-1] and not len(pinches_of(hand, height)):
         return (
-            f"{obj.name} lies {1e3 * height:.0f} mm high, and fingertips of {hand.name} that rest beside it do not "
-            "face each other so near to their ends"
+            f"{obj.name} is {1e3 * height:.0f} mm high, and fingertips of {hand.name} that rest beside it do not face "
+            "each other this close to their ends"
         )
     thin = thinnest_fingertip(hand)
     gap = max(_widest_gap(pairs, fits, scene, thin) for scene in scenes)
@@ -340,7 +340,7 @@ def why_narrow(hand: HandModel, obj: ObjectModel, scenes: Sequence[Environment])
         return None
     return (
         f"the gap of about {1e3 * gap:.0f} mm beside {obj.name} is thinner than the thinnest fingertip of {hand.name}, "
-        f"{1e3 * thin:.0f} mm, and the {1e3 * CLEAR_M:.0f} mm that it keeps"
+        f"{1e3 * thin:.0f} mm, with its clearance of {1e3 * CLEAR_M:.0f} mm"
     )
 
 
@@ -447,7 +447,7 @@ def _grips(hand: HandModel, obj: ObjectModel, device: str) -> tuple[Any, bool] |
         out.opened = wp.array(known.width, dtype=wp.float32)
         out.balls = wp.array(balls, dtype=wp.vec3)
         out.radius = BALL_M - SLACK_M
-        # Objects that are too small or too wide are held where there was space, never nearer to the palm.
+        # Objects that are too small or too wide are held between the pads, never nearer to the palm.
         out.deep = 0.0 if size else 1.0
         out.palm = wp.vec3(*hand.palm.approach)
         out.noise = wp.array(NOISE * hand.span, dtype=wp.float32)

@@ -109,7 +109,7 @@ class Batches:
         ]
 
     def rollout(self, grasps: GraspSet, rows: Rows, beat: Floats) -> Floats:
-        """Score (n,) grasps of these rows by their batches' rollouts, against the scores `beat` (n,).
+        """Score (n,) grasps of these rows by their batches' rollouts; `beat` (n,): scores to improve on.
         Grasps of stopped batches count as good enough."""
         owners, scores = self.owner[rows], np.zeros(len(grasps))
         placed = self.placed.take(rows) if self.placed is not None else None

@@ -3,8 +3,8 @@ Most starts are antipodal; in the others the palm faces a random point of the ob
 A start has `ROOM` more clearance from obstacles than the later margin, so that the optimisation can rotate the hand.
 
 Before the expensive phases `hindrance` tests whether each hand can leave its grasp: by opening and retreating along the
-approach, and by the lift when closed. A hand hooked around an edge holds well but cannot reach its grasp; one close
-below a board cannot lift.
+approach, and by the lift when closed. A hand hooked around an edge holds well but cannot reach its grasp; a hand
+close below a board cannot lift.
 """
 
 from __future__ import annotations
@@ -84,8 +84,8 @@ def free_ways(scene: Environment, obj: ObjectModel) -> Floats:
 def no_place(model: Model) -> NoStartFound:
     hand, obj = model.hand.model, model.obj.model
     return NoStartFound(
-        f"{hand.name} finds no free place around {obj.name} in this scene: the object is too large, or what stands "
-        "around it leaves no room"
+        f"{hand.name} finds no free place around {obj.name} in this scene: the object is too large, or its "
+        "surroundings leave no room"
     )
 
 
@@ -154,8 +154,8 @@ def _depths(
     """Return depths (n, len(RETREATS)) [m] of hands and mountings in scenes (n,); inf if not computed. Depths are
     computed inwards, from the farthest distance with `worth` (n, len(RETREATS)), while they are clear.
 
-    Most draws fail for reasons that no retreat fixes. Hardly any draw is clear closer than at a distance that is
-    not."""
+    Most draws fail for reasons that no retreat fixes. A draw that is not clear at one distance is hardly ever
+    clear at a smaller one."""
     found, open_ = np.full((len(scene), len(RETREATS)), np.inf), np.ones(len(scene), bool)
     for k in reversed(range(len(RETREATS))):
         left = np.flatnonzero(open_ & worth[:, k])

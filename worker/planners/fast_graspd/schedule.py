@@ -23,7 +23,7 @@ PAPER_RATES: Final = (1e-3, 1e-3, 1e-3)
 #: Largest dilation of the object [m].
 DILATION: Final = 0.01
 SELF_WEIGHT: Final = 2e4
-#: Length of the attraction term, see `LossOptions` [m]. With it the planner prefers enclosing grasps, and more of them
+#: Length of the attraction term, see `LossOptions` [m]. The term favours enclosing grasps, and more of them
 #: hold at half friction. Half this length hardly changes results of a Barrett hand; twice this length draws the slender
 #: fingers of a Shadow hand into thin walls.
 PULL: Final = 3e-4

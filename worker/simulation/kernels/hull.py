@@ -257,9 +257,9 @@ def grow_to_nearest(
     """Grow the hull where it is nearest to the origin, until its nearest facet is the whole hull's.
 
     Return the facet's distance, and 1 on failure. A facet with no point above it is a facet of the hull of all points.
-    No facet of the built part is nearer, and the whole contains the part. So this is the distance of the whole hull, of
-    which little is built (Zheng, "An efficient algorithm for a grasp quality measure", IEEE T-RO 2013). At most 0
-    for an outside origin.
+    No facet of the built part is nearer, and the whole hull contains the part. So the distance is that of the whole
+    hull, although little of it is built (Zheng, "An efficient algorithm for a grasp quality measure", IEEE T-RO 2013).
+    At most 0 for an outside origin.
     """
     top = wp.int32(7)
     spares = wp.int32(0)

@@ -112,7 +112,7 @@ def obstacle_distance(obstacles: Obstacles, k: wp.int32, f: Feature):
 
 @wp.func
 def kept(features: Features, obstacles: Obstacles, i: wp.int32, k: wp.int32, room: wp.float32):
-    """Return the clearance of feature i from obstacle k [m], plus `room`."""
+    """Return the required clearance of feature i from obstacle k, plus `room` [m]."""
     out = features.margin[i] + room
     if features.tip[i] != 0:
         out = wp.min(out, obstacles.tips[k] + TIP_ROOM * room)

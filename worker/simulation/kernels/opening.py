@@ -64,7 +64,7 @@ def body_wrenches(
     torque_out: wp.array2d(dtype=wp.vec3d),
 ):
     """Compute forces on bodies (B, L) and torques about the origin, along the object's normals.
-    Each point's force is the part of `reach` by which it is closer. Launch over (B, L)."""
+    A point's force is `reach` minus its distance, if positive. Launch over (B, L)."""
     b, body = wp.tid()
     force = wp.vec3d(wp.float64(0.0))
     torque = wp.vec3d(wp.float64(0.0))
@@ -220,7 +220,7 @@ def take_opening(
     plain_in: Sweep,
     open_out: wp.array2d(dtype=wp.float64),
 ):
-    """Write dofs (B, D) of each finger's best opening: plain if it beats the other, or `stuck`.
+    """Write dofs (B, D) of each finger: plain if its clearance exceeds that of the first, or `stuck`.
     Launch over (B, D)."""
     b, d = wp.tid()
     open_out[b, d] = hands_in.q[b, d]

@@ -264,7 +264,7 @@ def keep_best(
     best_inout: States,
     depth_inout: wp.array(dtype=wp.float64),
 ):
-    """Select hands with less penetration than ever by more than `better` [m]; finish those without any.
+    """Store hands with the least penetration so far, by more than `better` [m]; finish those without any.
     Their residuals are reset. Launch over B."""
     b = wp.tid()
     if active_inout[b] == 0:

@@ -27,7 +27,7 @@ class Grips:
     opened: wp.array(dtype=wp.float32)  # (K,) width between the pads, ascending
     balls: wp.array2d(dtype=wp.vec3)  # (K, S) centres of balls in the hand
     radius: wp.float32
-    deep: wp.float32  # share of the distance to the palm by which hands may hold deeper than with their pads
+    deep: wp.float32  # share of the way from pads to palm by which the pair may be nearer to the palm
     palm: wp.vec3  # unit, direction that the palm faces
     noise: wp.array(dtype=wp.float32)  # (D,) standard deviation of dofs
     lower: wp.array(dtype=wp.float32)
@@ -103,7 +103,7 @@ def drawn(
     out.rotation = wp.normalize(turn * wp.quat_inverse(grips.frame[out.posture]))
     away = -wp.quat_rotate(out.rotation, grips.palm)
     reach = grips.between[out.posture]
-    # From holding with the fingertips to the palm against the object.
+    # The depth ranges from a fingertip grasp to a palm in contact with the object.
     ahead = wp.max(wp.dot(reach, grips.palm), 0.0) * deep * grips.deep
     pivot = grips.middle[pair] - wp.quat_rotate(out.rotation, reach) - ahead * away
     for r in range(retreats.shape[0]):

@@ -322,7 +322,7 @@ def distances(
     distance_inout: wp.array2d(dtype=wp.float32),
 ):
     """Compute the least distance (B, L) of each body from the solids of scene 0, at most `reach`.
-    A feature over no face of an obstacle is farther from it than an edge of the obstacle from the link. Over (B, P)."""
+    A feature over no face of an obstacle is skipped: an edge of the obstacle is nearer to the link. Over (B, P)."""
     b, piece = wp.tid()
     body = pieces_in.body[piece]
     least = reach_in

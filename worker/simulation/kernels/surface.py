@@ -85,7 +85,7 @@ def mesh_distance(surface: Surface, point: wp.vec3, reach: wp.float32):
 
 @wp.func
 def near_distance(surface: Surface, point: wp.vec3, reach: wp.float32):
-    """Return the same, from the list of the point's cell if it has one."""
+    """Return the result of `mesh_distance`, from the list of the point's cell if it has one."""
     x = (point - surface.field_origin) / surface.field_cell
     i = int(wp.floor(x[0]))
     j = int(wp.floor(x[1]))

@@ -216,7 +216,7 @@ def scale_torques(
     unit_out: wp.array(dtype=wp.float64),
 ):
     """Divide torques of a balance by `unit` (B,), which gives the largest of them `weight`.
-    `count` (B,) of contacts becomes that of columns. Launch over B."""
+    `count` (B,) becomes the number of columns instead of contacts. Launch over B."""
     b = wp.tid()
     count = EDGES * count_inout[b]
     count_inout[b] = count

@@ -18,7 +18,7 @@ Wrenches = wp.array3d(dtype=wp.int64)  # (B, L, 6)
 
 @wp.func
 def counts(x: wp.float32):
-    """Return a component in counts; a non-finite one counts as nothing: its hand shows it otherwise."""
+    """Return a component in counts; 0 if not finite, which other data of the hand reveal."""
     if not wp.isfinite(x):
         return wp.int64(0)
     return wp.int64(wp.clamp(x, -MOST, MOST) * PER_UNIT)

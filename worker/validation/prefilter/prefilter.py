@@ -125,7 +125,7 @@ class WorldPool:
             lost = np.flatnonzero(found.overflow)
             while len(lost) and self._doublings < DOUBLINGS:
                 self._doublings += 1
-                log.info("%d of %d grasps need more room for contacts: it is doubled", len(lost), len(grasps))
+                log.info("%d of %d grasps need more memory for contacts; it is doubled", len(lost), len(grasps))
                 self._allocate()
                 found = found.put(lost, self._validate(grasps.take(lost), run.quiet()))
                 lost = np.flatnonzero(found.overflow)
