@@ -114,7 +114,7 @@ class Settings(BaseSettings):
     task_s: float = Field(
         60.0,
         ge=0,
-        description="target duration of tasks of large jobs [s]; measured rates give their batches; 0: one batch",
+        description="target duration of a task of a large job [s], reached by its number of batches; 0: one batch",
     )
     task_timeout_s: float = Field(1800.0, gt=0, description="longest run of one task [s]")
     worker_max_memory_mb: int = Field(

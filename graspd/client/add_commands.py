@@ -150,7 +150,7 @@ def upload_of(path: Path) -> Iterator[tuple[Path, str]]:
 def one_of_set(path: Path, name: str | None) -> Objects:
     """Return a mesh file as a set of one object; raise InputError for anything else."""
     if path.suffix.lower() not in MESHES or not path.is_file():
-        raise InputError(f"several sizes are made of a mesh file or a folder of them, not of {path}")
+        raise InputError(f"several sizes need a mesh file or a folder of meshes, not {path}")
     return {name or name_of_upload(path.name): {path.name: path.read_bytes()}}
 
 

@@ -277,5 +277,5 @@ def _full_id(client: Client, prefix: str) -> str:
 def _only_one(ids: Iterable[str], prefix: str) -> str:
     found = {id for id in ids if id.startswith(prefix)}
     if len(found) > 1:
-        raise InputError(f"{len(found)} jobs begin with {prefix!r}; give more letters")
+        raise InputError(f"{len(found)} job ids begin with {prefix!r}; give more characters")
     return found.pop() if found else prefix

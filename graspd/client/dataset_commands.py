@@ -120,7 +120,7 @@ def read_spec(file: Path) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise InputError(f"{file} is no {kind}: {error}") from None
     if not isinstance(found, dict):
-        raise InputError(f"{file} must hold the keys of a dataset: hands, objects, grasps, ...")
+        raise InputError(f"{file} must contain the keys of a dataset: hands, objects, grasps, ...")
     try:
         if isinstance(found.get("scene"), str):
             found["scene"] = scene_option(found["scene"], beside=file.parent)
@@ -373,7 +373,7 @@ def _estimate(client: Client, matrix: dict[str, Any], files: Objects | None) -> 
         known = [one.name for kind in (AssetKind.HAND, AssetKind.OBJECT) for one in client.assets(kind)]
         raise InputError(
             f"there is no hand or object {', '.join(map(repr, unknown[:5]))}; `graspd hands list` and `graspd objects "
-            f"list` show what there is{did_you_mean(unknown[0], known)}"
+            f"list` show the known ones{did_you_mean(unknown[0], known)}"
         )
     return found
 

@@ -279,7 +279,7 @@ ATTRIBUTES: Final[dict[str, RootAttribute]] = {
     "verdict_level": RootAttribute("text", "level of validation; `none`: not validated", _BASE),
     "verdict_key": RootAttribute(
         "text",
-        "digest of everything that decides the verdicts; verdicts of different keys must not be mixed in one number",
+        "digest of everything that decides the verdicts; do not combine verdicts of different keys in one statistic",
         _BASE,
     ),
     "scene": RootAttribute(
