@@ -99,7 +99,7 @@ def create_app(settings: Settings, services: Services | None = None) -> FastAPI:
 def check_exposure(host: str, keys: KeyFile) -> None:
     if not keys.has_live_key and not is_loopback(host):
         raise InputError(
-            f"{host} is reachable from other machines and there is no live key; "
+            f"{host} is reachable from other machines and there is no valid key; "
             "make one with `graspd keys add NAME --scope admin`, or bind 127.0.0.1"
         )
 
@@ -116,7 +116,9 @@ def _add_middleware(app: FastAPI, settings: Settings, keys: KeyFile, proxy: Prox
     if prefix := settings.api_root_path:
         first = prefix.split("/")[1]
         if first in {str(getattr(route, "path", "/")).split("/")[1] for route in app.routes}:
-            raise InputError(f"GRASPD_API_ROOT_PATH: the service has a path /{first} itself; take another, say /graspd")
+            raise InputError(
+                f"GRASPD_API_ROOT_PATH: the service itself uses the path /{first}; choose another one, such as /graspd"
+            )
         app.add_middleware(RootPath, prefix=prefix)
 
 

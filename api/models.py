@@ -38,8 +38,7 @@ class Job(Validated):
     fidelity: str
     requested: int = Field(description="grasps requested")
     standing: Literal["valid", "feasible", "kept"] = Field(
-        "valid",
-        description="kind of its stored grasps: valid; feasible if not validated; kept: candidates, feasible or not",
+        "valid", description="kind of its stored grasps: valid, feasible (not validated) or kept (all candidates)"
     )
     progress: float = Field(ge=0, le=1)
     eta_s: float | None = Field(None, description="expected time until the job ends [s]; absent: unknown")
@@ -65,11 +64,13 @@ class Diversity(BaseModel):
 
     grasps: int = Field(description="number of grasps analysed")
     types: dict[str, int] = Field(description="number of power, precision and lateral grasps; none: undefined")
-    type_entropy_bits: float = Field(description="entropy of the types; 0: a single type; 1.58: three types equally")
+    type_entropy_bits: float = Field(
+        description="entropy of the types; 0: a single type; 1.58: three types in equal numbers"
+    )
     directions_used: int = Field(description="approach cells in use, on the sphere of directions in the object's frame")
     directions: int = Field(DIRECTION_CELLS, description="number of cells, all of equal area")
     direction_entropy_bits: float = Field(
-        description="entropy of the directions; 0: a single cell; 5.58: all 48 equally"
+        description="entropy of the directions; 0: a single cell; 5.58: all 48 cells in equal numbers"
     )
     evenness: float = Field(ge=0, le=1, description="2^entropy of the directions, divided by the number of cells")
 
@@ -95,7 +96,9 @@ class JobDetail(Job):
     recheck_held: int = Field(0, description="rechecked grasps that held")
     attempts: list[AttemptView]
     mean: MeanMetrics
-    diversity: Diversity | None = Field(None, description="absent without such grasps")
+    diversity: Diversity | None = Field(
+        None, description="of the valid grasps (all stored ones if not validated); absent: none"
+    )
     shards: list[Shard]
 
 

@@ -19,7 +19,7 @@ from graspd.service.model.errors import GraspdError, InputError, RateError, Stor
 
 MEDIA_TYPE: Final = "application/problem+json"
 RETRY_AFTER_S: Final = 2
-_FULL_SAID: Final = "no space is left on the disk of this service; the same request succeeds when there is room"
+_FULL_SAID: Final = "the disk of this service is full; the same request succeeds once there is space"
 _LONGEST_POINTER: Final = 200
 _MOST_ERRORS: Final = 100
 
@@ -110,7 +110,7 @@ def describe(error: Exception) -> tuple[str, str, int, str]:
     elif isinstance(error, HTTPException):
         status, detail = error.status_code, str(error.detail)
     else:
-        detail = "an unforeseen error; the log names it under this request id"
+        detail = "an unexpected error; the log has it under this request id"
         return GraspdError.slug, GraspdError.title, GraspdError.status, detail
     return HTTP_SLUGS.get(status, "internal"), HTTPStatus(status).phrase, status, detail
 

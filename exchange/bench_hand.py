@@ -227,8 +227,8 @@ class HandMapping:
         names = [ours for _, ours in self.joints]
         if hand.root_link != self.root_link or sorted(names) != sorted(hand.joint_names):
             raise InputError(
-                f"the grasps are of {self.hand} from {self.root_link!r} on with {len(names)} joints, {hand.name} "
-                f"begins at {hand.root_link!r} and has {len(hand.joint_names)}; is --hand the right hand?"
+                f"the grasps are of {self.hand} with root link {self.root_link!r} and {len(names)} joints, but "
+                f"{hand.name} has root link {hand.root_link!r} and {len(hand.joint_names)} joints; check --hand"
             )
         return [hand.joint_names.index(name) for name in names]
 

@@ -1,9 +1,9 @@
 """Objects and scenes in DexGraspBench's layout, and grasps on a table in the format of its tabletop test.
 
-An object has a mesh, convex pieces, facts, and scenes: afloat at scale 1, and on a table. All poses in the files of a
-table are in its frame, z up, its top at z = 0; the evaluator has a floor there and nothing else. Fields besides those
-of every grasp: `approach_qpos` (W, 7 + J) from the standoff to the pregrasp with the hand open, and `lift_qpos`
-(7 + J,), the raised squeeze. The evaluator raises a flying hand itself; arms use these fields.
+An object has a mesh, convex pieces, facts, and scenes: floating at scale 1, and on a table. Poses in the files of a
+table are in its frame, z up, its top at z = 0; the evaluator has only a floor there. Grasps on a table have two more
+fields, which arms use: `approach_qpos` (W, 7 + J) leads from the standoff to the pregrasp with the hand open;
+`lift_qpos` (7 + J,) is the raised squeeze. The evaluator raises a hand without arm itself.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ def check_table(placed: PlacedGrasps) -> None:
     table = placed.supports[0].planes if len(placed.supports) == 1 else np.zeros((0, 4))
     if table.shape != (1, 4) or not np.allclose(table[0], [0, 0, 1, 0], rtol=0, atol=SAME):
         raise InputError(
-            "DexGraspBench's tabletop test knows a floor at z = 0 and nothing else, the shard's scene is another; "
+            "DexGraspBench's tabletop test has only a floor at z = 0, but the shard has another scene; "
             "export grasps that were planned with --scene table"
         )
 
@@ -151,7 +151,7 @@ def object_of_scene(file: Path, scene_path: str) -> Row:
         raise InputError(f"{file} names the scene {scene_path!r}; a scene lies below assets/")
     path = next((above / place for above in file.resolve().parents if (above / place).is_file()), None)
     if path is None:
-        raise InputError(f"{file} names the scene {scene_path}, which is in no folder above; keep assets/ whole")
+        raise InputError(f"{file} names the scene {scene_path}, which no folder above contains; keep assets/ complete")
     found = load_npy(path)
     try:
         thing = found["scene"][found["task"]["obj_name"]]
@@ -166,7 +166,7 @@ def object_of_scene(file: Path, scene_path: str) -> Row:
 def with_way(
     hand: HandModel, grasps: GraspSet, rows: Sequence[Row], obj_pose: Floats, mapping: HandMapping | None
 ) -> GraspSet:
-    """Add approach and lift from files, in the object frame, if all have as many waypoints and one open hand."""
+    """Add approach and lift from files, in the object frame, if waypoints are equally many and the hand stays open."""
     if not all({"approach_qpos", "lift_qpos"} <= set(row) for row in rows):
         return grasps
     ways = [np.asarray(row["approach_qpos"], float) for row in rows]

@@ -149,7 +149,7 @@ def _rows(file: Path) -> list[Row]:
     """Return the grasps of a file: one, or several if `..._qpos` have one more axis."""
     found = load_npy(file)
     if not isinstance(found, dict):
-        raise InputError(f"{file} holds no dictionary; DexGraspBench has one a file")
+        raise InputError(f"{file} holds no dictionary; DexGraspBench has one per file")
     if missing := [f"{name}_qpos" for name in POSTURES if f"{name}_qpos" not in found]:
         raise InputError(f"{file} has no {missing[0]}")
     # A file without the object's pose names a scene that has it.
@@ -159,7 +159,7 @@ def _rows(file: Path) -> list[Row]:
     if count == {0}:
         return [_scaled(found)]
     if len(count) > 1 or 0 in count:
-        raise InputError(f"{file}: pregrasp, grasp and squeeze are not as many as one another")
+        raise InputError(f"{file}: the numbers of pregrasps, grasps and squeezes differ")
     return [_scaled({key: _part(value, k, count) for key, value in found.items()}) for k in range(min(count))]
 
 
@@ -195,11 +195,11 @@ def _set(
         try:
             qpos = np.array([np.ravel(row[f"{name}_qpos"]) for row in rows], float)
         except ValueError as error:
-            raise InputError(f"{path}: {name}_qpos has not one length in all files: {error}") from None
+            raise InputError(f"{path}: the length of {name}_qpos differs between files: {error}") from None
         if qpos.shape[1] != 7 + len(hand.joint_names):
             raise InputError(
-                f"{path}: {name}_qpos has {qpos.shape[1]} numbers, {hand.name} needs 7 + {len(hand.joint_names)}; "
-                "is --hand the right hand?"
+                f"{path}: {name}_qpos has {qpos.shape[1]} numbers, but {hand.name} needs 7 + {len(hand.joint_names)}; "
+                "check --hand"
             )
         root, joints = (qpos[:, :7], qpos[:, 7:]) if mapping is None else mapping.posture(hand, qpos)
         return Posture(compose(invert(pose), root), joints)

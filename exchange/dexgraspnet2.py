@@ -23,14 +23,14 @@ src/preprocess/dex_graspness.py, the clouds their src/utils/pc.py, both as in zc
     grasp g aims from the palm at the middle between its thumb and its other fingers
     seen    points ahead within 30 degrees of that line, at most 20 mm farther along it than the first of them
     p_g     the seen point with the least angle / 10 degrees + height / 15 mm
-    value   of a point: the sum over all grasps of 10^(-150 d), d its distance from p_g [m]; no share and
-        no logarithm: their loader computes the logarithm of value + 0.001
+    value   of a point: the sum over all grasps of 10^(-150 d), d its distance from p_g [m]. It is not
+        normalised; their loader computes the logarithm of value + 0.001
     pixel   on the object: the value of the nearest point; elsewhere 0
 
-Theirs uses thumb and middle finger of a LEAP hand and the centre of its palm's box; here it is any hand's thumb, the
-mean of its other fingertips, and the palm's surface. If no point is seen, theirs stops; here the point nearest to the
-palm counts. For the nearest point theirs documents 15 mm but compares 0.015 with a squared distance, which pytorch3d's
-`knn_points` returns. The actual 122 mm are used here.
+Their code uses thumb and middle finger of a LEAP hand and the centre of its palm's box; this module uses any hand's
+thumb, the mean of its other fingertips, and the palm's surface. If no point is seen, their code stops; here the point
+nearest to the palm counts. For the nearest point their code documents a limit of 15 mm but compares 0.015 with the
+squared distance of pytorch3d's `knn_points`. This module uses the resulting limit of 122 mm.
 
 `service.readers.clouds.graspness` differs: it is the share of grasps whose hand touches a point.
 """
@@ -236,14 +236,14 @@ def write(
     """Write each scene that has pictures and grasps, planned in it or carried over into it."""
     top = folder / "data"
     if top.exists():
-        raise InputError(f"{top} is there already; give another folder as --output")
+        raise InputError(f"{top} exists already; give another folder as --output")
     known = {lot.id: lot for lot in lots}
     seen = by_scene(pictures)
     scenes = [some for some in seen if some[0].base in known and len(some[0].rows)]
     if not scenes:
         if any(some[0].base in known for some in seen):
             raise InputError(
-                "no grasp is valid and clear in the scenes of the pictures; plan them in scenes: synth --scene"
+                "no grasp is valid and clear in the scenes of the pictures; plan grasps in scenes: synth --scene"
             )
         raise InputError("no picture shows a scene with grasps; put views beside the grasps: graspd render")
     done = ExportSummary({"grasps": 0, "scenes": len(scenes), "views": 0, "files": len(scenes)})
@@ -260,7 +260,7 @@ def write(
         done.counts["grasps"] += len(some[0].rows)
         done.counts["views"] += min(len(some), VIEWS)
     if not out:
-        done.notes.append("one object: all scenes are numbered for training, none for a test")
+        done.notes.append("only one object: all scenes have numbers for training, none for a test")
     return done
 
 
@@ -271,7 +271,7 @@ def _numbers(
     room = [number for numbers in (HELD_OUT if held else TRAIN) for number in numbers]
     if count > len(room):
         what = "held-out objects" if held else "objects to train on"
-        raise InputError(f"there are {count} scenes of {what}, DexGraspNet 2.0 has numbers for {len(room)}")
+        raise InputError(f"there are {count} scenes of {what}, but DexGraspNet 2.0 has numbers for {len(room)}")
     return islice(room, count)
 
 
@@ -362,14 +362,14 @@ def read(path: Path, *, hand: str, obj: str, number: int = 0) -> list[ImportedGr
     except (KeyError, ValueError, TypeError) as error:
         raise InputError(f"{path} is no file of grasps of DexGraspNet 2.0: {error}") from None
     if not np.isfinite(matrices).all():
-        raise InputError(f"{path} has grasps whose place is no number")
+        raise InputError(f"{path} has grasps whose pose is not finite")
     away = invert(_object_pose(path, number))
     model, thing = hand_from_path(hand), scaled_object(obj)
     names = [name for name in found if name not in (*_PLACE, *_OURS)]
     try:
         values = np.stack([np.asarray(found[name], float).reshape(count) for name in names], axis=1)
     except ValueError as error:
-        raise InputError(f"{path} has not one value of each joint for each of {count} grasps: {error}") from None
+        raise InputError(f"{path} needs one value of each joint for each of {count} grasps: {error}") from None
     grasp = Posture(compose(away, pose_from_matrix(matrices)), joints_by_name(model, names, values, what=str(path)))
     grasps = _with_ours(path, model, found, grasp, away)
     if grasps is None:
@@ -401,17 +401,17 @@ def _object_pose(path: Path, number: int) -> Floats:
         raise InputError(f"{path} is in no folder dex_grasps_new/SCENE/HAND") from None
     file = data / "scenes" / scene / CAMERA / "meta" / "0000.mat"
     if not file.is_file():
-        raise InputError(f"{path} needs its scene: {file} is not there")
+        raise InputError(f"{path} needs its scene: {file} does not exist")
     if file.stat().st_size > _LARGEST_META:
-        raise InputError(f"{file} is larger than {_LARGEST_META >> 10} KiB, which no description of a view is")
+        raise InputError(f"{file} is larger than {_LARGEST_META >> 10} KiB, too large for the description of a view")
     try:
         poses = np.asarray(scipy.io.loadmat(file)["poses"], float)
         pose = np.concatenate([poses[:3, :, number], [[0, 0, 0, 1]]])
     except Exception as error:
         # SciPy raises arbitrary exceptions; all of them mean an invalid file.
-        raise InputError(f"{file} does not say where object {number} stands: {error}") from None
+        raise InputError(f"{file} has no pose of object {number}: {error}") from None
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
-        raise InputError(f"{file} does not say where object {number} stands")
+        raise InputError(f"{file} has no pose of object {number}")
     return pose_from_matrix(pose)
 
 

@@ -52,10 +52,12 @@ def write(
     clouds, bare = _clouds(pictures, lots, scenes, folder, noise)
     done = ExportSummary({"grasps": 0, "scenes": len({*scenes.values()}), "clouds": clouds, "files": 0})
     if not clouds:
-        done.notes.append("there are no pictures, so no clouds: put views beside the grasps (graspd render) to train")
+        done.notes.append(
+            "there are no pictures and so no clouds; training needs views beside the grasps: graspd render"
+        )
     elif bare:
         done.counts["scenes"] -= bare
-        done.notes.append(f"{bare} scenes are seen by no picture; their grasps are left out")
+        done.notes.append(f"no picture shows {bare} of the scenes; their grasps are left out")
     groups: dict[tuple[str, bool], list[ExportPart]] = defaultdict(list)
     for lot in lots:
         groups[lot.hand.digest, lot.placed is None].append(lot)
@@ -63,7 +65,7 @@ def write(
         _write_group(group, scenes, folder, out, done, seen=bool(clouds))
     names = {lot.name for lot in lots}
     if not out:
-        done.notes.append("one object: train.json and test.json both name it, so the test tells nothing of unseen ones")
+        done.notes.append("only one object, in both train.json and test.json: the test has no unseen object")
     for split, some in (("train", names - out), ("test", out or names)):
         (folder / SET / "valid_split" / f"{split}.json").write_text(json.dumps(sorted(some), indent=1) + "\n")
     return done

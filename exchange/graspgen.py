@@ -48,7 +48,7 @@ POSTURES: Final = ("pregrasp", "grasp", "squeeze")
 PER_SHARD: Final = 64
 #: Largest size of a record that is read [bytes]; 2,000 grasps have half a megabyte.
 LARGEST: Final = 256 * 2**20
-#: Its generator skips objects with fewer good grasps.
+#: GraspGen's generator skips objects with fewer good grasps.
 FEWEST: Final = 5
 #: Tolerance of a published rotation matrix: they are printed with six digits or more.
 _ROTATION: Final = 1e-3
@@ -96,7 +96,7 @@ def _write_hand(hand: HandModel, lots: list[ExportPart], folder: Path, out: set[
     _json(folder / "grasps" / name / INDEX, index)
     (folder / "splits" / name).mkdir(parents=True, exist_ok=True)
     if not out:
-        done.notes.append("one object: train.txt and valid.txt both name it")
+        done.notes.append("only one object, in both train.txt and valid.txt")
     for split, some in (("train", set(uuids) - out), ("valid", set(uuids) & out if out else set(uuids))):
         (folder / "splits" / name / f"{split}.txt").write_text("".join(f"{uuid}\n" for uuid in sorted(some)))
     (folder / "grippers").mkdir(exist_ok=True)
@@ -107,7 +107,7 @@ def _write_hand(hand: HandModel, lots: list[ExportPart], folder: Path, out: set[
     done.counts["good"] += sum(good.values())
     if few := sorted(uuid for uuid, count in good.items() if count < FEWEST):
         done.notes.append(
-            f"GraspGen's generator leaves out objects with fewer than {FEWEST} good grasps: {few[0]}, say"
+            f"GraspGen's generator leaves out objects with fewer than {FEWEST} good grasps, such as {few[0]}"
         )
 
 
@@ -188,7 +188,7 @@ def _grasps(file: str, hand: HandModel, record: dict[str, Any], pose: Floats) ->
         joints = joints_by_name(hand, names, grasps[f"{name}_joints"], what=file)
         place = pose if name == "grasp" else np.asarray(grasps[f"{name}_pose"], float)
         if place.shape != pose.shape or len(joints) != len(pose):
-            raise InputError(f"{file}: pregrasp, grasp and squeeze are not as many as one another")
+            raise InputError(f"{file}: the numbers of pregrasps, grasps and squeezes differ")
         parts.append(Posture(place, joints))
     return GraspSet(parts[1], parts[0], parts[2], np.full(len(pose), np.nan))
 
@@ -216,14 +216,14 @@ def _found(path: Path, uuid: str) -> tuple[str, dict[str, Any]]:
         except (OSError, tarfile.TarError) as error:
             raise InputError(f"{file} is no tar file: {error}") from None
     if found is None or (not uuid and len(names) > 1):
-        there = f"it has {len(names)}, {', '.join(names[:5])} among them" if names else "it has none"
-        raise InputError(f"{path} has no object {uuid!r}; name one with --name: {there}")
+        there = f"it has {len(names)}, such as {', '.join(names[:5])}" if names else "it has none"
+        raise InputError(f"{path}: {uuid!r} selects no single object; name one with --name: {there}")
     return found
 
 
 def _parsed(what: str, data: bytes) -> dict[str, Any]:
     if len(data) > LARGEST:
-        raise InputError(f"{what} is larger than {LARGEST >> 20} MiB, which no record is")
+        raise InputError(f"{what} is larger than {LARGEST >> 20} MiB, too large for a record")
     try:
         record = json.loads(data)
     except (ValueError, RecursionError) as error:

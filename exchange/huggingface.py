@@ -89,7 +89,7 @@ def write(
     names = {lot.id: lot.name for lot in lots}
     for split, some in sides.items():
         if not some:
-            done.notes.append("one object: all of it is train, there is no test")
+            done.notes.append("only one object: all grasps are in train, and there is no test split")
             continue
         mine = [lot for lot in lots if lot.name in some]
         file = folder / "grasps" / f"{split}-00000.parquet"
@@ -207,14 +207,16 @@ def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[Impo
     columns["object"] = list(map(str, columns["object"]))
     names = sorted(set(columns["object"]))
     if len(names) != 1 and object_name not in names:
-        raise InputError(f"{path} has grasps on {', '.join(names[:8]) or 'nothing'}; name one object of them: --name")
+        raise InputError(f"{path} has grasps on {', '.join(names[:8]) or 'nothing'}; select one object: --name")
     wanted = object_name or names[0]
     kinds = columns.get("scene_kind", [])
     if len(kinds) != len(columns["object"]):
         kinds = [FREE] * len(columns["object"])
     rows = [k for k, name in enumerate(columns["object"]) if name == wanted]
     if other := {kinds[k] for k in rows} - {FREE, TABLE}:
-        raise InputError(f"{path} has grasps for scenes of the kind {sorted(other)[0]!r}; only tables come back")
+        raise InputError(
+            f"{path} has grasps for scenes of the kind {sorted(other)[0]!r}; only table and free are supported"
+        )
     apart = {kind: [k for k in rows if kinds[k] == kind] for kind in (FREE, TABLE)}
     return [
         _set(path, hand, obj, wanted, columns, some, on_table=kind == TABLE) for kind, some in apart.items() if some

@@ -61,7 +61,7 @@ def verdicts(values: Sequence[Any] | NDArray[Any]) -> NDArray[np.int8]:
 
 
 def joints_by_name(hand: HandModel, names: Sequence[str], values: Any, *, what: str) -> Floats:
-    """Return (N, J) joints of the hand from (N, n) values of `names`; others follow a mimic or stay at their middle."""
+    """Return (N, J) joints of the hand from (N, n) values of `names`; all others are at the middle of their range."""
     given = np.atleast_2d(np.asarray(values, float))
     if given.shape[1] != len(names):
         raise InputError(f"{what}: {given.shape[1]} joint values for {len(names)} joints")
@@ -77,7 +77,7 @@ def joints_by_name(hand: HandModel, names: Sequence[str], values: Any, *, what: 
 
 
 def scaled_object(path: str | Path, scale: float = 1.0) -> ObjectModel:
-    """Load a mesh or built-in object times `scale`; sources with scales use the file's numbers: no unit is guessed."""
+    """Load a mesh or built-in object times `scale`; with a scale, units of the file are metres and not guessed."""
     if scale == 1.0:
         return object_from_path(path)
     plain = object_from_path(path, options={"units": "m"})

@@ -42,7 +42,7 @@ class Case:
 
     @property
     def centred(self) -> Case:
-        """The case centred at the object's middle, where measurements do not depend on the file's origin."""
+        """The case relative to the object's centre, so that measurements do not depend on the file's origin."""
         return replace(
             self,
             obj=self.obj.centred,
@@ -105,7 +105,7 @@ def _shard(path: Path, hand: str | None, obj: str | None) -> Case:
 
 def _bench_folder(path: Path, hand: str | None, obj: str | None) -> Case:
     if hand is None or obj is None:
-        raise InputError("a DexGraspBench folder does not hold the hand and the object; name both: --hand and --object")
+        raise InputError("a DexGraspBench folder does not contain hand and object; name both: --hand and --object")
     sets = dexgraspbench.read(path, hand=hand, obj=obj)
     if len(sets) > 1:
         kinds = ", ".join(f"scale {one.scale:g}{' on a table' if one.placed else ''}" for one in sets)

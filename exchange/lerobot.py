@@ -9,7 +9,7 @@ A frame is a waypoint of the trajectory, from the standoff to the squeeze. `obse
 all moving joints [rad or m]. `observation.environment_state` is the object's rest pose in the same frame. Waypoints
 have no times, so `fps` only numbers them.
 
-The importer `lerobot` reads the trajectories of our own data sets, in the object's frame.
+The importer `lerobot` reads trajectories of data sets from graspd, in the object's frame.
 """
 
 from __future__ import annotations
@@ -72,10 +72,12 @@ def write(lots: Sequence[ExportPart], pictures: Pictures, folder: Path, out: fro
     if (folder / "meta").exists():
         raise InputError(f"{folder} holds a data set already; give another folder as --output")
     if len({lot.hand.digest for lot in lots}) > 1:
-        raise InputError(f"a LeRobot data set is of one robot; {folder} would be of several hands: export them apart")
+        raise InputError(
+            "a LeRobot data set has one robot, but these grasps are of several hands; export each hand by itself"
+        )
     ways = [lot for lot in sorted(lots, key=lambda lot: lot.name in out) if lot.placed is not None]
     if not ways:
-        raise InputError("grasps of free objects have no way to their object; plan them in a scene: --scene table")
+        raise InputError("grasps of free objects have no approach; plan grasps in a scene: --scene table")
     seen = {(some[0].base, some[0].scene): some for some in by_scene(pictures)}
     episodes = [(lot, row, look) for lot in ways for row, look in _seen(lot, seen)]
     if not episodes:
@@ -132,7 +134,7 @@ class _Writer:
         way = postures_of(lot, row).astype(np.float32)
         colour = np.asarray(self.pictures[look.index]["image/rgb"])
         if self._size not in ((), colour.shape):
-            raise InputError(f"pictures of {colour.shape[:2]} and {self._size[:2]} pixels do not go into one data set")
+            raise InputError(f"pictures of {colour.shape[:2]} and {self._size[:2]} pixels do not fit into one data set")
         self._size = colour.shape
         picture, number, count = png(colour), len(self.episodes), len(way) - 1
         rest = look.object_pose.astype(np.float32)
@@ -245,7 +247,7 @@ def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[Impo
     task = _task(path, object_name)
     ways, rest, numbers = _ways(path, task)
     if not len(ways) or min(map(len, ways)) < _STOPS:
-        raise InputError(f"{path} has no episodes of the task {task_of(object_name)!r} with a whole way")
+        raise InputError(f"{path} has no episodes of the task {task_of(object_name)!r} with a complete trajectory")
     model, thing = hand_from_path(hand), scaled_object(obj)
 
     def posture(qpos: Floats) -> Posture:
@@ -273,7 +275,7 @@ def _names(path: Path) -> list[str]:
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(f"{file} is no description of a LeRobot data set: {why(error)}") from None
     if tuple(names[:7]) != POSE_PARTS:
-        raise InputError(f"{path} is no data set of ours: its states do not begin with {', '.join(POSE_PARTS)}")
+        raise InputError(f"{path} was not exported by graspd: its states do not begin with {', '.join(POSE_PARTS)}")
     return names[7:]
 
 
@@ -283,7 +285,7 @@ def _task(path: Path, object_name: str) -> int:
     if not object_name and len(numbers) == 1:
         return int(numbers[0])
     if task_of(object_name) not in words:
-        raise InputError(f"{path} has the tasks {', '.join(map(str, words[:8]))}; name an object of them: --name")
+        raise InputError(f"{path} has the tasks {', '.join(map(str, words[:8]))}; select one object: --name")
     return int(numbers[words.index(task_of(object_name))])
 
 
@@ -303,7 +305,7 @@ def _ways(path: Path, task: int) -> tuple[list[Floats], Floats, list[int]]:
                 rest.append(np.array(found[OBJECT][rows[0]], float).reshape(7))
                 numbers.append(int(number))
         except (KeyError, ValueError, TypeError) as error:
-            raise InputError(f"{file} is no file of frames of ours: {error}") from None
+            raise InputError(f"{file} is no file of frames from graspd: {error}") from None
     place = np.array(rest).reshape(len(rest), 7)
     place[:, 3:] /= np.maximum(np.linalg.norm(place[:, 3:], axis=1, keepdims=True), 1e-12)
     return ways, place, numbers

@@ -47,7 +47,7 @@ class ExportPart:
 
 
 def held_out(kinds: Mapping[str, str], share: float) -> frozenset[str]:
-    """Return the objects of `share` of the kinds, by the order of a hash: not none, not all, none of a single one."""
+    """Return the objects of a share of the kinds, ordered by hash: at least one kind and not all; none of a single."""
     order = sorted(set(kinds.values()), key=lambda kind: hashlib.sha256(kind.encode()).digest())
     chosen = order[: min(max(1, round(share * len(order))), len(order) - 1)]
     return frozenset(name for name, kind in kinds.items() if kind in chosen)

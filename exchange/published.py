@@ -8,7 +8,7 @@ DexGraspNet's layout: a `.npy` for each object, a list of dictionaries with `qpo
 
 Wang et al., DexGraspNet, ICRA 2023. `qpos` has the root's translation WRJTx, y, z [m], its rotation WRJRx, y, z (Euler
 angles about the fixed axes x, y, z in turn [rad]), and the joints `robot0:FFJ3` ... of the MuJoCo Shadow hand, whose
-numbers are one less than those of the URDF (FFJ4 ...). The object's mesh is multiplied by `scale`.
+numbers are one less than in the URDF (FFJ4 ...). The object's mesh is multiplied by `scale`.
 
 MultiDex, the dataset of GenDexGrasp: a torch file with a list `metadata` of (..., q, object, robot) tuples.
 
@@ -61,7 +61,9 @@ def read_ddgc(path: Path, *, hand: str, obj: str, number: int = 0) -> list[Impor
         raise InputError(f"{path} needs its barrett_representation_K.npy beside it")
     places, joints = (list(load_npy(file)) for file in (path, beside))
     if number >= len(places) or len(places) != len(joints):
-        raise InputError(f"{path} has {len(places)} objects and {beside.name} {len(joints)}; none is number {number}")
+        raise InputError(
+            f"{path} has {len(places)} objects and {beside.name} {len(joints)}; object {number} was requested"
+        )
     place, values = np.asarray(places[number], float), np.asarray(joints[number], float)
     if place.ndim != 2 or place.shape[1] != 7 or values.shape != (len(place), len(ROLES)):
         raise InputError(f"{path}: object {number} has grasps of shape {place.shape} and joints of {values.shape}")
@@ -77,7 +79,7 @@ def _names(hand: HandModel) -> list[str]:
     for role in ROLES:
         found = [name for name in hand.joint_names if re.search(role, name)]
         if len(found) != 1:
-            raise InputError(f"{hand.name} has no one joint that matches {role!r}: it is no Barrett hand")
+            raise InputError(f"{hand.name} is no Barrett hand: not exactly one joint matches {role!r}")
         names.append(found[0])
     return names
 

@@ -51,8 +51,8 @@ def write(views: Shard, folder: Path) -> list[Path]:
 def box_3d(corners: Floats, extrinsics: Floats) -> tuple[Floats, Floats, Floats]:
     """Return corners (3,), (3,) of an object-aligned box in its own centred frame, and that frame in the world.
 
-    The frame (4, 4) acts on row vectors. Of the corners (8, 3) in the camera frame, corner k takes the maximum of
-    x, y, z where bit 0, 1, 2 of k is set.
+    The frame (4, 4) acts on row vectors. Corner k of (8, 3) in the camera frame has the maximum x, y, z if bit 0, 1, 2
+    of k is set.
     """
     world = (corners - extrinsics[:3, 3]) @ extrinsics[:3, :3]
     edges = np.stack([world[1 << axis] - world[0] for axis in range(3)])

@@ -59,7 +59,7 @@ def export_grasps(source: Path, format_: str, wishes: RobotExportOptions, folder
     if not 0 < wishes.speed <= 1:
         raise InputError(f"--speed is {wishes.speed:g}; give a share of the velocity limits above 0 and at most 1")
     if wishes.arm is None and (wishes.mount or wishes.base or wishes.mount_pose):
-        raise InputError("--mount, --mount-pose and --base go with an arm; name its file: --arm ARM.urdf")
+        raise InputError("--mount, --mount-pose and --base need an arm: --arm ARM.urdf")
     if wishes.arm is not None and not wishes.mount:
         raise InputError("an arm needs the link that the hand is mounted on: --mount LINK")
     shard = read_shard(source, kind="base")
@@ -103,7 +103,7 @@ def _carried(
         "refused": dict(reached.refused),
     }
     if reached.refused:
-        written.notes.append(f"the arm carries out {len(reached.rows)} of {reached.candidates} grasps; left out: {why}")
+        written.notes.append(f"the arm can execute {len(reached.rows)} of {reached.candidates} grasps; left out: {why}")
     of_arm = hand_limits(arm.model)
     written.notes += _assumptions(of_arm)
     names = (*arm.model.joint_names, *found.hand.joint_names)
@@ -124,7 +124,9 @@ def _found(
     quality = _quality(shard, rows)
     found = executions(case.hand, case.obj, grasps, rows=rows, tool=tool, quality=quality, placed=placed)
     if lost := len(rows) - len(found):
-        written.notes.append(f"{lost} of {len(rows)} {word} have no straight way of 10 cm free of the object: left out")
+        written.notes.append(
+            f"{lost} of {len(rows)} {word} are left out: no straight approach of 10 cm is free of the object"
+        )
     return found
 
 

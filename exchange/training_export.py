@@ -100,7 +100,7 @@ PAIRS: Final = 40_000
 QUANTILES: Final = np.linspace(0.01, 0.99, 50)
 #: Root mean square difference of the quantiles, with distances of about 1, below which two shapes count as one. For 14
 #: scanned objects, copies that were turned, mirrored, scaled and simplified to 3 mm differ by at most 0.0043; the two
-#: most similar objects differ by 0.0095. Too large families cost a split little, too small ones leak.
+#: most similar objects differ by 0.0095. Too large families hardly affect a split; too small ones leak.
 SAME: Final = 0.006
 
 

@@ -32,7 +32,7 @@ def write(
         shards, _COLUMNS, grasp_quality=("quality/epsilon", "quality/success"), valid=valid, unvalidated=unvalidated
     )
     if not len(pictures):
-        raise InputError("the shards hold no picture; ask for views when you submit, or run graspd render")
+        raise InputError("the shards contain no picture; submit the job with views, or run graspd render")
     folder.mkdir(parents=True, exist_ok=True)
     if any(folder.glob("pictures-*.tar")):
         raise InputError(f"{folder} holds tar files of pictures already; give another folder as --output")

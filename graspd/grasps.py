@@ -313,7 +313,7 @@ class Grasps:
         # For several files, the attributes are those of the first file: they do not describe another object.
         if self.objects and self.objects != [str(self._attributes.get("object", ""))]:
             raise InputError(
-                f"these were chosen among grasps on several objects; open the file of {self.objects[0]} alone"
+                f"these grasps were selected from several objects; open the file of {self.objects[0]} alone"
             )
         said = {name: value for name, value in self._attributes.items() if name not in ("shard_id", "schema")}
         columns = {name: data for name, data in self._columns.items() if name != "object"}
@@ -371,13 +371,13 @@ def open(
 def joined(shards: Sequence[Shard]) -> Grasps:
     """Concatenate the grasps of base shards of one hand; columns missing from some shards are omitted."""
     if not shards:
-        raise InputError("there is no file of grasps here")
+        raise InputError("no file of grasps was found")
     first = shards[0]
     for shard in shards[1:]:
         if shard.attributes.get("joint_names") != first.attributes.get("joint_names"):
-            raise InputError(f"the files are of hands with other joints: {first.path} and {shard.path}")
+            raise InputError(f"the hands of these files have different joints: {first.path} and {shard.path}")
         if not np.array_equal(shard[_THRESHOLDS], first[_THRESHOLDS]):
-            raise InputError(f"the files were measured at other contact thresholds: {first.path} and {shard.path}")
+            raise InputError(f"these files have different contact thresholds: {first.path} and {shard.path}")
     common = set.intersection(*(set(shard.arrays) for shard in shards))
     columns: dict[str, Array] = {
         path: np.concatenate([shard[path] for shard in shards])
@@ -397,7 +397,7 @@ def joined(shards: Sequence[Shard]) -> Grasps:
 def _of_hand(shards: Shards, hand: str | None) -> Shards:
     hands = sorted({file.hand for file in shards.of("base")})
     if hand is not None and hand not in hands:
-        raise InputError(f"there are no grasps of the hand {hand!r}; there are those of {', '.join(hands) or 'none'}")
+        raise InputError(f"there are no grasps of the hand {hand!r}; hands with grasps: {', '.join(hands) or 'none'}")
     if hand is None and len(hands) > 1:
         raise InputError(f"these are grasps of {', '.join(hands)}; name one of them: hand={hands[0]!r}")
     return shards.only(hands=[hand]) if hand else shards

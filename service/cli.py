@@ -91,15 +91,15 @@ def at_the_door(command: Callable[[], object]) -> None:
 
 def _refusal(error: OSError | MemoryError) -> str:
     if isinstance(error, MemoryError):
-        return "there is not enough memory; give it more, or ask for less at once"
+        return "there is not enough memory; provide more, or request less at once"
     what = ", ".join(str(name) for name in (error.filename, error.filename2) if name is not None)
     said = f"{what}: {error.strerror}" if what and error.strerror else error.strerror or str(error)
     fixes = {
-        errno.ENOSPC: "make room, or name another place",
-        errno.EDQUOT: "make room, or name another place",
-        errno.EACCES: "name another place, or let this user write there",
-        errno.EROFS: "name another place",
-        errno.ENOENT: "see whether the name is right",
+        errno.ENOSPC: "free disk space, or give another path",
+        errno.EDQUOT: "free disk space, or give another path",
+        errno.EACCES: "give another path, or let this user write there",
+        errno.EROFS: "give another path",
+        errno.ENOENT: "check the name",
     }
     return without_secrets(f"{said}; {fixes[error.errno]}" if error.errno in fixes else said)
 
@@ -186,7 +186,7 @@ def load_settings(**overrides: Any) -> Settings:
     """Load the settings of the environment and the given command options; InputError for a bad value."""
     from graspd.service.settings import GONE, Settings
 
-    if gone := [f"{name} is gone: {GONE[name]}" for name in sorted(GONE) if os.environ.get(name)]:
+    if gone := [f"{name} was removed: {GONE[name]}" for name in sorted(GONE) if os.environ.get(name)]:
         raise InputError("; ".join(gone))
     try:
         return Settings(**{name: value for name, value in overrides.items() if value is not None})

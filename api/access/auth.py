@@ -1,7 +1,7 @@
 """Authentication of a request by key, session cookie or proxy; permissions of the caller.
 
-The service is open as long as no key was ever made and it binds only to this machine. After the first key it stays
-closed, even if the last key is revoked or expired.
+While no key was ever made, the service is open to this machine only. After the first key it stays closed, even if the
+last key is revoked or expired.
 
 A proxy in front of the service may authenticate people (OIDC); it is trusted only from its address and with its secret.
 
@@ -63,7 +63,7 @@ def authorize(request: HTTPConnection, scope: Scope) -> Key | None:
     if key is None:
         raise ApiError(
             401,
-            "a live key is needed: send `Authorization: Bearer gd_...`; `graspd keys add` makes one",
+            "a valid key is needed: send `Authorization: Bearer gd_...`; `graspd keys add` makes one",
             headers={"WWW-Authenticate": 'Bearer realm="graspd"'},
         )
     if not key.scope.includes(scope):
@@ -81,7 +81,7 @@ def may_still(request: HTTPConnection, scope: Scope) -> bool:
 
 
 def may_change(owner: str, project: str = "") -> bool:
-    """Check whether the present key may change a resource; without an owner or a project only `admin` may."""
+    """Check whether the present key may change a resource; only `admin` may change one without owner and project."""
     key = caller.get()
     if key is None or key.scope.includes(Scope.ADMIN):
         return True
@@ -96,8 +96,8 @@ def must_own(owner: str, what: str, project: str = "") -> None:
         assert key is not None
         raise ForeignResource(
             403,
-            f"{what} is not of the key {key.name!r}; a key of its project can do this (without a project: the key that "
-            "submitted it), or one with scope admin",
+            f"{what} does not belong to the key {key.name!r}; use a key of its project (without a project: the key "
+            "that submitted it), or a key with scope admin",
         )
 
 
@@ -118,7 +118,7 @@ def _refuse_strangers(request: HTTPConnection) -> None:
     by = f"through a proxy (header {passed_on})" if passed_on else f"from {address}"
     raise ApiError(
         403,
-        f"this service has no keys and answers to its own machine only; the request came {by}; "
+        f"this service has no keys, so it answers only its own machine; this request came {by}; "
         "make a key with `graspd keys add NAME --scope admin`",
     )
 
@@ -155,7 +155,7 @@ class Proxy:
     def __init__(self, settings: Settings) -> None:
         secret = settings.proxy_secret.get_secret_value() if settings.proxy_secret else ""
         if bool(secret) != bool(settings.proxy_addresses):
-            raise InputError("GRASPD_PROXY_ADDRESSES and GRASPD_PROXY_SECRET are set both or not at all")
+            raise InputError("set both GRASPD_PROXY_ADDRESSES and GRASPD_PROXY_SECRET, or neither")
         if secret and len(secret) < _LEAST_SECRET:
             raise InputError(f"GRASPD_PROXY_SECRET is shorter than {_LEAST_SECRET} characters; take a random one")
         self._secret = secret.encode()
@@ -216,13 +216,13 @@ def _network(text: str) -> ipaddress.IPv4Network | ipaddress.IPv6Network:
     try:
         return ipaddress.ip_network(text)
     except ValueError:
-        raise InputError(f"GRASPD_PROXY_ADDRESSES: {text!r} is no address; write 10.0.0.5 or 10.0.0.0/24") from None
+        raise InputError(f"GRASPD_PROXY_ADDRESSES: {text!r} is not an address; write 10.0.0.5 or 10.0.0.0/24") from None
 
 
 def _rights(group: str, said: str) -> tuple[str, Scope]:
     project, _, scope = said.partition(":")
     if (project and not re.fullmatch(PATTERN, project)) or scope not in set(Scope):
         raise InputError(
-            f"GRASPD_PROXY_GROUPS: {said!r} of {group!r} is no PROJECT:SCOPE; write vision:submit, or :admin for none"
+            f"GRASPD_PROXY_GROUPS: {said!r} of {group!r} is not PROJECT:SCOPE; write vision:submit, or :admin"
         )
     return project, Scope(scope)

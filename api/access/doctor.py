@@ -25,22 +25,22 @@ def keys(settings: Settings) -> Finding:
         return bad(str(error), f"restore {path}, or make new keys: move it away, then {_ADD}")
     if not found:
         if Proxy(settings).is_on:
-            return good("there are none; people come through the proxy alone")
+            return good("no keys; people sign in only through the proxy")
         if settings.host in _LOCAL:
-            return good(f"there are none, and none are needed: the API binds {settings.host}")
-        return bad(f"there are none, and the API does not start on {settings.host} without one", _ADD)
+            return good(f"no keys, and none are needed, because the API binds {settings.host}")
+        return bad(f"no keys, but the API does not start on {settings.host} without one", _ADD)
     if stat.S_IMODE(path.stat().st_mode) & 0o007:
         return bad(f"everybody can read {path}, which holds the secret of the browser sessions", f"chmod 600 {path}")
     live = [key for key in found if key.is_live]
     if not live:
-        return bad(f"none of the {len(found)} keys opens anything any more", _ADD)
+        return bad(f"all {len(found)} keys are expired or revoked", _ADD)
     if ending := sorted({key.name for key in live} - {key.name for key in live if not _ends_soon(key)}):
         return warning(
-            f"keys that end within a week: {', '.join(ending[:3])}", f"graspd keys rotate {ending[0]} --grace 24h"
+            f"keys that expire within a week: {', '.join(ending[:3])}", f"graspd keys rotate {ending[0]} --grace 24h"
         )
     if not any(key.scope is Scope.ADMIN for key in live):
-        return warning(f"{len(live)} keys, and no admin among them", _ADD)
-    return good(f"{len(live)} live keys")
+        return warning(f"{len(live)} valid keys, none with scope admin", _ADD)
+    return good(f"{len(live)} valid keys")
 
 
 def _ends_soon(key: Key) -> bool:

@@ -50,18 +50,18 @@ class KeyLimits(BaseModel):
     """Limits of one key. None: as in the settings; 0: no limit."""
 
     requests_per_minute: int | None = Field(None, ge=0)
-    concurrency: int | None = Field(None, ge=0, description="requests being answered at once")
+    concurrency: int | None = Field(None, ge=0, description="concurrent requests")
     grasps_in_flight: int | None = Field(None, ge=0, description="grasps of its jobs that have not ended")
-    jobs_per_day: int | None = Field(None, ge=0, description="new jobs from midnight to midnight UTC")
+    jobs_per_day: int | None = Field(None, ge=0, description="new jobs per day (UTC)")
 
 
 class ProjectLimits(BaseModel):
     """Shared limits of the keys of one project. None or 0: no limit."""
 
     grasps_in_flight: int | None = Field(None, ge=0, description="grasps of its jobs that have not ended")
-    grasps_per_day: int | None = Field(None, ge=0, description="grasps asked for from midnight to midnight UTC")
+    grasps_per_day: int | None = Field(None, ge=0, description="requested grasps per day (UTC)")
     gpu_seconds_per_day: int | None = Field(
-        None, ge=0, description="time of GPU workers on its tasks from midnight to midnight UTC; then no new job [s]"
+        None, ge=0, description="GPU workers' time on its tasks per day (UTC), after which new jobs are refused [s]"
     )
 
 
@@ -132,7 +132,7 @@ class KeyFile:
             if any(key.name == name and key.is_live for key in document.keys):
                 raise ConflictError(f"there is a key named {name!r}; revoke or rotate it, or take another name")
             if "@" in name:
-                raise InputError(f"{name!r} is no key name: those with an @ are of people that a proxy signs in")
+                raise InputError(f"{name!r} is no key name: names with an @ belong to people whom a proxy signs in")
             token = PREFIX + secrets.token_urlsafe(32)
             try:
                 key = Key(
@@ -205,12 +205,12 @@ class KeyFile:
     def open_session(self, key: Key) -> str:
         """Return a signed cookie for a browser that presented a key."""
         if not self._read().session_secret:
-            raise UnavailableError(f"the key file {self.path} has no session_secret; `graspd keys add` gives it one")
+            raise UnavailableError(f"the key file {self.path} has no session_secret; `graspd keys add` adds one")
         claim = base64.urlsafe_b64encode(json.dumps([key.sha256, int(time.time()) + SESSION_S]).encode()).decode()
         return f"{claim}.{self._sign(claim)}"
 
     def find_session(self, cookie: str) -> Key | None:
-        """Return the live key of a session; revoking the key ends its sessions. None without a signing secret."""
+        """Return the valid key of a session; revoking the key ends its sessions. None without a signing secret."""
         claim, _, signature = cookie.partition(".")
         if not self._read().session_secret or not hmac.compare_digest(signature.encode(), self._sign(claim).encode()):
             return None
@@ -272,7 +272,7 @@ def _no_project(name: str) -> str:
 def _live(document: _Document, name: str) -> list[Key]:
     found = [key for key in document.keys if key.name == name and key.is_live]
     if not found:
-        raise NotFoundError(f"there is no live key named {name!r}; `graspd keys list` shows them")
+        raise NotFoundError(f"there is no valid key named {name!r}; `graspd keys list` shows them")
     return found
 
 

@@ -110,7 +110,7 @@ class SubmissionClaim:
 
 @dataclass(frozen=True)
 class _Holder:
-    """Owner of counters: a key, which counts jobs per day, or a project, which counts their grasps."""
+    """Owner of counters: a key, which counts jobs per day, or a project, which counts requested grasps."""
 
     name: str
     words: str
@@ -129,14 +129,14 @@ class _Holder:
     def refusal(self, met: str, amount: int) -> QuotaError:
         if met == "grasps":
             return QuotaError(
-                f"{self.words} has {amount} grasps in work and may have {self.grasps}; "
-                "wait for a job to end, or ask for fewer grasps",
+                f"{self.words} has {amount} grasps in unfinished jobs, and at most {self.grasps} are allowed; "
+                "wait for a job to end, or request fewer grasps",
                 retry_after_s=60,
             )
         if self.counts_jobs:
-            words = f"{self.words} has submitted its {self.today} jobs of today; more tomorrow (UTC)"
+            words = f"{self.words} has submitted the {self.today} jobs allowed per day; more tomorrow (UTC)"
         else:
-            words = f"{self.words} has asked for {amount} of its {self.today} grasps of today; more tomorrow (UTC)"
+            words = f"{self.words} has requested {amount} of {self.today} grasps allowed per day; more tomorrow (UTC)"
         return QuotaError(words, retry_after_s=_until_midnight())
 
 
@@ -176,7 +176,8 @@ class Quotas:
         most = self._limits_of(project).gpu_seconds_per_day if project else None
         if most and (used := self._gpu_seconds(project, f"{datetime.now(UTC):%Y-%m-%d}")) >= most:
             raise QuotaError(
-                f"the project {project!r} has used {used:.0f} of its {most} GPU seconds of today; more tomorrow (UTC)",
+                f"the project {project!r} has used {used:.0f} of the {most} GPU seconds allowed per day; submit "
+                "more tomorrow (UTC)",
                 retry_after_s=_until_midnight(),
             )
 
@@ -277,7 +278,7 @@ class Idempotency:
     """Idempotency-Key (IETF draft): the same key with a different body is an input error.
 
     Identical requests give the same job even without a key, because a job's id depends on its content. Redis stores for
-    a day only the content of each key, not the response: its loss loses a check, never a job.
+    a day only the content of each key, not the response; if Redis loses it, only this check is lost.
     """
 
     def __init__(self, connection: Any) -> None:
@@ -310,5 +311,5 @@ class Idempotency:
         except RedisError as error:
             raise QueueUnavailable(f"Redis does not answer: {error}") from None
         if bound not in (None, content):
-            raise InputError("this Idempotency-Key came with another request before; take a new key")
+            raise InputError("this Idempotency-Key was used for another request before; use a new key")
         return False

@@ -73,7 +73,7 @@ class Assets:
         digest = self._mark(kind, name, files, "" if shared else project)
         known = self._find(kind, digest)
         if known is None and self._find(kind, digest, EVERYTHING):
-            raise ConflictError(f"another project keeps this {kind.value} to itself; upload it without sharing it")
+            raise ConflictError(f"this {kind.value} is private to another project; upload it without sharing it")
         # A refused upload does not occupy its name.
         if known and (rename or known.verdict == "refuse"):
             return known
@@ -111,7 +111,7 @@ class Assets:
         said = json_object(asset_json(files), "asset.json")
         text = json.dumps(corrected(said, facts, corrections)).encode()
         if len(text) > MAX_BYTES:
-            raise LimitError(f"what is said of the hand takes more than {MAX_BYTES} bytes; correct less")
+            raise LimitError(f"the corrected asset.json exceeds {MAX_BYTES} bytes; give fewer corrections")
         files["asset.json"] = text
         if not new_name:
             # Equal corrections give the same hand.

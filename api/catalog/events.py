@@ -110,7 +110,7 @@ class Webhooks:
         )
         with recording(self._services) as (connection, put):
             if len(self._services.index.outbox.hooks(scope=ProjectScope(project, everything=False))) >= MOST_HOOKS:
-                raise LimitError(f"there are {MOST_HOOKS} webhooks, which is the most; delete one")
+                raise LimitError(f"there are {MOST_HOOKS} webhooks already, the maximum; delete one")
             put(names.webhook(hook.id), hook)
             self._services.index.outbox.add(hook, within=connection)
         key = caller.get()

@@ -60,7 +60,7 @@ class Grasps:
         """Return identifiers of all grasps that pass every filter; LimitError if they are too many for a selection."""
         found = self._index.grasps.members(self._filter(query), limit=MOST_TAGGED + 1)
         if len(found) > MOST_TAGGED:
-            raise LimitError(f"more than {MOST_TAGGED} grasps pass this filter, which is the most at once; narrow it")
+            raise LimitError(f"more than {MOST_TAGGED} grasps pass this filter, the maximum of a selection; narrow it")
         return found
 
     def listed(self, places: Sequence[Grasp]) -> Iterator[GraspView]:

@@ -109,7 +109,7 @@ class Jobs:
             with bind(job=record.id), self._quotas.claim(key, record.id, record.request.grasps) as claim:
                 job, is_new = job_actions.enter(self._services, record)
                 claim.counts = is_new
-                log.info("job submitted" if is_new else "job was there already")
+                log.info("job submitted" if is_new else "job existed already")
         # An identical job may exist under a fidelity's name; a request with a target still gets the fidelity chosen for
         # it.
         return self._detail(job).model_copy(update={"choice": record.choice or job.choice})

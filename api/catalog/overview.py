@@ -160,7 +160,7 @@ class Overview:
 KEPT_S: Final = 2.0
 #: A part that does not answer within this time counts as unavailable [s].
 PATIENCE_S: Final = 2.0
-_INCOMPLETE: Final = "the controller makes it from the store now; until it has, jobs are missing from it"
+_INCOMPLETE: Final = "the controller is rebuilding the index from the store; until it is complete, jobs are missing"
 
 
 class Probes:
@@ -196,7 +196,7 @@ class Probes:
         return Health(ok=all(part.ok for part in parts.values()), parts=parts, controller=controller, workers=workers)
 
     def _redis(self) -> Part:
-        """Probe Redis; that of another service is not ready, because its controller ignores jobs of this one."""
+        """Probe Redis; a Redis of another service is not ready, because that service ignores jobs of this one."""
         part, service = _answering(self._services.queue.ping()), self._services.queue.service()
         if service != self._service:
             try:
@@ -215,7 +215,10 @@ class Probes:
             return part.model_copy(update={"ok": False, "detail": _INCOMPLETE})
         if made.left_out:
             some = ", ".join(made.names[:3])
-            detail = f"{made.left_out} damaged records of the store are left out: {some}; `graspd admin store verify`"
+            detail = (
+                f"{made.left_out} damaged records of the store are not in the index: {some}; run "
+                "`graspd admin store verify`"
+            )
             return part.model_copy(update={"detail": detail})
         return part
 
@@ -241,7 +244,7 @@ class _Probe:
     def part(self, deadline: float) -> Part:
         start = time.monotonic()
         self.thread.join(max(0.0, deadline - start))
-        return self._part or Part(ok=False, detail="it has not answered in time; see the log of the part itself")
+        return self._part or Part(ok=False, detail="no answer in time; see the log of this part")
 
     def _run(self) -> None:
         try:
@@ -269,9 +272,9 @@ class Usage:
         last = until or datetime.now(UTC).date()
         first = since or last - timedelta(days=min(DAYS - 1, last.toordinal() - 1))
         if first > last:
-            raise InputError(f"since {first} is after until {last}")
+            raise InputError(f"`since` {first} is after `until` {last}")
         if (last - first).days >= MOST_DAYS:
-            raise InputError(f"at most {MOST_DAYS} days are told at once; ask for fewer")
+            raise InputError(f"at most {MOST_DAYS} days can be listed at once; request fewer")
         return self._services.index.usage.days(first.isoformat(), last.isoformat(), scope=project_scope())
 
     def limits(self) -> dict[str, ProjectLimits]:

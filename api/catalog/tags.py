@@ -68,7 +68,7 @@ class Tags:
         def permit(tag: Tag | None) -> None:
             _permit(tag)
             if tag is None and self._mine(project) >= MOST_TAGS:
-                raise LimitError(f"there are {MOST_TAGS} tags, which is the most; delete one")
+                raise LimitError(f"there are {MOST_TAGS} tags already, the maximum; delete one")
 
         changed = tagging.give(self._services, name, grasps, project=project, owner=caller_id(), permit=permit)
         log.info("tag %s given to %d grasps", name, changed)
@@ -156,11 +156,11 @@ class GraspExports:
     def _zip(self, file: IO[bytes], places: Sequence[Grasp], said: Mapping[str, Any]) -> None:
         shards = by_shard(places)
         if not shards:
-            raise InputError("no grasp is chosen, and a file of none says nothing; choose others")
+            raise InputError("the selection contains no grasp; change it")
         if len(shards) > MOST_SHARDS:
             raise LimitError(
-                f"these grasps lie in {len(shards)} shards and a ZIP takes them of at most {MOST_SHARDS}; choose "
-                "fewer, or write them with `graspd grasps where` where the store is at hand"
+                f"these grasps are in {len(shards)} shards, and a ZIP has at most {MOST_SHARDS}; select "
+                "fewer, or write them with `graspd grasps where` on a machine that can read the store"
             )
         looked_at, names = 0, list[PurePosixPath]()
         with zipfile.ZipFile(file, "w") as packed:

@@ -1,6 +1,6 @@
 """Limits of requests: rate and concurrency for each caller; permission, size and duration of bodies.
 
-Rates follow GCRA (ITU-T I.371 annex A): a leaky bucket, stored as one number per caller: the time at which the bucket
+Rates follow GCRA (ITU-T I.371 annex A), a leaky bucket. One number is stored per caller: the time at which the bucket
 is empty again. Requests in progress form a sorted set with an expiry time each, so that requests of a killed process
 expire. Times come from Redis's clock, so clocks of the API machines do not matter.
 """
@@ -119,7 +119,7 @@ def _headers(allowance: Allowance, admission: Admission) -> dict[str, str]:
 def _refusal(admission: Admission, allowance: Allowance, headers: dict[str, str]) -> ApiError:
     wait = _seconds_up(admission.seconds)
     if admission.refused == "concurrency":
-        reason = f"{allowance.concurrency} of your requests are being answered, and more at once are not"
+        reason = f"{allowance.concurrency} of your requests are in progress, the maximum at once"
         headers = {}
     else:
         reason = f"more than {allowance.per_minute} requests in a minute"
@@ -284,13 +284,13 @@ class BodyLimit(HttpMiddleware):
                 async with asyncio.timeout(None if is_whole else self.piece_s):
                     message = await receive()
             except TimeoutError:
-                refusal = ApiError(408, f"no piece of the body came for {self.piece_s:g} s; send it again")
+                refusal = ApiError(408, f"no part of the body arrived for {self.piece_s:g} s; send it again")
                 return {"type": "http.disconnect"}
             is_whole = not message.get("more_body", False)
             received += len(message.get("body", b""))
             late = time.monotonic() - began - self.piece_s
             if not is_whole and received < late * LEAST_BYTES_S:
-                refusal = ApiError(408, f"the body comes at less than {LEAST_BYTES_S >> 10} KiB/s; send it again")
+                refusal = ApiError(408, f"the body arrives at less than {LEAST_BYTES_S >> 10} KiB/s; send it again")
                 return {"type": "http.disconnect"}
             if received > limit:
                 refusal = _too_large(limit)
@@ -320,7 +320,7 @@ def _body_refusal(scope: Scope, limit: int, *, is_upload: bool) -> Exception | N
     if encoding not in ("", "identity") and scope["method"] not in SAFE_METHODS:
         return ApiError(
             415,
-            f"the body has Content-Encoding {encoding[:40]!r}, and only plain bodies are read; send it as it is",
+            f"the body has Content-Encoding {encoding[:40]!r}; send an unencoded body",
             headers={"Accept-Encoding": "identity"},
         )
     declared = given.get(b"content-length", b"0")

@@ -221,7 +221,7 @@ class SameOrigin(HttpMiddleware):
         headers = Headers(scope=scope)
         host = headers.get("host", "")
         if self.allowed_hosts is not None and host_name(host) not in self.allowed_hosts:
-            return ApiError(421, f"this service does not answer to the name {host_name(host)!r}; use 127.0.0.1")
+            return ApiError(421, f"this service does not accept the host name {host_name(host)!r}; use 127.0.0.1")
         if scope["method"] in SAFE_METHODS:
             return None
         site = headers.get("sec-fetch-site")

@@ -58,15 +58,15 @@ def asset_router(kind: AssetKind) -> APIRouter:
         assets: AssetsOf,
         limit: Limit = 50,
         cursor: Cursor = None,
-        refused: Annotated[bool, Query(description="also those that the check refused")] = False,
+        refused: Annotated[bool, Query(description="include assets that the check refused")] = False,
     ) -> Page[AssetView]:
-        """List all of them, newest first; refused ones only on request."""
+        """List all assets of this kind, newest first; refused ones only on request."""
         page = assets.page(kind, limit=limit, cursor=cursor, refused=refused)
         return Paging(request, response, limit, cursor).linked(page)
 
     @router.get("/{name}", dependencies=READ, responses=responses(404), name=f"get_{kind}")
     def get_asset(name: str, assets: AssetsOf) -> AssetView:
-        """Return one of them, with the findings of its check."""
+        """Return an asset with the findings of its check."""
         return assets.one(kind, name)
 
     if kind is not AssetKind.NETWORK:
@@ -91,16 +91,16 @@ def asset_router(kind: AssetKind) -> APIRouter:
         ] = "",
         self_test: Annotated[
             bool,
-            Form(description="of a hand: its check ends with 80 grasps of plain objects, some minutes of a worker"),
+            Form(description="hands only: the check ends with 80 grasps of plain objects, which takes some minutes"),
         ] = False,
-        shared: Annotated[bool, Form(description="whether every project may use it, not only that of the key")] = False,
+        shared: Annotated[bool, Form(description="whether all projects may use it, not only the key's")] = False,
         rename: Annotated[
-            bool, Form(description="whether the next free name is given where the name stands for something else")
+            bool, Form(description="whether the asset gets the next free name if its name is taken")
         ] = False,
     ) -> AssetView:
         uploads: RequestLimiter = request.app.state.uploads
         if self_test and kind is not AssetKind.HAND:
-            raise InputError("self_test: only a hand can be tried")
+            raise InputError("self_test: only hands have a self-test")
         said = {"options": options, "self_test": self_test, "shared": shared, "rename": rename}
         limit = request.app.state.settings.max_upload_bytes
         asset = await uploads.run(store_upload, assets, kind, file, name, limit_bytes=limit, **said)
@@ -113,7 +113,7 @@ def asset_router(kind: AssetKind) -> APIRouter:
         "/{name}", status_code=204, dependencies=SUBMIT, responses=responses(404, 409), name=f"delete_{kind}"
     )
     def delete_asset(name: str, assets: AssetsOf) -> None:
-        """Delete it; refused while a job, a dataset or a set of objects needs it. `name` may be a digest."""
+        """Delete an asset; refused while a job, a dataset or a set of objects needs it. `name` may be a digest."""
         assets.delete(kind, name)
 
     return router
@@ -128,7 +128,7 @@ def _add_model_route(router: APIRouter, kind: AssetKind) -> None:
             404,
             others={
                 200: {"content": {_GLB: {}}, "description": "Binary glTF"},
-                304: {"description": "What If-None-Match names is this file"},
+                304: {"description": "The file is unchanged: it has the tag of If-None-Match"},
             },
         ),
         name=f"get_{kind}_model",

@@ -24,7 +24,9 @@ routers = (router, sets_router)
 
 DatasetName = Annotated[str, Path(max_length=64)]
 SnapshotDigest = Annotated[str, Path(pattern=r"^[0-9a-f]{32}$")]
-_ENDED: dict[int | str, dict[str, Any]] = {200: {"model": DatasetView, "description": "It has ended"}}
+_ENDED: dict[int | str, dict[str, Any]] = {
+    200: {"model": DatasetView, "description": "The dataset existed already and has ended"}
+}
 
 
 class ObjectSetRequest(BaseModel):
@@ -55,7 +57,7 @@ class _NoDataset:
     """Reserved path: no dataset may be named `estimate`, so only POST is valid there."""
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        raise ApiError(405, "an estimate is asked for with POST", headers={"Allow": "POST"})
+        raise ApiError(405, "request an estimate with POST", headers={"Allow": "POST"})
 
 
 # A class accepts every method; a function would have to list them.
@@ -97,7 +99,7 @@ def delete_dataset(
     name: DatasetName,
     datasets: DatasetsOf,
     with_snapshots: Annotated[
-        bool, Query(description="whether its snapshots may go too; else they protect it")
+        bool, Query(description="whether to delete its snapshots too; otherwise they protect it")
     ] = False,
 ) -> None:
     """Delete an ended dataset, and those of its jobs that belong to it alone.
@@ -112,7 +114,7 @@ def delete_dataset(
     status_code=201,
     dependencies=SUBMIT,
     responses=responses(
-        404, 409, others={200: {"model": SnapshotView, "description": "There was one of these shards"}}
+        404, 409, others={200: {"model": SnapshotView, "description": "A snapshot of these shards existed already"}}
     ),
 )
 def take_snapshot(name: DatasetName, response: Response, datasets: DatasetsOf) -> SnapshotView:

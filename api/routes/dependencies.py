@@ -92,7 +92,7 @@ DeletionsOf = Annotated[Deletions, Depends(_provided("deletions"))]
 WebhooksOf = Annotated[Webhooks, Depends(_provided("webhooks"))]
 OverviewOf = Annotated[Overview, Depends(_provided("overview"))]
 Limit = Annotated[int, Query(ge=1, le=200, description="items on a page")]
-Cursor = Annotated[str | None, Query(max_length=512, description="`next` of the page before")]
+Cursor = Annotated[str | None, Query(max_length=512, description="`next` of the previous page")]
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 
 IdempotencyKey = Annotated[
     str | None,
-    Header(max_length=255, description="the same key with another body is refused; the same request is the same job"),
+    Header(max_length=255, description="the same key with another body is refused; equal requests give the same job"),
 ]
 
 
@@ -30,7 +30,9 @@ IdempotencyKey = Annotated[
     "",
     status_code=202,
     dependencies=SUBMIT,
-    responses=responses(400, 404, 409, others={200: {"model": JobDetail, "description": "It has ended"}}),
+    responses=responses(
+        400, 404, 409, others={200: {"model": JobDetail, "description": "The job existed already and has ended"}}
+    ),
 )
 def submit(body: JobRequest, response: Response, jobs: JobsOf, idempotency_key: IdempotencyKey = None) -> JobDetail:
     """Submit a job. Identical content gives the same job: its id follows from request, hand and object."""
@@ -76,7 +78,7 @@ def retry(job_id: str, jobs: JobsOf) -> JobDetail:
 
 @router.delete("/{job_id}", status_code=204, dependencies=SUBMIT, responses=responses(404, 409))
 def delete(job_id: str, jobs: JobsOf) -> None:
-    """Delete an ended job. After a grace time its shards follow, unless another job needs them; until then
+    """Delete an ended job. After a grace time its shards are deleted, unless another job needs them; until then
     `POST .../restore` restores the job."""
     jobs.delete(job_id)
 
@@ -132,9 +134,9 @@ def get_shard(shard_id: str, shards: ShardsOf) -> Shard:
         416,
         others={
             200: {"content": {_MEDIA_TYPE: {}}, "description": "The file"},
-            206: {"content": {_MEDIA_TYPE: {}}, "description": "The bytes asked for"},
-            304: {"description": "What If-None-Match names is this file"},
-            307: {"description": "The store hands the file out itself, under a signed address"},
+            206: {"content": {_MEDIA_TYPE: {}}, "description": "The requested bytes"},
+            304: {"description": "The file is unchanged: it has the tag of If-None-Match"},
+            307: {"description": "The store serves the file at a signed address"},
         },
     ),
 )

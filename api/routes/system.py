@@ -97,10 +97,12 @@ def get_usage(usage: UsageOf, since: Since = None, until: Until = None) -> list[
     "/v1/usage.csv",
     dependencies=READ,
     response_class=Response,
-    responses=responses(400, others={200: {"content": {"text/csv": {}}, "description": "One line a day and project"}}),
+    responses=responses(
+        400, others={200: {"content": {"text/csv": {}}, "description": "One line per day and project"}}
+    ),
 )
 def get_usage_csv(usage: UsageOf, since: Since = None, until: Until = None) -> Response:
-    """Return the same as a table."""
+    """Return the usage of `/v1/usage` as CSV."""
     headers = {"Content-Disposition": 'attachment; filename="usage.csv"'}
     return Response(as_csv(usage.days(since, until)), media_type="text/csv", headers=headers)
 
@@ -132,9 +134,7 @@ for _kind in get_args(What):
 event_router = APIRouter(tags=["events"])
 
 WebhookId = Annotated[str, Path(max_length=64)]
-AfterEnd = Annotated[
-    int, Query(ge=0, lt=2**62, description="`seq` of the last end that is known; 0: from the first on")
-]
+AfterEnd = Annotated[int, Query(ge=0, lt=2**62, description="`seq` of the last known end; 0: return all ends")]
 
 
 class DeliveryPage(BaseModel):
@@ -156,7 +156,7 @@ class WebhookRequest(BaseModel):
 class CreatedWebhook(WebhookView):
     """Webhook and the secret that signs its bodies."""
 
-    secret: str = Field(description="told this once")
+    secret: str = Field(description="shown only once")
 
 
 @event_router.get("/v1/events", dependencies=READ)
@@ -171,9 +171,9 @@ async def stream_ends(
     request: Request,
     webhooks: WebhooksOf,
     since: AfterEnd = 0,
-    last_event_id: Annotated[str | None, Header(max_length=20, description="goes over `since`")] = None,
+    last_event_id: Annotated[str | None, Header(max_length=20, description="takes precedence over `since`")] = None,
 ) -> AsyncIterable[ServerSentEvent]:
-    """Stream the same: one `end` event each. A client that reconnects continues where it stopped."""
+    """Stream ended jobs and datasets, one `end` event each. A client that reconnects continues where it stopped."""
     start = int(last_event_id) if last_event_id and last_event_id.isascii() and last_event_id.isdigit() else since
     async for event in events.ends(webhooks, min(start, 2**62), request):
         yield event

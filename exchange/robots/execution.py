@@ -1,7 +1,7 @@
 """Executable grasps: six postures each, in a frame of the user's choice, and the timed trajectory.
 
-Each motion starts and ends at rest: its share s of the path is 10 u^3 - 15 u^4 + 6 u^5 for the share u of its time
-(minimum jerk, Flash and Hogan 1985), whose steepest slope is 15/8.
+Each motion starts and ends at rest (minimum jerk, Flash and Hogan 1985). After the share u of its time it has covered
+the share 10 u^3 - 15 u^4 + 6 u^5 of its path; the steepest slope of this polynomial is 15/8.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from graspd.worker.simulation.environment import STANDOFF_M, PlacedGrasps
 #: Postures of a grasp in order. The open hand moves from `standoff` to `arrival`, takes the shape of `pregrasp`, closes
 #: to `grasp`, is commanded to `squeeze`, and rises to `lift`.
 POSTURES: Final = ("standoff", "arrival", "pregrasp", "grasp", "squeeze", "lift")
-#: Motions from one posture to the next.
+#: Motions between consecutive postures.
 PHASES: Final = ("approach", "shape", "close", "squeeze", "lift")
 
 
@@ -120,8 +120,7 @@ def executions(
     whole = Executions(hand, obj, tool, frame, np.asarray(rows, np.intp), at, postures, placed, dict(quality))
     if not free.any():
         raise InputError(
-            f"none of {len(grasps)} grasps can be reached along a straight way of {100 * STANDOFF_M:.0f} cm that is "
-            "free of the object"
+            f"none of {len(grasps)} grasps has a straight approach of {100 * STANDOFF_M:.0f} cm free of the object"
         )
     return whole.take(np.flatnonzero(free))
 

@@ -113,7 +113,7 @@ LONG: Final = 21
 SHORT: Final = 5
 _LONG_PHASES: Final = ("approach", "lift")
 #: Reasons why an arm cannot execute a grasp.
-REASONS: Final = ("out of reach", "way not possible", "collision")
+REASONS: Final = ("out of reach", "no continuous motion", "collision")
 
 
 @dataclass
@@ -124,7 +124,7 @@ class ReachResult:
     paths: list[list[Path]] = field(default_factory=list)
     """Their motions; joints are the arm's, then the hand's."""
     refused: Counter[str] = field(default_factory=Counter)
-    """How many of the others for which reason."""
+    """Number of the other grasps by reason."""
     candidates: int = 0
 
 
@@ -255,7 +255,7 @@ ALWAYS: Final = 0.95
 SAMPLES: Final = 100
 #: Name of the frame that carries the hand.
 MOUNT: Final = "mount"
-#: The arm collides with everything; hand, object and supports with the arm alone, the rest was checked before.
+#: The arm is tested against everything; hand, object and supports only against the arm: other pairs were tested.
 _ARM: Final = {"contype": 1, "conaffinity": 1}
 _OTHER: Final = {"contype": 0, "conaffinity": 1}
 
@@ -313,7 +313,7 @@ class ArmScene:
         for prefix, names in (("arm", self.arm.model.body_names), ("hand", self.hand.body_names)):
             if body.startswith(prefix):
                 return names[int(body.removeprefix(prefix))]
-        return "what stands there" if body == "world" else str(body)
+        return "an obstacle" if body == "world" else str(body)
 
     def _put(self, model: Any, data: Any, arm_joints: Floats, hand_joints: Floats) -> None:
         data.qpos[_addresses(model, self.arm.model, "arm")] = self.arm.model.expand(arm_joints)

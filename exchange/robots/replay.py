@@ -7,7 +7,7 @@
 Each grasp has six key frames in the scene: standoff, arrival, pregrasp, grasp, squeeze, lift. The hand must not touch
 anything during its approach, and closes in 0.8 s. With gravity it then rises within 0.4 s and holds for 2 s; else the
 object is pushed with ten times its mass in newton in six directions for 2 s each. The object may end 5 cm and 15
-degrees from its goal. Without --full a hold ends as soon as the object's present rates keep it there for 2 s.
+degrees from its goal. Without --full a test ends early if the object's present velocities keep it there for 2 s.
 """
 
 import argparse
@@ -64,7 +64,7 @@ class Replay:
         if self.deepest() > MAX_DEPTH_M:
             return "penetration"
         if self.touches(grasp):
-            return "touched on the way"
+            return "contact on the approach"
         self.reset(grasp, "pregrasp")
         self.move(grasp, "pregrasp", "grasp")
         self.move(grasp, "grasp", "squeeze")
@@ -109,7 +109,7 @@ class Replay:
             self.run(STAGE_S)
 
     def hold(self, goal: Any) -> str:
-        """Hold as the validator does: end once the present rates keep the object in half of its limits."""
+        """Hold as the validator does: end once its present velocities keep the object within half of its limits."""
         self.run(FIRST_LOOK_S - LOOK_S)
         elapsed, before = FIRST_LOOK_S - LOOK_S, self.offset(goal)
         while elapsed < HOLD_S - 1e-9:
@@ -217,7 +217,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene")
     parser.add_argument("--view", nargs="?", const="", help="watch a grasp, by default the first")
-    parser.add_argument("--full", action="store_true", help="hold for 2 s even where the end can be foreseen")
+    parser.add_argument("--full", action="store_true", help="hold for the full 2 s even if the result is clear earlier")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     if options.view is not None:

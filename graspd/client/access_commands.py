@@ -121,7 +121,7 @@ def duration(text: str) -> timedelta:
     """Parse a time such as 90d, 12h, 30m or 45s; raise InputError for anything else."""
     match = re.fullmatch(r"(\d{1,6})([smhd])", text.strip())
     if match is None:
-        raise InputError(f"{text!r} is no length of time; write 90d, 12h, 30m or 45s")
+        raise InputError(f"{text!r} is not a duration; write 90d, 12h, 30m or 45s")
     return timedelta(**{_UNITS[match[2]]: int(match[1])})
 
 

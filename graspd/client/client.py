@@ -125,7 +125,7 @@ class Client:
         deadline = time.monotonic() + timeout_s
         while (asset := self.asset(kind, digest)).verdict is None:
             if time.monotonic() > deadline:
-                why = asset.message or "is one running?"
+                why = asset.message or "is a worker running?"
                 raise UnavailableError(f"no worker has checked {kind.value} {asset.name!r} yet; {why}")
             time.sleep(_POLL_S)
         return asset
@@ -286,7 +286,7 @@ def _authorization(key: str) -> dict[str, str]:
     if not key:
         return {}
     if not (key.isascii() and key.isprintable() and " " not in key):
-        raise InputError("the API key (GRASPD_API_KEY) holds a character that no key has; copy it again")
+        raise InputError("the API key (GRASPD_API_KEY) contains an invalid character; copy it again")
     return {"Authorization": f"Bearer {key}"}
 
 
@@ -322,6 +322,6 @@ def _raise_for(answer: httpx.Response) -> None:
         problem = answer.json()
         slug, detail = str(problem["type"]).rpartition("/")[2], str(problem["detail"])
     except (ValueError, KeyError, TypeError):
-        slug, detail = "", f"{answer.url} answered {answer.status_code}, and not as graspd does; check the address"
+        slug, detail = "", f"{answer.url} answered {answer.status_code}, but not as a graspd API; check the address"
     fallback: type[GraspdError] = InputError if answer.is_client_error else UnavailableError
     raise ERRORS.get(slug, fallback)(detail)

@@ -120,7 +120,7 @@ def read_spec(file: Path) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise InputError(f"{file} is no {kind}: {error}") from None
     if not isinstance(found, dict):
-        raise InputError(f"{file} must hold the keys of a dataset: hands, objects, grasps, ...")
+        raise InputError(f"{file} must contain the keys of a dataset: hands, objects, grasps, ...")
     try:
         if isinstance(found.get("scene"), str):
             found["scene"] = scene_option(found["scene"], beside=file.parent)

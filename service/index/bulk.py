@@ -18,7 +18,7 @@ _ROWS: Final = 10_000
 def upsert(connection: Connection, table: Table, rows: Sequence[Row], *, keep: Sequence[str] = ()) -> None:
     """Insert rows; for existing primary keys update all given columns except `keep`.
 
-    All rows have the same columns. The last of two rows with one key counts.
+    All rows have the same columns. Of two rows with one key the last one counts.
     """
     if not rows:
         return

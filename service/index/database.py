@@ -96,7 +96,7 @@ class Database:
 
     @contextmanager
     def writing(self, within: Connection | None = None) -> Iterator[Connection]:
-        """Yield a transaction, or the given one: all of it is committed or nothing. Writers take turns.
+        """Yield a transaction, or the given one: all of it is committed or nothing.
 
         Writers take turns because states are derived from facts read in the same transaction: two concurrent ones would
         each miss the other's facts.
@@ -157,7 +157,7 @@ class Database:
         if self._file is not None and self._file.identity() != self._identity:
             with self._opening:
                 if self._file.identity() != self._identity:
-                    log.warning("the index %s was removed or exchanged; it is opened again", self._file.path)
+                    log.warning("the index %s was removed or replaced; it is opened again", self._file.path)
                     old, self._engine = self._engine, self._open()
                     old.dispose()
         return self._engine
@@ -326,11 +326,11 @@ def mapped() -> Iterator[None]:
         # The data is at fault, not the database: retries would never end.
         raise InputError(f"the index cannot hold this: {_line(error)}") from error
     except (OverflowError, UnicodeEncodeError):
-        raise InputError("the index knows whole numbers below 2^63 and Unicode text; give such values") from None
+        raise InputError("the index stores only whole numbers below 2^63 and Unicode text; give such values") from None
     except SQLAlchemyError as error:
         if getattr(getattr(error, "orig", None), "sqlite_errorcode", 0) & 0xFF in _DAMAGED:
             raise IndexDamaged(
-                f"the index is damaged ({_line(error)}); a new one takes its place, and is filled from the store"
+                f"the index is damaged ({_line(error)}); a new one replaces it and is filled from the store"
             ) from error
         raise IndexUnavailable(f"the index does not answer or cannot be written: {_line(error)}") from error
 
@@ -361,7 +361,7 @@ Identity = tuple[int, int] | None
 
 
 class SqliteFile:
-    """File of an SQLite index; a lock prevents that a process opens it while another moves it away."""
+    """File of an SQLite index; a lock prevents a process from opening it while another moves it away."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -396,7 +396,7 @@ class SqliteFile:
         if damaged is None or self.identity() != damaged:
             return
         suffix = f".damaged-{datetime.now(UTC):%Y%m%dT%H%M%S}"
-        log.error("the index %s is damaged and moved to %s%s; a new one takes its place", self.path, self.path, suffix)
+        log.error("the index %s is damaged and moved to %s%s; a new one replaces it", self.path, self.path, suffix)
         for name in ("", *_COMPANIONS):
             if (found := self._beside(name)).exists():
                 found.rename(found.with_name(f"{self.path.name}{suffix}{name}"))

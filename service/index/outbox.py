@@ -34,8 +34,8 @@ class DueDelivery:
 def note_ends(connection: Connection, rows: Sequence[dict[str, Any]]) -> None:
     """Append ends to the feed within a transaction; writers take turns, so numbers appear in order.
 
-    A number is the time in milliseconds, or the last one plus 1. So the numbers of a new index follow those that
-    readers saw before the old one was lost.
+    A number is the time in milliseconds, or the last number plus 1. A rebuilt index thus continues after the
+    numbers of the lost one.
     """
     if rows:
         first = max(last_end(connection) + 1, int(time.time() * 1000))

@@ -80,11 +80,11 @@ def decode(cursor: str, *kinds: type | tuple[type, ...]) -> tuple[Any, ...]:
     try:
         key = from_json(base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4)), allow_inf_nan=False)
     except ValueError:
-        raise InputError("the cursor is not one that this list gave out; start without it") from None
+        raise InputError("the cursor is not from this list; start without it") from None
     if not isinstance(key, list) or len(key) != len(kinds) or not all(map(isinstance, key, kinds)):
         raise InputError("the cursor belongs to another list or another order; start without it")
     if any(isinstance(part, int) and not -_MOST <= part < _MOST for part in key):
-        raise InputError("the cursor is not one that this list gave out; start without it")
+        raise InputError("the cursor is not from this list; start without it")
     return tuple(key)
 
 

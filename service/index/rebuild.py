@@ -179,7 +179,7 @@ class _Rebuild:
                 yield
         except _OF_THE_RECORD as error:
             self.left_out.append(key)
-            log.warning("%s is left out of the index: %s", key, error)
+            log.warning("%s is not entered into the index: %s", key, error)
             return
         if what is not None:
             self.counts[what] += 1
@@ -201,7 +201,7 @@ def differences(index: Index, store: Store) -> list[str]:
     ):
         rebuild(fresh, store)
         made = fresh.notes.completeness()
-        damaged = [f"{name}: damaged, and left out" for name in made.names] if made is not None else []
+        damaged = [f"{name}: damaged, so not in the index" for name in made.names] if made is not None else []
         with index.database.reading() as live, fresh.database.reading() as derived:
             rows = [line for table in metadata.tables.values() for line in _compare(table, live, derived)]
         return [*damaged, *rows][:_SHOWN_DIFFERENCES]

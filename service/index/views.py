@@ -27,7 +27,7 @@ class Page(View, Generic[T]):
 
 
 class Validated(View):
-    """Number of grasps, and how many are valid. Those without validation are no failures and omitted."""
+    """Numbers of grasps and of valid grasps. Grasps without validation are not failures: the yield omits them."""
 
     grasps: int = Field(0, description="grasps stored so far")
     valid: int = Field(

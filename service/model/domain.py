@@ -290,13 +290,13 @@ class JobOptions(Model):
             example = "lift>=0.9" if self.in_scene else "gsr>=0.6"
             raise ValueError(f"fidelity auto needs a target, such as {example}")
         if self.target and self.fidelity != AUTO:
-            raise ValueError("a target goes with fidelity auto")
+            raise ValueError("a target requires fidelity auto")
         if self.mass is not None and self.density is not None:
             raise ValueError("mass and density both: give one of them")
         if self.validation == "dexgraspbench" and self.matter:
             raise ValueError(
                 f"validation dexgraspbench gives all objects {MASS_KG:g} kg and friction "
-                f"{FRICTION:g}: {', '.join(self.matter)} goes with standard, fast or none"
+                f"{FRICTION:g}: {', '.join(self.matter)} requires standard, fast or none"
             )
         self._check_scene()
         if self.views and not self.scenes:
@@ -310,7 +310,7 @@ class JobOptions(Model):
             if self.method in FREE_ONLY_METHODS:
                 raise ValueError(f"method {self.method} plans around free objects only: in a scene use fast_graspd")
             if self.robustness:
-                raise ValueError("robustness repeats the six pushes of free grasps: it goes with scene free")
+                raise ValueError("robustness repeats the six pushes of free grasps: choose scene free")
         if not self.SUBMITTED:
             return
         if self.shake and not self.in_scene:

@@ -102,5 +102,7 @@ def resolve_fidelity(value: str | Fidelity) -> Fidelity:
         return value
     if value not in FIDELITIES:
         meant = did_you_mean(str(value), FIDELITIES)
-        raise ValueError(f"unknown fidelity {value!r}; choose one of {', '.join(FIDELITIES)}, or give the knobs{meant}")
+        raise ValueError(
+            f"unknown fidelity {value!r}; choose one of {', '.join(FIDELITIES)}, or give its settings{meant}"
+        )
     return FIDELITIES[value]

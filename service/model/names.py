@@ -136,7 +136,9 @@ log = logging.getLogger(__name__)
 def refuse_long(name: str) -> str:
     """Return the name; InputError if it is too long and a user can choose another."""
     if len(name) > MOST:
-        raise InputError(f"the name {name} has {len(name)} characters, at most {MOST} are taken; give a shorter one")
+        raise InputError(
+            f"the name {name} has {len(name)} characters, and at most {MOST} are allowed; give a shorter one"
+        )
     return name
 
 

@@ -101,8 +101,7 @@ class SceneSpec(Model):
     """drawn: resting faces with their frequency after drops; all: one scene for each stable face."""
 
     touch: Touch = TOUCH
-    """Clearance of fingertips to supports [mm]: 2, as for the rest of the hand; 0: contact allowed; below: they press.
-    """
+    """Clearance of fingertips to supports [mm]: 2, as for the rest of the hand; 0: contact; negative: they press."""
     neighbours: tuple[NeighbourSpec, ...] = Field((), max_length=MOST_NEIGHBOURS)
 
     @model_validator(mode="after")
@@ -115,10 +114,10 @@ class SceneSpec(Model):
         if self.kind == "free" and self.faces != "drawn":
             raise ValueError("a free object lies on no face: choose table, bin or shelf")
         if self.kind == "free" and self.touch != TOUCH:
-            raise ValueError("around a free object there is nothing to touch: choose table, bin or shelf")
+            raise ValueError("a free object has no supports to touch: choose table, bin or shelf")
         check_quaternion(self.target)
         if self.target is not None and self.faces == "all":
-            raise ValueError("a target with a pose lies on one face: faces all goes with a dropped target")
+            raise ValueError("a target with a pose lies on one face: faces all requires a dropped target")
         return self
 
     def told(self) -> dict[str, Any]:
@@ -130,11 +129,11 @@ class SceneSpec(Model):
         if not placed:
             return
         if self.kind == "free":
-            raise ValueError("neighbours stand in a scene: choose table, bin, shelf or a scene file, not free")
+            raise ValueError("neighbours need a scene: choose table, bin, shelf or a scene file, not free")
         if len(placed) > 1:
             raise ValueError("give all neighbours a pose, or none: those without are dropped together")
         if placed == {True} and self.kind != "file":
-            raise ValueError("neighbours with poses belong into a scene file")
+            raise ValueError("neighbours with poses need a scene file")
         if placed == {False} and self.target is not None:
             raise ValueError("neighbours without a pose are dropped with the target: give all of them poses")
 

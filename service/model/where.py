@@ -81,11 +81,13 @@ Node = Flag | MetricComparison | WordComparison | TypeComparison | Negation | Co
 def parsed(text: str) -> Node:
     """Parse an expression to its tree; InputError states the position of a mistake, or the known names."""
     if len(text) > LONGEST:
-        raise InputError(f"the expression is {len(text)} characters long; at most {LONGEST} are read")
+        raise InputError(f"the expression is {len(text)} characters long; at most {LONGEST} are allowed")
     parser = _Parser(_tokens(text))
     found = parser.expression(0)
     if parser.at < len(parser.tokens):
-        raise InputError(f"{parser.tokens[parser.at].text!r} is left over; join conditions by `and` or `or`")
+        raise InputError(
+            f"{parser.tokens[parser.at].text!r} follows a complete expression; join conditions by `and` or `or`"
+        )
     return found
 
 
@@ -136,18 +138,18 @@ class _Parser:
     def _condition(self, token: _Token) -> Node:
         name = _SHORT.get(token.text, token.text)
         if token.kind != "word" or token.text in ("and", "or"):
-            raise InputError(f"{token.text!r} stands where a name is expected")
+            raise InputError(f"{token.text!r} was found where a name is expected")
         following = self.tokens[self.at] if self.at < len(self.tokens) else None
         compared = following is not None and following.kind == "op" and following.text in _COMPARISONS
         if name in FLAGS:
             if compared:
-                raise InputError(f"{name} is true or not: write `{name}` or `not {name}`")
+                raise InputError(f"{name} is a flag: write `{name}` or `not {name}`")
             return Flag(name)
         if name not in _METRICS and name not in _WORDS:
             known = [*_METRICS, *FLAGS, *_WORDS]
             raise InputError(f"there is no {token.text!r}; the names are {one_of(token.text, known)}")
         if not compared or following is None:
-            raise InputError(f"{name} is to be compared, as in `{name} {'= power' if name == 'type' else '> 0'}`")
+            raise InputError(f"{name} needs a comparison, such as `{name} {'= power' if name == 'type' else '> 0'}`")
         self.at += 1
         op, value = _COMPARISONS[following.text], self._next("a value")
         if name in _WORDS:
@@ -171,7 +173,7 @@ class _Parser:
 
 def _of_word(name: str, op: str, value: _Token) -> Node:
     if op not in ("=", "!="):
-        raise InputError(f"{name} is = or != a word, not {op} one")
+        raise InputError(f"{name} is compared with a word by = or !=, not by {op}")
     if value.kind not in ("word", "quoted"):
         raise InputError(f"{name} is compared with a word, not with {value.text!r}")
     if name != "type":

@@ -83,12 +83,12 @@ class Capabilities:
     def lacks(self, need: Requirements) -> str:
         oldest, newest = self.schemas
         if need.schema > newest:
-            return f"schema {need.schema} of tasks is needed, and {newest} is the newest known"
+            return f"the task needs schema {need.schema}, but the worker reads at most schema {newest}"
         if need.newest < oldest:
-            return f"schema {need.newest} of tasks is the newest it may have, and {oldest} the oldest known"
+            return f"the task has at most schema {need.newest}, but the worker reads schemas from {oldest} on"
         made = self.revisions.get(need.stage.value, 0)
         if need.revision and need.revision != made:
-            return f"revision {need.revision} of {need.stage.value} is needed, and revision {made} is made"
+            return f"the task needs revision {need.revision} of {need.stage.value}, but the worker has revision {made}"
         return ""
 
 

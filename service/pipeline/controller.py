@@ -141,7 +141,7 @@ class Controller:
                 stop.wait(pause)
             except Exception:
                 pause = min(_LONGEST_PAUSE_S, max(1.0, 2 * pause))
-                log.exception("a round broke off; the controller goes on in %.2g s", pause)
+                log.exception("a round failed; the controller continues in %.2g s", pause)
                 stop.wait(pause)
         if self._started:
             with _noted([]):
@@ -198,7 +198,7 @@ class Controller:
         try:
             record = read_record(JobRecord, self._services.store, names.job_record(self._entered))
         except (NotFoundError, DamagedError) as error:
-            log.error("the rest of job %s is not entered: %s", self._entered, error)
+            log.error("the remaining tasks of job %s are not entered: %s", self._entered, error)
         self._services.index.write.enter_more(self._entered, record)
 
     def _look_after_workers(self) -> None:
@@ -220,7 +220,7 @@ class Controller:
         )
 
     def _see_to_the_index(self) -> None:
-        """Ensure that the index is complete before events are applied. It may be lost at any time."""
+        """Ensure that the index is complete before events are applied, because it may be lost at any time."""
         if not self._started:
             self._start()
         elif self._services.index.notes.completeness() is None or self._is_stale():
@@ -252,7 +252,7 @@ class Controller:
         return True
 
     def _make_whole(self) -> None:
-        log.warning("the index may lack what the store has: it is made from the store")
+        log.warning("the index may lack records of the store: it is rebuilt from the store")
         rebuild(self._services.index, self._services.store, progress=lambda *_: self._alive.touch())
 
     def _index_assets(self) -> None:

@@ -1,7 +1,7 @@
-"""Deletion of assets, jobs and datasets by users. The deletion's record decides; the rest follows.
+"""Deletion of assets, jobs and datasets by users.
 
 `deletions/{what}/{id}.json` is written under the index's write lock, in the same step that removes the rows. From then
-on the thing is gone: a rebuild omits it, and nothing of that id is accepted. The garbage collector
+on the resource does not exist: a rebuild omits it, and nothing of that id is accepted. The garbage collector
 (`service.pipeline.garbage_collector`) removes its objects, then the record itself. If killed, it restarts.
 """
 
@@ -101,9 +101,9 @@ def delete_dataset(services: Services, name: str, *, owner: str = "", with_snaps
 
 
 def put_away(services: Services, deletion: Deletion) -> None:
-    """Move the deleted objects below `removed/`, the own record last, then remove the deletion's record.
+    """Move the deleted objects below `removed/`, its own record last, then remove the deletion's record.
 
-    Do nothing for a thing that was restored meanwhile.
+    Do nothing for a resource that was restored meanwhile.
     """
     record = _record_of(deletion)
     with services.index.database.writing():

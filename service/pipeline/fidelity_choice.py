@@ -104,13 +104,13 @@ def _no_chart(request: JobRequest) -> str:
     scene = request.place.kind
     asked, named = ("FILE", "of a scene file with the same supports") if scene == "file" else (scene, f"in a {scene}")
     return (
-        f"fidelity auto needs a chart of scenes, here {named}; that of free objects says nothing of lifts: run "
+        f"fidelity auto needs a chart of scenes, here {named}, because charts of free objects have no lifts: run "
         f"`graspd chart --scene {asked} --publish` once, or name a fidelity"
     )
 
 
 def parse_target(text: str, *, in_scene: bool = False) -> tuple[str, float]:
-    """Parse `gsr>=0.6` into metric and bound; in a scene `lift>=0.9`. InputError for what no chart can promise."""
+    """Parse `gsr>=0.6` into metric and bound; in a scene `lift>=0.9`. InputError for any other text."""
     known, examples = IN_SCENES if in_scene else FREE, _EXAMPLES[in_scene]
     found = _TARGET.fullmatch(text)
     if found is None:
@@ -140,7 +140,7 @@ def cheapest(chart: Row, target: str, *, method: str, hand: str, object_: str) -
         raise InputError(f"the stored chart has no run of {method}; run {again}, or name a fidelity")
     found = _nearest(runs, metric, {"hand": hand, "object": object_})
     if found is None:
-        raise InputError(f"the stored chart does not hold {metric} of {method}; run {again}, or ask for another target")
+        raise InputError(f"the stored chart lacks {metric} of {method}; run {again}, or ask for another target")
     measured_on, near = found
     names = dict.fromkeys(run["fidelity"] for run in near)
     means = {name: (_speed(near, name), _mean(near, name, metric)) for name in names}

@@ -1,4 +1,4 @@
-"""Apply events to the index. An event only names a place: the index is filled from the store."""
+"""Apply events to the index. An event only refers to the store, from which the index is filled."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Indexer:
         self._readers = ThreadPoolExecutor(_READERS, thread_name_prefix="manifests")
 
     def apply(self, events: Sequence[Event]) -> list[int]:
-        """Update the index. To apply an event twice changes nothing.
+        """Update the index. An event that is applied twice changes nothing more.
 
         Return the positions of events that need the unavailable store; apply these again later.
         """
@@ -95,7 +95,7 @@ class Indexer:
             elif isinstance(found, StoreUnavailable):
                 waiting.append(place)
             else:
-                log.error("the end of task %s is left out", events[place].task_id, exc_info=found)
+                log.error("the end of task %s is not indexed", events[place].task_id, exc_info=found)
         if waiting:
             log.warning("the store does not answer, and %d events wait for it", len(waiting))
         self._index(made)
@@ -121,7 +121,7 @@ class Indexer:
             states = self._services.index.write.add_manifests(made) if made else {}
         except InputError:
             if len(made) == 1:
-                log.exception("shard %s is left out", made[0].shard_id)
+                log.exception("shard %s is not indexed", made[0].shard_id)
             else:
                 for manifest in made:
                     self._index([manifest])
@@ -217,7 +217,7 @@ def _left_out(what: str) -> Iterator[None]:
     except UnavailableError:
         raise
     except Exception:
-        log.exception("%s is left out", what)
+        log.exception("%s is ignored", what)
 
 
 #: Most names of errors with their own series: more than an engine raises, and a bound against forged names.

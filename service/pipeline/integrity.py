@@ -48,7 +48,7 @@ _RECORDS: Final[tuple[tuple[str, type[Any]], ...]] = (
     (r"webhooks/[^/]+\.json", Webhook),
     (r"tags/[^/]+/[^/]+\.json", Tag),
 )
-#: In the order of the controller's rounds, which store a position in it.
+#: In the order in which a scan reads them; it stores its position.
 FOLDERS: Final = (
     names.SHARDS,
     names.ASSETS,
@@ -72,10 +72,10 @@ _UPLOAD: Final = re.compile(r"assets/(hand|object|network)/([0-9a-f]{32})/(files
 _SHARD: Final = re.compile(r"shards/(base|scene|views)/([0-9a-f]{32})\.(h5|json)")
 STAGES: Final = {kind: stage for stage, kind in names.SHARD_KINDS.items()}
 
-MISSING: Final = "its file is gone"
+MISSING: Final = "its file is missing"
 NO_MANIFEST: Final = "it has no manifest"
 BAD_MANIFEST: Final = "its manifest is damaged"
-FOREIGN: Final = "nothing that graspd put there"
+FOREIGN: Final = "graspd did not write it"
 #: Time for which a file may lack its manifest [s].
 _ON_ITS_WAY_S: Final = 60.0
 #: Called after each read part with its bytes.
@@ -163,7 +163,7 @@ def _check_upload(store: Store, key: str, kind: AssetKind, digest: str) -> None:
         except InputError as error:
             raise DamagedError(f"{key} in the store is damaged: {error}") from None
     if found != digest:
-        raise DamagedError(f"{key} in the store is damaged: its files are not those of its name; upload it again")
+        raise DamagedError(f"{key} in the store is damaged: its files do not match its name; upload it again")
 
 
 def _manifest(store: Store, key: str, stage: Stage, shard: str, read: Read, unsealed: Unsealed) -> Damage | None:

@@ -40,7 +40,7 @@ class Interrupted(Exception):
 
 
 class ReadPermit:
-    """Exclusive right to read through the store; `store verify` precedes the controller."""
+    """Exclusive right to read through the store; `store verify` takes precedence over the controller."""
 
     def __init__(self, services: Services, *, is_controller: bool, clock: Callable[[], float] = time.monotonic) -> None:
         self._services, self._is_controller, self._clock = services, is_controller, clock
@@ -83,9 +83,9 @@ class IntegrityScan:
             except Interrupted:
                 pass
             except GraspdError as error:
-                log.warning("%s; the integrity scan goes on later", error)
+                log.warning("%s; the integrity scan continues later", error)
             except Exception:
-                log.exception("the integrity scan broke off; it goes on later")
+                log.exception("the integrity scan failed; it continues later")
             self._stop.wait(_PAUSE_S)
         with suppress(GraspdError):
             self.turn.end()

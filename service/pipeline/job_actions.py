@@ -39,7 +39,7 @@ from graspd.service.telemetry import bound
 log = logging.getLogger(__name__)
 #: Interval at which held-back tasks are checked for a capable worker [s].
 HELD_S: Final = 10.0
-#: Allowed depth of a centre of mass in a support [m]: it was measured on another mesh than the grasped one.
+#: Allowed depth of a centre of mass in a support [m]: the centre was measured on another mesh.
 _SUNK_M: Final = 1e-3
 
 
@@ -124,7 +124,7 @@ def cancel(services: Services, job_id: str, *, cause: str = "") -> JobView:
     try:
         services.queue.discard(in_queue)
     except UnavailableError as error:
-        log.warning("job %s is cancelled; its tasks in the queue follow when it answers: %s", job_id, error)
+        log.warning("job %s is cancelled; its queued tasks are removed once the queue answers: %s", job_id, error)
     return _told(services, job_id)
 
 
@@ -139,7 +139,7 @@ def retry(services: Services, job_id: str, *, cause: str = "") -> JobView:
 @dataclass(frozen=True)
 class Route:
     apart: bool = False
-    """Whether it enters a list that only some workers of its stage read."""
+    """Whether the task enters a list that only some workers of its stage read."""
     held: str = ""
 
 
@@ -160,7 +160,7 @@ class Routes:
         here = self._here.get(need.stage) or [own_ability()]
         lacking = {one.lacks(need) for one in here} - {""}
         if all(one.lacks(need) for one in here):
-            return Route(held=f"held back, no worker that is here can do it: {'; '.join(sorted(lacking))}")
+            return Route(held=f"held back, because no present worker can do it: {'; '.join(sorted(lacking))}")
         return Route(apart=bool(lacking))
 
 
@@ -239,7 +239,7 @@ def _told(services: Services, job_id: str) -> JobView:
     try:
         services.queue.publish(Event(kind=EventKind.JOB, at=timestamp(), job_id=job_id, message=job.state.value))
     except UnavailableError as error:
-        log.warning("nobody was told that job %s is %s: %s", job_id, job.state, error)
+        log.warning("the state of job %s, %s, was not announced: %s", job_id, job.state, error)
     return job
 
 
@@ -275,6 +275,6 @@ def _check_pose(obj: AssetView, word: str, pose: Pose | None, supports: Supports
             depth = float((np.asarray(support.size) / 2 - np.abs(inside)).min())
         if depth > _SUNK_M:
             raise SceneError(
-                f"{obj.name} stands in support {number} of its scene: its centre lies {1e3 * depth:.0f} mm deep; move "
+                f"{obj.name} penetrates support {number} of its scene: its centre is {1e3 * depth:.0f} mm inside; move "
                 f"the {word} or the support"
             )

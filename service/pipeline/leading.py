@@ -88,5 +88,5 @@ class Leadership:
         try:
             return self._queue.lead(self.holder, self._lease_s)
         except QueueUnavailable as error:
-            log.debug("nobody knows which controller leads: %s", error)
+            log.debug("it is unknown which controller leads: %s", error)
             return None

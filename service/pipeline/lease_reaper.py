@@ -130,8 +130,8 @@ class LeaseReaper:
         except UnavailableError:
             raise
         except Exception:  # any client of Redis can forge a lease: it must not block the others
-            log.exception("the lease of task %s is left out", lease.task_id)
-        # Only now: if the store was unavailable, the next round finds the lease again.
+            log.exception("the lease of task %s is ignored", lease.task_id)
+        # Removed only now: if the store was unavailable, the next round finds the lease again.
         self._services.queue.release(lease)
 
     def _lose_task(self, worker: str, message: TaskMessage) -> None:
@@ -156,7 +156,7 @@ class LeaseReaper:
 
     def _lose_check(self, message: IngestMessage) -> None:
         if message.attempt >= message.max_attempt:
-            ended = f"checking this {message.kind.value} ended its worker {message.attempt} times"
+            ended = f"the check of this {message.kind.value} ended its worker {message.attempt} times"
             reason = f"{ended}; delete it to try again"
             found = {"verdict": "refuse", "message": reason, "repairs": [], "facts": {}}
             put_document(self._services.store, names.asset_check(message.kind, message.digest), found)

@@ -49,7 +49,7 @@ def _fix(services: Services, one: Damage, harmed: set[str]) -> str:
         return "put a copy in its place"
     stage = STAGES[one.key.split("/")[1]]
     if is_on_its_way(services.store, one):
-        return "its manifest may be on its way; run it again in a minute"
+        return "its manifest may follow soon; run the command again in a minute"
     planned = _planned(services, stage, one.shard)
     if isinstance(planned, str):
         if one.what == NO_MANIFEST:
@@ -58,7 +58,7 @@ def _fix(services: Services, one: Damage, harmed: set[str]) -> str:
         return planned
     job, task = planned
     if harmed & set(task.inputs):
-        return "its input is made again first; run it again when that is done"
+        return "its input is made again first; run the command again when that is done"
     if one.what != MISSING:
         _clear(services, one, stage)
     number = len(task_attempts(services.store, task.id)) + 1

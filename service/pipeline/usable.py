@@ -49,7 +49,7 @@ def with_neighbours(
     found = []
     for one, asset in zip(options.beside, beside, strict=True):
         if one.object not in (asset.name, asset.digest):
-            raise InputError(f"the neighbour {one.object!r} has a digest that is of {asset.name!r}; leave it out")
+            raise InputError(f"the neighbour {one.object!r} has the digest of {asset.name!r}; omit the digest")
         found.append(one.model_copy(update={"object": asset.name, "digest": asset.digest}))
     return options.with_beside(found), beside
 

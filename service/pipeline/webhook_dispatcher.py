@@ -1,7 +1,7 @@
 """Webhook dispatcher: signed reports of ends, one at a time to each address, retried with back-off.
 
 An address that does not accept a delivery pauses with all its deliveries. Projects take turns; within one, the least
-recently tried address comes first. Addresses that failed last share half of the slots to not delay the others.
+recently tried address comes first. Addresses that failed last share half of the slots, so the others are not delayed.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class WebhookDispatcher:
             except UnavailableError as error:
                 log.warning("webhooks wait: %s", error)
             except Exception:
-                log.exception("a round of webhooks broke off")
+                log.exception("a round of webhooks failed")
         self._pool.shutdown(wait=False, cancel_futures=True)
 
     def start_deliveries(self, *, now: float | None = None) -> list[Future[None]]:
@@ -115,7 +115,7 @@ class WebhookDispatcher:
         except UnavailableError as error:
             log.warning("a webhook waits: %s", error)
         except Exception:
-            log.exception("a delivery broke off")
+            log.exception("a delivery failed")
         finally:
             with self._lock:
                 del self._under_way[due.hook.id]

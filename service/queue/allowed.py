@@ -1,8 +1,8 @@
 """Restriction of queued jobs to graspd's own task, whatever a Redis client writes there.
 
 RQ imports and calls any function named in a job's hash, even with the JSON serializer. It does the same with callbacks,
-and posts to any webhook URL. A worker therefore rebuilds each job from its id and message only, and passes the message
-to its engine without calling anything named in the job.
+and posts to any webhook URL. A worker therefore rebuilds each job from its id and message only. It passes the message
+to its engine and calls nothing that the job names.
 """
 
 from __future__ import annotations

@@ -252,7 +252,7 @@ class RqQueue:
                 self.resign(holder)  # lease of an ended process of the same name
                 if lease.acquire(blocking=False, token=holder):
                     return True
-                if self.connection.ttl(LEAD) == -1:  # leases always expire, so this is none
+                if self.connection.ttl(LEAD) == -1:  # a key without expiry is not a lease
                     self.connection.delete(LEAD)
             except LockError:
                 pass

@@ -137,7 +137,7 @@ class Pictures(Sequence[dict[str, Any]]):
             scene_shard = str(opened.attrs.get("base_shard") or opened.attrs.get("scene_shard") or "")
             if not scene_shard:
                 raise InputError(
-                    f"shard {file.id} does not say which shard has its scenes; take the pictures again: graspd render"
+                    f"shard {file.id} does not name the shard of its scenes; render the pictures again: graspd render"
                 )
             if absent := [name for name in self.columns if name not in opened]:
                 raise InputError(f"shard {file.id[:12]} of {file.object} has no column {absent[0]!r}")

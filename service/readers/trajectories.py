@@ -94,4 +94,4 @@ def scene_spec_of(shard: Shard) -> SceneSpec | None:
     try:
         return SceneSpec(**from_json(str(said)))
     except (ValueError, TypeError):
-        raise InputError("the shard's attribute scene says no scene") from None
+        raise InputError("the shard's attribute scene is not a valid scene") from None

@@ -130,7 +130,7 @@ def joining(settings: Settings, file: Path, *, host: str | None = None, port: in
     InputError: other machines cannot share the configured Redis or store through this file.
     """
     if settings.redis_url is not None:
-        raise InputError("GRASPD_REDIS_URL names a Redis already: give that to the workers, and leave --share away")
+        raise InputError("GRASPD_REDIS_URL is already set: give it to the workers, and omit --share")
     if settings.store_url is None:
         raise InputError("other machines need the store: set GRASPD_STORE_URL to file:///SHARED/FOLDER or s3://BUCKET")
     name = host or socket.gethostname()

@@ -134,7 +134,7 @@ def stop_children(children: Sequence[Child], grace_s: float) -> None:
 
 
 def end_leftovers(folder: Path) -> list[int]:
-    """Kill processes in the pid files of an earlier `graspd up`, if still its own; return the pids."""
+    """Kill the children of an earlier `graspd up` by its pid files, unless a pid was reused; return the pids."""
     ended = []
     for file in (folder / "run").glob("*.pid"):
         try:

@@ -102,10 +102,10 @@ def _run_controller(settings: Settings, stop: threading.Event) -> None:
     alive = HeartbeatFile(settings.heartbeat_file)
     with closing(open_queue(settings, patience=0)) as queue:
         leadership = Leadership(queue, lease_s=settings.lease_s, alive=alive, name=settings.controller_name)
-        # A controller of another service must not stand by here: all would take it for their own.
+        # A controller of another service must not stand by here: processes would mistake it for their own.
         _identify(settings, stop, alive)
         while leadership.wait(stop):
-            # A fresh controller receives the events again that an earlier one did not finish.
+            # A new controller receives again the events that an earlier one did not finish.
             with leadership.held(stop) as over, closing(Services.open(settings)) as services:
                 Controller(services).run(over)
 

@@ -81,7 +81,7 @@ def own_redis(settings: Settings) -> IO[str]:
 
 
 def give_up_log(settings: Settings, output: Path) -> None:
-    """After a failed start: move the append-only log aside if Redis reports in `output` that it is broken.
+    """Move the append-only log aside after a failed start, if Redis reports in `output` that the log is broken.
 
     All content of Redis is queued again from the index, so an empty one is better than none.
     """
@@ -102,7 +102,7 @@ def set_log_aside(settings: Settings, why: str) -> None:
         for one in found:
             one.rename(aside / one.name)
         log.warning(
-            "the log of Redis is moved to %s: %s; it starts empty, and what is unfinished is queued again", aside, why
+            "the log of Redis is moved to %s: %s; Redis starts empty, and unfinished tasks are queued again", aside, why
         )
 
 

@@ -1,7 +1,7 @@
 """Launcher of a program that ends with its parent.
 
 Usage: `python -m graspd.service.run.launch PARENT_PID PROGRAM ARGUMENTS...`. On Linux the kernel signals the child
-(prctl survives exec). Elsewhere the next `graspd up` kills by pid files.
+(prctl survives exec). Elsewhere the next `graspd up` kills it by its pid file.
 """
 
 from __future__ import annotations

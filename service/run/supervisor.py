@@ -260,7 +260,7 @@ class Supervisor:
         try:
             record_address(folder, self.api_url)
         except OSError as error:
-            log.warning("where the API answers cannot be noted in %s: %s", folder, error.strerror)
+            log.warning("the address of the API cannot be written to %s: %s", folder, error.strerror)
 
     def _release(self) -> None:
         if self._locks and self._joining is not None:

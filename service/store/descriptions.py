@@ -47,7 +47,7 @@ def parse_description(data: bytes, what: str) -> Description:
     try:
         return Description.model_validate(given)
     except ValidationError as error:
-        raise InputError(f"{what}: asset.json must name the main file and hold short facts: {refusal(error)}") from None
+        raise InputError(f"{what}: asset.json must name the main file and have short facts: {refusal(error)}") from None
 
 
 def json_object(text: bytes | str, what: str) -> dict[str, Any]:
@@ -137,7 +137,7 @@ def facts_of(model: bytes) -> HandFacts:
         return HandFacts.model_validate(extras["facts"] | {"links": list(extras["links"]), "bodies": bodies})
     except (struct.error, ValueError, KeyError, TypeError, ValidationError):
         raise ConflictError(
-            "the model of this hand was made by an older version and tells too little; correct it with "
+            "the model of this hand was made by an older version and lacks facts; correct it with "
             "`graspd hands check --write`"
         ) from None
 

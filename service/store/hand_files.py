@@ -239,7 +239,9 @@ def _named(wanted: str, known: list[str], where: str) -> str:
         if len(fits) == 1:
             return fits[0]
         if fits:
-            raise InputError(f"{where} holds {len(fits)} files called {wanted!r} ({', '.join(fits[:5])}); say which")
+            raise InputError(
+                f"{where} holds {len(fits)} files called {wanted!r} ({', '.join(fits[:5])}); name one by its path"
+            )
     others = ", ".join(known[:8]) or "none"
     raise InputError(f"{where} names the file {wanted!r}, which is not there; hand files are: {others}")
 

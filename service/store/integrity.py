@@ -51,7 +51,7 @@ def check_digest(name: str, found: str, expected: str) -> None:
 
 
 def gone(key: str) -> DamagedShard:
-    return DamagedShard(f"{key} is gone from the store, and its manifest is there; {FIX}")
+    return DamagedShard(f"{key} is missing in the store, although its manifest exists; {FIX}")
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class CheckedObjects:
             if _of_block(block) != known.blocks[number]:
                 with self._lock:
                     self._known.pop((key, sha256), None)
-                raise DamagedShard(f"{key} is damaged: some of its bytes turned since it was read; {FIX}")
+                raise DamagedShard(f"{key} is damaged: some of its bytes changed since it was read; {FIX}")
             yield block[max(0, start - at) : end - at]
 
     def _intact(self, key: str, sha256: str) -> _Intact:
@@ -268,7 +268,7 @@ def is_sealed(key: str, chunks: Iterable[bytes], size: int) -> bool:
 
 def _damaged(key: str) -> DamagedError:
     return DamagedError(
-        f"{key} in the store is damaged: its bytes are not those of its checksum; put a copy in its place, or run "
+        f"{key} in the store is damaged: its bytes do not match its checksum; put a copy in its place, or run "
         "`graspd admin store verify --repair`"
     )
 

@@ -64,7 +64,9 @@ def record_asset(store: Store, asset: Asset, put: Put | None = None) -> Asset:
     if store.exists(names.deletion(asset.kind.value, asset.digest)):
         if new:
             store.delete(record)
-        raise ConflictError(f"the same {asset.kind.value} of before is still being removed; try again in a moment")
+        raise ConflictError(
+            f"the same {asset.kind.value}, deleted before, is still being removed; try again in a moment"
+        )
     if new:
         return asset
     known = load_asset(store, asset.kind, asset.digest)

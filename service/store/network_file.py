@@ -232,7 +232,7 @@ def _difference(found: list[str], expected: Mapping[str, object]) -> str:
     wanted = {f"{name}.npy" for name in [_META, *expected]}
     missing, foreign = sorted(wanted - {*found, f"{_META}.npy"}), sorted(set(found) - wanted)
     parts = [f"{word} {', '.join(names[:4])}" for word, names in (("without", missing), ("besides", foreign)) if names]
-    return "; ".join(parts) or "a name stands twice"
+    return "; ".join(parts) or "a name occurs twice"
 
 
 #: Name of the file in its archive, independent of the upload: equal networks are equal assets.

@@ -27,7 +27,7 @@ from graspd.service.store.store import Store
 
 log = logging.getLogger(__name__)
 #: Message for a store with packs.
-PACKED: Final = "packs of graspd 0.2; take them apart with `graspd admin store upgrade`"
+PACKED: Final = "packs of graspd 0.2; extract them with `graspd admin store upgrade`"
 _FOLDER: Final = "packs"
 _MAGIC: Final = b"graspd\x00\x01"
 _HEAD: Final = struct.Struct("<8sQ")
@@ -96,7 +96,7 @@ def _take_apart(store: Store, key: str, dead: list[str]) -> Iterator[ShardManife
     if whole:
         store.delete(key)
     else:
-        log.error("some of the pack %s is damaged, and it is moved aside: `graspd admin store verify --repair`", key)
+        log.error("the pack %s is partly damaged, and moved aside: `graspd admin store verify --repair`", key)
         store.set_aside(key)
 
 
@@ -105,7 +105,7 @@ def _directory(key: str, data: bytes) -> tuple[int, list[_Packed]]:
     magic, length = _HEAD.unpack(head) if len(head) == _HEAD.size else (b"", 0)
     directory = rest[:length]
     if magic != _MAGIC or digest_bytes(directory) != key.rpartition("/")[2].removesuffix(".pack"):
-        raise DamagedError("its directory is not the one of its name")
+        raise DamagedError("its directory does not match its name")
     try:
         return _HEAD.size + length, [_Packed.model_validate(one) for one in json.loads(directory)["shards"]]
     except ValidationError as error:

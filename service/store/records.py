@@ -239,7 +239,7 @@ def pending(store: Store) -> set[tuple[str, str]]:
 
 def refuse_pending(store: Store, what: str, name: str) -> None:
     if store.exists(names.deletion(what, name)):
-        raise ConflictError(f"the {what} {name} of before is still being removed; try again in a moment")
+        raise ConflictError(f"the deleted {what} {name} is still being removed; try again in a moment")
 
 
 def removed_folder(deletion: Deletion) -> str:
@@ -255,7 +255,7 @@ def removed_before(key: str, at: str) -> bool:
 def deletions(store: Store, what: str = "") -> list[Deletion]:
     """Return the deletions that can be undone, newest first; `what` selects one kind of resource."""
     found: dict[str, Deletion] = {}
-    # While the controller moves an object, it is in the second folder before it leaves the first.
+    # An object that the controller moves is in the second folder before it leaves the first.
     for folder, before_kind in ((names.DELETIONS, "/"), (names.REMOVED, "-")):
         for key in _keys(store, folder):
             if key.count("/") == 2 and (not what or key.split(before_kind)[1] == what):

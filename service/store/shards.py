@@ -156,7 +156,7 @@ def _check_contents(file: h5py.File, name: str) -> None:
         for key in group:
             path = f"{place}{key}"
             if len(seen) > _MOST_ITEMS:
-                raise InputError(f"{name} holds more than {_MOST_ITEMS} datasets and groups, which no shard does")
+                raise InputError(f"{name} holds more than {_MOST_ITEMS} datasets and groups, too many for a shard")
             if not isinstance(group.get(key, getlink=True), h5py.HardLink):
                 raise InputError(f"{name}: {path} is a link; a shard holds its own values")
             item = group[key]
@@ -171,9 +171,11 @@ def _check_contents(file: h5py.File, name: str) -> None:
                 size = item.id.get_storage_size()
                 claimed, held = claimed + item.nbytes, held + size
                 if item.nbytes > _MOST_DEFLATED * size + _FREE_BYTES:
-                    raise InputError(f"{name}: {path} claims {item.nbytes} bytes, which the file does not hold")
+                    raise InputError(f"{name}: {path} claims {item.nbytes} bytes, which the file cannot contain")
     if claimed > _MOST_IN_ALL * held + _FREE_IN_ALL:
-        raise InputError(f"{name} claims {claimed} bytes, {claimed // held} times what it holds, as no shard does")
+        raise InputError(
+            f"{name} claims {claimed} bytes, {claimed // held} times what it contains, too much for a shard"
+        )
 
 
 def kind_of(file: h5py.File, name: str) -> ShardKind:
@@ -188,7 +190,7 @@ def read_column(file: h5py.File, path: str, name: str) -> NDArray[Any]:
     dataset = file[path]
     data = np.asarray(dataset)
     if (expected := dataset.attrs.get(_DIGEST)) is not None and _digest(data) != expected:
-        raise DamagedShard(f"{name} is damaged: the values of {path} are not those that were written")
+        raise DamagedShard(f"{name} is damaged: the values of {path} changed since they were written")
     return data
 
 

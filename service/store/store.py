@@ -181,10 +181,10 @@ def local_folder(url: str) -> Path | None:
     if parts.scheme != "file":
         return None
     if parts.netloc or not parts.path.startswith("/"):
-        raise InputError(f"the store URL {url!r} must hold an absolute path: file:///absolute/folder")
+        raise InputError(f"the store URL {url!r} must contain an absolute path: file:///absolute/folder")
     if "?" in url or "#" in url or not url.isprintable():
         raise InputError(
-            f"the store URL {url!r} holds what ends a path; write %3F for ?, %23 for #, %0A for a line break"
+            f"the store URL {url!r} has a character that ends a path; write %3F for ?, %23 for #, %0A for a line break"
         )
     return Path(unquote(parts.path))
 

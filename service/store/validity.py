@@ -1,6 +1,6 @@
 """Status of the grasps of a base shard: valid, feasible without validation, or neither.
 
-*Feasible*: passed the geometric gate. *Valid*: feasible and held by a validator. A shard without validation has no
+*Feasible*: within the geometric limits. *Valid*: feasible and held by a validator. A shard without validation has no
 valid grasps, whatever its column `quality/valid` contains: in that column graspd 0.1 marked feasible grasps.
 """
 
@@ -27,7 +27,7 @@ def valid(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
 
 
 def feasible(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
-    """Return the mask (N,) of grasps that passed the geometric gate, as far as known; valid grasps did."""
+    """Return the mask (N,) of grasps known to be within the geometric limits; valid grasps are."""
     return np.asarray(columns.get("quality/feasible", columns["quality/valid"])) == 1
 
 

@@ -173,5 +173,5 @@ def test_redis_lost_in_the_middle_of_a_claim_forgets_no_job() -> None:
 
     quotas = Quotas(Settings(quota_grasps_in_flight=10), Dropping(), lambda ids: set(ids))
     key = Key(name="k", scope=Scope.SUBMIT, sha256="0" * 64, created="2026-01-01T00:00:00Z")
-    with pytest.raises(QuotaError, match="has 7 grasps in work"), quotas.claim(key, "j", 5):
+    with pytest.raises(QuotaError, match="has 7 grasps in unfinished jobs"), quotas.claim(key, "j", 5):
         pass

@@ -127,7 +127,7 @@ def test_what_nobody_validated_has_no_label(on_tables: Path, tmp_path: Path) -> 
         ({"transforms": [np.diag([1.0, 1, -1, 1]).tolist()] * 8}, "no poses"),
         ({"transforms": [[1, 2], [3]]}, "no record"),
         ({"object_in_gripper": [True]}, "shape"),
-        ({"squeeze_pose": [[0, 0, 0, 1, 0, 0, 0]]}, "as many"),
+        ({"squeeze_pose": [[0, 0, 0, 1, 0, 0, 0]]}, "numbers of pregrasps"),
     ],
 )
 def test_a_record_that_is_wrong_is_told(data: Path, tmp_path: Path, change: dict[str, Any], said: str) -> None:

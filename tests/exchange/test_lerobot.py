@@ -143,7 +143,7 @@ def test_a_data_set_of_somebody_else_is_told(root: Path, tmp_path: Path) -> None
     info = json.loads((other / "meta" / "info.json").read_text())
     info["features"]["observation.state"]["names"] = ["shoulder", "elbow"]
     (other / "meta" / "info.json").write_text(json.dumps(info))
-    with pytest.raises(InputError, match="no data set of ours"):
+    with pytest.raises(InputError, match="was not exported by graspd"):
         lerobot.read(other, hand="barrett", obj="block", object_name="block")
     with pytest.raises(InputError, match="lift the block, lift the mug"):
         lerobot.read(root, hand="barrett", obj="block", object_name="cup")

@@ -27,7 +27,7 @@ def run(line: str) -> subprocess.CompletedProcess[str]:
 def test_a_full_disk_behind_the_output_is_one_line(command: str) -> None:
     done = run(f"{GRASPD} {command} > /dev/full")
     assert done.returncode == 1
-    assert done.stderr == "graspd: No space left on device; make room, or name another place\n"
+    assert done.stderr == "graspd: No space left on device; free disk space, or give another path\n"
 
 
 def test_a_reader_that_has_enough_and_a_closed_output_are_no_fault() -> None:
@@ -52,16 +52,16 @@ def test_a_file_does_not_take_the_place_of_a_closed_output(tmp_path: Path) -> No
     [
         (
             OSError(errno.ENOSPC, "No space left on device", "/srv/x.h5"),
-            "/srv/x.h5: No space left on device; make room, or name another place",
+            "/srv/x.h5: No space left on device; free disk space, or give another path",
         ),
         (
             PermissionError(errno.EACCES, "Permission denied", "/srv/x.h5"),
-            "/srv/x.h5: Permission denied; name another place, or let this user write there",
+            "/srv/x.h5: Permission denied; give another path, or let this user write there",
         ),
         (NotADirectoryError(errno.ENOTDIR, "Not a directory", "a/b"), "a/b: Not a directory"),
         (OSError("Can't write data\n(file write failed)"), "Can't write data (file write failed)"),
         (OSError(errno.EIO, "I/O error at http://me:secret@host/"), "I/O error at http://***@host/"),
-        (MemoryError(), "there is not enough memory; give it more, or ask for less at once"),
+        (MemoryError(), "there is not enough memory; provide more, or request less at once"),
     ],
 )
 def test_a_refusal_of_the_system_names_the_thing_and_the_fix(

@@ -135,7 +135,7 @@ def test_each_version_of_worker_takes_what_it_can(
 
     after = submit(2, revision=NEW)
     house.until(
-        lambda: house.says("controller", "held back, no worker that is here can do it"), "the controller says so"
+        lambda: house.says("controller", "held back, because no present worker can do it"), "the controller says so"
     )
     assert state(after) is State.QUEUED
     tasks = house.services.index.jobs.tasks(job=after, limit=10).items

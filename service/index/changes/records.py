@@ -158,7 +158,7 @@ class Changes(IndexPart):
         upsert(connection, tasks, rows, keep=[name for name in rows[0] if name != "priority"])
 
     def _enter(self, connection: Connection, record: JobRecord, first: int, *, goes_on: bool) -> None:
-        """Add some ranges from `first`. A note contains the next range, and that the job cannot have ended."""
+        """Add some ranges from `first`. A note stores the next range and marks the job as unfinished."""
         number = ranges_of(record.request.grasps, record.span)
         some = range(first, min(number, first + RANGES_AT_ONCE))
         self._upsert_tasks(connection, list(task_rows(record, some)))

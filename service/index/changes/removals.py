@@ -1,4 +1,4 @@
-"""Removal of rows: users of a thing, and the rows removed with it. All removals are idempotent."""
+"""Removal of rows, after a check that nothing else needs them. All removals are idempotent."""
 
 from __future__ import annotations
 

@@ -147,9 +147,9 @@ def _dataset_view(connection: Connection, row: Any) -> DatasetView:
 def _state(row: Any, states: dict[State, int]) -> State:
     state = job_state(state for state, count in states.items() if count)
     if row["cancelled"]:
-        # Nothing is pending, though its jobs stop a moment later, or continue for another dataset.
+        # A cancelled dataset has no pending work, although its jobs stop later or continue for another dataset.
         return state if state.is_final else State.CANCELLED
-    # An event that the jobs do not have yet: a retry.
+    # The jobs have not received the dataset's last event, a retry.
     return State.QUEUED if state.is_final and row["applied"] < row["events"] else state
 
 

@@ -382,7 +382,7 @@ def _known(column: Any, op: str, value: float) -> ColumnElement[bool]:
 
 
 def _unknown(name: str) -> InputError:
-    return InputError(f"the index does not hold {name!r}, the shards do: `graspd grasps where` reads them")
+    return InputError(f"the index lacks {name!r}, but the shards have it: `graspd grasps where` reads them")
 
 
 class GraspFilter(Model):

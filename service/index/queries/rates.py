@@ -2,8 +2,8 @@
 
 The nearest measurement counts: the same hand on the same object, else the same hand, else any hand; always with the
 same method, fidelity and validator on the same kind of device. Stored values are in `STORED` and `STORED_METHODS`, with
-their origin. After the first measurement, one factor (this machine's seconds over the stored ones) scales all of them,
-so that two fidelities are never compared by clocks of two machines.
+their origin. After the first measurement, one factor (this machine's seconds over the stored seconds) scales all
+stored values, so that two fidelities are never compared by times of two machines.
 
 Every rate has an interval: for a measured one the scatter of its batches, for a stored one its observed error.
 """
@@ -42,7 +42,7 @@ class Machine:
     factor: float = 1.0
     """Its seconds over the stored ones: the median of its batches of all fidelities and methods."""
     spread: tuple[float, float] = (1.0, 1.0)
-    """Interval of single batches, as factors of that."""
+    """Interval of single batches, as factors of the median."""
     batches: int = 0
     """Finished batches of the comparison; 0: unknown."""
 
@@ -98,8 +98,8 @@ STORED_PLACE: Final = StageRate(0.5, 2200.0, ORIGIN, 0)
 #: Cost of a candidate in a scene relative to a free object, and the valid share there: values of built-in hands and
 #: objects on tables, to within a factor of four.
 STORED_IN_SCENE: Final = (1.6, 0.5)
-#: Seconds of a valid grasp in each model around the nominal one, with as many cores: docs/results/robust.md, 25 to 70
-#: core-ms, and a lift 44 to 59. All models count, although a missed share ends the test sooner: few are missed.
+#: Seconds per valid grasp and perturbed model on two cores: 25 to 70 core-ms, for a lift 44 to 59
+#: (docs/results/robust.md). All models are counted, because few tests end early.
 STORED_MODEL_S: Final = 0.018
 STORED_PICTURE: Final = StageRate(2.1, 1.34e6, ORIGIN, 0)
 
@@ -173,9 +173,9 @@ def _stored_of(options: JobOptions) -> tuple[float, float, str]:
     method, name = options.method, options.knobs.name
     if method in STORED_METHODS:
         return *STORED_METHODS[method], f"{ORIGIN}, {method}"
-    origin = ORIGIN if name in STORED else f"{ORIGIN}, of standard for want of {name}"
+    origin = ORIGIN if name in STORED else f"{ORIGIN}, value of standard (none for {name})"
     if method != "fast_graspd":
-        origin = f"{ORIGIN}, of fast_graspd for want of {method}"
+        origin = f"{ORIGIN}, value of fast_graspd (none for {method})"
     return *STORED.get(name, STORED["standard"]), origin
 
 
@@ -210,7 +210,7 @@ def _spread(values: list[float], least: tuple[float, float]) -> tuple[float, flo
 
 
 def _whole(batches: list[BatchCost]) -> list[BatchCost]:
-    """Return those of at least half a full batch, if any: small ones are dominated by loading time."""
+    """Return the costs of at least half a full batch, if any: small ones are dominated by loading time."""
     return [batch for batch in batches if 2 * batch.candidates >= BATCH_SIZE] or batches
 
 

@@ -1,6 +1,6 @@
 """Users' actions on datasets, a part in each round of the controller: plan, cancel and retry jobs.
 
-It can be killed at any time, and its successor continues: the index contains which cells have a job. A job's event
+A killed controller's successor continues, because the index records which cells have a job. A job's event
 names the causing event of the dataset, so no event is applied twice.
 """
 

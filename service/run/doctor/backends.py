@@ -80,7 +80,7 @@ def _check_redis(settings: Settings, client: Redis, info: Mapping[str, Any]) -> 
     most, policy = int(info.get("maxmemory", 0)), str(info.get("maxmemory_policy", "noeviction"))
     if most and policy != "noeviction":
         fix = "redis-cli config set maxmemory-policy noeviction, and the same line in its configuration"
-        return bad(f"maxmemory-policy is {policy}: when memory is full, it throws tasks away without a word", fix)
+        return bad(f"maxmemory-policy is {policy}: when its memory is full, Redis deletes tasks silently", fix)
     used = int(info.get("used_memory", 0))
     if most and used > _FULL * most:
         return bad(
@@ -89,13 +89,14 @@ def _check_redis(settings: Settings, client: Redis, info: Mapping[str, Any]) -> 
     seconds = _write(client)
     line = f"Redis {version} at {_shown(settings)}, {1000 * seconds:.1f} ms, {used >> 20} MiB"
     if tuple(int(part) for part in version.split(".")[:2]) < _OLDEST:
-        return warning(f"{line}: older than 6.2, on which graspd was tried", "install Redis 6.2 or newer, or Valkey")
+        return warning(f"{line}: older than 6.2, the oldest tested version", "install Redis 6.2 or newer, or Valkey")
     if _is_open(settings):
         fix = "requirepass in its configuration, or an ACL, and the password in GRASPD_REDIS_URL"
-        return warning(f"{line}: it asks for no password, and who writes to it can start tasks", fix)
+        return warning(f"{line}: it requires no password, so any client can start tasks", fix)
     if seconds > _SLOW_REDIS_S:
         return warning(
-            f"{line}: a task takes some 109 operations", "put Redis nearer to the workers, or look after the network"
+            f"{line}: slow, since a task takes about 109 operations",
+            "move Redis closer to the workers, or check the network",
         )
     return good(line)
 
@@ -109,7 +110,7 @@ def _write(client: Redis) -> float:
     seconds = (time.perf_counter() - start) / 2
     client.delete(key)
     if found != value:
-        raise RedisError("what was written is not what is read")
+        raise RedisError("a written value is read differently")
     return seconds
 
 
@@ -127,7 +128,7 @@ def persistence(settings: Settings) -> Finding:
         for what in ("aof_last_write_status", "aof_last_bgrewrite_status"):
             if info.get(what, "ok") != "ok":
                 return bad(f"the log of writes fails ({what}: {info[what]})", fix)
-        return good("the log of writes is on: a killed Redis comes back with its tasks")
+        return good("the log of writes is on: a killed Redis restarts with its tasks")
     if info.get("rdb_last_bgsave_status", "ok") != "ok":
         return bad("its snapshots fail, and it may refuse writes", "make room on the disk of Redis and see its log")
     return warning(
@@ -156,7 +157,7 @@ def _fix(error: Exception, settings: Settings) -> str:
     if "MISCONF" in said or "OOM" in said:
         return "it cannot write: make room on its disk or in its memory, and see its log"
     if settings.redis_url is None:
-        return "the service of this data folder ended without a word: start `graspd up` again"
+        return "the service of this data folder crashed: start `graspd up` again"
     return _START
 
 
@@ -273,7 +274,7 @@ def index_is_store(settings: Settings, *, full: bool = False, settles_s: float =
         made = opened.notes.completeness()
         if made is None:
             return warning(
-                "the index is new, and lacks what the store has", "start graspd controller: it fills the index"
+                "the index is new, and lacks records of the store", "start graspd controller: it fills the index"
             )
         with opened.database.reading() as connection:
             count = int(connection.scalar(select(func.count()).select_from(shards)) or 0)
@@ -291,7 +292,7 @@ def index_is_store(settings: Settings, *, full: bool = False, settles_s: float =
         more = f", and {len(found) - 3} more" if len(found) > 3 else ""
         return bad(f"{'; '.join(found[:3])}{more}", _REBUILD)
     what = f"all rows of {count} shards" if whole else f"a sample of {count} shards (--full compares all)"
-    return good(f"{what} are what the store says")
+    return good(f"{what} match the store")
 
 
 def store_damage(settings: Settings) -> Finding:
@@ -303,23 +304,23 @@ def store_damage(settings: Settings) -> Finding:
         note, made = opened.notes.scan_note(), opened.notes.completeness()
     if count:
         return bad(
-            f"{count} objects of the store are damaged or missing, {known[0].key}: {known[0].what}",
+            f"{count} objects of the store are damaged or missing, such as {known[0].key}: {known[0].what}",
             "graspd admin store verify --repair",
         )
     if made is not None and made.left_out:
         fix = "put copies in their place, then graspd admin index rebuild"
-        return bad(f"{made.left_out} damaged records are left out of the index, {made.names[0]}", fix)
+        return bad(f"{made.left_out} damaged records are not in the index, such as {made.names[0]}", fix)
     if not settings.integrity_scan_mb_per_s:
         return warning(
             "no damage is known, and the integrity scan is off",
-            "GRASPD_INTEGRITY_SCAN_MB_PER_S=1, or graspd admin store verify at times",
+            "set GRASPD_INTEGRITY_SCAN_MB_PER_S=1, or run graspd admin store verify regularly",
         )
     when = (
-        f"last read through by {note.ended}"
+        f"the last scan ended at {note.ended}"
         if note.ended
-        else "not read through yet; graspd admin store verify does at once"
+        else "no scan has ended yet; graspd admin store verify scans at once"
     )
-    return good(f"nothing is known to be damaged; {when}")
+    return good(f"no damage is known; {when}")
 
 
 _FOLDER: Final = "health"
@@ -335,7 +336,7 @@ _CREDENTIALS: Final = (
 
 
 def store(settings: Settings) -> Finding:
-    """Try every operation that graspd uses on an object with a name of its own."""
+    """Try every operation that graspd uses, on an object with a random name."""
     folder = local_store(settings)
     if folder is not None and not folder.exists():
         return good(f"{folder} is made at the first start, below {existing(folder)}")
@@ -359,15 +360,15 @@ def check_store(opened: Store) -> Finding:
     if not wrong and opened.exists(key):
         wrong = "an object that was removed is still there"
     if wrong:
-        fix = "name a store that keeps this: a local disk, Amazon, Google, Azure, SeaweedFS, Ceph, or a recent MinIO"
+        fix = (
+            "use a store that guarantees this: a local disk, Amazon, Google, Azure, SeaweedFS, Ceph, or a recent MinIO"
+        )
         return bad(f"{opened.url}: {wrong}", fix)
-    line = (
-        f"{opened.url} gives what it takes, lists, removes, and refuses a name that is taken ({1000 * seconds:.0f} ms)"
-    )
+    line = f"{opened.url}: put, get, list, delete and create-only writes work ({1000 * seconds:.0f} ms)"
     if opened.url.startswith("memory:"):
-        return warning(f"{opened.url} is gone with its process", "GRASPD_STORE_URL=file:///FOLDER or s3://BUCKET")
+        return warning(f"{opened.url} is lost when its process ends", "GRASPD_STORE_URL=file:///FOLDER or s3://BUCKET")
     if seconds > _SLOW_STORE_S:
-        return warning(f"{line}: that is slow", "put the store nearer, or look after the network")
+        return warning(f"{line}: slow", "move the store closer, or check the network")
     return good(line)
 
 
@@ -377,17 +378,19 @@ def _try(opened: Store, key: str) -> str:
     with ThreadPoolExecutor(_RIVALS) as pool:
         won = list(pool.map(lambda content: opened.put(key, content), contents))
     if sum(won) != 1:
-        return f"of {_RIVALS} puts of one name at once, {sum(won)} were taken: results could be overwritten"
+        return (
+            f"of {_RIVALS} concurrent puts of one name, {sum(won)} succeeded instead of 1: results could be overwritten"
+        )
     kept = contents[won.index(True)]
     try:
         if opened.get(key) != kept:
-            return "what is read is not what was written"
+            return "an object is read differently from how it was written"
         if opened.get_range(key, 100, 50) != kept[100:150]:
-            return "a part of an object is not what was written there"
+            return "a byte range of an object is read wrongly"
     except NotFoundError:
-        return "what was written is not there when it is read"
+        return "an object is missing right after it was written"
     if opened.put(key, b"another") or opened.get(key) != kept:
         return "an object can be overwritten: create-only puts (If-None-Match: *) are not honoured"
     if (key, len(kept)) not in [(entry.key, entry.size) for entry in opened.list(_FOLDER)]:
-        return "what was written is not in the list of its folder"
+        return "a written object is missing in the list of its folder"
     return ""

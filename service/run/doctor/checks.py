@@ -47,7 +47,7 @@ class Check:
     name: str
     look: Callable[[], Finding]
     limit_s: float = 60.0
-    mend_hang: str = "look after the network and the log of that part; what hangs here hangs for the service as well"
+    mend_hang: str = "check the network and the log of that part; the service will hang there too"
 
 
 def run_checks(checks: Sequence[Check]) -> Iterator[Finding]:
@@ -79,7 +79,7 @@ class _Run:
             self._finding = bad(str(error), "see the message")
         except Exception as error:
             line = " ".join(f"{type(error).__name__}: {error}".split())[:300]
-            self._finding = bad(f"the check itself broke off: {line}", "tell the authors of graspd")
+            self._finding = bad(f"the check itself failed: {line}", "report it to the authors of graspd")
 
 
 def good(message: str) -> Finding:

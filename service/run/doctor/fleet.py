@@ -91,7 +91,7 @@ def _check_workers(beats: list[WorkerBeat], waiting: Counter[Stage]) -> Finding:
             f"{tasks} tasks wait, and no worker takes {', '.join(alone)}", f"graspd worker --stages {','.join(alone)}"
         )
     if not beats:
-        return warning("there is none; nothing waits for one", "graspd worker, or graspd up --workers 1")
+        return warning("there is no worker, and no task waits", "graspd worker, or graspd up --workers 1")
     states = Counter(beat.state for beat in beats)
     told = ", ".join(f"{number} {state}" for state, number in sorted(states.items()))
     return good(f"{told}, on {len({beat.host for beat in beats})} machines; {sum(waiting.values())} tasks wait")
@@ -108,7 +108,7 @@ def port(settings: Settings) -> Finding:
     if settings.port and (found := _readyz(f"http://{_reachable(settings.host)}:{settings.port}")) is not None:
         if found:
             return _check_api(f"http://{_reachable(settings.host)}:{settings.port}")
-        return bad(f"{where} is taken by something that is no graspd", "stop it, or set GRASPD_PORT (0: any free one)")
+        return bad(f"{where} is used by another program", "stop it, or set GRASPD_PORT (0: any free one)")
     return _bind(settings, where)
 
 
@@ -116,13 +116,13 @@ def _check_api(url: str) -> Finding:
     found = _readyz(url)
     if found is None:
         return bad(
-            f"no API answers at {url}", "start graspd up or graspd api there; see proxy, firewall and GRASPD_API_URL"
+            f"no API answers at {url}", "start graspd up or graspd api there; check proxy, firewall and GRASPD_API_URL"
         )
     if not found:
-        return bad(f"what answers at {url} is no graspd", "set GRASPD_API_URL to the address of the API")
+        return bad(f"the server at {url} is not graspd", "set GRASPD_API_URL to the address of the API")
     if not found.get("ok"):
         away = [part for part, state in found["parts"].items() if not state.get("ok")]
-        return bad(f"the API at {url} is not ready: {', '.join(away)}", "see these parts above")
+        return bad(f"the API at {url} is not ready: {', '.join(away)}", "see the checks of these parts above")
     return good(f"the API at {url} is ready")
 
 
@@ -163,14 +163,14 @@ def _bind(settings: Settings, where: str) -> Finding:
 
 _OFF_S: Final = 2.0
 _WRONG_S: Final = 300.0
-_FIX: Final = "timedatectl set-ntp true, or chronyd, on the machine that is wrong: it differs from all others"
+_FIX: Final = "timedatectl set-ntp true, or chronyd, on the machine whose clock differs from all others"
 
 
 def clocks(settings: Settings) -> Finding:
     """Compare the clocks of the other machines with this one."""
     offsets = dict(_offsets(settings))
     if not offsets:
-        return skipped("no clock but this machine's is within reach")
+        return skipped("only this machine's clock can be read")
     line = ", ".join(
         f"{who} {offset:+.1f} s" for who, offset in sorted(offsets.items(), key=lambda one: -abs(one[1]))[:5]
     )

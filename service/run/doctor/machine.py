@@ -106,7 +106,7 @@ def data_folder(settings: Settings, *, mounts: Path = Path("/proc/self/mounts"))
     kind = filesystem(there, mounts)
     if kind in _NETWORK and kept_here:
         return warning(
-            f"{folder} is on a network ({kind}), and {' and '.join(kept_here)} would be kept there: locks may fail",
+            f"{folder} is a network folder ({kind}) and would contain {' and '.join(kept_here)}: locks may fail",
             "set GRASPD_DATA_DIR to a disk of this machine and GRASPD_STORE_URL=file:///SHARED/FOLDER; or name a "
             "PostgreSQL and a Redis by GRASPD_INDEX_URL and GRASPD_REDIS_URL",
         )
@@ -116,7 +116,7 @@ def data_folder(settings: Settings, *, mounts: Path = Path("/proc/self/mounts"))
         return warning(
             f"others can read {folder}: it holds requests, results and hashes of keys", f"chmod 700 {folder}"
         )
-    return good(f"{folder}, {kind or 'a file system of unknown kind'}, for its user alone")
+    return good(f"{folder}, {kind or 'a file system of unknown kind'}, private to its user")
 
 
 def filesystem(folder: Path, mounts: Path = Path("/proc/self/mounts")) -> str:
@@ -145,14 +145,16 @@ def versions(requirements: Iterable[str] | None = None) -> Finding:
         return bad(f"the code is graspd {PACKAGE_VERSION}, its install says {own.version}", fix)
     python = SpecifierSet(str(own.metadata["Requires-Python"]))
     if platform.python_version() not in python:
-        return bad(f"Python {platform.python_version()} is none of {python}", "make an environment with Python 3.12")
+        return bad(
+            f"Python {platform.python_version()} does not satisfy {python}", "make an environment with Python 3.12"
+        )
     wrong = [
         line for text in (requirements if requirements is not None else own.requires or ()) if (line := _unmet(text))
     ]
     if wrong:
         needed = " ".join(f"'{line.partition(' (')[0]}'" for line in wrong)
-        return bad(f"libraries that do not fit: {'; '.join(wrong)}", f"pip install {needed}")
-    return good(f"graspd {PACKAGE_VERSION}, Python {platform.python_version()}, and libraries that fit")
+        return bad(f"incompatible libraries: {'; '.join(wrong)}", f"pip install {needed}")
+    return good(f"graspd {PACKAGE_VERSION}, Python {platform.python_version()}, compatible libraries")
 
 
 def _unmet(text: str) -> str:
@@ -180,5 +182,5 @@ def limits(*, files: int | None = None, memory: int | None = None) -> Finding:
     if memory < _MEMORY_LOW:
         return warning(f"{line}: a worker takes up to 2 GiB", "give the container, job or machine more memory")
     if files < _FILES_LOW:
-        return warning(f"{line}: streams and uploads take one each", "ulimit -n 4096, or LimitNOFILE=4096 of systemd")
+        return warning(f"{line}: each stream or upload needs one", "ulimit -n 4096, or LimitNOFILE=4096 of systemd")
     return good(line)

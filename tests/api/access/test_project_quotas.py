@@ -59,7 +59,7 @@ def test_keys_of_a_project_share_its_grasps_in_work(ask: Ask, settings: Settings
     limit(settings, grasps_in_flight=64)
     first = ask("ann", 1).json()["id"]
     assert ask("amy", 2).status_code == 202
-    assert "the project 'red' has 64 grasps in work and may have 64" in refused(ask("amy", 3))
+    assert "the project 'red' has 64 grasps in unfinished jobs, and at most 64 are allowed" in refused(ask("amy", 3))
     assert ask("bob", 3).status_code == 202
     finish_all(services, record_of(services, first))
     assert ask("amy", 3).status_code == 202, "one of ann's ended"
@@ -70,12 +70,12 @@ def test_keys_of_a_project_share_its_grasps_of_a_day(ask: Ask, settings: Setting
     first = ask("ann", 1).json()["id"]
     finish_all(services, record_of(services, first))
     too_many = ask("amy", 2, grasps=65)
-    assert "has asked for 32 of its 96 grasps of today" in refused(too_many), "also for what is done"
+    assert "has requested 32 of 96 grasps allowed per day" in refused(too_many), "also for what is done"
     assert 12 * 3600 <= int(too_many.headers["retry-after"]) <= 12 * 3600 + 1, "until midnight, and not before"
     matrix = {"name": "d", "hands": ["allegro"], "objects": ["mug", "bottle"], "grasps": 32}
     assert ask("amy", 0, "/v1/datasets", **matrix | {"grasps": 33}).status_code == 429
     assert ask("amy", 0, "/v1/datasets", **matrix).status_code == 202
-    assert "has asked for 96 of its 96" in refused(ask("ann", 2))
+    assert "has requested 96 of 96" in refused(ask("ann", 2))
     assert ask("bob", 2).status_code == 202
 
 
@@ -88,7 +88,7 @@ def test_a_project_without_gpu_seconds_left_submits_no_more(ask: Ask, settings: 
     done(services, ask("ann", 4).json()["id"], day="2026-11-19", seconds=61.0)
     assert ask("amy", 5).status_code == 202, "neither a CPU's time nor yesterday's counts"
     done(services, made[1], seconds=61.0)
-    assert "the project 'red' has used 61 of its 60 GPU seconds of today" in refused(ask("amy", 6))
+    assert "the project 'red' has used 61 of the 60 GPU seconds allowed per day" in refused(ask("amy", 6))
     assert ask("bob", 6).status_code == 202
     assert not services.index.jobs.get(waiting).state.is_final, "what was submitted before goes on"
 

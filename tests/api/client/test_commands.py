@@ -203,7 +203,7 @@ def test_an_object_is_added_from_a_file_and_its_licence_kept(graspd: Shell, tmp_
         ("submit --hand allegro --object teapot", "'teapot'"),
         ("submit --hand allegro --object mug --fidelity perfect", "standard"),
         ("submit --hand allegro --object mug --views 2", "scenes"),
-        ("submit --hand allegro --object mug --with block", "neighbours stand in a scene"),
+        ("submit --hand allegro --object mug --with block", "neighbours need a scene"),
         ("submit --hand allegro --object mug --scene bin --with teapot", "no object 'teapot'"),
         ("submit --hand allegro --object mug --channels infrared", "channels"),
         ("datasets estimate --hands alegro --objects mug", "did you mean allegro?"),

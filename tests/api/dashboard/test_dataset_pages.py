@@ -94,7 +94,7 @@ def test_a_dataset_is_made_in_scenes_with_neighbours(http: TestClient, services:
     assert "on a table with neighbours block, bottle" in page
     assert [one.object for one in services.index.datasets.get("clutter").options.beside] == ["block", "bottle"]
     wrong = http.post("/datasets", data=form | {"name": "afloat"})
-    assert wrong.status_code == 422 and "neighbours stand in a scene" in wrong.text
+    assert wrong.status_code == 422 and "neighbours need a scene" in wrong.text
     assert 'value="block, bottle"' in wrong.text and 'value="afloat"' in wrong.text, "what was typed stays"
     wrong = http.post("/datasets", data=form | {"name": "too-deep", "touch": "-3", "scene": "table"})
     assert wrong.status_code == 422

@@ -54,7 +54,7 @@ def test_the_same_upload_is_one_object_and_a_name_one_content(http: TestClient) 
     assert answer.status_code == 409 and "'box'" in answer.json()["detail"]
     assert upload(STL + b" ", name="crate").json()["name"] == "crate"
     refused = upload(STL, self_test="true")
-    assert refused.status_code == 422 and "only a hand" in refused.json()["detail"]
+    assert refused.status_code == 422 and "only hands" in refused.json()["detail"]
 
 
 def test_an_upload_over_the_limit_is_refused_and_leaves_nothing(http: TestClient, settings: Settings) -> None:

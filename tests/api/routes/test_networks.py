@@ -70,7 +70,7 @@ def test_what_is_no_network_is_refused_in_a_line_and_not_kept(http: TestClient, 
         ("net.zip", {}, "net.zip is no network"),
         ("net.npz", {"options": '{"units": "mm"}'}, "a network has no 'units'"),
         ("net.npz", {"options": '{"file": "../up.npz"}'}, "not among its files"),
-        ("net.npz", {"self_test": "true"}, "only a hand can be tried"),
+        ("net.npz", {"self_test": "true"}, "only hands have a self-test"),
         ("net.npz", {"name": "../up"}, "name"),
     ],
 )

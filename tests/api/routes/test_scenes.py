@@ -79,6 +79,6 @@ def test_the_form_asks_for_a_scene_and_neighbours(http: TestClient) -> None:
     assert [one["object"] for one in told["neighbours"]] == ["block", "bottle", "block"]
     assert (told["scene"], told["faces"], told["scenes"]) == ("bin", "all", 4)
     page = http.post("/submit", data=form | {"scene": "free", "faces": "drawn", "neighbours": "block"})
-    assert page.status_code == 422 and "neighbours stand in a scene" in page.text
+    assert page.status_code == 422 and "neighbours need a scene" in page.text
     assert 'value="block"' in page.text, "what was typed stays"
     assert http.post("/submit", data=form | {"neighbours": "teapot"}).status_code == 404

@@ -127,7 +127,9 @@ LONG = "mujoco-Office_Depot_Canon_CL211XL_Remanufactured_Ink_Cartridge_TriColor"
 def test_a_long_name_of_an_upload_is_refused_and_one_of_others_is_cut_and_told(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    with pytest.raises(InputError, match=f"the name {LONG} has 71 characters, at most 64 are taken; give a shorter"):
+    with pytest.raises(
+        InputError, match=f"the name {LONG} has 71 characters, and at most 64 are allowed; give a shorter"
+    ):
         name_of_upload(f"{LONG}.stl")
     fitted.cache_clear()
     first, second = plain_name(LONG), plain_name(f"{LONG}2")

@@ -168,7 +168,7 @@ def test_a_document_comes_back_and_fingertips_may_touch_unless_it_says_otherwise
         ({"scene": {"supports": [PLANE], "file": "/etc/passwd"}}, "Extra inputs"),
         ({"scene": {"supports": [PLANE], "target": [0, 0, 0, 1, 0, 0, 0]}, "faces": "all"}, "lies on one face"),
         ({"faces": "all"}, "lies on no face"),
-        ({"touch": 1}, "nothing to touch"),
+        ({"touch": 1}, "no supports to touch"),
         ({"scene": "table", "touch": -1.5}, "greater than or equal to -1"),
         ({"scene": "table", "touch": NAN}, "finite number"),
         ({"scene": "table", "method": "dfc"}, "plans around free objects only"),

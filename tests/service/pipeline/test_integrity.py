@@ -109,7 +109,9 @@ def test_what_is_made_again_has_the_checksum_it_had(services: Services, shards: 
     harm(services, shards)
     repaired, left = repair(services, findings(services))
     # The worker of a file without a manifest may be about to put it.
-    assert [one.what for one in left] == [f"{NO_MANIFEST}; its manifest may be on its way; run it again in a minute"]
+    assert [one.what for one in left] == [
+        f"{NO_MANIFEST}; its manifest may follow soon; run the command again in a minute"
+    ]
     assert len(repaired) == 4
     work_off(services)
     for manifest in (*shards[:4], shards[5]):

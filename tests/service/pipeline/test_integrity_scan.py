@@ -151,7 +151,7 @@ def test_files_of_an_earlier_upload_are_held_against_their_name(services: Servic
     key = names.asset_files(AssetKind.HAND, services.index.assets.get(AssetKind.HAND, "gripper").digest)
     overwrite(services.store, key, pack_files(HAND_FILES | {"hand.urdf": b"<robot name='other'/>"}))
     wrong = examine(services.store, key)
-    assert wrong is not None and "its files are not those of its name" in wrong.what
+    assert wrong is not None and "its files do not match its name" in wrong.what
 
 
 def test_a_damaged_upload_is_replaced_by_the_same_files(services: Services) -> None:

@@ -214,13 +214,13 @@ def ball(centre: Any) -> AssetView:
     ("supports", "target", "said"),
     [
         # The plane lies at 0.2 / |normal| = 0.1 m, the centre at 0.03.
-        ([GROUND], [0, 0, 0, *UPRIGHT], "support 0 of its scene: its centre lies 70 mm deep"),
+        ([GROUND], [0, 0, 0, *UPRIGHT], "support 0 of its scene: its centre is 70 mm inside"),
         ([GROUND], [0, 0, 0.0995, *UPRIGHT], None),
         # The box's middle is 20 mm from the centre, whichever way the box is turned.
         ([GROUND, SLOPE], [0.52, 0, 0.3, *UPRIGHT], None),
-        ([SLOPE], [0.5, 0, -0.03, *UPRIGHT], "support 0 of its scene: its centre lies 100 mm deep"),
+        ([SLOPE], [0.5, 0, -0.03, *UPRIGHT], "support 0 of its scene: its centre is 100 mm inside"),
         # Turned upside down about x the centre hangs below the frame.
-        ([GROUND], [0, 0, 0.12, 0, 1, 0, 0], "support 0 of its scene: its centre lies 10 mm deep"),
+        ([GROUND], [0, 0, 0.12, 0, 1, 0, 0], "support 0 of its scene: its centre is 10 mm inside"),
     ],
 )
 def test_a_target_whose_centre_lies_in_a_support_is_refused(supports: Any, target: Any, said: str | None) -> None:
@@ -240,6 +240,6 @@ def test_a_refused_scene_leaves_no_job_behind(services: Services) -> None:
     asset = services.index.assets.get(AssetKind.OBJECT, "ball")
     facts = {"verdict": "accept", "facts": {"centre_of_mass_m": [0.0, 0.0, 0.0]}}
     services.index.write.add_asset(load_asset(services.store, AssetKind.OBJECT, asset.digest), facts)
-    with pytest.raises(SceneError, match="ball stands in support 0"):
+    with pytest.raises(SceneError, match="ball penetrates support 0"):
         job_actions.submit(services, request(scene={"supports": [GROUND], "target": [0, 0, 0, *UPRIGHT]}))
     assert list(services.store.list(names.JOBS)) == []

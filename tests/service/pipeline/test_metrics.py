@@ -63,7 +63,7 @@ def test_no_read_of_the_index_for_metrics_scans_a_table(tmp_path: Path, query: A
 
 def test_damage_of_the_store_is_told(services: Services) -> None:
     assert overview.read_index(services.index.database).damaged == 0
-    services.index.damage.mark([Damage("shards/base/a.h5", "its file is gone", "a")])
+    services.index.damage.mark([Damage("shards/base/a.h5", "its file is missing", "a")])
     assert overview.read_index(services.index.database).damaged == 1
     shown = Snapshot()
     shown.add_index(overview.read_index(services.index.database))

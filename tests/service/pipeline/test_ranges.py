@@ -71,10 +71,14 @@ def test_a_task_goes_where_those_look_who_can_do_it(
 @pytest.mark.parametrize(
     ("present", "need", "why"),
     [
-        ([NEXT], NEED, f"revision {REVISION} of synthesize is needed, and revision {REVISION + 1} is made"),
-        ([], replace(NEED, revision=1), "revision 1 of synthesize is needed"),
-        ([beat(schemas=(2, 2))], replace(NEED, schema=3, newest=3), "schema 3 of tasks is needed, and 2 is the newest"),
-        ([beat(schemas=(5, 6))], replace(NEED, newest=4), "schema 4 of tasks is the newest it may have"),
+        ([NEXT], NEED, f"needs revision {REVISION} of synthesize, but the worker has revision {REVISION + 1}"),
+        ([], replace(NEED, revision=1), "needs revision 1 of synthesize"),
+        (
+            [beat(schemas=(2, 2))],
+            replace(NEED, schema=3, newest=3),
+            "needs schema 3, but the worker reads at most schema 2",
+        ),
+        ([beat(schemas=(5, 6))], replace(NEED, newest=4), "has at most schema 4"),
     ],
 )
 def test_what_nobody_can_do_is_held_back_with_the_reason(

@@ -213,11 +213,11 @@ def test_a_rebuilt_index_knows_the_same_of_neighbours(services: Services) -> Non
     ("changes", "error", "words"),
     [
         ({"neighbours": ({"object": "ball", "digest": "a" * 32},)}, NotFoundError, "there is no object"),
-        ({"neighbours": ({"object": "cap", "digest": "cup"},)}, InputError, "digest that is of 'cup'"),
+        ({"neighbours": ({"object": "cap", "digest": "cup"},)}, InputError, "has the digest of 'cup'"),
         (
             {"scene": {"supports": [FLOOR], "neighbours": [{"object": "cup", "pose": [0, 0, -0.2, *UPRIGHT]}]}},
             SceneError,
-            "cup stands in support 0 of its scene: its centre lies 200 mm deep; move the neighbour",
+            "cup penetrates support 0 of its scene: its centre is 200 mm inside; move the neighbour",
         ),
     ],
 )

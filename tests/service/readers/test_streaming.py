@@ -136,7 +136,7 @@ def test_a_picture_whose_bytes_turned_is_refused_alone(box: Path, tmp_path: Path
     if stream:
         copy.unlink()
         shards.ranges.forget()
-        with pytest.raises(DamagedShard, match="is gone from the store"):
+        with pytest.raises(DamagedShard, match="is missing in the store"):
             pictures[1]
 
 

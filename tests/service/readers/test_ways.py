@@ -65,7 +65,7 @@ def test_a_shard_says_its_scene_or_none_and_nonsense_is_refused():
     spec = SceneSpec(kind="bin")
     assert scene_spec_of(Shard("base", {}, {})) is None
     assert scene_spec_of(Shard("base", {"scene": json_attribute(spec.model_dump(mode="json"))}, {})) == spec
-    with pytest.raises(InputError, match="says no scene"):
+    with pytest.raises(InputError, match="is not a valid scene"):
         scene_spec_of(Shard("base", {"scene": '{"kind": "moon"}'}, {}))
 
 

@@ -84,7 +84,7 @@ def test_a_bad_setting_names_its_variable(monkeypatch: pytest.MonkeyPatch) -> No
 )
 def test_a_setting_of_0_2_is_refused_with_its_new_name(monkeypatch: pytest.MonkeyPatch, old: str, new: str) -> None:
     monkeypatch.setenv(old, "1")
-    with pytest.raises(InputError, match=rf"^{old} is gone: use {new}$"):
+    with pytest.raises(InputError, match=rf"^{old} was removed: use {new}$"):
         load_settings()
     monkeypatch.delenv(old)
     monkeypatch.setenv(new, "1")

@@ -110,7 +110,7 @@ def test_bytes_that_turned_in_secret_are_not_given(tmp_path: Path, store: Store,
     path.write_bytes(flipped(data, turned))
     os.utime(path, ns=(facts.st_atime_ns, facts.st_mtime_ns))
     if not given:  # told before the first byte of an answer
-        with pytest.raises(DamagedShard, match="some of its bytes turned"):
+        with pytest.raises(DamagedShard, match="some of its bytes changed"):
             checked.stream("large.bin", digest, 50, 100)
     got = list[bytes]()
     with pytest.raises(DamagedShard):

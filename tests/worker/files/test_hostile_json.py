@@ -45,5 +45,5 @@ def test_a_file_that_is_nested_deep_is_refused_in_one_line(
 def test_an_attribute_that_is_nested_deep_says_nothing() -> None:
     assert options_of(DEEP) == {} and _short("fidelity", DEEP) == DEEP
     shard = Shard("base", {"scene": DEEP}, {})
-    with pytest.raises(InputError, match="says no scene"):
+    with pytest.raises(InputError, match="is not a valid scene"):
         scene_spec_of(shard)

@@ -219,7 +219,7 @@ def test_synth_with_neighbours_writes_them_lifts_judge_alike(tmp_path: Path) -> 
     ("args", "words"),
     [
         ("--scene table" + 9 * " --with mug", "at most 8"),
-        ("--with mug", "neighbours stand in a scene"),
+        ("--with mug", "neighbours need a scene"),
         ("--scene bin" + 8 * " --with mug", "no room for 8 neighbours beside block"),
         ("--scene table --with no-such-thing", "no-such-thing"),
     ],

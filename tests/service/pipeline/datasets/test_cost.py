@@ -135,8 +135,8 @@ def batch_of(seconds: float) -> BatchCost:
 @pytest.mark.parametrize(
     ("changes", "words", "stored"),
     [
-        ({"fidelity": {"starts": 3}}, "of standard for want of custom", STORED["standard"]),
-        ({"method": "mine"}, "of fast_graspd for want of mine", STORED["standard"]),
+        ({"fidelity": {"starts": 3}}, "value of standard (none for custom)", STORED["standard"]),
+        ({"method": "mine"}, "value of fast_graspd (none for mine)", STORED["standard"]),
         ({"method": "graspit"}, "graspit", STORED_METHODS["graspit"]),
     ],
 )

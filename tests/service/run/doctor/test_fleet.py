@@ -245,8 +245,8 @@ UNREADY = json.dumps({"ok": False, "parts": {"redis": {"ok": True}, "store": {"o
     [
         (200, READY, True, "is ready"),
         (503, UNREADY, False, "not ready: store"),
-        (200, "<html>a wiki</html>", False, "no graspd"),
-        (404, "{}", False, "no graspd"),
+        (200, "<html>a wiki</html>", False, "another program"),
+        (404, "{}", False, "another program"),
     ],
 )
 def test_what_has_the_port_is_told(tmp_path: Path, status: int, body: str, ok: bool, told: str) -> None:
