@@ -432,11 +432,11 @@ def test_a_slow_creep_is_held_early_and_a_fast_one_watched() -> None:
     push = Scripted(still, still)
     assert push._hold(Rollout()) is Outcome.HELD
     assert push.elapsed == pytest.approx(0.08)
-    push = Scripted(creeping(0.15), creeping(0.15))
+    push = Scripted(creeping(0.3), creeping(0.3))
     assert push._hold(Rollout()) is Outcome.HELD
     assert push.elapsed == pytest.approx(0.08)
-    assert Scripted(creeping(0.3), still)._hold(Rollout()) is Outcome.DISPLACED
-    assert Scripted(still, creeping(0.3))._hold(Rollout()) is Outcome.ROTATED
+    assert Scripted(creeping(0.5), still)._hold(Rollout()) is Outcome.DISPLACED
+    assert Scripted(still, creeping(0.5))._hold(Rollout()) is Outcome.ROTATED
 
 
 def test_an_object_that_turned_while_closing_and_stands_still_is_held_early() -> None:
