@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import threading
-import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import pytest
@@ -207,25 +204,3 @@ def test_a_job_whose_record_is_gone_is_given_up(services: Services, work_off: Wo
     job, _ = job_actions.submit(services, request(grasps=LARGE))
     services.store.delete(names.job_record(job.id))
     assert work_off() == [(job.id, 0)]
-
-
-@pytest.mark.slow
-def test_five_jobs_of_a_million_delay_a_small_one_by_under_3_s(services: Services) -> None:
-    stop, waits = threading.Event(), list[float]()
-    leading = Controller(services)
-    leading.round()
-    entering = threading.Thread(target=leading.run, args=(stop,))
-    entering.start()
-    with ThreadPoolExecutor(5) as pool:
-        large = [pool.submit(job_actions.submit, services, request(grasps=10**6, seed=seed)) for seed in range(5)]
-        number = 0
-        while not all(one.done() for one in large) or services.index.write.entering():
-            number += 1
-            start = time.monotonic()
-            job_actions.submit(services, request(grasps=1, seed=100 + number))
-            waits.append(time.monotonic() - start)
-    stop.set()
-    entering.join()
-    print(f"{number} small jobs beside five large ones: longest wait {max(waits):.2f} s")
-    assert entered(services) == 5 * 31_250 + number
-    assert max(waits) < 3
