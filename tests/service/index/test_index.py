@@ -344,7 +344,7 @@ def test_what_was_made_adds_up_in_intervals_of_any_length(services: Services) ->
 
 def test_writers_at_once_leave_the_rows_of_the_store(services: Services, index_url: str) -> None:
     """The controller indexes shards while the API of another process cancels and retries their job, over and over."""
-    job, _ = job_actions.submit(services, request(grasps=32 * 12, scenes=1))
+    job, _ = job_actions.submit(services, request(grasps=32 * 6, scenes=1))
     record = record_of(services, job.id)
     messages = [message_of(record, task, attempt=1, max_attempt=3) for task in plan(record)]
     other = Services(services.settings, services.store, Index(index_url), services.queue)
@@ -367,7 +367,7 @@ def test_writers_at_once_leave_the_rows_of_the_store(services: Services, index_u
         for thread in threads:
             thread.join()
         other.index.close()
-    assert services.index.overview.stats().tasks[State.SUCCEEDED] == 24
+    assert services.index.overview.stats().tasks[State.SUCCEEDED] == 12
     assert services.index.jobs.get(job.id).state is State.SUCCEEDED
     assert differences(services.index, services.store) == []
 

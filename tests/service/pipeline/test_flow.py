@@ -69,7 +69,7 @@ def test_the_next_stage_is_queued_without_waiting_for_a_sweep(services: Services
 
 
 def test_what_runs_is_not_queued_and_many_ends_are_one_round(services: Services, controller: Controller) -> None:
-    job, _ = job_actions.submit(services, request(grasps=32 * 150), priority=Priority.BULK)
+    job, _ = job_actions.submit(services, request(grasps=32 * 40), priority=Priority.BULK)
     held = taken(services)
     finish(services, held[0])
     controller.round()
@@ -78,7 +78,7 @@ def test_what_runs_is_not_queued_and_many_ends_are_one_round(services: Services,
         finish(services, delivery)
     controller.round()
     done = services.index.jobs.get(job.id)
-    assert (done.state, done.grasps) == (State.SUCCEEDED, 32 * 150)
+    assert (done.state, done.grasps) == (State.SUCCEEDED, 32 * 40)
 
 
 def test_progress_of_a_task_reaches_the_index_and_goes(services: Services, controller: Controller) -> None:
