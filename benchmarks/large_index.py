@@ -21,7 +21,7 @@ import numpy as np
 from sqlalchemy import Connection, Table
 
 from graspd.service.index.bulk import upsert
-from graspd.service.index.changes.rows import attempt_row, job_row, settle, shard_row, task_rows
+from graspd.service.index.changes.rows import fitted, job_row, settle, shard_row, task_rows
 from graspd.service.index.index import Index
 from graspd.service.index.tables import attempts, grasps, jobs, metadata, shards, tasks
 from graspd.service.model import names
@@ -137,19 +137,18 @@ class _Maker:
     def _attempt(self, record: JobRecord) -> dict[str, Any]:
         done = _done(record, State.FAILED)
         task = next(task for task in plan(record) if task.batch == done)
-        return attempt_row(
-            AttemptRecord(
-                task_id=task.id,
-                job_id=record.id,
-                stage=task.stage,
-                number=3,
-                kind="PlannerError",
-                reason="the planner lost its way",
-                worker="worker-0",
-                ended=self._at(record.request.seed, 0.9),
-                last=True,
-            )
+        attempt = AttemptRecord(
+            task_id=task.id,
+            job_id=record.id,
+            stage=task.stage,
+            number=3,
+            kind="PlannerError",
+            reason="the planner lost its way",
+            worker="worker-0",
+            ended=self._at(record.request.seed, 0.9),
+            last=True,
         )
+        return fitted(attempts, attempt, stage=task.stage.value)
 
     def _shard(self, record: JobRecord, task: PlannedTask) -> dict[str, Any]:
         kind = names.SHARD_KINDS[task.stage]

@@ -3,20 +3,16 @@
 SHARDS is a folder with base, scene and views shards, for example `demo-out/shards`. Each reader makes five warm passes,
 alternating with the others; the best pass counts, by wall time and by processor time. Ratios are to plain h5py with the
 same samples and the same number per read. Single pictures in random order are compared with plain h5py in bulk.
-`--s3` reads only pictures: by byte ranges from an S3 server on this machine, compared with the local disk.
 """
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 import json
-import os
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +20,9 @@ import h5py
 import numpy as np
 import typer
 
-from graspd.service.readers import Grasps, Pictures, ShardCache, Shards, open_shards, prefetched
+from graspd.service.readers import Grasps, Pictures, Shards, open_shards
 from graspd.service.readers.grasps import DEFAULT_COLUMNS
 from graspd.service.readers.pictures import PictureAddress
-from graspd.service.store.store import open_store
-from tests.servers import S3Server
 
 ROUNDS = 5
 PICTURE = ("image/rgb", "image/depth", "image/segmentation", "camera/intrinsics", "camera/extrinsics")
@@ -116,7 +110,6 @@ def of_pictures(shards: Shards) -> dict[str, Trajectory]:
         bulk: Trajectory(lambda: plain_bulk(shards), bulk),
         "h5py, picture by picture": Trajectory(lambda: plain_pictures(shards), bulk),
         "Pictures, in turn": Trajectory(lambda: sum(1 for _ in pictures), bulk),
-        "prefetched(Pictures), 2 threads": Trajectory(lambda: sum(1 for _ in prefetched(pictures)), bulk),
         "h5py, drawn one by one": Trajectory(lambda: plain_drawn(shards, order, pictures.places), bulk),
         "Pictures, drawn one by one": Trajectory(lambda: sum(1 for i in order if pictures[i]), bulk),
     }
@@ -158,32 +151,6 @@ def rows_of(loaders: list[Any]) -> Callable[[], int]:
     return lambda: sum(len(batch["row"]) for batch in itertools.chain.from_iterable(loaders))
 
 
-def streamed(local: Shards, url: str, scratch: Path) -> dict[str, Trajectory]:
-    """Return readers of pictures from a store with four prefetch threads, and from disk; passes start uncached."""
-    store = open_store(url)
-    files = []
-    for file in local:
-        data = local.path(file).read_bytes()
-        key = f"shards/{file.kind}/{file.id}.h5"
-        store.put(key, data)
-        files.append(replace(file, path=None, key=key, sha256=hashlib.sha256(data).hexdigest()))
-    remote = Shards(tuple(files), store, ShardCache(scratch), stream=True)
-    here, there = Pictures(local, PICTURE), Pictures(remote, PICTURE)
-    order = np.random.default_rng(0).permutation(len(here)).tolist()
-
-    def fresh(order: Sequence[int] | None = None) -> int:
-        remote.ranges.forget()
-        return sum(1 for _ in prefetched(there, order, workers=4, ahead=16))
-
-    return {
-        "disk, in turn": Trajectory(lambda: sum(1 for _ in here), "disk, in turn"),
-        "disk, in turn, 2 threads": Trajectory(lambda: sum(1 for _ in prefetched(here)), "disk, in turn"),
-        "S3, in turn": Trajectory(fresh, "disk, in turn"),
-        "disk, drawn": Trajectory(lambda: sum(1 for i in order if here[i]), "disk, drawn"),
-        "S3, drawn": Trajectory(lambda: fresh(order), "disk, drawn"),
-    }
-
-
 @dataclass(frozen=True)
 class Rate:
     by_clock: float
@@ -209,12 +176,6 @@ def main() -> None:
     if len(folders) != 1:
         sys.exit("give one folder of shards")
     shards = open_shards(Path(folders[0]))
-    if "--s3" in sys.argv:
-        with S3Server() as server, tempfile.TemporaryDirectory() as scratch:
-            os.environ.update(server.environment)
-            chosen = streamed(shards, server.url, Path(scratch))
-            tell(chosen, run(chosen))
-        return
     chosen = ways(shards)
     tell(chosen, run(chosen))
 

@@ -2,17 +2,7 @@
 
 from typing import Any
 
-from graspd.service.readers import (
-    Clouds,
-    DepthNoise,
-    Grasps,
-    Pictures,
-    ShardCache,
-    ShardFile,
-    Shards,
-    open_shards,
-    prefetched,
-)
+from graspd.service.readers import Clouds, DepthNoise, Grasps, Pictures, ShardCache, ShardFile, Shards, open_shards
 
 __all__ = [
     "Clouds",
@@ -24,7 +14,6 @@ __all__ = [
     "Shards",
     "hand_surface",
     "open_shards",
-    "prefetched",
 ]
 
 

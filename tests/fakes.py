@@ -146,6 +146,15 @@ def make_task(services: Services, job: JobRecord, task: PlannedTask, **info: Any
     return made
 
 
+def finish(
+    services: Services, job: str, *, batches: int | None = None, stage: Stage | None = None, **info: Any
+) -> None:
+    """The first tasks of a job, of one stage or all, done on the spot; see `make_task`."""
+    for task in plan(record := record_of(services, job)):
+        if (batches is None or task.batch < batches) and stage in (None, task.stage):
+            make_task(services, record, task, **info)
+
+
 def fail_task(services: Services, job: str, task: PlannedTask | TaskView, number: int = 1, **changes: Any) -> str:
     """A failed attempt at a task, the last one, in store and index; its key."""
     fields = {"kind": "ValueError", "reason": "it broke", "worker": "w", "ended": timestamp(), "last": True, **changes}

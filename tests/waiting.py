@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
 from typing import Any, Final
@@ -32,6 +33,19 @@ def until_a_worker_is_idle(address: str) -> None:
         return any(worker["state"] == "idle" for worker in workers)
 
     until(idle, "a worker takes tasks")
+
+
+class Pauses(threading.Event):
+    """A word to stop, for which nobody waits: each pause moves its clock on."""
+
+    now = 0.0
+
+    def wait(self, timeout: float | None = None) -> bool:
+        self.now += timeout or 0.0
+        return self.is_set()
+
+    def clock(self) -> float:
+        return self.now
 
 
 class Clock:

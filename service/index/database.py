@@ -36,7 +36,7 @@ from sqlalchemy import (
 from sqlalchemy.exc import ArgumentError, DataError, NoSuchModuleError, SQLAlchemyError
 
 from graspd.service.index.tables import grasps, metadata
-from graspd.service.model.errors import IndexDamaged, IndexUnavailable, InputError
+from graspd.service.model.errors import IndexDamaged, IndexUnavailable, InputError, NotFoundError
 from graspd.service.model.metrics import indexed
 
 log = logging.getLogger(__name__)
@@ -118,10 +118,21 @@ class Database:
         with self.reading(within) as connection:
             return connection.execute(query).mappings().all()
 
+    def one(self, query: Select[Any], what: str, within: Connection | None = None) -> RowMapping:
+        """Return the first row; NotFoundError, which says `what` there is not, without rows."""
+        if not (found := self.rows(query, within)):
+            raise NotFoundError(f"there is no {what}")
+        return found[0]
+
     def column(self, query: Select[Any], within: Connection | None = None) -> list[Any]:
         """Return the first column of the rows."""
         with self.reading(within) as connection:
             return list(connection.scalars(query))
+
+    def among(self, query: Select[Any], column: ColumnElement[Any], wanted: Iterable[Any]) -> list[Any]:
+        """Return the rows whose column has one of the wanted values, for any number of these."""
+        with self.reading() as connection:
+            return list(rows_among(connection, query, column, wanted))
 
     def value(self, query: Select[Any], within: Connection | None = None) -> Any:
         """Return the first column of the first row; None without rows."""
@@ -191,29 +202,26 @@ def chunks(ids: Sequence[T], size: int = 1000) -> Iterable[Sequence[T]]:
 
 
 def rows_among(
-    connection: Connection, query: Select[Any], column: ColumnElement[Any], wanted: Iterable[Any], size: int = 1000
+    connection: Connection, query: Select[Any], column: ColumnElement[Any], wanted: Iterable[Any]
 ) -> Iterator[Any]:
     """Yield the rows whose column has one of the wanted values, for any number of these."""
-    for some in chunks(list(wanted), size):
+    for some in chunks(list(wanted)):
         yield from connection.execute(query.where(column.in_(some)))
 
 
 def _file_of(url: str | URL) -> SqliteFile | None:
-    """Return the file of an SQLite index; None for another database or one in memory."""
+    """Return the file of an SQLite index; None for another database or one in memory; InputError for no URL."""
     try:
         parsed = make_url(url)
-    except UNUSABLE:
-        return None
-    is_file = parsed.get_backend_name() == "sqlite" and parsed.database and parsed.database != ":memory:"
+        is_file = parsed.get_backend_name() == "sqlite" and parsed.database and parsed.database != ":memory:"
+    except UNUSABLE as error:
+        raise unusable(error) from None
     return SqliteFile(Path(str(parsed.database))) if is_file else None
 
 
 def _engine(url: str | URL) -> Engine:
     try:
-        parsed = make_url(url)
-        if parsed.get_backend_name() == "sqlite":
-            return _sqlite_engine(url, parsed.database)
-        return connect_postgres(url)
+        return _sqlite_engine(url) if make_url(url).get_backend_name() == "sqlite" else connect_postgres(url)
     except UNUSABLE as error:
         raise unusable(error) from None
 
@@ -244,14 +252,7 @@ def connect_postgres(url: str | URL) -> Engine:
     return engine
 
 
-def _sqlite_engine(url: str | URL, database: str | None) -> Engine:
-    if database and database != ":memory:":
-        try:
-            Path(database).parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise IndexUnavailable(
-                f"the index folder {Path(database).parent} cannot be made: {error.strerror}"
-            ) from None
+def _sqlite_engine(url: str | URL) -> Engine:
     engine = create_engine(url, connect_args={"timeout": _BUSY_TIMEOUT_S})
 
     @event.listens_for(engine, "connect")
@@ -381,6 +382,7 @@ class SqliteFile:
     def opening(self) -> Iterator[None]:
         """Hold the lock among processes. Files that belonged to a missing database are removed."""
         try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
             lock = self._beside(".lock").open("w")
         except OSError as error:
             raise IndexUnavailable(f"the index {self.path} cannot be opened: {error.strerror}") from None

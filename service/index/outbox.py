@@ -15,7 +15,6 @@ from graspd.service.index.project_scope import seen
 from graspd.service.index.tables import datasets, deliveries, ends, webhooks
 from graspd.service.index.views import DeliveryView, EndView, WebhookView
 from graspd.service.model.clock import timestamp
-from graspd.service.model.errors import NotFoundError
 from graspd.service.model.projects import EVERYTHING, ProjectScope
 from graspd.service.model.webhooks import MOST_WAITING, WAITS_S, Webhook
 
@@ -79,10 +78,8 @@ class Outbox(IndexPart):
         return [WebhookView(**row) for row in self.database.rows(query)]
 
     def hook(self, webhook: str, *, scope: ProjectScope = EVERYTHING) -> WebhookView:
-        for one in self.hooks(scope=scope):
-            if one.id == webhook:
-                return one
-        raise NotFoundError(f"there is no webhook {webhook!r}")
+        query = select(webhooks).where(webhooks.c.id == webhook, *seen(scope, webhooks))
+        return WebhookView(**self.database.one(query, f"webhook {webhook!r}"))
 
     def remove(self, webhook: str) -> None:
         with self.database.writing() as connection:

@@ -6,28 +6,37 @@ A change here needs another `REVISION` in `database`, which a test enforces. Met
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Any, Final
 
 from sqlalchemy import JSON, BigInteger, Boolean, Column, Float, Index, Integer, MetaData, String, Table, Text, false
+from sqlalchemy.types import TypeEngine
 
 from graspd.service.model.metrics import IndexLevel, indexed
 
 metadata: Final = MetaData()
+
+
+def required(kind: TypeEngine[Any] | type[TypeEngine[Any]], *names: str) -> list[Column[Any]]:
+    return [Column(name, kind, nullable=False) for name in names]
+
+
+def ownership() -> list[Column[Any]]:
+    widths = {"owner": 64, "project": 32}
+    return [Column(name, String(width), nullable=False, server_default="") for name, width in widths.items()]
+
+
 jobs: Final = Table(
     "jobs",
     metadata,
     Column("id", String(32), primary_key=True),
     Column("state", String(10), nullable=False),
     Column("priority", String(12), nullable=False),
-    Column("hand", String(64), nullable=False),
-    Column("object", String(64), nullable=False),
-    Column("hand_digest", String(32), nullable=False),
-    Column("object_digest", String(32), nullable=False),
+    *required(String(64), "hand", "object"),
+    *required(String(32), "hand_digest", "object_digest"),
     Column("request", JSON, nullable=False),
     Column("revisions", JSON, nullable=False, server_default='{"synthesize": 1, "scene": 1, "render": 1}'),
     Column("origin", JSON(none_as_null=True)),
-    Column("owner", String(64), nullable=False, server_default=""),
-    Column("project", String(32), nullable=False, server_default=""),
+    *ownership(),
     Column("cancelled", Boolean, nullable=False),
     # Batches of each of its tasks.
     Column("span", Integer, nullable=False),
@@ -50,15 +59,12 @@ tasks: Final = Table(
     Column("id", String(32), primary_key=True),
     Column("job_id", String(32), nullable=False),
     Column("stage", String(12), nullable=False),
-    Column("batch", Integer, nullable=False),
-    Column("position", Integer, nullable=False),
-    Column("count", Integer, nullable=False),
+    *required(Integer, "batch", "position", "count"),
     Column("priority", String(12), nullable=False),
     Column("inputs", JSON, nullable=False),
     Column("shard_id", String(32), nullable=False),
     Column("state", String(10), nullable=False),
-    Column("ready", Boolean, nullable=False),
-    Column("done", Boolean, nullable=False),
+    *required(Boolean, "ready", "done"),
     Column("last_attempt", Integer, nullable=False),
     Column("exhausted", Boolean, nullable=False),
     Column("retried_upto", Integer, nullable=False),
@@ -106,16 +112,13 @@ shards: Final = Table(
     Column("key", String(128), nullable=False),
     Column("sha256", String(64), nullable=False),
     Column("size_bytes", BigInteger, nullable=False),
-    Column("count", Integer, nullable=False),
-    Column("valid", Integer, nullable=False),
+    *required(Integer, "count", "valid"),
     Column("candidates", Integer, nullable=False, server_default="0"),
     Column("rechecked", Integer, nullable=False, server_default="0"),
     Column("recheck_held", Integer, nullable=False, server_default="0"),
     Column("validated", Integer, nullable=False, server_default="0"),
-    Column("hand", String(64), nullable=False),
-    Column("object", String(64), nullable=False),
-    Column("hand_digest", String(32), nullable=False),
-    Column("object_digest", String(32), nullable=False),
+    *required(String(64), "hand", "object"),
+    *required(String(32), "hand_digest", "object_digest"),
     Column("batch", Integer, nullable=False),
     Column("batches", Integer, nullable=False, server_default="1"),
     Column("seed", Integer, nullable=False),
@@ -142,8 +145,7 @@ grasps: Final = Table(
     metadata,
     Column("shard_id", String(32), primary_key=True),
     Column("row", Integer, primary_key=True),
-    Column("hand", String(64), nullable=False),
-    Column("object", String(64), nullable=False),
+    *required(String(64), "hand", "object"),
     *(Column(metric.name, Integer if metric.whole else Float) for metric in indexed()),
     Column("valid", Boolean, nullable=False),
     Column("success", Boolean),
@@ -170,13 +172,11 @@ assets: Final = Table(
     Column("size_bytes", Integer, nullable=False),
     Column("created", String(32), nullable=False),
     Column("builtin", Boolean, nullable=False),
-    Column("owner", String(64), nullable=False, server_default=""),
-    Column("project", String(32), nullable=False, server_default=""),
+    *ownership(),
     Column("shared", Boolean, nullable=False, server_default=false()),
     Column("verdict", String(8)),
     Column("message", Text),
-    Column("repairs", JSON, nullable=False),
-    Column("facts", JSON, nullable=False),
+    *required(JSON, "repairs", "facts"),
     Column("last_attempt", Integer, nullable=False),
     Column("queued", Boolean, nullable=False, default=False),
     Column("not_before", Float, nullable=False, default=0.0),
@@ -194,8 +194,7 @@ workers: Final = Table(
     Column("version", String(32), nullable=False),
     Column("state", String(16), nullable=False),
     Column("task_id", String(32)),
-    Column("started", String(32), nullable=False),
-    Column("seen", String(32), nullable=False),
+    *required(String(32), "started", "seen"),
     Column("reason", String(300), nullable=False, server_default=""),
 )
 #: Costs of deleted shards, a row per project, day and device: deleted results count as usage.
@@ -205,9 +204,7 @@ spent: Final = Table(
     Column("project", String(32), primary_key=True),
     Column("day", String(10), primary_key=True),
     Column("device", String(64), primary_key=True),
-    Column("grasps", BigInteger, nullable=False),
-    Column("valid", BigInteger, nullable=False),
-    Column("tasks", BigInteger, nullable=False),
+    *required(BigInteger, "grasps", "valid", "tasks"),
     Column("seconds", Float, nullable=False),
 )
 notes: Final = Table(
@@ -221,35 +218,19 @@ damage: Final = Table(
     Column("shard", String(64), nullable=False),
     Column("found", String(32), nullable=False),
 )
+_PROGRESS: Final = ("progress_done", "progress_total", "progress_message")
 #: Columns of present state, and tables that contain nothing else: a rebuild resets them.
-LIVE_COLUMNS: Final = frozenset(
-    {
-        "queued",
-        "not_before",
-        "progress_done",
-        "progress_total",
-        "progress_message",
-        "applied",
-        "planned",
-        "charged",
-        "told",
-        "seen",
-    }
-)
+LIVE_COLUMNS: Final = frozenset({"queued", "not_before", "applied", "planned", "charged", "told", "seen", *_PROGRESS})
 LIVE_TABLES: Final = frozenset({"workers", "notes", "damage", "spent", "ends", "deliveries"})
 datasets: Final = Table(
     "datasets",
     metadata,
     Column("name", String(64), primary_key=True),
     Column("digest", String(32), nullable=False),
-    Column("hands", JSON, nullable=False),
-    Column("objects", JSON, nullable=False),
-    Column("options", JSON, nullable=False),
-    Column("revisions", JSON, nullable=False),
+    *required(JSON, "hands", "objects", "options", "revisions"),
     Column("cells", Integer, nullable=False),
     Column("created", String(32), nullable=False),
-    Column("owner", String(64), nullable=False, server_default=""),
-    Column("project", String(32), nullable=False, server_default=""),
+    *ownership(),
     Column("cancelled", Boolean, nullable=False),
     Column("events", Integer, nullable=False),
     Column("applied", Integer, nullable=False, default=0),
@@ -265,11 +246,8 @@ dataset_cells: Final = Table(
     metadata,
     Column("dataset", String(64), primary_key=True),
     Column("position", Integer, primary_key=True),
-    Column("hand", String(64), nullable=False),
-    Column("object", String(64), nullable=False),
-    Column("hand_digest", String(32), nullable=False),
-    Column("object_digest", String(32), nullable=False),
-    Column("job_id", String(32), nullable=False),
+    *required(String(64), "hand", "object"),
+    *required(String(32), "hand_digest", "object_digest", "job_id"),
     Column("fidelity", String(64), nullable=True),
     Column("choice", JSON(none_as_null=True)),
     Index("dataset_cells_by_job", "job_id"),
@@ -281,9 +259,7 @@ dataset_snapshots: Final = Table(
     Column("digest", String(32), primary_key=True),
     Column("created", String(32), nullable=False),
     Column("complete", Boolean, nullable=False),
-    Column("shards", Integer, nullable=False),
-    Column("grasps", Integer, nullable=False),
-    Column("valid", Integer, nullable=False),
+    *required(Integer, "shards", "grasps", "valid"),
     Column("size_bytes", BigInteger, nullable=False),
 )
 object_sets: Final = Table(
@@ -300,10 +276,8 @@ tags: Final = Table(
     metadata,
     Column("id", String(32), primary_key=True),
     Column("name", String(64), nullable=False),
-    Column("created", String(32), nullable=False),
-    Column("changed", String(32), nullable=False),
-    Column("owner", String(64), nullable=False, server_default=""),
-    Column("project", String(32), nullable=False, server_default=""),
+    *required(String(32), "created", "changed"),
+    *ownership(),
     Index("tags_by_name", "name", "project"),
 )
 #: Grasps of a tag. Some may be missing: their shards were deleted with the last job that needed them.
@@ -335,8 +309,7 @@ webhooks: Final = Table(
     Column("url", Text, nullable=False),
     Column("states", JSON, nullable=False),
     Column("created", String(32), nullable=False),
-    Column("owner", String(64), nullable=False, server_default=""),
-    Column("project", String(32), nullable=False, server_default=""),
+    *ownership(),
     # Live: ends up to here have deliveries.
     Column("seen", BigInteger, nullable=False, server_default="0"),
 )

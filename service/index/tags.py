@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from typing import Final
 
 from sqlalchemy import Connection, case, delete, func, select, tuple_
 
 from graspd.service.index.bulk import upsert
-from graspd.service.index.database import IndexPart, rows_among
+from graspd.service.index.database import IndexPart
 from graspd.service.index.project_scope import seen, seen_shards
 from graspd.service.index.tables import grasps, tagged, tags
 from graspd.service.index.views import TagView
 from graspd.service.model.errors import NotFoundError
 from graspd.service.model.projects import EVERYTHING, ProjectScope
 from graspd.service.model.records import Grasp, Tag
-
-#: Grasps named in one statement: two parameters each.
-_AT_ONCE: Final = 400
 
 
 class Tags(IndexPart):
@@ -43,16 +39,14 @@ class Tags(IndexPart):
         query = select(tagged.c.shard_id, tagged.c.row, tags.c.name).order_by(tags.c.name)
         query = query.where(tags.c.id == tagged.c.tag, *seen(scope, tags))
         key = tuple_(tagged.c.shard_id, tagged.c.row)
-        with self.database.reading() as connection:
-            for shard, row, name in rows_among(connection, query, key, sorted(wanted), _AT_ONCE):
-                found.setdefault((shard, row), []).append(name)
+        for shard, row, name in self.database.among(query, key, sorted(wanted)):
+            found.setdefault((shard, row), []).append(name)
         return found
 
     def there(self, wanted: Sequence[Grasp], *, scope: ProjectScope = EVERYTHING) -> set[Grasp]:
         query = select(grasps.c.shard_id, grasps.c.row).where(*seen_shards(scope, grasps.c.shard_id))
         key = tuple_(grasps.c.shard_id, grasps.c.row)
-        with self.database.reading() as connection:
-            return {(shard, row) for shard, row in rows_among(connection, query, key, wanted, _AT_ONCE)}
+        return {(shard, row) for shard, row in self.database.among(query, key, wanted)}
 
     def put(self, tag: Tag, *, within: Connection | None = None) -> None:
         row = {name: getattr(tag, name) for name in ("id", "name", "created", "changed", "owner", "project")}

@@ -1,13 +1,11 @@
-"""Cache of remote shards, verified on download and bounded in size; prefetching of samples by threads."""
+"""Cache of remote shards, verified on download and bounded in size."""
 
 from __future__ import annotations
 
 import hashlib
 import os
 import time
-from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -52,7 +50,12 @@ class ShardCache:
         return True
 
     def _checked(self, store: Store, key: str, sha256: str) -> Iterator[bytes]:
-        check_not_forked(store, self._process)
+        # Requests to a remote store would never return in a fork.
+        if os.getpid() != self._process and not store.url.startswith(("file:", "memory:")):
+            raise InputError(
+                f"{store.url} cannot be read in a fork of the process that opened it; "
+                "start the processes anew: DataLoader(..., multiprocessing_context='spawn')"
+            )
         digest = hashlib.sha256()
         try:
             for chunk in store.stream(key):
@@ -61,49 +64,3 @@ class ShardCache:
         except NotFoundError:
             raise gone(f"{store.url}/{key}") from None
         check_digest(f"{store.url}/{key}", digest.hexdigest(), sha256)
-
-
-def check_not_forked(store: Store, process: int) -> None:
-    """Raise an error for a remote store in a fork of the process that opened it: requests would never return."""
-    if os.getpid() != process and not store.url.startswith(("file:", "memory:")):
-        raise InputError(
-            f"{store.url} cannot be read in a fork of the process that opened it; "
-            "start the processes anew: DataLoader(..., multiprocessing_context='spawn')"
-        )
-
-
-def prefetched(
-    source: Sequence[dict[str, Any]], order: Iterable[int] | None = None, *, workers: int = 2, ahead: int = 8
-) -> Iterator[dict[str, Any]]:
-    """Yield samples of `Pictures`, `Clouds` or `Grasps` in the given order, each equal to `source[i]`.
-
-    Reading and unpacking pictures releases the GIL, so threads share the work; with a remote store they also overlap
-    the network latency.
-
-    Args:
-        source: the samples.
-        order: their indices; by default all in order.
-        workers: number of threads.
-        ahead: most samples read in advance and not yet consumed; bounds the memory.
-
-    Raises:
-        InputError: a number is less than one.
-        Exception: errors of reading a sample are raised when that sample is due.
-    """
-    if workers < 1 or ahead < 1:
-        raise InputError(f"reading ahead takes at least one thread and one sample; got {workers} and {ahead}")
-    return _read(source, iter(range(len(source)) if order is None else order), workers, ahead)
-
-
-def _read(source: Sequence[dict[str, Any]], order: Iterator[int], workers: int, ahead: int) -> Iterator[dict[str, Any]]:
-    waiting: deque[Future[dict[str, Any]]] = deque()
-    pool = ThreadPoolExecutor(workers, thread_name_prefix="prefetch")
-    try:
-        for index in order:
-            waiting.append(pool.submit(source.__getitem__, index))
-            if len(waiting) > ahead:
-                yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Final
-
-import h5py
 
 from graspd.service.model import names
 from graspd.service.model.errors import InputError, NotFoundError
 from graspd.service.model.planning import plan
 from graspd.service.model.records import JobRecord
 from graspd.service.readers.cache import DEFAULT_BYTES, ShardCache
-from graspd.service.readers.ranges import RangeReader
 from graspd.service.store.columns import ShardKind
 from graspd.service.store.integrity import check_file
 from graspd.service.store.manifests import load_manifest
@@ -50,8 +46,6 @@ class Shards:
     files: tuple[ShardFile, ...]
     store: Store | None = None
     cache: ShardCache | None = None
-    stream: bool = False
-    """Whether pictures of the store are read by byte ranges, without a cache."""
 
     def __len__(self) -> int:
         return len(self.files)
@@ -81,19 +75,7 @@ class Shards:
             for file in self.files
             if (not of_hands or file.hand in of_hands) and (not of_objects or file.object in of_objects)
         )
-        return Shards(tuple(kept), self.store, self.cache, self.stream)
-
-    def streamed(self, file: ShardFile) -> bool:
-        return self.stream and file.path is None and file.kind == "views"
-
-    @cached_property
-    def ranges(self) -> RangeReader:
-        assert self.store is not None, "a shard without a path comes from a store"
-        return RangeReader(self.store)
-
-    def opened(self, file: ShardFile, *, whole: bool = False) -> AbstractContextManager[h5py.File]:
-        """Open the HDF5 file of a shard; `whole`: pictures of a streamed shard are needed too."""
-        return self.ranges.open(file.key, whole=whole) if self.streamed(file) else open_shard(self.path(file))
+        return Shards(tuple(kept), self.store, self.cache)
 
     def path(self, file: ShardFile) -> Path:
         """Return the local file, downloaded if necessary; DamagedShard if it does not match its checksum."""
@@ -112,7 +94,6 @@ def open_shards(
     snapshot: str | None = None,
     cache: Path | None = None,
     cache_bytes: int = DEFAULT_BYTES,
-    stream: bool = False,
 ) -> Shards:
     """Find the shards of a folder (searched recursively), of files, or of a job or dataset in a store.
 
@@ -123,8 +104,6 @@ def open_shards(
         snapshot: digest of another snapshot of that dataset.
         cache: folder for files of a store; by default `$XDG_CACHE_HOME/graspd/shards`.
         cache_bytes: size limit of the cache [bytes].
-        stream: read pictures from the store by byte ranges on demand, without a cache. Damage is detected on
-            unpacking, not by the SHA-256 of the shard.
 
     Raises:
         NotFoundError: no such file, job, dataset or snapshot.
@@ -136,7 +115,7 @@ def open_shards(
         store = source if isinstance(source, Store) else open_store(source, make=False)
         found = _of_store(store, job, dataset, snapshot)
         kept = ShardCache(cache or folder("shards"), limit_bytes=cache_bytes)
-        return Shards(_ordered(found), store, kept, stream)
+        return Shards(_ordered(found), store, kept)
     given = [source] if isinstance(source, str | Path) else list(source)
     return Shards(_ordered(_local(path) for entry in given for path in _paths(Path(entry))))
 

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from graspd.service.model import transforms
 from graspd.service.model.errors import InputError
 from graspd.service.readers.files import ShardFile, Shards
-from graspd.service.readers.ranges import RowTable, read_file
+from graspd.service.readers.rows import RowTable
 from graspd.service.store import validity
 from graspd.service.store.columns import check_known
-from graspd.service.store.shards import read_shard
+from graspd.service.store.shards import open_shard, read_shard
 
 if TYPE_CHECKING:
     from graspd.service.readers.clouds import Clouds
@@ -114,15 +114,8 @@ class Pictures(Sequence[dict[str, Any]]):
 
     def columns_of(self, place: PictureAddress, columns: Iterable[str]) -> dict[str, Array]:
         """Read columns of one picture; DamagedShard if they do not match their checksum."""
-        file, row, wanted = place.file, place.row, list(columns)
-        table = self._table(file, wanted)
-        if not self.shards.streamed(file):
-            path = self.shards.path(file)
-            return table.row(row, wanted, lambda ranges: read_file(path, ranges))
-        reader = self.shards.ranges
-        return table.row(
-            row, wanted, lambda ranges: reader.read(file.key, ranges, row, lambda other: table.ranges(other, wanted))
-        )
+        wanted = list(columns)
+        return self._table(place.file, wanted).row(self.shards.path(place.file), place.row, wanted)
 
     def clouds(self, points: int = 1024, **options: Any) -> Clouds:
         """Return the pictures as labelled point clouds; see `Clouds` for the options."""
@@ -131,7 +124,7 @@ class Pictures(Sequence[dict[str, Any]]):
         return Clouds(self, points, **options)
 
     def _add(self, file: ShardFile, *, with_grasps_only: bool) -> None:
-        with self.shards.opened(file) as opened:
+        with open_shard(self.shards.path(file)) as opened:
             scenes = np.asarray(opened["camera/scene_index"])
             # For grasps planned in scenes these are in the base shard.
             scene_shard = str(opened.attrs.get("base_shard") or opened.attrs.get("scene_shard") or "")
@@ -150,7 +143,7 @@ class Pictures(Sequence[dict[str, Any]]):
         table = self._tables.get(file.id)
         known = table.columns if table else set()
         if table is None or not known.issuperset(columns):
-            with self.shards.opened(file, whole=True) as opened:
+            with open_shard(self.shards.path(file)) as opened:
                 table = RowTable.of(opened, {*columns, *known}, str(file.path or file.key))
             self._tables[file.id] = table
             if len(self._tables) > _TABLES:

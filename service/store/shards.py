@@ -128,7 +128,7 @@ class ShardH5(h5py.File):  # type: ignore[misc]
 
 
 @contextmanager
-def open_shard(source: bytes | Path | io.RawIOBase, *, name: str = "") -> Iterator[h5py.File]:
+def open_shard(source: bytes | Path, *, name: str = "") -> Iterator[h5py.File]:
     """Open a shard for partial reading; DamagedShard if it does not match its checksum or is unreadable, also later."""
     name = name or (str(source) if isinstance(source, Path) else "shard")
     if isinstance(source, Path) and source.is_file():

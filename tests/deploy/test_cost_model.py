@@ -16,9 +16,8 @@ from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
 from graspd.service.store.store import open_store
 from tests.conftest import REPOSITORY
-from tests.fakes import request
+from tests.fakes import finish, request
 from tests.service.conftest import services  # noqa: F401
-from tests.service.index.test_index import run_all
 
 PAGE = (REPOSITORY / "docs" / "explanation" / "scaling.md").read_text()
 _CORE_S = {"core_s_per_grasp": 1.0, "core_s_per_scene": 10.0, "core_s_per_picture": 100.0, "busy": 0.5}
@@ -73,7 +72,7 @@ def test_sizes_are_measured_on_a_data_folder(services: Services, tmp_path: Path)
         store.put(entry.key, services.store.get(entry.key))
     with pytest.raises(SystemExit, match="no shard"):
         sizes(tmp_path)
-    run_all(kept, job_actions.submit(kept, request(grasps=64))[0].id)
+    finish(kept, job_actions.submit(kept, request(grasps=64))[0].id)
     shards = list((tmp_path / "store" / "shards" / "base").glob("*.h5"))
     assert sizes(tmp_path)["base_bytes_per_grasp"] == sum(shard.stat().st_size for shard in shards) / 64
 

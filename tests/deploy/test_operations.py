@@ -23,9 +23,8 @@ from graspd.service.settings import Settings
 from graspd.service.store.library import publish_builtins
 from tests.conftest import REPOSITORY
 from tests.deploy import composition
-from tests.fakes import add_assets, request
+from tests.fakes import add_assets, finish, request
 from tests.indexes import open_services
-from tests.service.index.test_index import run_all
 from tests.shell import completed
 
 TEXT: Final = "\n".join((REPOSITORY / "docs" / "how-to" / page).read_text() for page in ("install.md", "operations.md"))
@@ -53,7 +52,7 @@ def kept(tmp_path: Path) -> Iterator[Services]:
     identify(services)
     add_assets(services)
     publish_builtins(services.store)
-    run_all(services, job_actions.submit(services, request(grasps=64, scenes=1))[0].id)
+    finish(services, job_actions.submit(services, request(grasps=64, scenes=1))[0].id)
     job_actions.submit(services, request(grasps=32, seed=5))
     yield services
     services.close()

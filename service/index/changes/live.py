@@ -8,7 +8,7 @@ from typing import Any
 from sqlalchemy import Connection, delete, select, update
 
 from graspd.service.index.bulk import update_rows, upsert
-from graspd.service.index.changes.rows import NO_PROGRESS, clean, settle
+from graspd.service.index.changes.rows import NO_PROGRESS, clean, fitted, settle
 from graspd.service.index.database import IndexPart, chunks, rows_among
 from graspd.service.index.tables import assets, jobs, tasks, workers
 from graspd.service.model.states import State
@@ -76,20 +76,7 @@ class Live(IndexPart):
     def set_workers(self, beats: Sequence[WorkerBeat], *, forget_before: str, lost_before: str = "9999") -> None:
         """Record living workers; mark others as lost and delete them by the time they were last seen."""
         rows = [
-            {
-                "name": clean(beat.name, 128),
-                "host": clean(beat.host, 128),
-                "pid": beat.pid,
-                "device": clean(beat.device, 64),
-                "device_name": clean(beat.device_name, 128),
-                "stages": [stage.value for stage in beat.stages],
-                "version": clean(beat.version, 32),
-                "state": clean(beat.state, 16),
-                "task_id": clean(beat.task_id, 32) or None,
-                "started": beat.started,
-                "seen": beat.seen,
-                "reason": clean(beat.reason, 300),
-            }
+            fitted(workers, beat, stages=[stage.value for stage in beat.stages], task_id=beat.task_id or None)
             for beat in beats
         ]
         with self.database.writing() as connection:
@@ -101,19 +88,15 @@ class Live(IndexPart):
             for some in chunks(lost):
                 of_lost = update(workers).where(workers.c.name.in_(some))
                 connection.execute(of_lost.values(state="lost", task_id=None, reason=""))
-            self._forget(connection, [row.name for row in gone if row.seen < forget_before])
+            self.forget_workers([row.name for row in gone if row.seen < forget_before], within=connection)
 
-    def forget_workers(self, names: Sequence[str]) -> None:
-        with self.database.writing() as connection:
-            self._forget(connection, names)
-
-    def _forget(self, connection: Connection, names: Sequence[str]) -> None:
-        for some in chunks(names):
-            connection.execute(delete(workers).where(workers.c.name.in_(some)))
+    def forget_workers(self, names: Sequence[str], *, within: Connection | None = None) -> None:
+        with self.database.writing(within) as connection:
+            for some in chunks(names):
+                connection.execute(delete(workers).where(workers.c.name.in_(some)))
 
     def add_asset_attempt(self, digest: str, number: int, *, not_before: float) -> None:
         values = {"last_attempt": number, "queued": False, "not_before": not_before}
         with self.database.writing() as connection:
-            connection.execute(
-                update(assets).where(assets.c.digest == digest, assets.c.last_attempt < number).values(**values)
-            )
+            earlier = (assets.c.digest == digest, assets.c.last_attempt < number)
+            connection.execute(update(assets).where(*earlier).values(**values))

@@ -14,9 +14,9 @@ from graspd.service.index.changes.rows import (
     NO_PROGRESS,
     Row,
     asset_row,
-    attempt_row,
     beside,
     clean,
+    fitted,
     grasp_rows,
     job_row,
     settle,
@@ -115,7 +115,7 @@ class Changes(IndexPart):
         with self.database.writing(within) as connection:
             if connection.scalar(select(tasks.c.id).where(tasks.c.id == attempt.task_id)) is None:
                 return None  # of a deleted job, or a forged one
-            upsert(connection, attempts, [attempt_row(attempt)])
+            upsert(connection, attempts, [fitted(attempts, attempt, stage=attempt.stage.value)])
             values: dict[str, Any] = {
                 "last_attempt": attempt.number,
                 "exhausted": attempt.last,
@@ -152,7 +152,8 @@ class Changes(IndexPart):
         upsert(connection, jobs, [job_row(record)], keep=("state", "cancelled", "finished", "reason"))
 
     def _upsert_tasks(self, connection: Connection, rows: list[Row]) -> None:
-        known = self._finished_shards(connection, [row["shard_id"] for row in rows])
+        query, ids = select(shards.c.id, *_OUTCOME), [row["shard_id"] for row in rows]
+        known = {shard: _outcome(*made) for shard, *made in rows_among(connection, query, shards.c.id, ids)}
         for row in rows:
             row.update(known.get(row["shard_id"], {}))
         upsert(connection, tasks, rows, keep=[name for name in rows[0] if name != "priority"])
@@ -167,10 +168,6 @@ class Changes(IndexPart):
         elif goes_on:
             connection.execute(delete(notes).where(notes.c.name == ENTERING + record.id))
         settle(connection, record.id, [number * record.span for number in some])
-
-    def _finished_shards(self, connection: Connection, ids: Sequence[str]) -> dict[str, dict[str, Any]]:
-        rows = rows_among(connection, select(shards.c.id, *_OUTCOME), shards.c.id, ids)
-        return {shard: _outcome(*outcome) for shard, *outcome in rows}
 
     def _askers(self, connection: Connection, ids: Sequence[str]) -> dict[str, str]:
         """Return the project of the first job that requested each shard, if it has one."""

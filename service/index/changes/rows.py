@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from itertools import groupby
 from typing import Any, Final
 
-from sqlalchemy import ColumnElement, Connection, exists, func, literal, select, tuple_, update
+from sqlalchemy import ColumnElement, Connection, Table, exists, func, literal, select, tuple_, update
 
 from graspd.service.index.database import chunks
 from graspd.service.index.outbox import note_ends
@@ -16,7 +16,7 @@ from graspd.service.index.tables import attempts, jobs, notes, shards, tasks
 from graspd.service.model.domain import Asset, JobOptions
 from graspd.service.model.errors import LoadError, SceneError
 from graspd.service.model.planning import TaskFacts, batch_ready, batch_states, job_state, plan, stages_of
-from graspd.service.model.records import AttemptRecord, JobRecord
+from graspd.service.model.records import JobRecord
 from graspd.service.model.states import State
 from graspd.service.store.manifests import ShardManifest
 
@@ -86,15 +86,11 @@ def clean(text: str, length: int | None = None) -> str:
     return text.replace("\0", "")[:length]
 
 
-def attempt_row(attempt: AttemptRecord) -> Row:
-    return {
-        **{name: getattr(attempt, name) for name in ("task_id", "number", "job_id", "started", "ended", "last")},
-        "stage": attempt.stage.value,
-        "kind": clean(attempt.kind, 64),
-        "reason": clean(attempt.reason),
-        "trace": attempt.trace and clean(attempt.trace),
-        "worker": clean(attempt.worker, 128),
-    }
+def fitted(table: Table, record: object, **others: Any) -> Row:
+    """Return a row of the attributes of a record, except `others`, with text that fits its columns."""
+    row = {column.name: getattr(record, column.name) for column in table.columns if column.name not in others} | others
+    lengths = {column.name: getattr(column.type, "length", None) for column in table.columns}
+    return {name: clean(value, lengths[name]) if isinstance(value, str) else value for name, value in row.items()}
 
 
 def shard_row(manifest: ShardManifest) -> Row:

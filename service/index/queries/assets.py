@@ -53,8 +53,7 @@ class Assets(IndexPart):
     def sizes(self, kind: AssetKind, wanted: Collection[str], *, scope: ProjectScope = EVERYTHING) -> dict[str, int]:
         """Return the sizes [bytes] of the named hands or objects; unknown names are omitted."""
         query = select(assets.c.name, assets.c.size_bytes).where(assets.c.kind == kind.value, *seen_assets(scope))
-        with self.database.reading() as connection:
-            sizes = {row.name: row.size_bytes for row in connection.execute(query.order_by(assets.c.created))}
+        sizes = {row["name"]: row["size_bytes"] for row in self.database.rows(query.order_by(assets.c.created))}
         return {name: sizes[name] for name in wanted if name in sizes}
 
     def missing(self, wanted: Collection[tuple[AssetKind, str]], *, within: Connection) -> list[str]:

@@ -9,7 +9,7 @@ from typing import Any
 
 from sqlalchemy import Column, ColumnElement, exists, or_, select
 
-from graspd.service.index.database import IndexPart, rows_among
+from graspd.service.index.database import IndexPart
 from graspd.service.index.tables import assets, dataset_cells, datasets, jobs, tasks
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.planning import MAX_BACKOFF_S, PlannedTask, RoundRobin, WaitingJob, interleave, share_of
@@ -95,14 +95,11 @@ class Feed(IndexPart):
 
     def outputs(self, task_ids: Collection[str]) -> dict[str, tuple[str, str]]:
         query = select(tasks.c.id, tasks.c.stage, tasks.c.shard_id)
-        with self.database.reading() as connection:
-            rows = rows_among(connection, query, tasks.c.id, task_ids)
-            return {task: (stage, shard) for task, stage, shard in rows}
+        return {task: (stage, shard) for task, stage, shard in self.database.among(query, tasks.c.id, task_ids)}
 
     def cancelled(self, task_ids: Collection[str]) -> set[str]:
         query = select(tasks.c.id).where(tasks.c.state == State.CANCELLED.value)
-        with self.database.reading() as connection:
-            return {row.id for row in rows_among(connection, query, tasks.c.id, task_ids)}
+        return {row.id for row in self.database.among(query, tasks.c.id, task_ids)}
 
     def failed_tasks(self, job_id: str) -> dict[str, int]:
         """Return failed and cancelled tasks of a job with the number of their last attempt."""

@@ -40,7 +40,7 @@ from graspd.service.index.project_scope import decode, encode, page_size, seen_s
 from graspd.service.index.tables import dataset_cells, grasps, jobs, shards, tagged, tasks
 from graspd.service.index.views import GraspView, Page
 from graspd.service.model.base import Model
-from graspd.service.model.errors import InputError, NotFoundError
+from graspd.service.model.errors import InputError
 from graspd.service.model.metric_fields import SortedName
 from graspd.service.model.metrics import indexed
 from graspd.service.model.projects import EVERYTHING, ProjectScope
@@ -59,8 +59,6 @@ class GraspSort(Model):
 
 
 _BEST_FIRST = GraspSort()
-#: Grasps named in one statement: two parameters each.
-_AT_ONCE: Final = 400
 
 
 class Grasps(IndexPart):
@@ -82,10 +80,8 @@ class Grasps(IndexPart):
 
     def get(self, shard_id: str, row: int, *, scope: ProjectScope = EVERYTHING) -> GraspView:
         query = select(grasps).where(grasps.c.shard_id == shard_id, grasps.c.row == row)
-        found = self.database.rows(query.where(*seen_shards(scope, grasps.c.shard_id)))
-        if not found:
-            raise NotFoundError(f"there is no grasp {row} in shard {shard_id!r}")
-        return GraspView(**found[0])
+        query = query.where(*seen_shards(scope, grasps.c.shard_id))
+        return GraspView(**self.database.one(query, f"grasp {row} in shard {shard_id!r}"))
 
     def members(self, where: GraspFilter, *, limit: int) -> list[Grasp]:
         query = select(grasps.c.shard_id, grasps.c.row).order_by(grasps.c.shard_id, grasps.c.row).limit(limit)
@@ -93,7 +89,7 @@ class Grasps(IndexPart):
 
     def listed(self, wanted: Sequence[Grasp]) -> Iterator[GraspView]:
         """Yield grasps by shard and row, in that order; missing ones are omitted."""
-        for some in chunks(sorted(wanted), _AT_ONCE):
+        for some in chunks(sorted(wanted)):
             query = select(grasps).where(tuple_(grasps.c.shard_id, grasps.c.row).in_(some))
             for row in self.database.rows(query.order_by(grasps.c.shard_id, grasps.c.row)):
                 yield GraspView(**row)
@@ -296,12 +292,12 @@ def _few(connection: Connection, where: GraspFilter | None, wanted: Sequence[Tes
         if group == "shard":
             return group
         if group != "flag":
-            numbers[group] = _number(connection, where or GraspFilter(), group, wanted)
+            numbers[group] = number_of(connection, where or GraspFilter(), group, wanted)
     few = min(numbers, key=lambda name: numbers[name], default=None)
     return few if few is not None and numbers[few] <= SORTED_AT_ONCE else None
 
 
-def _number(connection: Connection, where: GraspFilter, group: str, wanted: Sequence[Test]) -> int:
+def number_of(connection: Connection, where: GraspFilter, group: str, wanted: Sequence[Test] = ()) -> int:
     """Return the number of rows that pass a group; for metrics, counting stops at the relevant limit."""
     query: Select[Any]
     if group == "job":

@@ -8,11 +8,10 @@ from typing import Any, Final, Literal
 
 from sqlalchemy import Column, ColumnElement, Connection, Float, and_, case, cast, func, select
 
-from graspd.service.index.database import IndexPart, rows_among
+from graspd.service.index.database import IndexPart
 from graspd.service.index.project_scope import page_rows, page_size, seen, seen_shards, seen_with_job
 from graspd.service.index.tables import attempts, jobs, shards, tasks
 from graspd.service.index.views import AttemptView, JobView, Page, ShardView, StageProgress, TaskView
-from graspd.service.model.errors import NotFoundError
 from graspd.service.model.planning import ranges_of, totals
 from graspd.service.model.projects import EVERYTHING, ProjectScope
 from graspd.service.model.states import Stage, State
@@ -44,18 +43,15 @@ class Jobs(IndexPart):
 
     def get(self, job_id: str, *, scope: ProjectScope = EVERYTHING) -> JobView:
         with self.database.reading() as connection:
-            rows = self.database.rows(select(jobs).where(jobs.c.id == job_id, *seen(scope, jobs)), connection)
-            if not rows:
-                raise NotFoundError(f"there is no job {job_id!r}")
-            (view,) = _job_views(connection, rows)
+            query = select(jobs).where(jobs.c.id == job_id, *seen(scope, jobs))
+            (view,) = _job_views(connection, [self.database.one(query, f"job {job_id!r}", connection)])
             if view.note is None:
                 return view
             return view.model_copy(update={"outcomes": outcomes_of(connection, tasks.c.job_id == job_id)})
 
     def unfinished(self, ids: Collection[str]) -> set[str]:
         query = select(jobs.c.id).where(jobs.c.finished.is_(None))
-        with self.database.reading() as connection:
-            return {row.id for row in rows_among(connection, query, jobs.c.id, ids)}
+        return {row.id for row in self.database.among(query, jobs.c.id, ids)}
 
     def tasks(
         self,
@@ -73,15 +69,12 @@ class Jobs(IndexPart):
         return Page(items=[_task_view(row) for row in rows], next=following)
 
     def task(self, task_id: str, *, scope: ProjectScope = EVERYTHING) -> TaskView:
-        rows = self.database.rows(select(tasks).where(tasks.c.id == task_id, *seen_with_job(scope, tasks)))
-        if not rows:
-            raise NotFoundError(f"there is no task {task_id!r}")
-        return _task_view(rows[0])
+        query = select(tasks).where(tasks.c.id == task_id, *seen_with_job(scope, tasks))
+        return _task_view(self.database.one(query, f"task {task_id!r}"))
 
     def out_of_scope(self, task_ids: Collection[str], scope: ProjectScope) -> set[str]:
         query = select(tasks.c.id).join(jobs, jobs.c.id == tasks.c.job_id).where(jobs.c.project != scope.project)
-        with self.database.reading() as connection:
-            return {row.id for row in rows_among(connection, query, tasks.c.id, task_ids)}
+        return {row.id for row in self.database.among(query, tasks.c.id, task_ids)}
 
     def attempts(self, *, job: str | None = None, limit: int = 50) -> list[AttemptView]:
         query = select(attempts).where(*_equal({attempts.c.job_id: job}))
@@ -207,7 +200,4 @@ class Shards(IndexPart):
 
     def get(self, shard_id: str, *, scope: ProjectScope = EVERYTHING) -> ShardView:
         query = select(shards).where(shards.c.id == shard_id, *seen_shards(scope, shards.c.id))
-        rows = self.database.rows(query)
-        if not rows:
-            raise NotFoundError(f"there is no shard {shard_id!r}")
-        return ShardView(**rows[0])
+        return ShardView(**self.database.one(query, f"shard {shard_id!r}"))

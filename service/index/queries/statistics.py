@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from sqlalchemy import ColumnElement, Connection, Integer, cast, func, select
 
 from graspd.service.index.database import IndexPart
-from graspd.service.index.queries.grasps import GraspFilter, Metric, conditions, sql_conditions
-from graspd.service.index.tables import dataset_cells, grasps, shards, tasks
+from graspd.service.index.queries.grasps import GraspFilter, Metric, conditions, number_of, sql_conditions
+from graspd.service.index.tables import grasps
 
 
 @dataclass(frozen=True)
@@ -115,25 +115,12 @@ class Statistics(IndexPart):
 
 def _sampled(connection: Connection, where: GraspFilter, at_most: int) -> list[ColumnElement[bool]]:
     """Return the filter restricted to a share of shards with about `at_most` grasps."""
-    share = min(1.0, at_most / max(1, _size(connection, where)))
+    group = "job" if where.job is not None else "dataset" if where.dataset is not None else "pair"
+    # A shard is never larger than a sample.
+    size = number_of(connection, where, group) if where.shard is None else 0
+    share = min(1.0, at_most / max(1, size))
     tests = [c.sql(["shard", "job", "dataset"]) for c in conditions(where)]
     return [*tests, grasps.c.shard_id < f"{round(share * 16**8):08x}"] if share < 1.0 else tests
-
-
-def _size(connection: Connection, where: GraspFilter) -> int:
-    """Return the number of grasps of the filter's shard, job or pair, or of all."""
-    query = select(func.sum(shards.c.count)).where(shards.c.kind == "base")
-    if where.shard is not None:
-        query = query.where(shards.c.id == where.shard)
-    elif where.job is not None:
-        query = select(func.sum(tasks.c.count)).where(tasks.c.job_id == where.job, tasks.c.position == 0)
-    elif where.dataset is not None:
-        cells = (dataset_cells.c.job_id == tasks.c.job_id, dataset_cells.c.dataset == where.dataset)
-        query = select(func.sum(tasks.c.count)).where(*cells, tasks.c.position == 0)
-    else:
-        pair = {"hand": where.hand, "object": where.object}
-        query = query.where(*(shards.c[name] == value for name, value in pair.items() if value is not None))
-    return int(connection.scalar(query) or 0)
 
 
 def _distribution(values: NDArray[np.float64], bins: int, ends: tuple[float, float]) -> Distribution | None:

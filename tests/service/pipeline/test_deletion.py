@@ -81,15 +81,6 @@ def test_a_deleted_job_is_gone_and_its_shards_after_a_grace_time(services: Servi
         restore(services, "job", job, permit=lambda _: None)
 
 
-def test_a_shard_that_another_job_needs_stays(services: Services) -> None:
-    short, long = finished(services), finished(services, grasps=64)
-    delete_job(services, short)
-    GarbageCollector(services).advance()
-    assert not graceless(services).collect(budget_s=60)
-    assert len(keys(services, "shards")) == 4
-    assert services.index.jobs.get(long).grasps == 64
-
-
 def test_a_deleted_job_may_be_submitted_again(services: Services) -> None:
     job = finished(services)
     delete_job(services, job)

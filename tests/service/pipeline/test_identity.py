@@ -20,7 +20,7 @@ from graspd.service.store.store import Store, open_store
 from graspd.service.telemetry import HeartbeatFile
 from tests.indexes import open_services
 from tests.memory_queue import MemoryQueue
-from tests.waiting import PATIENCE_S, until
+from tests.waiting import PATIENCE_S, Pauses, until
 
 
 def service(folder: Path, *, store: Store | None = None, queue: RqQueue | None = None, **more: str) -> Services:
@@ -166,19 +166,6 @@ def often(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("graspd.service.pipeline.leading._RENEWALS", LEASE_S * 100)
 
 
-class Pauses(threading.Event):
-    """A word to stop, for which nobody waits: each pause moves the queue's clock on."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.now = 0.0
-        self.queue = MemoryQueue(clock=lambda: self.now)
-
-    def wait(self, timeout: float | None = None) -> bool:
-        self.now += timeout or 0.0
-        return self.is_set()
-
-
 def leadership(queue: MemoryQueue, *, file: Path | None = None) -> Leadership:
     return Leadership(queue, lease_s=LEASE_S, alive=HeartbeatFile(file))
 
@@ -200,8 +187,9 @@ def test_a_lease_is_renewed_while_held_and_given_back() -> None:
 def test_who_waits_leads_soon_after_the_other_fell_silent(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("graspd.service.pipeline.leading._RENEWALS", 3.0)
     stop = Pauses()
-    stop.queue.lead("silent", LEASE_S)
-    assert leadership(stop.queue).wait(stop)
+    queue = MemoryQueue(clock=stop.clock)
+    queue.lead("silent", LEASE_S)
+    assert leadership(queue).wait(stop)
     assert LEASE_S <= stop.now <= LEASE_S * 4 / 3
 
 

@@ -49,7 +49,7 @@ from tests.damage import flip, flipped, overwrite, remove
 from tests.fakes import HAND_FILES, OBJECT_FILES, make_shard, message_for, request, with_settings
 from tests.indexes import open_services
 from tests.packs import tasks_of
-from tests.waiting import PATIENCE_S, until
+from tests.waiting import PATIENCE_S, Pauses, until
 
 #: Flips of each object: with some thirty objects more than the 265 that were once tried by hand.
 FLIPS: Final = 15
@@ -195,28 +195,13 @@ def test_charts_of_one_moment_are_all_kept(services: Services) -> None:
     assert found is not None and found["runs"] == [11]
 
 
-class Slept(threading.Event):
-    """An event whose waits take no time, but are counted; the clock of whom it is given to."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.now = 0.0
-
-    def wait(self, timeout: float | None = None) -> bool:
-        self.now += timeout or 0.0
-        return self.is_set()
-
-    def clock(self) -> float:
-        return self.now
-
-
 @pytest.fixture
 def shards(services: Services) -> list[ShardManifest]:
     return [make_shard(services.store, message_for(seed=seed)) for seed in range(4)]
 
 
-def a_round(services: Services, stop: Slept | None = None) -> None:
-    stop = stop or Slept()
+def a_round(services: Services, stop: Pauses | None = None) -> None:
+    stop = stop or Pauses()
     scan = IntegrityScan(services, stop, clock=stop.clock)
     for _ in FOLDERS:
         scan.advance()
@@ -252,7 +237,7 @@ def test_what_is_mended_or_removed_since_is_forgotten(services: Services, shards
     remove(services.store, names.shard_manifest(shards[1].stage, shards[1].shard_id))
     remove(services.store, shards[1].key)
     remove(services.store, "shards/base/notes.txt")
-    IntegrityScan(services, Slept()).look_again()
+    IntegrityScan(services, Pauses()).look_again()
     assert found(services).keys() == {shards[2].shard_id}
 
 
@@ -264,7 +249,7 @@ def test_a_file_whose_manifest_may_be_on_its_way_is_no_damage(services: Services
 
 def test_it_reads_no_faster_than_the_settings_say(services: Services, shards: list[ShardManifest]) -> None:
     size = sum(manifest.size_bytes for manifest in shards)
-    stop = Slept()
+    stop = Pauses()
     a_round(with_settings(services, integrity_scan_mb_per_s=size / 2**20 / 100), stop)
     assert stop.now > 99.0
 
@@ -282,7 +267,7 @@ def test_a_successor_goes_on_where_it_stopped(services: Services, shards: list[S
 def test_a_small_store_is_not_read_over_and_over(services: Services, shards: list[ShardManifest]) -> None:
     a_round(services)
     flip(services.store, shards[0].key)
-    scan = IntegrityScan(services, Slept())
+    scan = IntegrityScan(services, Pauses())
     assert not scan.advance()
     note = services.index.notes.scan_note()
     services.index.notes.set_scan_note(type(note)(**vars(note) | {"started": "2026-01-01T00:00:00.000Z"}))
@@ -291,22 +276,18 @@ def test_a_small_store_is_not_read_over_and_over(services: Services, shards: lis
 
 
 def test_it_makes_way_for_a_verify_and_goes_on_afterwards(services: Services, shards: list[ShardManifest]) -> None:
-    stop = Slept()
+    stop = Pauses()
     scan = IntegrityScan(services, stop, clock=stop.clock)
     verify = ReadPermit(services, is_controller=False)
+    assert scan.turn.is_mine() and not ReadPermit(services, is_controller=True).is_mine()
     assert verify.is_mine()
+    stop.now += 10.0
     with pytest.raises(Interrupted):
         scan.advance()
     assert not ReadPermit(services, is_controller=False).is_mine()
     assert not ReadPermit(services, is_controller=True).is_mine()
     verify.end()
     assert scan.advance()
-
-
-def test_a_verify_takes_the_turn_from_a_controller(services: Services) -> None:
-    assert ReadPermit(services, is_controller=True).is_mine()
-    assert not ReadPermit(services, is_controller=True).is_mine()
-    assert ReadPermit(services, is_controller=False).is_mine()
 
 
 def test_a_second_verify_is_refused(tmp_path: Path) -> None:

@@ -19,9 +19,9 @@ from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.job_actions import check_scene
 from graspd.service.store.library import load_asset
 from graspd.service.store.records import job_events
-from tests.fakes import fail_task, make_task, record_of, request, with_settings
+from tests.fakes import fail_task, finish, make_task, record_of, request, with_settings
 from tests.memory_queue import MemoryQueue
-from tests.service.index.test_index import fail, run_all
+from tests.service.index.test_index import fail
 
 
 def queue_of(services: Services) -> MemoryQueue:
@@ -66,7 +66,7 @@ def test_a_large_job_fills_the_window_and_no_more(services: Services) -> None:
 def test_a_cancelled_job_leaves_the_queue(services: Services) -> None:
     job, _ = job_actions.submit(services, request(grasps=64))
     queue_of(services).take("w")
-    run_all(services, job.id, batches=1)
+    finish(services, job.id, batches=1)
     after = job_actions.cancel(services, job.id)
     assert after.state is State.CANCELLED
     assert (after.stages[0].succeeded, after.stages[0].cancelled) == (1, 1)
@@ -85,14 +85,14 @@ def test_where_a_cancelled_task_ran_is_no_difference(services: Services) -> None
 
 def test_a_finished_job_cannot_be_cancelled(services: Services) -> None:
     job, _ = job_actions.submit(services, request())
-    run_all(services, job.id)
+    finish(services, job.id)
     with pytest.raises(ConflictError, match="succeeded"):
         job_actions.cancel(services, job.id)
 
 
 def test_a_retried_job_gets_fresh_attempts(services: Services) -> None:
     job, _ = job_actions.submit(services, request(grasps=64))
-    run_all(services, job.id, batches=1)
+    finish(services, job.id, batches=1)
     for number in (1, 2, 3):
         fail(services, job.id, 1, number, last=number == 3)
     failed = services.index.jobs.get(job.id)

@@ -115,16 +115,6 @@ def test_an_older_copy_of_the_store_is_believed(tmp_path: Path, rebuilt: list[ob
     assert len(rebuilt) == 1
 
 
-def test_an_index_that_is_lost_is_made_once(tmp_path: Path, rebuilt: list[object]) -> None:
-    data = tmp_path / "data"
-    in_service(data, submit(1))
-    for file in data.glob("index.sqlite*"):
-        file.unlink()
-    assert in_service(data) == []
-    assert in_service(data) == []
-    assert len(rebuilt) == 1
-
-
 def test_a_copy_that_is_as_new_as_the_store_is_kept(tmp_path: Path, rebuilt: list[object]) -> None:
     data, backup = tmp_path / "data", tmp_path / "backup"
     in_service(data, submit(1))

@@ -16,7 +16,7 @@ from graspd.api.metrics import Metrics, Snapshot
 from graspd.service.index.notes import Damage
 from graspd.service.index.queries import overview
 from graspd.service.model.messages import TaskMessage
-from graspd.service.model.series import SERIES, parse_field
+from graspd.service.model.series import SERIES, field
 from graspd.service.model.states import Priority, Stage, State
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.indexer import MOST_KINDS, OTHER_KIND, Tally
@@ -25,20 +25,6 @@ from graspd.service.queue.rq_queue import WORKERS, RqQueue, worker_key
 from tests.conftest import REPOSITORY
 from tests.fakes import beat_of, make_shard, message_for, request
 from tests.indexes import empty_index
-
-
-class Sums:
-    """Counters in a dictionary."""
-
-    def __init__(self) -> None:
-        self.sums: dict[tuple[str, ...], float] = {}
-
-    def count(self, amounts: Any) -> None:
-        for text, amount in amounts.items():
-            parsed = parse_field(text)
-            assert parsed is not None
-            key = (parsed[0], *parsed[1])
-            self.sums[key] = self.sums.get(key, 0.0) + amount
 
 
 def tasks(count: int) -> list[TaskMessage]:
@@ -117,25 +103,25 @@ def test_sums_outlive_the_process_that_counts(rq_queue: RqQueue) -> None:
 
 
 def test_a_shard_counts_its_grasps_and_its_seconds(services: Services) -> None:
-    sums = Sums()
-    tally = Tally(sums.count)
+    sums: dict[str, float] = {}
+    tally = Tally(sums.update)
     manifest = make_shard(services.store, message_for())
     tally.made([manifest])
     tally.flush()
-    assert sums.sums["graspd_grasps_total", "all"] == 32
-    assert sums.sums["graspd_grasps_total", "valid"] == manifest.valid
-    assert sums.sums["graspd_stage_seconds_bucket", "synthesize", "1.0"] == 1
-    assert sums.sums["graspd_stage_seconds_sum", "synthesize"] == pytest.approx(manifest.seconds)
+    assert sums[field("graspd_grasps_total", "all")] == 32
+    assert sums[field("graspd_grasps_total", "valid")] == manifest.valid
+    assert sums[field("graspd_stage_seconds_bucket", "synthesize", "1.0")] == 1
+    assert sums[field("graspd_stage_seconds_sum", "synthesize")] == pytest.approx(manifest.seconds)
 
 
 def test_error_names_cannot_become_series_without_end() -> None:
-    sums = Sums()
-    tally = Tally(sums.count)
+    sums: dict[str, float] = {}
+    tally = Tally(sums.update)
     for number in range(3 * MOST_KINDS):
         tally.failed("scene", f"Error{number}")
     tally.flush()
-    assert len(sums.sums) == MOST_KINDS + 1
-    assert sums.sums["graspd_task_failures_total", "scene", OTHER_KIND] == 2 * MOST_KINDS
+    assert len(sums) == MOST_KINDS + 1
+    assert sums[field("graspd_task_failures_total", "scene", OTHER_KIND)] == 2 * MOST_KINDS
 
 
 def test_the_page_of_metrics_asks_only_for_series_that_exist() -> None:

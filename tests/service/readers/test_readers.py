@@ -1,12 +1,9 @@
-"""Reading shards back: from files, jobs, snapshots and S3, ahead of need; how pictures and grasps belong together."""
+"""Reading shards back: from files, jobs, snapshots and S3; how pictures and grasps belong together."""
 
 from __future__ import annotations
 
 import hashlib
-import threading
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +13,7 @@ from graspd.service.model.names import dataset_snapshot
 from graspd.service.model.records import Snapshot
 from graspd.service.model.transforms import compose, pose_from_matrix
 from graspd.service.pipeline.backends import Services
-from graspd.service.readers import Grasps, Pictures, ShardCache, Shards, open_shards, prefetched
+from graspd.service.readers import Grasps, Pictures, ShardCache, Shards, open_shards
 from graspd.service.settings import Settings
 from graspd.service.store.records import put_record
 from graspd.service.store.shards import read_shard
@@ -154,46 +151,3 @@ def test_what_was_read_once_from_s3_needs_the_server_no_more(s3_url: str, s3_ser
     finally:
         s3_server.start()
     remote.close()
-
-
-class Counted(Sequence[dict[str, Any]]):
-    """Numbers as samples; number `bad` cannot be read."""
-
-    def __init__(self, bad: int = -1) -> None:
-        self.bad, self.asked, self._lock = bad, 0, threading.Lock()
-
-    def __len__(self) -> int:
-        return 30
-
-    def __getitem__(self, index: Any) -> Any:
-        with self._lock:
-            self.asked += 1
-        if index == self.bad:
-            raise InputError("no such number")
-        return {"number": index}
-
-
-def test_samples_come_in_order_and_none_is_left_out() -> None:
-    assert [sample["number"] for sample in prefetched(Counted(), workers=3, ahead=4)] == list(range(30))
-    order = [7, 3, 3, 29]
-    assert [sample["number"] for sample in prefetched(Counted(), order, workers=2, ahead=50)] == order
-
-
-def test_no_more_are_read_than_may_be_held() -> None:
-    source = Counted()
-    found = prefetched(source, workers=2, ahead=5)
-    for _ in range(3):
-        next(found)
-    assert source.asked <= 3 + 5
-    found.close()
-    assert not [thread for thread in threading.enumerate() if thread.name.startswith("prefetch")]
-
-
-def test_an_error_comes_when_it_is_its_turn() -> None:
-    found = prefetched(Counted(bad=4), workers=2, ahead=10)
-    assert [next(found)["number"] for _ in range(4)] == [0, 1, 2, 3]
-    with pytest.raises(InputError, match="no such number"):
-        next(found)
-    for options in ({"workers": 0}, {"ahead": 0}):
-        with pytest.raises(InputError, match="at least one"):
-            prefetched(Counted(), **options)

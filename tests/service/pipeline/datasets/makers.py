@@ -12,7 +12,7 @@ from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.datasets import actions
 from graspd.service.pipeline.datasets.spec import DatasetRequest
 from graspd.service.store.library import publish_asset
-from tests.fakes import fail_task, make_task, record_of
+from tests.fakes import fail_task, finish, record_of
 from tests.planning import plan_all
 
 
@@ -31,13 +31,6 @@ def wanted(name: str = "grasps", **changes: Any) -> DatasetRequest:
     """Two hands x two objects, one batch each."""
     given = {"hands": ("gripper", "claw"), "objects": ("ball", "cube"), "grasps": 32, "validation": "standard"}
     return DatasetRequest.model_validate({"name": name, **given, **changes})
-
-
-def finish(services: Services, job: str, *, batches: int | None = None, lost: dict[str, int] | None = None) -> None:
-    """Do the first tasks of a job; of each, so many candidates are `lost` by outcome."""
-    for task in plan(record := record_of(services, job)):
-        if batches is None or task.batch < batches:
-            make_task(services, record, task, **({"outcomes": lost} if lost else {}))
 
 
 def done(services: Services, name: str = "grasps", **changes: Any) -> None:

@@ -27,7 +27,6 @@ from graspd.service.model.planning import OUTCOMES
 from graspd.service.model.records import DatasetRecord, Snapshot, SnapshotShard, request_of
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.states import AssetKind, Priority, State
-from graspd.service.model.studies import IN_SCENE
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.datasets import actions
@@ -39,9 +38,10 @@ from graspd.service.pipeline.fidelity_choice import Resolver
 from graspd.service.store.records import charts_of, job_events, load_dataset, publish
 from graspd.service.store.store import open_store
 from tests.dataset_status import status
-from tests.fakes import record_of
+from tests.fakes import finish, record_of
 from tests.planning import plan_all
-from tests.service.pipeline.datasets.makers import add_asset, done, fail, finish, jobs_of, wanted
+from tests.service.pipeline.datasets.makers import add_asset, done, fail, jobs_of, wanted
+from tests.service.pipeline.test_fidelity_choice import lifts, run
 
 
 def test_a_dataset_has_a_job_for_each_hand_and_object(either: Services) -> None:
@@ -75,16 +75,6 @@ def test_a_planner_that_was_stopped_is_continued(services: Services) -> None:
     plan_all(services)
     assert all(cell.planned for cell in services.index.datasets.cells("grasps").items)
     assert not DatasetRounds(services).advance(10)
-
-
-def test_datasets_and_jobs_of_their_own_share_what_all_want(services: Services) -> None:
-    job, _ = job_actions.submit(services, JobRequest(hand="claw", object="ball", grasps=32))
-    actions.create(services, wanted("one"))
-    actions.create(services, wanted("two", hands=("gripper",), objects=("cube", "cone")))
-    plan_all(services)
-    assert jobs_of(services, "one")[1] == jobs_of(services, "two")[0]
-    assert jobs_of(services, "one")[2] == job.id
-    assert len(services.index.jobs.page().items) == 5
 
 
 def test_a_name_stands_for_one_dataset(services: Services) -> None:
@@ -157,33 +147,15 @@ def test_a_dataset_that_found_fewer_grasps_tells_the_outcomes(either: Services) 
     actions.create(either, wanted(objects=("ball",)))
     plan_all(either)
     first, second = jobs_of(either, "grasps")
-    finish(either, first, lost={"slipped": 3})
+    finish(either, first, outcomes={"slipped": 3})
     assert status(either.index, "grasps").dataset.reason is None
-    finish(either, second, lost={"slipped": 1, "turned": 2})
+    finish(either, second, outcomes={"slipped": 1, "turned": 2})
     found = status(either.index, "grasps")
     whole = found.dataset
     assert whole.valid < 64 and whole.outcomes == {"turned": 2, "slipped": 4}
     assert whole.reason is not None and f"found {whole.valid} of 64 valid" in whole.reason
     reasons = [cell.reason or "" for cell in found.cells]
     assert "3 slipped;" in reasons[0] and f"2 {OUTCOMES['turned']}, 1 slipped;" in reasons[1]
-
-
-def test_datasets_come_newest_first_in_pages(services: Services) -> None:
-    for name in ("a", "b", "c"):
-        actions.create(services, wanted(name))
-    first = services.index.datasets.page(limit=2)
-    rest = services.index.datasets.page(limit=2, cursor=first.next)
-    assert sorted(view.name for view in first.items + rest.items) == ["a", "b", "c"] and rest.next is None
-
-
-def test_cells_come_in_pages_and_by_state(either: Services) -> None:
-    actions.create(either, wanted(objects=("ball", "cube", "cone")))
-    plan_all(either)
-    for job in jobs_of(either, "grasps")[1:4]:
-        finish(either, job)
-    first = either.index.datasets.cells("grasps", state=State.SUCCEEDED, limit=2)
-    rest = either.index.datasets.cells("grasps", state=State.SUCCEEDED, limit=2, cursor=first.next)
-    assert [cell.position for cell in first.items + rest.items] == [1, 2, 3] and rest.next is None
 
 
 def test_cancel_stops_what_is_planned_and_what_is_not(services: Services) -> None:
@@ -261,20 +233,6 @@ def test_the_store_alone_tells_everything(either: Services) -> None:
     assert (counts["datasets"], counts["snapshots"], counts["object_sets"]) == (2, 1, 1)
     assert [either.index.datasets.get(name) for name in ("a", "b")] == before
     assert [view.shards for view in either.index.datasets.snapshots("a").items] == [4]
-
-
-def test_a_difference_between_index_and_store_is_found(services: Services) -> None:
-    actions.create(services, wanted())
-    actions.add_dataset_event(services.store, "grasps", "cancelled")
-    found = differences(services.index, services.store)
-    assert found[0] == "datasets grasps: cancelled is False, the store says True" and len(found) == 2
-
-
-def test_a_set_of_objects_is_spelled_out_at_creation(services: Services) -> None:
-    actions.add_object_set(services, "round", ["cone", "ball"])
-    actions.create(services, wanted(objects=("cube",), sets=("round",)))
-    actions.add_object_set(services, "round", ["ball"])
-    assert services.index.datasets.get("grasps").objects == ["cube", "ball", "cone"]
 
 
 def test_a_set_has_versions_and_the_newest_counts(either: Services) -> None:
@@ -363,17 +321,14 @@ ANNEALED = {"method": "graspit", "options": {"keep": 20, "steps": 40000}}
 AUTO = {"fidelity": "auto", "target": "gsr>=0.6"}
 
 
-def run_of(fidelity: str, speed: float, reached: float, hand: str, object_: str, way: str = "") -> dict[str, Any]:
-    what = {"method": "fast_graspd", "fidelity": fidelity, "hand": hand, "object": object_}
-    if way:
-        return what | {"way": way, "end_to_end_per_second": speed, "lift": reached}
-    return what | {"valid_per_second": speed, "gsr": reached, "epsilon": 0.3, "pd_mm": 0.1}
+_ON_BALL = (("draft", 40, 0.3), ("standard", 15, 0.8))
 
 
 def chart(created: str = "2026-11-21T10:00:00.000Z", *, claw: str = "fine") -> dict[str, Any]:
     """The gripper needs standard on all but the cube, the claw a fidelity of one's choice on all."""
-    runs = [run_of("draft", 40, 0.3, "gripper", "ball"), run_of("standard", 15, 0.8, "gripper", "ball")]
-    runs += [run_of("draft", 40, 0.9, "gripper", "cube"), run_of(claw, 6, 0.7, "claw", "elsewhere")]
+    runs = [run(name, speed, gsr, hand="gripper", object_="ball") for name, speed, gsr in _ON_BALL]
+    runs.append(run("draft", 40, 0.9, hand="gripper", object_="cube"))
+    runs.append(run(claw, 6, 0.7, hand="claw", object_="elsewhere"))
     return {"created": created, "runs": runs}
 
 
@@ -450,8 +405,10 @@ def test_a_record_from_before_has_neither_and_is_read(services: Services) -> Non
 
 
 def test_each_cell_in_scenes_says_how_its_fidelity_was_chosen(either: Services) -> None:
-    runs = [run_of("draft", 20, lift, "gripper", obj, IN_SCENE) for obj, lift in (("ball", 0.8), ("cube", 0.92))]
-    runs += [run_of("standard", 15, lift, "gripper", obj, IN_SCENE) for obj, lift in (("ball", 0.95), ("cube", 0.99))]
+    measured = {"draft": {"ball": 0.8, "cube": 0.92}, "standard": {"ball": 0.95, "cube": 0.99}}
+    of_each = [(name, obj, lift) for name, lifted in measured.items() for obj, lift in lifted.items()]
+    speeds = {"draft": 20, "standard": 15}
+    runs = [lifts(name, speeds[name], lift, hand="gripper", object=obj) for name, obj, lift in of_each]
     place = SceneSpec(kind="table")
     created = {"created": "2026-11-21T10:00:00.000Z", "scene": place.model_dump(mode="json")}
     key = publish(either.store, charts_of(place), created | {"runs": runs})

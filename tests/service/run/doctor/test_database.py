@@ -21,11 +21,11 @@ from graspd.service.run.doctor import backends
 from graspd.service.run.doctor.checks import Condition, Finding
 from graspd.service.settings import Settings
 from graspd.service.store.store import open_store
-from tests.fakes import add_assets, request
+from tests.fakes import add_assets, finish, request
 from tests.indexes import open_services
 from tests.memory_queue import MemoryQueue
 from tests.servers import PostgresServer, free_ports
-from tests.service.index.test_index import fail, run_all
+from tests.service.index.test_index import fail
 
 Look = Callable[[], Finding]
 
@@ -35,7 +35,7 @@ def kept(tmp_path: Path) -> Iterator[Services]:
     """A data folder with a job of two batches, done."""
     services = open_services(Settings(data_dir=tmp_path))
     add_assets(services)
-    run_all(services, job_actions.submit(services, request(grasps=64))[0].id)
+    finish(services, job_actions.submit(services, request(grasps=64))[0].id)
     services.index.notes.set_complete()
     yield services
     services.close()
