@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 import sys
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -172,9 +173,8 @@ def matrix(valid: int) -> tuple[Contents, Tally]:
     tally = Tally()
     for name in MANY:
         columns = {"epsilon": [rng.random(50).astype(np.float32)]}
-        tally.cells["claw", name] = CellTally(
-            grasps=valid, valid=valid, candidates=2 * valid, validated=2 * valid, columns=columns
-        )
+        made = Counter(grasps=valid, valid=valid, candidates=2 * valid, validated=2 * valid)
+        tally.cells["claw", name] = CellTally(made, columns=columns)
     extents = {"extents_m": [0.05, 0.06, 0.1]}
     assets = {name: AssetFacts(name, "d" * 32, facts=extents) for name in MANY}
     return Contents("many", Shards(()), {"claw": AssetFacts("claw")}, assets), tally
