@@ -33,7 +33,7 @@ def main(folder: Path, older_index: str) -> None:
     from graspd.service.model.states import Stage
     from graspd.service.store.columns import SCHEMAS
     from graspd.service.store.manifests import load_manifest
-    from graspd.studies.cards.tables import quality_table
+    from graspd.studies.cards.page import quality_table
     from tests.api.conftest import BASE_URL
     from tests.studies.cards.conftest import case
 

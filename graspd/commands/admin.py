@@ -1,9 +1,8 @@
-"""Command line: `graspd admin kernels`, `bench-render` and `gallery`."""
+"""Command line: `graspd admin kernels` and `gallery`."""
 
 from __future__ import annotations
 
 import os
-import re
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from graspd.service.cli import CommandGroup, JsonFlag, report
-from graspd.service.model.errors import InputError
 from graspd.worker.engines.devices import Device
 
 if TYPE_CHECKING:
@@ -40,27 +38,6 @@ def kernels(
     made = {"folder": str(folder), "files": len(files), "bytes": size, "architectures": list(architectures), "cpu": cpu}
     line = f"{len(files)} kernel files, {size / 1e6:.1f} MB, in {folder}; GRASPD_KERNELS={folder.resolve()}"
     report(made, line, json=json)
-
-
-@app.command("bench-render", epilog="graspd admin bench-render --object mug --size 320x240 --size 640x480")
-def bench_render(
-    object: Annotated[str, typer.Option(help="Mesh or built-in object.")] = "mug",
-    size: Annotated[list[str] | None, typer.Option(help="Picture size, WIDTHxHEIGHT; repeatable.")] = None,
-    device: Annotated[str, typer.Option(help="Warp device: cpu, cuda:0, or auto.")] = "auto",
-    repeats: Annotated[int, typer.Option(min=1, help="Timed runs, of which the median is reported.")] = 3,
-    json: JsonFlag = False,
-) -> None:
-    """Measure pictures per second with all channels, per core or GPU, and the time of each step."""
-    from graspd.studies.rendering_bench import bench_render as measure
-    from graspd.studies.rendering_bench import tables
-    from graspd.worker.objects.prepare import object_from_path
-
-    obj, used = object_from_path(object, face_error_m=3e-4), Device(device).resolve()
-    results = []
-    for width, height in [_size(text) for text in size or ["320x240", "640x480"]]:
-        typer.echo(f"{width} x {height} on {used}", err=True)
-        results.append(measure(obj, width=width, height=height, device=used, repeats=repeats))
-    report({"results": results}, tables(results), json=json)
 
 
 @app.command(epilog="graspd admin gallery --object mug --object banana.stl -o docs/images/scenes")
@@ -94,12 +71,3 @@ def _object(text: str) -> ObjectModel:
     name, _, path = text.rpartition("=")
     obj = object_from_path(path, face_error_m=3e-4)
     return replace(obj, name=name) if name else obj
-
-
-def _size(text: str) -> tuple[int, int]:
-    if not (match := re.fullmatch(r"(\d{2,4})x(\d{2,4})", text)):
-        raise InputError(f"{text!r} is no picture size; write WIDTHxHEIGHT, such as 320x240")
-    width, height = int(match[1]), int(match[2])
-    if not (16 <= width <= 4096 and 16 <= height <= 4096):
-        raise InputError(f"width and height of a picture must be 16 to 4096 pixels; got {text}")
-    return width, height

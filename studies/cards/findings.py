@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from statistics import median_high
 from typing import Any, Final
 
 import numpy as np
@@ -22,175 +23,164 @@ _UNEVEN: Final = 1.2
 #: A direction is preferred above this multiple of its share under uniform directions.
 _PEAKED: Final = 1.25
 _SHOWN: Final = 8
+#: Key of a card's `making`, and what must not be mixed.
+_UNMIXED: Final = {
+    "methods": "methods",
+    "levels": "levels of the validator",
+    "friction": "friction coefficients",
+    "code_versions": "versions of graspd",
+    "wants": "wanted grasps (candidates and valid)",
+    "devices": "devices",
+}
 
 
 def findings(card: Row) -> list[str]:
     """Return sentences in Markdown, each with its figures."""
-    told = [_snapshot(card), *_gaps(card), _yields(card), _balance(card), _rechecks(card), *_table(card)]
-    told += [_directions(card), *_joints(card), _qualities(card), _repeated(card), *_mixed(card), *_unknown(card)]
-    return [line for line in told if line]
+    parts = (_gaps, _yields, _balance, _rechecks, _table, _directions, _joints, _qualities, _mixed, _unknown)
+    return [line for part in parts for line in part(card)]
 
 
-def _snapshot(card: Row) -> str:
-    if not card["snapshot"] or card["snapshot"]["complete"]:
-        return ""
-    return "**Not complete**: the snapshot was taken before every cell had succeeded."
-
-
-def _gaps(card: Row) -> list[str]:
+def _gaps(card: Row) -> Iterator[str]:
+    if card["snapshot"] and not card["snapshot"]["complete"]:
+        yield "**Not complete**: the snapshot was taken before every cell had succeeded."
     missing = [cell for cell in card["cells"] if cell["missing_tasks"]]
-    told = [
-        f"**{_pair(cell)} lacks {cell['missing_tasks']} of its shards**: {cell['missing_because']}."
-        for cell in missing[:_SHOWN]
-    ]
+    for cell in missing[:_SHOWN]:
+        yield f"**{_pair(cell)} lacks {cell['missing_tasks']} of its shards**: {cell['missing_because']}."
     if len(missing) > _SHOWN:
-        told.append(f"{len(missing) - _SHOWN} more cells lack shards; `card.json` lists them.")
+        yield f"{len(missing) - _SHOWN} more cells lack shards; `card.json` lists them."
     wanted = (card["making"]["options"] or {}).get("want") == "valid"
     short = [c for c in card["cells"] if wanted and not c["missing_tasks"] and c["valid"] < c["asked"]]
     if short:
         short.sort(key=lambda cell: cell["valid"] / cell["asked"])
         each = _listed([f"{_pair(c)} ({c['valid']} of {c['asked']} after {c['candidates']} candidates)" for c in short])
-        told.append(
+        yield (
             f"**{len(short)} of {len(card['cells'])} cells ran out of budget** before enough valid grasps were found: "
             f"{each}."
         )
-    return told
 
 
-def _yields(card: Row) -> str:
+def _yields(card: Row) -> Iterator[str]:
+    yields: dict[str, list[float]] = {}
     rows = [cell for cell in card["cells"] if cell["of_validated"] is not None]
-    low: list[Row] = []
-    for hand in dict.fromkeys(cell["hand"] for cell in rows):
-        own = [cell for cell in rows if cell["hand"] == hand]
-        middle = sorted(cell["of_validated"] for cell in own)[len(own) // 2]
-        low += [cell for cell in own if cell["of_validated"] < _LITTLE * middle]
-    if not low:
-        return ""
-    low.sort(key=lambda cell: cell["of_validated"])
-    each = _listed([f"{_pair(cell)} ({_percent(cell['of_validated'])})" for cell in low])
-    return (
-        f"**Difficult pairs**, with less than half of the hand's median yield: {each}. Their valid grasps are biased "
-        "towards easy ones."
-    )
+    for cell in rows:
+        yields.setdefault(cell["hand"], []).append(cell["of_validated"])
+    low = [cell for cell in rows if cell["of_validated"] < _LITTLE * median_high(yields[cell["hand"]])]
+    if low:
+        low.sort(key=lambda cell: cell["of_validated"])
+        each = _listed([f"{_pair(cell)} ({_percent(cell['of_validated'])})" for cell in low])
+        yield (
+            f"**Difficult pairs**, with less than half of the hand's median yield: {each}. Their valid grasps are "
+            "biased towards easy ones."
+        )
 
 
-def _balance(card: Row) -> str:
+def _balance(card: Row) -> Iterator[str]:
     said = []
     for what in ("hands", "objects"):
         counts = {asset["name"]: asset["valid"] for asset in card["composition"][what]}
-        if len(counts) < 2:
-            continue
         least, most = min(counts, key=counts.__getitem__), max(counts, key=counts.__getitem__)
-        if counts[most] >= _UNEVEN * max(1, counts[least]):
+        if len(counts) > 1 and counts[most] >= _UNEVEN * max(1, counts[least]):
             said.append(f"{what[:-1]} {most} has {counts[most]:,} valid grasps and {least} {counts[least]:,}")
-    return f"**Uneven**: {'; '.join(said)}." if said else ""
+    if said:
+        yield f"**Uneven**: {'; '.join(said)}."
 
 
-def _rechecks(card: Row) -> str:
-    found = card["validity"]
-    if not found["rechecked"]:
-        return (
+def _rechecks(card: Row) -> Iterator[str]:
+    found, rate = card["validity"], card["validity"]["false_valid"]
+    if not rate:
+        yield (
             "**No rechecks**: no verdict was checked under the unmodified DexGraspBench protocol, so the share of "
             "false verdicts is unknown."
         )
-    wrong = [
-        f"{_pair(cell)} ({cell['recheck_dropped']} of {cell['rechecked']})"
-        for cell in card["cells"]
-        if cell["recheck_dropped"]
-    ]
-    if not wrong:
-        return ""
-    rate = found["false_valid"]
-    return (
-        f"**Rechecks overturned {found['recheck_dropped']} of {found['rechecked']:,} verdicts** "
-        f"({_percent(rate['share'])}, 95 % {_percent(rate['low'])} to {_percent(rate['high'])}): {_listed(wrong)}."
-    )
+    elif found["recheck_dropped"]:
+        wrong = [
+            f"{_pair(cell)} ({cell['recheck_dropped']} of {cell['rechecked']})"
+            for cell in card["cells"]
+            if cell["recheck_dropped"]
+        ]
+        yield (
+            f"**Rechecks overturned {found['recheck_dropped']} of {found['rechecked']:,} verdicts** "
+            f"({_percent(rate['share'])}, 95 % {_percent(rate['low'])} to {_percent(rate['high'])}): {_listed(wrong)}."
+        )
 
 
-def _table(card: Row) -> list[str]:
+def _table(card: Row) -> Iterator[str]:
     found = card["table"]
     if not found["grasps"]:
-        return []
-    told = [
+        return
+    told = (
         f"**{_percent(1 - found['of_grasps']['share'])} of the valid grasps are not clear of the table in any scene** "
-        f"({found['clear']:,} of {found['grasps']:,} are clear, in {_percent(found['of_pairs']['share'])} of all "
-        "pairs of "
-        "grasp and scene), because grasps are planned around a free object, from all directions."
-    ]
+        f"({found['clear']:,} of {found['grasps']:,} are clear, in {_percent(found['of_pairs']['share'])} of all pairs "
+        "of grasp and scene), because grasps are planned around a free object, from all directions."
+    )
     rows = {name: row["of_grasps"]["share"] for name, row in found["by_object"].items() if row["of_grasps"]}
     worst = sorted(rows, key=rows.__getitem__)[:3]
     if found["too_near"]:
         why = [f"{_percent(count / found['pairs'])} to {what}" for what, count in found["too_near"].items()]
-        told[0] += f" Pairs that are too close: {', '.join(why)}."
+        told += f" Pairs that are too close: {', '.join(why)}."
     if len(rows) > 3:
-        told[0] += f" Fewest clear grasps: {_listed([f'{name} ({_percent(rows[name])})' for name in worst])}."
-    return [*told, *_elevations(card)]
+        told += f" Fewest clear grasps: {_listed([f'{name} ({_percent(rows[name])})' for name in worst])}."
+    yield told
+    yield from _elevations(card)
 
 
-def _elevations(card: Row) -> list[str]:
+def _elevations(card: Row) -> Iterator[str]:
     """Compare the palm's elevation over the table with directions drawn uniformly on the sphere."""
     every, clear = (
         np.sum([sums[name] for sums in card["elevation"].values()] or [[0]], axis=0) for name in ("all", "clear")
     )
     if not every.sum():
-        return []
+        return
     edges = np.linspace(-90, 90, len(every) + 1)
-    middles = np.abs(edges[1:] + edges[:-1]) / 2
+    middles = (edges[1:] + edges[:-1]) / 2
     even = np.diff(np.sin(np.radians(edges))) / 2
-    told, said = [], []
-    for what, chosen in (("10° of the horizontal", middles < 10), ("20° of the vertical", middles > 70)):
+    said = []
+    for what, chosen in (("10° of the horizontal", abs(middles) < 10), ("20° of the vertical", abs(middles) > 70)):
         found, expected = every[chosen].sum() / every.sum(), even[chosen].sum()
         if found > _PEAKED * expected:
             said.append(f"{_percent(found)} approach within {what} ({_percent(expected)} under uniform directions)")
     if said:
-        told.append(f"**Preferred directions**: of all palms over the table, {' and '.join(said)}.")
+        yield f"**Preferred directions**: of all palms over the table, {' and '.join(said)}."
     if clear.sum():
-        above = clear[(edges[1:] + edges[:-1]) / 2 > 45].sum() / clear.sum()
-        told.append(
-            f"In {_percent(above)} of the pairs that are clear of the table, the palm approaches from 45° or more "
-            "above the "
-            "horizontal."
+        yield (
+            f"In {_percent(clear[middles > 45].sum() / clear.sum())} of the pairs that are clear of the table, the "
+            "palm approaches from 45° or more above the horizontal."
         )
-    return told
 
 
-def _directions(card: Row) -> str:
+def _directions(card: Row) -> Iterator[str]:
     rows = card["directions"]
     some = {name: row for name, row in rows["by_object"].items() if row and row["grasps"] >= rows["enough"]}
     empty = {name: row["empty"] for name, row in some.items() if row["empty"] > _EMPTY * rows["cells"]}
-    if not some:
-        return ""
-    if not empty:
+    if empty:
+        each = _listed([f"{name} ({empty[name]})" for name in sorted(empty, key=lambda name: -empty[name])])
+        yield f"**Unused directions**, of {rows['cells']} of equal area in the object's frame: {each}."
+    elif some:
         most = max(some, key=lambda name: some[name]["empty"])
         low, high = (end(row["evenness"] for row in some.values()) for end in (min, max))
-        return (
+        yield (
             f"Hands approach from nearly all directions, but not uniformly. Of {rows['cells']} directions of equal "
-            "area, "
-            f"at most {some[most]['empty']} are empty per object ({most}). By object, the spread equals that of "
+            f"area, at most {some[most]['empty']} are empty per object ({most}). By object, the spread equals that of "
             f"{_percent(low)} to {_percent(high)} of the directions used uniformly."
         )
-    each = _listed([f"{name} ({empty[name]})" for name in sorted(empty, key=lambda name: -empty[name])])
-    return f"**Unused directions**, of {rows['cells']} of equal area in the object's frame: {each}."
 
 
-def _joints(card: Row) -> list[str]:
-    told = []
+def _joints(card: Row) -> Iterator[str]:
     for hand, joints in card["joints"].items():
         still = [f"`{name}` ({_percent(use['used'])})" for name, use in joints.items() if use["used"] < _STILL]
         if still:
-            told.append(f"**{hand} hardly moves** {_listed(still)} (share of the range that 98 % of the grasps use).")
+            yield f"**{hand} hardly moves** {_listed(still)} (share of the range that 98 % of the grasps use)."
         ends = [
-            f"`{name}` {end} ({_percent(use[key])})"
+            f"`{name}` {end} ({_percent(use[f'at_{end}'])})"
             for name, use in joints.items()
-            for key, end in (("at_lower", "lower"), ("at_upper", "upper"))
-            if use[key] > _AT_LIMIT and use["used"] >= _STILL
+            for end in ("lower", "upper")
+            if use[f"at_{end}"] > _AT_LIMIT and use["used"] >= _STILL
         ]
         if ends:
-            told.append(f"**{hand} has joints at a limit** in more than half of its grasps: {_listed(ends)}.")
-    return told
+            yield f"**{hand} has joints at a limit** in more than half of its grasps: {_listed(ends)}."
 
 
-def _qualities(card: Row) -> str:
+def _qualities(card: Row) -> Iterator[str]:
     said = []
     for hand, found in card["quality"].items():
         parts = []
@@ -199,54 +189,36 @@ def _qualities(card: Row) -> str:
         if (depth := found.get("penetration_depth_mm")) and depth["p95"] > 1:
             parts.append(f"5 % penetrate deeper than {depth['p95']:.1f} mm")
         if (models := found.get("robust_share")) and models["median"] < 1:
-            parts.append(
-                f"half of them hold in at most {_percent(models['median'])} of the models around the nominal one"
-            )
+            share = _percent(models["median"])
+            parts.append(f"half of them hold in at most {share} of the models around the nominal one")
         if (robust := found.get("robustness")) and robust["median"] < 1:
-            parts.append(
-                f"half of them fail in at least {_percent(1 - robust['median'])} of the repeats with 1 mm and 1° "
-                "of noise"
-            )
+            share = _percent(1 - robust["median"])
+            parts.append(f"half of them fail in at least {share} of the repeats with 1 mm and 1° of noise")
         if parts:
             said.append(f"{hand}: {'; '.join(parts)}")
-    return f"**Valid is not ideal.** {'. '.join(said)}." if said else ""
+    if said:
+        yield f"**Valid is not ideal.** {'. '.join(said)}."
 
 
-def _repeated(card: Row) -> str:
-    count = card["repeated"]
-    return f"**{count:,} valid grasps equal another** of their cell to six digits." if count else ""
-
-
-def _mixed(card: Row) -> list[str]:
+def _mixed(card: Row) -> Iterator[str]:
+    if count := card["repeated"]:
+        yield f"**{count:,} valid grasps equal another** of their cell to six digits."
     making = card["making"]
-    told = []
-    for key, what in (
-        ("methods", "methods"),
-        ("levels", "levels of the validator"),
-        ("friction", "friction coefficients"),
-        ("code_versions", "versions of graspd"),
-        ("wants", "wanted grasps (candidates and valid)"),
-        ("devices", "devices"),
-    ):
+    for key, what in _UNMIXED.items():
         if len(making[key]) > 1:
-            told.append(
-                f"**Mixed {what}**: {', '.join(map(str, making[key]))}. Attributes of each shard distinguish them."
-            )
+            yield f"**Mixed {what}**: {', '.join(map(str, making[key]))}. Attributes of each shard distinguish them."
     if len({str(knobs) for knobs in making["fidelities"]}) > 1:
-        told.append(f"**Mixed fidelities**: {', '.join(str(knobs.get('name')) for knobs in making['fidelities'])}.")
-    return told
+        yield f"**Mixed fidelities**: {', '.join(str(knobs.get('name')) for knobs in making['fidelities'])}."
 
 
-def _unknown(card: Row) -> list[str]:
-    told = []
+def _unknown(card: Row) -> Iterator[str]:
     for what in ("hands", "objects"):
         nameless = [asset["name"] for asset in card["composition"][what] if not asset["licence"]]
         if nameless:
-            told.append(
+            yield (
                 f"**Licence not recorded** for {len(nameless)} {what}: {_listed(nameless)}. Ask their authors "
                 "before you share the dataset."
             )
-    return told
 
 
 def _pair(cell: Row) -> str:

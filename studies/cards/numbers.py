@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterable, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -34,7 +32,7 @@ _KINDS: Final = ("base", "scene", "views")
 
 def numbers(contents: Contents, tally: Tally, *, licence: str = "", source: str = "") -> Row:
     """Return the whole content of a card as JSON values."""
-    cells = list(tally.cells.values())
+    whole = CellTally.of(tally.cells.values())
     taken = contents.snapshot
     return {
         "schema": "graspd/card@1",
@@ -44,12 +42,12 @@ def numbers(contents: Contents, tally: Tally, *, licence: str = "", source: str 
         "card_made": timestamp(),
         "graspd": PACKAGE_VERSION,
         "snapshot": taken and {"digest": taken.digest, "created": taken.created, "complete": taken.complete},
-        "composition": _composition(contents, tally),
-        "making": _making(contents, tally),
-        "validity": {**_validity(cells), "by_hand": {hand: _validity(tally.of_hand(hand)) for hand in contents.hands}},
+        "composition": _composition(contents, tally, whole),
+        "making": _making(contents, tally, whole),
+        "validity": {**_validity(whole), "by_hand": {hand: _validity(tally.of_hand(hand)) for hand in contents.hands}},
         "quality": {hand: _quality(tally.of_hand(hand)) for hand in contents.hands},
         "contact_threshold_m": next((value for value, _ in tally.threshold_m.most_common(1)), None),
-        "table": {**_table(cells), "by_object": {obj: _table(tally.of_object(obj)) for obj in contents.objects}},
+        "table": {**_table(whole), "by_object": {obj: _table(tally.of_object(obj)) for obj in contents.objects}},
         "elevation": {
             hand: {name: counts.tolist() for name, counts in sums.items()} for hand, sums in tally.elevation.items()
         },
@@ -61,7 +59,7 @@ def numbers(contents: Contents, tally: Tally, *, licence: str = "", source: str 
             "by_hand": {hand: _directions(tally.of_hand(hand)) for hand in contents.hands},
         },
         "joints": {hand: use.shares() for hand, use in tally.joints.items()},
-        "repeated": sum(_repeated(cell) for cell in cells),
+        "repeated": sum(_repeated(cell) for cell in tally.cells.values()),
         "cells": _cells(contents, tally),
     }
 
@@ -74,35 +72,30 @@ def share(part: int, whole: int) -> Row | None:
     return {"share": part / whole, "low": low, "high": high}
 
 
-def _composition(contents: Contents, tally: Tally) -> Row:
-    cells = tally.cells.values()
+def _composition(contents: Contents, tally: Tally, whole: CellTally) -> Row:
     return {
         "hands": [_asset(asset, tally.of_hand(name), AssetKind.HAND) for name, asset in contents.hands.items()],
         "objects": [_asset(asset, tally.of_object(name), AssetKind.OBJECT) for name, asset in contents.objects.items()],
         "cells": len(contents.hands) * len(contents.objects) if contents.record else len(tally.cells),
-        "grasps": sum(cell.grasps for cell in cells),
-        "valid": sum(cell.valid for cell in cells),
-        "scenes": sum(cell.scenes for cell in cells),
-        "pairs": sum(cell.pairs for cell in cells),
-        "pictures": sum(cell.pictures for cell in cells),
+        **{key: whole.n[key] for key in ("grasps", "valid", "scenes", "pairs", "pictures")},
         "shards": {kind: tally.shards[kind] for kind in _KINDS},
         "bytes": {kind: tally.bytes[kind] for kind in _KINDS},
     }
 
 
-def _asset(asset: AssetFacts, cells: Sequence[CellTally], kind: AssetKind) -> Row:
+def _asset(asset: AssetFacts, cell: CellTally, kind: AssetKind) -> Row:
     facts = asset.facts
     known = {"name": asset.name, "digest": asset.digest or None, "licence": asset.licence or None}
     known |= {"source": asset.source or None, "description": asset.description or None}
-    counts = {"grasps": sum(cell.grasps for cell in cells), "valid": sum(cell.valid for cell in cells)}
+    counts = {key: cell.n[key] for key in ("grasps", "valid")}
     if kind is AssetKind.HAND:
         sizes = {key: len(facts[key]) if key in facts else None for key in ("dofs", "joints", "fingertips")}
         return {**known, **sizes, **counts}
     return {**known, **{key: facts.get(key) for key in ("extents_m", "volume_m3", "mass_kg", "faces")}, **counts}
 
 
-def _making(contents: Contents, tally: Tally) -> Row:
-    valid = sum(cell.valid for cell in tally.cells.values())
+def _making(contents: Contents, tally: Tally, whole: CellTally) -> Row:
+    valid = whole.n["valid"]
     total = sum(tally.seconds.values())
     scenes = [_knobs(text) for text in _said(tally, "scene")]
     return {
@@ -140,33 +133,26 @@ def _knobs(text: str) -> Any:
         return {"name": text}
 
 
-def _validity(cells: Iterable[CellTally]) -> Row:
-    cells = list(cells)
-    candidates, valid = sum(cell.candidates for cell in cells), sum(cell.valid for cell in cells)
-    validated = sum(cell.validated for cell in cells)
-    rechecked, held = sum(cell.rechecked for cell in cells), sum(cell.recheck_held for cell in cells)
-    rejected: Counter[str] = Counter()
-    for cell in cells:
-        rejected.update(cell.rejected)
+def _validity(cell: CellTally) -> Row:
+    n = cell.n
+    dropped = n["rechecked"] - n["recheck_held"]
     return {
-        "candidates": candidates,
-        "valid": valid,
-        "validated": validated,
-        "of_validated": share(min(valid, validated), validated),
-        "rejected": dict(rejected) or None,
-        "rechecked": rechecked,
-        "recheck_dropped": rechecked - held,
-        "false_valid": share(rechecked - held, rechecked),
-        "lift_hard": share(sum(cell.lift_hard for cell in cells), sum(cell.lift_tested for cell in cells)),
-        "seconds": round(sum(cell.seconds for cell in cells), 3),
+        **{key: n[key] for key in ("candidates", "valid", "validated")},
+        "of_validated": share(min(n["valid"], n["validated"]), n["validated"]),
+        "rejected": dict(cell.rejected) or None,
+        "rechecked": n["rechecked"],
+        "recheck_dropped": dropped,
+        "false_valid": share(dropped, n["rechecked"]),
+        "lift_hard": share(n["lift_hard"], n["lift_tested"]),
+        "seconds": round(cell.seconds, 3),
     }
 
 
-def _quality(cells: Sequence[CellTally]) -> dict[str, Row]:
-    """Return the distribution of each quality over the valid grasps of `cells`; omit missing qualities."""
+def _quality(cell: CellTally) -> dict[str, Row]:
+    """Return the distribution of each quality over the valid grasps; omit missing qualities."""
     found = {}
     for metric in GRASP_METRICS:
-        values = np.concatenate([np.empty(0, np.float32), *(cell.column(metric.name) for cell in cells)])
+        values = cell.column(metric.name)
         values = values[np.isfinite(values)].astype(float)
         if len(values) and not metric.code:
             found[metric.name] = {
@@ -179,27 +165,22 @@ def _quality(cells: Sequence[CellTally]) -> dict[str, Row]:
     return found
 
 
-def _table(cells: Iterable[CellTally]) -> Row:
-    cells = list(cells)
-    placed, clear = sum(cell.placed for cell in cells), sum(cell.clear for cell in cells)
-    pairs, clear_pairs = sum(cell.pairs for cell in cells), sum(cell.clear_pairs for cell in cells)
-    refused: Counter[int] = Counter()
-    for cell in cells:
-        refused.update(cell.refused)
+def _table(cell: CellTally) -> Row:
+    n = cell.n
     return {
-        "grasps": placed,
-        "clear": clear,
-        "of_grasps": share(clear, placed),
-        "pairs": pairs,
-        "clear_pairs": clear_pairs,
-        "of_pairs": share(clear_pairs, pairs),
-        "too_near": {REJECTIONS[code]: count for code, count in sorted(refused.items()) if code in REJECTIONS},
+        "grasps": n["placed"],
+        "clear": n["clear"],
+        "of_grasps": share(n["clear"], n["placed"]),
+        "pairs": n["pairs"],
+        "clear_pairs": n["clear_pairs"],
+        "of_pairs": share(n["clear_pairs"], n["pairs"]),
+        "too_near": {REJECTIONS[code]: count for code, count in sorted(cell.refused.items()) if code in REJECTIONS},
     }
 
 
-def _directions(cells: Iterable[CellTally]) -> Row | None:
+def _directions(cell: CellTally) -> Row | None:
     """Return the spread of approach directions in the object frame; None if palms are unknown."""
-    vectors = np.concatenate([np.empty((0, 3), np.float32), *(cell.directions() for cell in cells)])
+    vectors = cell.directions()
     if not len(vectors):
         return None
     counts = cell_counts(vectors)
@@ -227,15 +208,15 @@ def _cells(contents: Contents, tally: Tally) -> list[Row]:
     rows = []
     for pair in pairs:
         cell, gap = tally.cells.get(pair, CellTally()), contents.gaps.get(pair, (0, None))
-        valid = _validity([cell])
-        row: Row = {"hand": pair[0], "object": pair[1], "asked": asked, "grasps": cell.grasps}
+        valid = _validity(cell)
+        row: Row = {"hand": pair[0], "object": pair[1], "asked": asked, "grasps": cell.n["grasps"]}
         copied = ("candidates", "validated", "valid", "rejected", "rechecked", "recheck_dropped", "seconds")
         row |= {key: valid[key] for key in copied}
         row["of_validated"] = valid["of_validated"] and valid["of_validated"]["share"]
         row |= {"missing_tasks": gap[0], "missing_because": gap[1]}
-        row["median"] = {name: found["median"] for name, found in _quality([cell]).items()}
-        row["clear_of_table"] = (_table([cell])["of_grasps"] or {}).get("share")
-        row["directions"] = _directions([cell])
+        row["median"] = {name: found["median"] for name, found in _quality(cell).items()}
+        row["clear_of_table"] = (_table(cell)["of_grasps"] or {}).get("share")
+        row["directions"] = _directions(cell)
         row["types"] = _types(cell)
         row["diversity"] = _diversity(cell)
         rows.append(row)

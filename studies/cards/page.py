@@ -1,25 +1,23 @@
-"""A card as a page: `README.md` with the YAML head for dataset hubs, and citations as BibTeX."""
+"""A card as a page: `README.md` with the YAML head for dataset hubs, from the template `page.md.j2`."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from bisect import bisect_right
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, Final
 
-from graspd.studies.cards import tables
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+from graspd.service.model.metrics import GRASP_METRICS
 from graspd.studies.cards.findings import findings
-from graspd.studies.cards.tables import percent, size
 from graspd.worker.quality import gate as gates
 
 Row = Mapping[str, Any]
-#: Size classes of dataset hubs.
-_SIZES: Final = (
-    (1_000, "n<1K"),
-    (10_000, "1K<n<10K"),
-    (100_000, "10K<n<100K"),
-    (1_000_000, "100K<n<1M"),
-    (10_000_000, "1M<n<10M"),
-)
+#: Size classes of dataset hubs, and their limits.
+_SIZES: Final = ("n<1K", "1K<n<10K", "10K<n<100K", "100K<n<1M", "1M<n<10M", "n>10M")
+_LIMITS: Final = tuple(10**power for power in range(3, 8))
 #: Most objects of a table that is not collapsed.
 _UNFOLDED: Final = 20
 _LEVELS: Final = {
@@ -27,144 +25,73 @@ _LEVELS: Final = {
     "standard": "MuJoCo, DexGraspBench's protocol with early termination of pushes",
     "fast": "MuJoCo with coarse physics; level standard decides cases near a limit",
 }
-_NOT_MODELLED: Final = """\
-- Verdicts come from simulation: pushes with the object's weight from six sides after the hand has closed. Mass and
-  friction are the stated ones, by default 0.1 kg and 0.6. The verdicts are weak evidence for another mass or friction,
-  for a lift, or for a real hand. No grasp was tested on a robot.
-- Objects and pads are rigid. Pads that yield by 2 mm change some verdicts in either direction.
-- There is no arm: its reach and its collisions with the table are not tested. "Clear of the table" refers to the hand
-  alone, at contact and on the trajectory from the pregrasp.
-- A scene contains one object, dropped onto a plane as its convex hull.
-- Pictures have procedural materials and no textures, sensor noise, lens distortion or motion blur. The card counts
-  them but does not check their content.
-- ε and contact area depend mostly on the contact threshold: compare them only at equal thresholds."""
-_ENTRIES: Final = {
-    "fast_graspd": """@inproceedings{turpin2023fastgraspd,
-  title     = {Fast-Grasp'D: Dexterous Multi-finger Grasp Generation Through Differentiable Simulation},
-  author    = {Turpin, Dylan and Zhong, Tao and Zhang, Shutong and Zhu, Guanglei and Liu, Jingzhou and Singh, Ritvik and
-               Heiden, Eric and Macklin, Miles and Tsogkas, Stavros and Dickinson, Sven and Garg, Animesh},
-  booktitle = {IEEE International Conference on Robotics and Automation (ICRA)},
-  year      = {2023}
-}""",
-    "graspd2022": """@inproceedings{turpin2022graspd,
-  title     = {Grasp'D: Differentiable Contact-rich Grasp Synthesis for Multi-fingered Hands},
-  author    = {Turpin, Dylan and Wang, Liquan and Heiden, Eric and Chen, Yun-Chun and Macklin, Miles and
-               Tsogkas, Stavros and Dickinson, Sven and Garg, Animesh},
-  booktitle = {European Conference on Computer Vision (ECCV)},
-  year      = {2022}
-}""",
-    "graspit": """@article{ciocarlie2009hand,
-  title   = {Hand Posture Subspaces for Dexterous Robotic Grasping},
-  author  = {Ciocarlie, Matei T. and Allen, Peter K.},
-  journal = {The International Journal of Robotics Research},
-  volume  = {28},
-  number  = {7},
-  year    = {2009}
-}""",
-    "dfc": """@inproceedings{wang2023dexgraspnet,
-  title     = {DexGraspNet: A Large-Scale Robotic Dexterous Grasp Dataset for General Objects Based on Simulation},
-  author    = {Wang, Ruicheng and Zhang, Jialiang and Chen, Jiayi and Xu, Yinzhen and Li, Puhao and Liu, Tengyu and
-               Wang, He},
-  booktitle = {IEEE International Conference on Robotics and Automation (ICRA)},
-  year      = {2023}
-}""",
-    "autograsp": """@article{miller2004graspit,
-  title   = {GraspIt! A Versatile Simulator for Robotic Grasping},
-  author  = {Miller, Andrew T. and Allen, Peter K.},
-  journal = {IEEE Robotics \\& Automation Magazine},
-  volume  = {11},
-  number  = {4},
-  year    = {2004}
-}""",
+_REJECTED: Final = {
+    "dropped": "rejected by the validator",
+    "gate": "failed the gate",
+    "not_robust": "held in too few models",
+    "alike": "near-duplicates",
 }
-
-
-def front_matter(card: Row) -> str:
-    """Return the YAML head: every value is a JSON value, which is valid YAML."""
-    made = card["composition"]
-    known: dict[str, Any] = {"pretty_name": card["name"]}
-    if card["licence"]:
-        known["license"] = card["licence"].lower()
-    kind = next((name for limit, name in _SIZES if made["valid"] < limit), "n>10M")
-    tags = ["grasping", "dexterous-manipulation", "synthetic", "graspd", *(hand["name"] for hand in made["hands"])]
-    known |= {"task_categories": ["robotics"], "size_categories": [kind], "annotations_creators": ["machine-generated"]}
-    known |= {"tags": list(dict.fromkeys(tags))}
-    lines = [f"{key}: {json.dumps(value, ensure_ascii=False)}" for key, value in known.items()]
-    return "\n".join(["---", *lines, "---"])
+#: Metrics in the table of cells.
+_MEDIANS: Final = (
+    "epsilon",
+    "contact_area_cm2",
+    "intersection_volume_cm3",
+    "penetration_depth_mm",
+    "simulated_displacement_cm",
+)
 
 
 def page(card: Row, plots: Mapping[str, str]) -> str:
     """Return the whole page; `plots` are file names and captions."""
-    sections = (
-        front_matter(card),
-        f"# {card['name']}",
-        _summary(card, plots),
-        _composition(card),
-        _making(card),
-        _validity(card, plots),
-        _quality(card, plots),
-        _coverage(card, plots),
-        _biases(card),
-        _licence(card),
-        _opening(card),
-        _citing(card),
-        _files(card, plots),
+    unknown = {
+        "approach directions of palms and use of joints (the hands' files are not available)": "directions.png",
+        "clearance of the table (no scenes)": "table.png",
+        "sizes of the objects": "sizes.png",
+    }
+    return _TEMPLATE.render(
+        card,
+        plots=plots,
+        head=head(card),
+        findings=findings(card),
+        origins=_origins(card),
+        quality_table=quality_table(card),
+        cells_table=_cells_table(card),
+        unfolded=_UNFOLDED,
+        unknown=[
+            what
+            for what, file in unknown.items()
+            if file not in plots and not (file == "table.png" and card["making"]["scenes"])
+        ],
+        gate=f"penetration at most {gates.MAX_PENETRATION_MM:g} mm, self-penetration at most "
+        f"{gates.MAX_SELF_PENETRATION_MM:g} mm, at least {gates.MIN_CONTACT_LINKS} links in contact",
     )
-    return "\n\n".join(section for section in sections if section) + "\n"
 
 
-def _summary(card: Row, plots: Mapping[str, str]) -> str:
-    made, making = card["composition"], card["making"]
-    with_pictures = f", {made['pictures']:,} pictures of {made['scenes']:,} scenes" if made["pictures"] else ""
-    by = " and ".join(making["methods"]) or "an unknown method"
-    validated = " and ".join(making["levels"])
-    lines = [
-        f"{made['valid']:,} valid grasps{_places(making)} of {_count(len(made['hands']), 'robot hand')} on "
-        f"{_count(len(made['objects']), 'object')}{with_pictures}. Planned by `{by}`, "
-        + (f"validated by MuJoCo (`{validated}`), measured" if validated else "measured, not validated")
-        + f"; made by graspd {' and '.join(making['code_versions'])}."
-    ]
-    if taken := card["snapshot"]:
-        whole = "complete" if taken["complete"] else "**not complete**"
-        lines.append(f"Snapshot `{taken['digest']}` of {taken['created'][:19]}Z, {whole}.")
-    if card["source"]:
-        lines.append(card["source"])
-    lines.append("Every figure on this page was computed from the shards; `card.json` has all of them.")
-    return "\n".join(lines) + _plot("samples.jpg", plots)
-
-
-def _places(making: Row) -> str:
-    beside = f" with neighbours {', '.join(making['neighbours'])}" if making.get("neighbours") else ""
-    return f" in scenes ({' and '.join(making['scenes'])}{beside})" if making["scenes"] else ""
-
-
-def _composition(card: Row) -> str:
+def head(card: Row) -> dict[str, Any]:
+    """Return the YAML head: every value is a JSON value, which is valid YAML."""
     made = card["composition"]
-    shards = ", ".join(
-        f"{made['shards'][kind]:,} {kind} ({size(made['bytes'][kind])})"
-        for kind in made["shards"]
-        if made["shards"][kind]
-    )
-    counts = (
-        f"{made['cells']:,} pairs of hand and object, {made['grasps']:,} grasps of which {made['valid']:,} are valid, "
-        f"{made['scenes']:,} scenes, {made['pairs']:,} pairs of grasp and scene, {made['pictures']:,} pictures. "
-        f"Shards: {shards}; {size(sum(made['bytes'].values()))} in all."
-    )
-    objects = tables.objects_table(card)
-    if len(made["objects"]) > _UNFOLDED:
-        objects = _details(f"Objects: {len(made['objects']):,}", objects)
-    return f"## Contents\n\n{counts}\n\n{tables.hands_table(card)}\n\n{objects}"
+    tags = ["grasping", "dexterous-manipulation", "synthetic", "graspd", *(hand["name"] for hand in made["hands"])]
+    return {
+        "pretty_name": card["name"],
+        **({"license": card["licence"].lower()} if card["licence"] else {}),
+        "task_categories": ["robotics"],
+        "size_categories": [_SIZES[bisect_right(_LIMITS, made["valid"])]],
+        "annotations_creators": ["machine-generated"],
+        "tags": list(dict.fromkeys(tags)),
+    }
 
 
-def _making(card: Row) -> str:
-    making = card["making"]
-    knobs = ", ".join(str(found.get("name", "custom")) for found in making["fidelities"])
+def _origins(card: Row) -> dict[str, str]:
+    making, valid, threshold = card["making"], card["composition"]["valid"], card["contact_threshold_m"]
+    each = ", ".join(f"{kind} {1000 * value / (valid or 1):,.0f} s" for kind, value in making["seconds"].items())
+    total = making["seconds_per_1000_valid"]
     rows = {
-        "method, fidelity": f"{', '.join(making['methods'])}; {knobs}",
+        "method, fidelity": f"{', '.join(making['methods'])}; "
+        + ", ".join(str(found.get("name", "custom")) for found in making["fidelities"]),
         "validation": "; ".join(_LEVELS.get(level, level) for level in making["levels"]) or "none",
         "imported from": ", ".join(making["imported_from"]),
         "friction of ε and Vol": ", ".join(f"{value:g}" for value in making["friction"]),
-        "contact threshold of the figures": _millimetres(card["contact_threshold_m"]),
+        "contact threshold of the figures": "" if threshold is None else f"{1e3 * threshold:g} mm",
         "seeds": ", ".join(map(str, making["seeds"])),
         "graspd": ", ".join(making["code_versions"]),
         "revisions of the stages": ", ".join(
@@ -172,176 +99,128 @@ def _making(card: Row) -> str:
         ),
         "devices": ", ".join(making["devices"]),
         "workers": str(making["workers"] or ""),
-        "shards written": f"{making['first_shard'][:19]}Z to {making['last_shard'][:19]}Z"
-        if making["first_shard"]
-        else "",
+        "shards written": making["first_shard"] and f"{making['first_shard'][:19]}Z to {making['last_shard'][:19]}Z",
         "worker seconds": ", ".join(f"{kind} {value:,.0f}" for kind, value in making["seconds"].items()),
         "seconds of base shards by part": ", ".join(
             f"{name} {value:,.0f}" for name, value in making["synthesis_parts"].items()
         ),
-        "per 1,000 valid grasps": _per_thousand(card),
+        "per 1,000 valid grasps": f"{total:,.0f} worker seconds ({each})" if total else "",
     }
-    lines = "\n".join(
-        f"| {name} | {value or 'not recorded'} |" for name, value in rows.items() if value or name != "imported from"
-    )
-    options = ""
-    if making["options"]:
-        options = "\n\n" + _details("Options of the jobs", f"```json\n{json.dumps(making['options'], indent=1)}\n```")
-    return f"## How it was made\n\n| | |\n| --- | --- |\n{lines}{options}"
+    return {name: value for name, value in rows.items() if value or name != "imported from"}
 
 
-def _per_thousand(card: Row) -> str:
-    making, valid = card["making"], card["composition"]["valid"]
-    if not making["seconds_per_1000_valid"]:
-        return ""
-    each = ", ".join(f"{kind} {1000 * value / valid:,.0f} s" for kind, value in making["seconds"].items())
-    return f"{making['seconds_per_1000_valid']:,.0f} worker seconds ({each})"
-
-
-def _validity(card: Row, plots: Mapping[str, str]) -> str:
-    gate = (
-        f"penetration at most {gates.MAX_PENETRATION_MM:g} mm, self-penetration at most "
-        f"{gates.MAX_SELF_PENETRATION_MM:g} mm, at least {gates.MIN_CONTACT_LINKS} links in contact"
-    )
-    if card["making"]["scenes"] and card["making"]["levels"]:
-        text = (
-            f"Grasps were planned{_places(card['making'])}, and valid ones are lifted there. In MuJoCo the hand "
-            "moves along its approach without contact, closes, lifts the object 10 cm out of the scene and "
-            "holds it. "
-            f"Valid grasps also pass the geometric gate: {gate}.{_hard(card)}"
-        )
-    elif card["making"]["levels"]:
-        text = (
-            f"A grasp is valid if it holds in the validator and passes the geometric gate: {gate}. "
-            'Rechecked grasps were validated again under the unmodified DexGraspBench protocol. "False valid" is the '
-            "share of rechecked grasps that fail there."
-        )
-    else:
-        text = (
-            f"Not validated: no grasp is valid. Grasps that pass the geometric gate ({gate}) are feasible; "
-            "whether they hold is unknown."
-        )
-    return f"## Validity\n\n{text}\n\n{tables.validity_table(card)}{_plot('yield.png', plots)}"
-
-
-def _hard(card: Row) -> str:
-    found = card["validity"]["lift_hard"]
-    return f" At half friction {percent(found['share'])} of them are also lifted." if found else ""
-
-
-def _quality(card: Row, plots: Mapping[str, str]) -> str:
-    at = _millimetres(card["contact_threshold_m"])
-    text = f"Valid grasps: median (5th to 95th percentile). ε, Vol and contact area have a contact threshold of {at}."
-    note = (
-        "D: share of variance explained by the first principal component of position, rotation and joints; "
-        f"lower is more diverse. Directions: {card['directions']['cells']} cells of equal area for the palm's approach "
-        "in the object's frame."
-    )
-    fold = _details("Each hand on each object (medians)", f"{tables.cells_table(card)}\n\n{note}")
-    return f"## Quality\n\n{text}\n\n{tables.quality_table(card)}{_plot('quality.png', plots)}\n\n{fold}"
-
-
-def _coverage(card: Row, plots: Mapping[str, str]) -> str:
-    shown = "".join(_plot(name, plots) for name in ("directions.png", "table.png", "joints.png", "sizes.png"))
+def quality_table(card: Row) -> str:
+    """Return the distribution of each metric by hand, in Markdown."""
+    hands = list(card["quality"])
+    lines = [f"| quality | {' | '.join(hands)} |", f"| --- |{' --: |' * len(hands)}"]
     missing = []
-    if "directions.png" not in plots:
-        missing.append("approach directions of palms and use of joints (the hands' files are not available)")
-    if "table.png" not in plots and not card["making"]["scenes"]:
-        missing.append("clearance of the table (no scenes)")
-    if "sizes.png" not in plots:
-        missing.append("sizes of the objects")
-    note = f"\n\nNot known: {'; '.join(missing)}." if missing else ""
-    table = card["table"]
-    clear = ""
-    if table["grasps"]:
-        clear = (
-            f"\n\n{table['clear']:,} of {table['grasps']:,} valid grasps ({percent(table['of_grasps']['share'])}) are "
-            f"clear of the table in at least one of their scenes, and so are {table['clear_pairs']:,} of "
-            f"{table['pairs']:,} "
-            "pairs."
-            " A pair is a grasp in a scene."
+    for metric in GRASP_METRICS:
+        if metric.digits is None:
+            continue
+        found = [card["quality"][hand].get(metric.name) for hand in hands]
+        if any(found):
+            lines.append(f"| {metric.heading} | {' | '.join(_spread(one, metric.digits) for one in found)} |")
+        else:
+            missing.append(metric.heading)
+    return "\n".join(lines) + (f"\n\nNot measured: {', '.join(missing)}." if missing else "")
+
+
+def _spread(found: Row | None, digits: int) -> str:
+    if found is None:
+        return "-"
+    return f"{found['median']:.{digits}f} ({found['p5']:.{digits}f} to {found['p95']:.{digits}f})"
+
+
+def _cells_table(card: Row) -> str:
+    digits = {metric.name: (metric.heading, metric.digits or 0) for metric in GRASP_METRICS}
+    reasons = any(cell["missing_because"] for cell in card["cells"])
+    rows = []
+    for cell in card["cells"]:
+        used, types = cell["directions"], cell["types"]
+        rows.append(
+            {
+                "hand": cell_text(cell["hand"]),
+                "object": cell_text(cell["object"]),
+                "wanted": "-" if cell["asked"] is None else f"{cell['asked']:,}",
+                "candidates": f"{cell['candidates']:,}",
+                "valid": f"{cell['valid']:,}",
+                "valid of validated": percent(cell["of_validated"]),
+                **{digits[name][0]: fixed(cell["median"].get(name), digits[name][1]) for name in _MEDIANS},
+                "clear of table": percent(cell["clear_of_table"]),
+                "D": fixed(cell["diversity"], 2),
+                "share of directions used": percent(used and 1 - used["empty"] / card["directions"]["cells"]),
+                "entropy of directions, bit": fixed(used and used["entropy_bits"], 2),
+                "entropy of grasp types, bit": fixed(types and types["entropy_bits"], 2),
+                **({"missing because": cell_text(cell["missing_because"], "")} if reasons else {}),
+            }
         )
-    return f"## Coverage{clear}{shown}{note}"
+    names = list(rows[0])
+    lines = [names, ["---"] * 2 + ["--:"] * (len(names) - 2), *(list(row.values()) for row in rows)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def _biases(card: Row) -> str:
-    found = "\n".join(f"- {line}" for line in findings(card)) or "- None found."
-    return (
-        f"## Known biases and failures\n\nIn this dataset:\n\n{found}\n\n"
-        f"In all datasets made by this method:\n\n{_NOT_MODELLED}"
+def cell_text(text: str | None, missing: str = "not recorded") -> str:
+    return (text or missing).replace("|", "\\|").replace("\n", " ")
+
+
+def fixed(value: float | None, digits: int = 0) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def percent(value: float | None) -> str:
+    if value is None:
+        return "-"
+    digits = 0 if (value >= 0.1 and round(value, 3) < 0.995) or value in (0, 1) else 1
+    return f"{100 * value:.{digits}f} %"
+
+
+def _interval(found: Row | None) -> str:
+    return f"{percent(found['share'])} ({percent(found['low'])} to {percent(found['high'])})" if found else "unknown"
+
+
+def _count(number: int, what: str = "") -> str:
+    return f"{number:,} {what}{'' if number == 1 else 's'}" if what else f"{number:,}"
+
+
+def _size(count: int) -> str:
+    value, unit = float(count), 0
+    while value >= 1000 and unit < 4:
+        value, unit = value / 1000, unit + 1
+    return f"{value:.{0 if unit == 0 or value >= 100 else 1}f} {('B', 'kB', 'MB', 'GB', 'TB')[unit]}"
+
+
+def _rejected(rejected: Mapping[str, int] | None) -> str:
+    parts = [f"{count:,} {_REJECTED.get(why, why)}" for why, count in (rejected or {}).items() if count]
+    return ", ".join(parts) or ("-" if rejected is not None else "not recorded")
+
+
+def _millimetres(extents: Sequence[float] | None) -> str:
+    return "-" if extents is None else " x ".join(f"{1e3 * extent:.0f}" for extent in extents)
+
+
+def _template() -> Any:
+    # The page is Markdown: nothing is escaped but the cells of tables.
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        autoescape=False,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
     )
+    environment.filters |= {
+        "cell": cell_text,
+        "count": _count,
+        "fixed": fixed,
+        "interval": _interval,
+        "json": lambda value, indent=None: json.dumps(value, ensure_ascii=False, indent=indent),
+        "letters": lambda name: "".join(letter for letter in name if letter.isalnum()) or "dataset",
+        "millimetres": _millimetres,
+        "percent": percent,
+        "rejected": _rejected,
+        "size": _size,
+    }
+    return environment.get_template("page.md.j2")
 
 
-def _licence(card: Row) -> str:
-    own = (
-        f"The grasps, scenes and pictures: **{card['licence']}**."
-        if card["licence"]
-        else ("**No licence was stated for this dataset.** The option `--licence` adds one.")
-    )
-    return (
-        f"## Licence\n\n{own} Meshes of hands and objects are not in the shards. Pictures and grasps are derived "
-        "from them, so the licences in the tables above also apply."
-    )
-
-
-def _opening(card: Row) -> str:
-    example = f"""```python
-from graspd.service.readers import Grasps, open_shards
-
-grasps = Grasps(open_shards("{card["name"]}").only(hands=["{card["composition"]["hands"][0]["name"]}"]))
-arrays = grasps.arrays("grasp/hand_pose", "grasp/joint_positions", "quality/epsilon")
-print(len(grasps), arrays["grasp/hand_pose"].shape, grasps.joint_names("{card["composition"]["hands"][0]["name"]}"))
-```"""
-    return (
-        f"## How to open it\n\n`{card['name']}` is a folder of shards, written by `graspd datasets export`. With "
-        f"graspd:\n\n{example}\n\nOr with any HDF5 tool: each dataset has `units`, `frame` and `description`. A pose "
-        "is x y z [m] and a unit quaternion w x y z of the hand's root link in the object's frame."
-    )
-
-
-def _citing(card: Row) -> str:
-    making = card["making"]
-    year = (making["last_shard"] or card["card_made"])[:4]
-    snapshot = card["snapshot"]["digest"] if card["snapshot"] else ""
-    entries = citations(making["methods"], card["name"], " and ".join(making["code_versions"]), year, snapshot)
-    return (
-        "## How to cite it\n\nCite the method's paper, the dataset, and the sources of the hands and objects "
-        "that you use.\n\n"
-        f"```bibtex\n{entries}\n```"
-    )
-
-
-def _files(card: Row, plots: Mapping[str, str]) -> str:
-    names = ", ".join(f"[{name}]({name})" for name in plots)
-    return (
-        "## Files\n\n[card.json](card.json): all figures. [checksums.sha256](checksums.sha256): checksums of all "
-        "shards; "
-        f"`sha256sum -c` checks them in the folder of the shards. Plots: {names or 'none'}."
-    )
-
-
-def _plot(name: str, plots: Mapping[str, str]) -> str:
-    return f"\n\n![{plots[name]}]({name})" if name in plots else ""
-
-
-def _details(title: str, text: str) -> str:
-    return f"<details><summary>{title}</summary>\n\n{text}\n\n</details>"
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number:,} {what}{'' if number == 1 else 's'}"
-
-
-def _millimetres(value: float | None) -> str:
-    return "not recorded" if value is None else f"{1e3 * value:g} mm"
-
-
-def citations(methods: Iterable[str], name: str, version: str, year: str, snapshot: str) -> str:
-    """Return BibTeX of the methods' papers and of the dataset itself; `snapshot` may be empty."""
-    note = f",\n  note   = {{snapshot {snapshot}}}" if snapshot else ""
-    key = "".join(letter for letter in name if letter.isalnum()) or "dataset"
-    own = f"""@misc{{{key}{year},
-  title  = {{{name}: grasps made by graspd {version}}},
-  year   = {{{year}}}{note}
-}}"""
-    return "\n\n".join([*(_ENTRIES[method] for method in methods if method in _ENTRIES), own])
+_TEMPLATE: Final = _template()

@@ -105,11 +105,7 @@ def _qualities(card: Row, tally: Tally) -> Any:
     figure = _figure(10, 2.7 * lines + 0.4)
     panels = list(figure.subplots(lines, 3, squeeze=False).flat)
     for axes, (title, name, cut) in zip(panels, shown, strict=False):
-        columns = {
-            hand: np.concatenate([np.empty(0, np.float32), *(cell.column(name) for cell in tally.of_hand(hand))])
-            for hand in hands
-        }
-        columns = {hand: values[np.isfinite(values)] for hand, values in columns.items()}
+        columns = {hand: values[np.isfinite(values)] for hand in hands for values in [tally.of_hand(hand).column(name)]}
         every = np.concatenate(list(columns.values()))
         top = float(np.percentile(every, 99) if cut else every.max()) or 1.0
         bins = np.linspace(0, top, 41)
@@ -142,7 +138,7 @@ def _directions(card: Row, tally: Tally) -> Any:
     below = None
     for column, hand in enumerate(hands):
         axes = figure.add_subplot(grid[0, column], projection="mollweide")
-        vectors = np.concatenate([cell.directions() for cell in tally.of_hand(hand)])
+        vectors = tally.of_hand(hand).directions()
         density = cell_counts(vectors, bands, sectors) * bands * sectors / len(vectors)
         mesh = axes.pcolormesh(longitudes, latitudes, density, cmap="magma", vmin=0, vmax=3, rasterized=True)
         axes.set_xticklabels([])

@@ -93,27 +93,14 @@ _DIGITS: Final = 6
 
 @dataclass
 class CellTally:
-    """Sums of one cell (hand x object). Qualities and directions cover valid grasps only."""
+    """Sums of one cell (hand x object), or of several. Qualities and directions cover valid grasps only."""
 
-    grasps: int = 0
-    valid: int = 0
-    candidates: int = 0
-    validated: int = 0
-    """Number of candidates in validated shards."""
-    rechecked: int = 0
-    recheck_held: int = 0
-    scenes: int = 0
-    pairs: int = 0
-    clear_pairs: int = 0
-    placed: int = 0
-    """Number of valid grasps that were placed into scenes."""
-    clear: int = 0
-    """Number of these grasps that are clear in at least one scene."""
-    pictures: int = 0
-    lift_tested: int = 0
-    """Number of valid grasps in scenes that were also tested at half friction."""
-    lift_hard: int = 0
-    """Number of these grasps that were held."""
+    n: Counter[str] = field(default_factory=Counter)
+    """Numbers of grasps and pairs.
+
+    `validated`: candidates in validated shards. `placed`: valid grasps placed into scenes; `clear`: clear in at least
+    one of them. `lift_tested`: valid grasps in scenes tested at half friction; `lift_hard`: held there.
+    """
     seconds: float = 0.0
     """Worker seconds over all stages."""
     rejected: Counter[str] = field(default_factory=Counter)
@@ -125,6 +112,20 @@ class CellTally:
     """Unit vectors from the object to the palm before the approach, object frame."""
     prints: list[NDArray[np.int64]] = field(default_factory=list)
     sample: list[Posture] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, cells: Iterable[CellTally]) -> CellTally:
+        """Return the sums of several cells, without `prints` and `sample`."""
+        out = cls()
+        for cell in cells:
+            out.n.update(cell.n)
+            out.seconds += cell.seconds
+            out.rejected.update(cell.rejected)
+            out.refused.update(cell.refused)
+            out.towards += cell.towards
+            for name, parts in cell.columns.items():
+                out.columns.setdefault(name, []).extend(parts)
+        return out
 
     def pack(self) -> None:
         """Merge the arrays of all shards: thousands of small arrays need ten times the memory."""
@@ -162,11 +163,11 @@ class Tally:
     """First and last time of a shard, RFC 3339."""
     threshold_m: Counter[float] = field(default_factory=Counter)
 
-    def of_hand(self, hand: str) -> list[CellTally]:
-        return [cell for (name, _), cell in self.cells.items() if name == hand]
+    def of_hand(self, hand: str) -> CellTally:
+        return CellTally.of(cell for (name, _), cell in self.cells.items() if name == hand)
 
-    def of_object(self, obj: str) -> list[CellTally]:
-        return [cell for (_, name), cell in self.cells.items() if name == obj]
+    def of_object(self, obj: str) -> CellTally:
+        return CellTally.of(cell for (_, name), cell in self.cells.items() if name == obj)
 
 
 _ATTRIBUTES: Final = (
@@ -192,7 +193,7 @@ def tally_of(contents: Contents, pieces: Iterable[ShardContents]) -> Tally:
         elif piece.file.kind == "scene":
             _add_scene(tally, cell, piece, hand, valid)
         else:
-            cell.pictures += piece.rows
+            cell.n["pictures"] += piece.rows
     return tally
 
 
@@ -219,19 +220,19 @@ def _add_base(tally: Tally, cell: CellTally, piece: ShardContents, hand: AssetFa
     """Add a base shard; return its mask (N,) of valid grasps."""
     columns = piece.columns
     valid = validity.valid(columns)
-    cell.grasps += piece.rows
-    cell.valid += int(valid.sum())
+    cell.n.update(grasps=piece.rows, valid=int(valid.sum()))
     candidates = int(piece.said.get("candidates", piece.rows))
-    cell.candidates += candidates
+    cell.n["candidates"] += candidates
     if validity.validated(columns).any() or (not piece.rows and piece.said.get("verdict_level", "none") != "none"):
-        cell.validated += candidates
+        cell.n["validated"] += candidates
     cell.rejected.update({str(why): int(count) for why, count in dict(piece.info.get("rejected", {})).items()})
-    if (recheck := columns.get("quality/recheck")) is not None:
-        cell.rechecked += int(np.count_nonzero(recheck[valid] >= 0))
-        cell.recheck_held += int(np.count_nonzero(recheck[valid] == 1))
-    if (hard := columns.get("quality/lift_hard")) is not None:
-        cell.lift_tested += int(np.count_nonzero(hard[valid] >= 0))
-        cell.lift_hard += int(np.count_nonzero(hard[valid] == 1))
+    for name, tested, held in (
+        ("quality/recheck", "rechecked", "recheck_held"),
+        ("quality/lift_hard", "lift_tested", "lift_hard"),
+    ):
+        if (verdicts := columns.get(name)) is not None:
+            cell.n[tested] += int(np.count_nonzero(verdicts[valid] >= 0))
+            cell.n[held] += int(np.count_nonzero(verdicts[valid] == 1))
     thresholds = np.asarray(columns["quality/thresholds_m"], float)
     at = int(np.argmin(np.abs(thresholds - INDEX_THRESHOLD_M)))
     tally.threshold_m[float(thresholds[at])] += 1
@@ -263,15 +264,12 @@ def _add_scene(
     tally: Tally, cell: CellTally, piece: ShardContents, hand: AssetFacts, valid: Mapping[str, Array]
 ) -> None:
     columns = piece.columns
-    cell.scenes += len(columns["scene/object_pose"])
     index = np.asarray(columns["grasp/base_index"])
     mask = valid.get(str(piece.said.get("base_shard", "")))
     good = np.ones(len(index), bool) if mask is None else mask[index]
     clear = (columns["grasp/valid"] == 1) & good
-    cell.pairs += int(good.sum())
-    cell.clear_pairs += int(clear.sum())
-    cell.placed += len(np.unique(index[good]))
-    cell.clear += len(np.unique(index[clear]))
+    cell.n.update(scenes=len(columns["scene/object_pose"]), pairs=int(good.sum()), clear_pairs=int(clear.sum()))
+    cell.n.update(placed=len(np.unique(index[good])), clear=len(np.unique(index[clear])))
     if (why := columns.get("grasp/rejection")) is not None:
         codes, counts = np.unique(why[good], return_counts=True)
         cell.refused.update({int(code): int(count) for code, count in zip(codes, counts, strict=True)})

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from itertools import product
 from typing import Any, Final
 
@@ -57,99 +58,70 @@ _FEWER: Final = (
 Placement = tuple[tuple[float, ...], SceneSpec]
 
 
-def height_map(
-    hands: Sequence[HandModel], options: MapOptions, *, heights: Sequence[float], sides: Sequence[float]
-) -> StabilityMap:
-    cells = [
-        _cell(hand, height, side, _standing((side, side, height)), options)
-        for hand, side, height in product(hands, sides, heights)
-    ]
-    return _map(
-        "scene_height",
-        f"{options.count} grasps of boxes on a table, {options.fidelity}",
+@dataclass(frozen=True)
+class _Study:
+    title: str
+    axes: tuple[str, str]
+    placement: Callable[[HandModel, Any, Any], Placement]
+    """Function from hand, x and y to the box and its scene."""
+    guard_test: str
+    reach: str
+
+
+_STUDIES: Final = {
+    "scene_height": _Study(
+        "boxes on a table",
         ("height [mm]", "side of the footprint [mm]"),
-        cells,
+        lambda hand, height, side: _standing((side, side, height)),
         "test_a_plate_flat_on_a_table_ends_with_fewer_and_says_so",
         "uploaded objects can have such shapes",
-    )
-
-
-def wall_map(
-    hands: Sequence[HandModel], options: MapOptions, *, gaps: Sequence[float], walls: Sequence[str]
-) -> StabilityMap:
-    cells = [
-        _cell(hand, gap, name, _standing(TARGET_MM, _walls(WALLS[name], gap)), options)
-        for hand, name, gap in product(hands, walls, gaps)
-    ]
-    return _map(
-        "scene_wall",
-        f"{options.count} grasps of a box of {_TARGET} beside walls, {options.fidelity}",
+    ),
+    "scene_wall": _Study(
+        f"a box of {_TARGET} beside walls",
         ("distance from the walls [mm]", "walls"),
-        cells,
+        lambda hand, gap, name: _standing(TARGET_MM, _walls(WALLS[name], gap)),
         "test_object_in_a_narrow_well_is_refused_or_comes_out_valid",
         "bins, shelves and scene files have such walls",
-    )
-
-
-def neighbour_map(
-    hands: Sequence[HandModel], options: MapOptions, *, gaps: Sequence[float], around: Sequence[str]
-) -> StabilityMap:
-    cells = [
-        _cell(hand, gap, name, _standing(TARGET_MM, _neighbours(NEIGHBOURS[name], gap)), options)
-        for hand, name, gap in product(hands, around, gaps)
-    ]
-    return _map(
-        "scene_neighbours",
-        f"{options.count} grasps of a box of {_TARGET} among equal boxes, {options.fidelity}",
+    ),
+    "scene_neighbours": _Study(
+        f"a box of {_TARGET} among equal boxes",
         ("gap between them [mm]", "fixed boxes around it"),
-        cells,
+        lambda hand, gap, name: _standing(TARGET_MM, _neighbours(NEIGHBOURS[name], gap)),
         "test_a_box_among_boxes_is_lifted_out_or_not_valid",
         "clutter has such neighbours",
-    )
-
-
-def size_map(
-    hands: Sequence[HandModel], options: MapOptions, *, ratios: Sequence[float], kinds: Sequence[str]
-) -> StabilityMap:
-    cells = [
-        _cell(hand, ratio, kind, (3 * (1e3 * ratio * span_of(hand),), SceneSpec(kind=kind)), options)
-        for hand, kind, ratio in product(hands, kinds, ratios)
-    ]
-    spans = ", ".join(f"{hand.name} {1e3 * span_of(hand):.0f} mm" for hand in hands)
-    return _map(
-        "scene_size",
-        f"{options.count} grasps of cubes of different sizes relative to the hand's span, {options.fidelity}",
+    ),
+    "scene_size": _Study(
+        "cubes of different sizes relative to the hand's span",
         ("side of the cube over the hand's span", "scene"),
-        cells,
+        lambda hand, ratio, kind: (3 * (1e3 * ratio * span_of(hand),), SceneSpec(kind=kind)),
         "test_a_cube_that_does_not_fit_its_bin_is_refused",
         "uploaded objects can have such shapes",
-        measure=f"{_MEASURE}; scene free: held in the six pushes; span: largest distance between fingertips: {spans}",
-        guard=_FEWER + "; an object larger than the bin or the shelf is refused with a message",
-    )
+    ),
+}
 
 
-def _map(
-    name: str,
-    title: str,
-    axes: tuple[str, str],
-    cells: list[MapCell],
-    guard_test: str,
-    reach: str,
-    *,
-    measure: str = _MEASURE,
-    guard: str = _FEWER,
+def scene_map(
+    name: str, hands: Sequence[HandModel], options: MapOptions, *, xs: Sequence[float], ys: Sequence[float | str]
 ) -> StabilityMap:
+    """Return the map of a study of `_STUDIES`."""
+    study = _STUDIES[name]
+    cells = [_cell(hand, x, y, study.placement(hand, x, y), options) for hand, y, x in product(hands, ys, xs)]
+    measure, guard = _MEASURE, _FEWER
+    if name == "scene_size":
+        spans = ", ".join(f"{hand.name} {1e3 * span_of(hand):.0f} mm" for hand in hands)
+        measure += f"; scene free: held in the six pushes; span: largest distance between fingertips: {spans}"
+        guard += "; an object larger than the bin or the shelf is refused with a message"
     return StabilityMap(
         name,
-        title,
-        *axes,
+        f"{options.count} grasps of {study.title}, {options.fidelity}",
+        *study.axes,
         measure,
         "weak: below 0.5; broken: 0",
         reachable(cells, lambda cell: True),
         "few or no valid grasps: `clear_share` and `lift_share` of `graspd synth --json` show which of the two is low",
         guard,
-        f"tests/studies/test_stability.py::{guard_test}",
-        reach=f"all: {reach}",
+        f"tests/studies/test_stability.py::{study.guard_test}",
+        reach=f"all: {study.reach}",
     )
 
 

@@ -17,6 +17,8 @@ from graspd.worker.objects.prepare import object_from_path
 
 #: Further hands, for effects of size and structure.
 OTHER_HANDS: Final = ("barrett",)
+#: Values on an axis of a map.
+Values = Sequence[Any]
 #: Hands for effects of different drives.
 ALL_HANDS: Final = ("allegro", "barrett", "shadow")
 
@@ -40,12 +42,16 @@ def run(
     def beside(names: Sequence[str]) -> list[HandModel]:
         return [model] if quick else [model, *(hand_from_path(name) for name in names if name != model.name)]
 
-    pair = beside(OTHER_HANDS)
-    gaps = (5, 80) if quick else scenes.GAPS_MM
     options = MapOptions(4 if quick else 8, "draft" if quick else "standard", work, say)
     counted: dict[str, Any] = {"count": options.count, "say": say}
     few_errors = replace(options, count=2 if quick else 16)
     in_scenes = replace(options, count=2 if quick else 8, fidelity="draft")
+
+    def scene(name: str, xs: Values, ys: Values, few: tuple[Values, Values]) -> Callable[[], StabilityMap]:
+        return lambda: scenes.scene_map(
+            name, beside(OTHER_HANDS), in_scenes, xs=few[0] if quick else xs, ys=few[1] if quick else ys
+        )
+
     lengths = descents.LENGTHS[:1] if quick else (*descents.LENGTHS, *((descents.LONG,) if long else ()))
     studies: dict[str, Callable[[], StabilityMap]] = {
         "time_step": lambda: integrators.time_step_map(few(integrators.TIME_STEPS), few(integrators.SPEEDS)),
@@ -82,18 +88,10 @@ def run(
         "baselines": lambda: baseline_map(
             model, options, methods=METHODS[:2] if quick else METHODS, shapes={"cube": (60,)} if quick else SHAPES
         ),
-        "scene_height": lambda: scenes.height_map(
-            pair, in_scenes, heights=(10, 80) if quick else scenes.HEIGHTS_MM, sides=(60,) if quick else scenes.SIDES_MM
-        ),
-        "scene_wall": lambda: scenes.wall_map(
-            pair, in_scenes, gaps=gaps, walls=("corner",) if quick else tuple(scenes.WALLS)
-        ),
-        "scene_neighbours": lambda: scenes.neighbour_map(
-            pair, in_scenes, gaps=gaps, around=("four",) if quick else tuple(scenes.NEIGHBOURS)
-        ),
-        "scene_size": lambda: scenes.size_map(
-            pair, in_scenes, ratios=(0.1, 0.3) if quick else scenes.RATIOS, kinds=("table",) if quick else scenes.KINDS
-        ),
+        "scene_height": scene("scene_height", scenes.HEIGHTS_MM, scenes.SIDES_MM, ((10, 80), (60,))),
+        "scene_wall": scene("scene_wall", scenes.GAPS_MM, tuple(scenes.WALLS), ((5, 80), ("corner",))),
+        "scene_neighbours": scene("scene_neighbours", scenes.GAPS_MM, tuple(scenes.NEIGHBOURS), ((5, 80), ("four",))),
+        "scene_size": scene("scene_size", scenes.RATIOS, scenes.KINDS, ((0.1, 0.3), ("table",))),
     }
     found = []
     for name in names:

@@ -188,8 +188,10 @@ def test_grasps_for_benchmarks_own_model_come_back_as_they_were(block: ObjectMod
     dexgraspbench.write(hand, block, grasps, [0, 1], tmp_path)
     for config in ("shadow", "graspd_shadow"):
         (back,) = dexgraspbench.read(tmp_path / "output" / f"graspd_{config}", hand="shadow", obj="block")
-        np.testing.assert_allclose(back.grasps.grasp.hand_pose, grasps.grasp.hand_pose, atol=1e-12)
-        np.testing.assert_array_equal(back.grasps.grasp.joint_positions, grasps.grasp.joint_positions)
+        for name in dexgraspbench.POSTURES:
+            there, ours = getattr(back.grasps, name), getattr(grasps, name)
+            np.testing.assert_allclose(there.hand_pose, ours.hand_pose, atol=1e-12)
+            np.testing.assert_array_equal(there.joint_positions, ours.joint_positions)
 
 
 def random_postures(hand: HandModel) -> GraspSet:

@@ -23,7 +23,6 @@ from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.validation.validator import validate
 
 TINY = 1e-9  # positions and quaternions are only re-ordered, not computed with
 
@@ -47,15 +46,10 @@ def test_a_file_that_would_run_code_is_refused_and_does_not(tmp_path: Path, monk
             load_npy(Path("x.npy"))
 
 
-def test_dexgraspbench_there_and_back_is_the_same_grasp_also_of_a_moved_object(
+def test_a_grasp_of_dexgraspbench_moves_with_its_object(
     hand: HandModel, block: ObjectModel, grasps: GraspSet, tmp_path: Path
 ) -> None:
-    (path, *_) = dexgraspbench.write(hand, block, grasps, range(len(grasps)), tmp_path)
-    (back,) = dexgraspbench.read(tmp_path, hand="barrett", obj="block")
-    np.testing.assert_allclose(back.grasps.squeeze.hand_pose, grasps.squeeze.hand_pose, atol=TINY)
-    np.testing.assert_array_equal(back.grasps.pregrasp.joint_positions, grasps.pregrasp.joint_positions)
-    ours, theirs = (validate(hand, block, some).success for some in (grasps, back.grasps))
-    np.testing.assert_array_equal(theirs, ours)
+    (path, *_) = dexgraspbench.write(hand, block, grasps, [0], tmp_path)
     row = load_npy(path)
     moved = np.array([0.3, -0.2, 0.7, *Rotation.from_euler("xyz", [0.3, 1.1, -2.0]).as_quat(scalar_first=True)])
     for name in dexgraspbench.POSTURES:

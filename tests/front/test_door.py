@@ -101,7 +101,7 @@ _TYPED = """
     datasets balance FILE.h5 -o OUT; datasets card FILE.h5/ -o OUT; datasets diff FILE.h5 FILE.h5
     datasets create x --spec FILE.toml; datasets estimate --spec FILE.json
     hands check FILE.urdf; hands check FILE.zip; objects check FILE.zip; objects check FILE.stl
-    bench --hand FILE.urdf; admin bench-render --object FILE.stl; admin gallery --hand FILE.urdf -o OUT
+    bench --hand FILE.urdf; admin gallery --hand FILE.urdf -o OUT
     chart --from FILE.json; chart --scene FILE.json --quick; stability --from FILE.json
     submit --hand allegro --object mug --scene FILE.json
 """

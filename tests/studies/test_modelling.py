@@ -1,4 +1,4 @@
-"""The prices of what is left out: the studies' own arithmetic, and that the page says what was measured."""
+"""The prices of what is left out: the studies' own arithmetic, and the recipe of the page."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ import trimesh
 from benchmarks.modelling.common import auc, ranking
 from benchmarks.modelling.drops import drops, forearm
 from benchmarks.modelling.steps import forward_simulation, step
-from benchmarks.modelling.tables import TITLES
 from graspd.service.store.shards import write_shard
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import Posture
@@ -26,13 +25,6 @@ from graspd.worker.simulation.reference import Contacts, World, direct
 from tests.conftest import REPOSITORY
 
 PAGE = (REPOSITORY / "docs" / "explanation" / "modelling.md").read_text()
-#: Each table of the study by its title.
-RESULTS = (REPOSITORY / "docs" / "results" / "modelling.md").read_text()
-MEASURED = {
-    name: table
-    for name, title in TITLES.items()
-    for table in re.findall(rf"^\*\*{title}\*\*\n\n((?:\|.*\n)+)", RESULTS, re.MULTILINE)
-}
 
 
 def test_a_step_is_that_of_the_reference() -> None:
@@ -73,23 +65,6 @@ def test_convex_objects_fall_as_their_hull_forearms_end_below() -> None:
     lowest, slope = forearm(np.array([[0, 0, 0.5, *turn] for turn in turns]), np.zeros(3))
     np.testing.assert_allclose(lowest, [0.2, 0.8, 0.46], atol=1e-12)
     np.testing.assert_allclose(slope, [-1, 1, 0], atol=1e-12)
-
-
-def test_the_page_cites_the_measured_tables() -> None:
-    """The tables stand on the page of results alone."""
-
-    def cell(table: str, row: str, column: int) -> str:
-        (line,) = [line for line in MEASURED[table].splitlines() if line.startswith(f"| {row}")]
-        return line.split(" | ")[column].partition(" ")[0]
-
-    text = " ".join(PAGE.split())
-    changed = {row: 100 - int(cell("engines", row, 2)) for row in ("hand root", "pads", "no contact", "object as")}
-    assert f"with one hull {changed['object as']} % of verdicts change" in text
-    assert f"without it {changed['no contact']} % change" in text
-    assert f"{changed['hand root']} % of verdicts (" in text and f"{changed['pads']} % of verdicts (" in text
-    assert f"(AUC {cell('predictors', 'static hand, 1 step', 1)})" in text
-    assert f"(AUC {cell('predictors', 'static hand, balance', 1)})" in text
-    assert f"{cell('pads', 'within 5 mm', 1)} cm² within 5 mm" in text
 
 
 def test_pages_recipe_finds_point_of_the_mesh_behind_each_pixel(tmp_path: Path) -> None:

@@ -311,7 +311,7 @@ def test_a_cube_that_does_not_fit_its_bin_is_refused(hand: HandModel) -> None:
 
 
 def test_refused_scenes_are_cells_that_say_why_walls_stand_off(hand: HandModel) -> None:
-    (cell,) = scenes.wall_map([hand], MapOptions(2), gaps=(-5,), walls=("one",)).cells
+    (cell,) = scenes.scene_map("scene_wall", [hand], MapOptions(2), xs=(-5,), ys=("one",)).cells
     assert cell.outcome == "refused" and "deep in support" in cell.note
     half = np.array(scenes.TARGET_MM[:2]) * scenes.MILLIMETRES / 2
     for boxes in (scenes._walls(scenes.WALLS["four"], 20), scenes._neighbours(scenes.NEIGHBOURS["eight"], 20)):
