@@ -73,7 +73,7 @@ def object_to_pieces(
         return
     q = piece_rotation(pieces_in, piece, b, body_q_in)
     p = piece_centre(pieces_in, piece, b, body_p_in, body_q_in)
-    extent = world_extent(q, pieces_in.half[piece]) + wp.vec3(margin_in, margin_in, margin_in)
+    extent = world_extent(wp.quat_to_matrix(q), pieces_in.half[piece]) + wp.vec3(margin_in, margin_in, margin_in)
     least = float(1.0e3)
     query = wp.bvh_query_aabb(bvh_in, p - extent, p + extent)
     index = wp.int32(0)

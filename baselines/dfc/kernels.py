@@ -164,7 +164,7 @@ def penetration(
     q = piece_rotation(pieces_in, piece, b, body_q_in)
     p = piece_centre(pieces_in, piece, b, body_p_in, body_q_in)
     half = pieces_in.half[piece]
-    extent = world_extent(q, half)
+    extent = world_extent(wp.quat_to_matrix(q), half)
     force = wp.vec3(0.0)
     torque = wp.vec3(0.0)
     total = float(0.0)

@@ -166,7 +166,7 @@ def samples_collide(
         p = piece_centre(problem.pieces, piece, b, body_p, body_q)
         half = problem.pieces.half[piece]
         if field_distance(problem.surface, p).distance < wp.length(half) + problem.surface.field_error:
-            extent = world_extent(q, half)
+            extent = world_extent(wp.quat_to_matrix(q), half)
             query = wp.bvh_query_aabb(problem.bvh, p - extent, p + extent)
             index = wp.int32(0)
             while wp.bvh_query_next(query, index):

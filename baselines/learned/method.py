@@ -21,6 +21,7 @@ from graspd.service.store.network_file import ProposalNetwork
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.mesh_geometry import points_in
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners.fast_graspd.planner import plan, plan_joined
 from graspd.worker.planners.fast_graspd.scene_starts import ROOM, clear_scene_starts
@@ -226,10 +227,8 @@ class SurfaceView:
         area = np.linalg.norm(cross, axis=1)
         sums = np.cumsum(area)
         face = np.minimum(np.searchsorted(sums, sums[-1] * rng.random(DENSE)), len(area) - 1)
-        u, v = rng.random((2, DENSE, 1))
-        u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
-        a, b, c = np.moveaxis(corners[face], 1, 0)
-        return cls(obj, a + u * (b - a) + v * (c - a), cross[face] / np.maximum(area[face, None], 1e-20))
+        points = points_in(corners[face], *rng.random((2, DENSE, 1)))
+        return cls(obj, points, cross[face] / np.maximum(area[face, None], 1e-20))
 
     def camera(self, pose: Floats, rng: np.random.Generator) -> Floats:
         """Sample a camera position (3,) that views the object at `pose` (7,), z up [m]."""

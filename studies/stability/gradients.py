@@ -15,7 +15,7 @@ from graspd.service.model.studies import MapCell, StabilityMap, graded, reachabl
 from graspd.service.model.transforms import Floats
 from graspd.studies.stability.integrators import Solver, sweep
 from graspd.worker.simulation import reference
-from graspd.worker.simulation.kernels import contact
+from graspd.worker.simulation.kernels import contact, kinematics, packing
 from graspd.worker.simulation.model import initial_motions
 from graspd.worker.simulation.reference import Contacts, World
 
@@ -27,44 +27,51 @@ STEP_M: Final = 1e-3
 #: Sine of the angle between the two gradients that counts as weak and as broken.
 ANGLE: Final = (0.25, 0.7)
 #: Kernel of each solver, and its step in the reference.
-_SOLVERS: Final[dict[str, tuple[Any, Solver]]] = {
+SOLVERS: Final[dict[str, tuple[Any, Solver]]] = {
     "direct": (contact.direct, partial(reference.direct, passes=PASSES)),
     "gauss_seidel": (contact.gauss_seidel, sweep),
     "jacobi": (contact.jacobi, partial(reference.jacobi, passes=PASSES)),
 }
 
 
-def kernel_gradient(name: str, contacts: Contacts, world: World) -> Floats:
-    """Return dL/drho (N,) by a kernel, without leak, on the CPU."""
+def run_kernel(
+    name: str,
+    contacts: Contacts,
+    world: World,
+    *,
+    leak: float = 0.0,
+    one_sided: bool = True,
+    near_gap: float = 100.0,
+    lane: int = 64,
+) -> tuple[Floats, Floats, Floats]:
+    """Run a kernel on the CPU: motions at the end (M, 6), losses (M,), dL/drho (N,)."""
     motions = initial_motions(7, world.step, world.gyration)
     n, m = len(contacts.points), len(motions)
+    physics = _physics(world, leak, one_sided, near_gap, float(np.linalg.norm(contacts.points, axis=1).max()))
+    listed = np.flatnonzero(contacts.distances - world.dilation <= near_gap)
     with wp.ScopedDevice("cpu"):
+        hands, given = kinematics.Hands(), packing.Contacts()
+        hands.active, hands.iteration = wp.ones(1, dtype=wp.int32), wp.zeros(1, dtype=wp.int32)
+        hands.dilation_scale = wp.ones(1, dtype=wp.float32)
+        given.count, given.near_count = (wp.array([k], dtype=wp.int32) for k in (n, len(listed)))
+        given.point, given.normal = (wp.array(a[None], dtype=wp.vec3) for a in (contacts.points, contacts.normals))
+        given.distance = wp.array(contacts.distances[None], dtype=wp.float32)
+        given.weight = wp.array(contacts.weights[None], dtype=wp.float32)
+        given.gradient = wp.zeros((1, n), dtype=wp.float32)
+        given.near = wp.array(np.pad(listed, (0, n - len(listed)))[None], dtype=wp.int32)
+        dilation = wp.array([world.dilation], dtype=wp.float32)
         loss, end = wp.zeros((1, m), dtype=wp.float32), wp.zeros((1, m), dtype=contact.vec6)
-        gradient = wp.zeros((1, n), dtype=wp.float32)
-        physics = _physics(world)
-        given = [
-            wp.ones(1, dtype=wp.int32),
-            wp.zeros(1, dtype=wp.int32),
-            wp.array([world.dilation], dtype=wp.float32),
-            wp.ones(1, dtype=wp.float32),
-            wp.array([n], dtype=wp.int32),
-            wp.array(contacts.points[None], dtype=wp.vec3),
-            wp.array(contacts.normals[None], dtype=wp.vec3),
-            wp.array(contacts.distances[None], dtype=wp.float32),
-            wp.array(contacts.weights[None], dtype=wp.float32),
-        ]
-        inputs = [physics, wp.array(motions, dtype=contact.vec6), PASSES, *given]
+        inputs = [physics, wp.array(motions, dtype=contact.vec6), PASSES, dilation, hands, given]
         if name == "direct":
-            near = [wp.array([n], dtype=wp.int32), wp.array(np.arange(n)[None], dtype=wp.int32)]
             adjoint = wp.zeros((1, m), dtype=contact.vec6)
-            wp.launch(contact.direct, dim=(1, m), inputs=[*inputs, *near], outputs=[loss, end, adjoint])
-            wp.launch(
-                contact.direct_gradient, dim=(1, 1), inputs=[physics, n, *given, end, adjoint], outputs=[gradient]
-            )
+            wp.launch(contact.direct, dim=(1, m), inputs=inputs, outputs=[loss, end, adjoint])
+            inputs = [physics, lane, dilation, hands, end, adjoint]
+            wp.launch(contact.direct_gradient, dim=(1, -(-n // lane)), inputs=inputs, outputs=[given])
         else:
             states = wp.zeros((1, m, max(n, PASSES)), dtype=contact.vec6)
-            wp.launch(_SOLVERS[name][0], dim=(1, m), inputs=inputs, outputs=[states, loss, end, gradient])
-        return gradient.numpy()[0].astype(float)
+            wp.launch(SOLVERS[name][0], dim=(1, m), inputs=inputs, outputs=[states, loss, end])
+        found: Any = (end, loss, given.gradient)
+        return tuple(array.numpy()[0].astype(float) for array in found)
 
 
 def reference_gradient(name: str, contacts: Contacts, world: World) -> Floats:
@@ -74,7 +81,7 @@ def reference_gradient(name: str, contacts: Contacts, world: World) -> Floats:
     steps = step * np.eye(len(contacts.points))[:, None]
 
     def losses(distances: Floats) -> Floats:
-        ends = _SOLVERS[name][1](replace(contacts, distances=distances), motions, world)
+        ends = SOLVERS[name][1](replace(contacts, distances=distances), motions, world)
         return np.asarray(np.mean(reference.loss(ends, world), axis=-1))
 
     return (losses(contacts.distances + steps) - losses(contacts.distances - steps)) / (2 * step)
@@ -82,7 +89,7 @@ def reference_gradient(name: str, contacts: Contacts, world: World) -> Floats:
 
 def gradient_map(sizes: Sequence[float], gaps: Sequence[float], *, repeats: int) -> StabilityMap:
     cells = []
-    for name, size, gap in product(_SOLVERS, sizes, gaps):
+    for name, size, gap in product(SOLVERS, sizes, gaps):
         worst = float(np.median([_angle(name, size, gap, seed) for seed in range(repeats)]))
         cells.append(MapCell(name, size, gap, worst, graded(worst, *ANGLE)))
     return StabilityMap(
@@ -101,14 +108,13 @@ def gradient_map(sizes: Sequence[float], gaps: Sequence[float], *, repeats: int)
     )
 
 
-def _physics(world: World) -> Any:
+def _physics(world: World, leak: float, one_sided: bool, near_gap: float, radius: float) -> Any:
     out = contact.Physics()
     out.mass = contact.mat66(*world.mass.ravel().tolist())
     out.inverse_mass = contact.mat66(*np.linalg.inv(world.mass).ravel().tolist())
     out.gyration, out.friction, out.stiffness = world.gyration, world.friction, world.stiffness
-    out.leak, out.leak_length, out.one_sided, out.step = 0.0, 0.02, 1, world.step
-    out.radius = 10.0
-    out.near_gap = 100.0
+    out.leak, out.leak_length, out.one_sided, out.step = leak, 0.02, int(one_sided), world.step
+    out.radius, out.near_gap = radius, near_gap
     return out
 
 
@@ -120,7 +126,7 @@ def _angle(name: str, size: float, gap: float, seed: int) -> float:
     contacts = Contacts(size * normals, normals, distances, np.ones(count))
     inertia = 0.4 * size**2 * np.eye(3)
     world = World(inertia=inertia, gyration=float(np.sqrt(0.4)) * size, step=STEP_M)
-    ours, expected = kernel_gradient(name, contacts, world), reference_gradient(name, contacts, world)
+    ours, expected = run_kernel(name, contacts, world)[2], reference_gradient(name, contacts, world)
     lengths = float(np.linalg.norm(ours) * np.linalg.norm(expected))
     if lengths == 0.0:
         return 0.0 if np.linalg.norm(ours) == np.linalg.norm(expected) else 1.0

@@ -85,6 +85,12 @@ def corner_normals(vertices: Floats, faces: Ints, crease_deg: float = CREASE_DEG
     return normals.reshape(-1, 3, 3)
 
 
+def points_in(corners: Floats, u: Floats, v: Floats) -> Floats:
+    """Return points of triangles (n, 3, 3), uniform for uniform numbers (n, 1) in [0, 1)."""
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+    return corners[:, 0] + u * (corners[:, 1] - corners[:, 0]) + v * (corners[:, 2] - corners[:, 0])
+
+
 def _corner_angles(corners: Floats) -> Floats:
     """Compute the angle (F, 3) of each triangle (F, 3, 3) at each corner [rad]."""
     out = np.roll(corners, -1, axis=1) - corners

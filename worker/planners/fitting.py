@@ -16,6 +16,7 @@ from graspd.service.model.transforms import Floats
 from graspd.worker.hands.jaws import jaws_of
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.memory_cache import cached_by_content
+from graspd.worker.objects.mesh_geometry import points_in
 from graspd.worker.objects.model import ObjectModel
 
 #: Clearance between the opening and the object on each side [m].
@@ -90,12 +91,6 @@ def surface_of(obj: ObjectModel) -> tuple[Floats, Floats, Floats]:
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(cross, axis=1)
     return corners, cross / np.maximum(area, 1e-20)[:, None], np.cumsum(area) / area.sum()
-
-
-def points_in(corners: Floats, u: Floats, v: Floats) -> Floats:
-    """Return points of triangles (n, 3, 3), uniform for uniform numbers (n, 1) in [0, 1)."""
-    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
-    return corners[:, 0] + u * (corners[:, 1] - corners[:, 0]) + v * (corners[:, 2] - corners[:, 0])
 
 
 def even_points(obj: ObjectModel, count: int, rng: np.random.Generator) -> tuple[Floats, NDArray[np.intp]]:

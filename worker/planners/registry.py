@@ -15,7 +15,7 @@ from graspd.service.model.libraries import imports
 from graspd.worker.planners.port import BatchPlanner, Method, Options, Planner
 
 if TYPE_CHECKING:
-    from importlib.metadata import EntryPoint, EntryPoints
+    from importlib.metadata import EntryPoint
 
 #: Entry-point group of planners of other packages.
 GROUP: Final = "graspd.planners"
@@ -95,12 +95,7 @@ def of_this_machine(name: str, options: Mapping[str, Any] | None) -> dict[str, A
     return given | {key: files[key](Path(str(value))) for key, value in given.items() if key in files}
 
 
-def entry_points(group: str) -> EntryPoints:
-    """Return entry points of installed packages; imports the library that finds them."""
-    from importlib.metadata import entry_points as found
-
-    return found(group=group)
-
-
 def _offered() -> dict[str, EntryPoint]:
+    from importlib.metadata import entry_points
+
     return {point.name: point for point in entry_points(group=GROUP)}

@@ -16,7 +16,7 @@ from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.quality.contact import LINK_CONTACT_M, contact_links, finger_of_body
 from graspd.worker.quality.probe import Probe, probe_of
-from graspd.worker.simulation.device import PosedBodies, chain_of, room_for_bodies, to_xyzw
+from graspd.worker.simulation.device import chain_of, posed_bodies, room_for_bodies, to_xyzw
 from graspd.worker.simulation.kernels import balance, jamming, opening, optimizers, touching
 from graspd.worker.simulation.launches import launch
 
@@ -63,7 +63,7 @@ class PostureData:
         count = len(posture)
         root = np.array(posture.hand_pose, float)
         root[:, :3] -= self.probe.obj.centre_of_mass
-        bodies = PosedBodies.of(self.hand, root, posture.joint_positions, self.device).bodies
+        bodies = posed_bodies(self.hand, root, posture.joint_positions, self.device)
         near, shape = touching.NearbySurface(), (count, len(self.probe.points))
         with wp.ScopedDevice(self.device):
             near.distance, near.cosine = wp.empty(shape, dtype=wp.float32), wp.empty(shape, dtype=wp.float64)

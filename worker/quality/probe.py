@@ -22,7 +22,7 @@ from graspd.worker.objects.disk_cache import arrays_kept_or_made
 from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.topology import face_areas
-from graspd.worker.simulation.device import DeviceHand, PosedBodies, to_xyzw
+from graspd.worker.simulation.device import DeviceHand, posed_bodies, to_xyzw
 from graspd.worker.simulation.kernels import distance as kernels
 from graspd.worker.simulation.launches import launch
 from graspd.worker.simulation.sampling import object_samples
@@ -158,10 +158,8 @@ class Probe:
         """Return the least signed distance (P, L) of each body's points from the object in P postures.
         Distances are at most `reach`; inf where a body has no points. Equals `signed_distance` of `posed_points`, but
         is faster for many postures."""
-        posed, shape = (
-            PosedBodies.of(self.hand, hand_pose, joint_positions, self.device),
-            (len(hand_pose), self.hand.bodies),
-        )
+        posed = posed_bodies(self.hand, hand_pose, joint_positions, self.device)
+        shape = (len(hand_pose), self.hand.bodies)
         with wp.ScopedDevice(self.device):
             gap = wp.full(shape, np.inf, dtype=wp.float32)
             inputs = [self.skin, self.body_points, self._origin, reach, posed.position, posed.rotation]

@@ -7,7 +7,7 @@ iteration is the same list of launches each time.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import warp as wp
@@ -15,8 +15,15 @@ from numpy.typing import NDArray
 
 from graspd.service.model.transforms import Floats
 from graspd.worker.simulation.device import joint_units, to_wxyz, to_xyzw
-from graspd.worker.simulation.kernels import contact, packing, penalties
+from graspd.worker.simulation.kernels import contact, kinematics, packing, penalties
 from graspd.worker.simulation.model import MAX_DILATION, REFERENCE_POINTS, Model
+
+#: Kinds of penetration, see `kinematics.Depths`; arrays of the data that are fields of `kinematics.Hands`.
+_DEPTHS: Final = ("points", "object", "links", "obstacles")
+_HANDS: Final = (
+    *("active", "iteration", "dilation_scale", "scene"),
+    *("pivot", "rotation", "q", "body_p", "body_q", "axis", "wrench"),
+)
 
 
 class Tables:
@@ -31,42 +38,15 @@ class Tables:
         self.rates = wp.array(np.concatenate([schedule.rates[:, :2], joints], axis=1), dtype=wp.float32)
 
 
-class Contacts:
-    """Candidate contacts (B, N), packed at the front per hand in the order of its points.
-    `gradient` is dL/d distance, `near` (B, N) the indices of contacts that the object may reach in its step."""
-
-    def __init__(self, capacity: int, points: int) -> None:
-        shape = (capacity, points)
-        self.count, self.near_count = (wp.zeros(capacity, dtype=wp.int32) for _ in range(2))
-        self.body, self.near = (wp.empty(shape, dtype=wp.int32) for _ in range(2))
-        self.point, self.normal = (wp.empty(shape, dtype=wp.vec3) for _ in range(2))
-        self.distance, self.weight, self.gradient = (wp.empty(shape, dtype=wp.float32) for _ in range(3))
-        self.mark = wp.zeros((0, 0), dtype=wp.int32)
-
-    @property
-    def arrays(self) -> list[Any]:
-        """All but the marks, in the order of kernels' arguments."""
-        measured = [self.count, self.body, self.point, self.normal, self.distance, self.weight]
-        return [*measured, self.gradient, self.near_count, self.near]
-
-
-class MarkedContacts(Contacts):
-    """Contacts (B, N) at their points' indices, marked, with their counts per chunk (B, N / chunk)."""
-
-    def __init__(self, capacity: int, points: int) -> None:
-        super().__init__(capacity, points)
-        self.mark = wp.zeros((capacity, points), dtype=wp.int32)
-        chunks = (capacity, -(-points // packing.CHUNK))
-        self.kept_in, self.near_in = (wp.zeros(chunks, dtype=wp.int32) for _ in range(2))
-
-
-class Depths:
-    """Deepest penetrations (B,) at the last evaluation [m]: hand points in the object, the object in links, links in
-    links, and the shortfall of the hand's distance from obstacles."""
-
-    def __init__(self, capacity: int) -> None:
-        self.kinds = [wp.zeros(capacity, dtype=wp.float32) for _ in range(4)]
-        self.points, self.object, self.links, self.obstacles = self.kinds
+def allocate_contacts(capacity: int, points: int, *, marked: bool = False) -> Any:
+    """Allocate `packing.Contacts`; `marked`: at their points' indices, with marks."""
+    out, shape = packing.Contacts(), (capacity, points)
+    out.count, out.near_count = (wp.zeros(capacity, dtype=wp.int32) for _ in range(2))
+    out.body, out.near = (wp.empty(shape, dtype=wp.int32) for _ in range(2))
+    out.point, out.normal = (wp.empty(shape, dtype=wp.vec3) for _ in range(2))
+    out.distance, out.weight, out.gradient = (wp.empty(shape, dtype=wp.float32) for _ in range(3))
+    out.mark = wp.zeros(shape if marked else (0, 0), dtype=wp.int32)
+    return out
 
 
 class Data:
@@ -79,12 +59,19 @@ class Data:
         self.serial = not wp.get_device(model.device).is_cuda if serial is None else serial
         self.unit = joint_units(model.hand.model)
         with wp.ScopedDevice(self.device):
-            self.contacts = Contacts(capacity, model.count)
-            self.marked = None if self.serial else MarkedContacts(capacity, model.count)
-            self.depths = Depths(capacity)
+            self.contacts = allocate_contacts(capacity, model.count)
+            self.marked = None if self.serial else allocate_contacts(capacity, model.count, marked=True)
+            #: Contacts, and near ones, in every chunk of marks (B, N / chunk).
+            chunks = (capacity, -(-model.count // packing.CHUNK))
+            self.chunk_counts = [wp.zeros(chunks, dtype=wp.int32) for _ in range(2)]
+            self.depths = kinematics.Depths()
+            for kind in _DEPTHS:
+                setattr(self.depths, kind, wp.zeros(capacity, dtype=wp.float32))
             self.schedule = Tables(still_schedule(), self.unit)
             self._allocate(capacity, model.bodies, model.dofs, model.options.velocities)
-            self.states = _solver_states(model, capacity)
+            #: Motions that a contact solver stores for its reverse sweep; the direct solver stores none.
+            kept = {"direct": 0, "gauss_seidel": model.count}.get(model.options.contact_solver, model.options.passes)
+            self.states = wp.zeros((capacity, model.options.velocities, kept), dtype=contact.vec6)
 
     def _allocate(self, B: int, L: int, D: int, M: int) -> None:
         self.active = wp.ones(B, dtype=wp.int32)
@@ -102,19 +89,10 @@ class Data:
         self.end, self.adjoint = (wp.zeros((B, M), dtype=contact.vec6) for _ in range(2))
         self.gradient, self.first, self.second = (wp.zeros((B, 6 + D), dtype=wp.float32) for _ in range(3))
         self.best, self.waited = wp.zeros(B, dtype=wp.float32), wp.zeros(B, dtype=wp.int32)
-
-    @property
-    def bodies(self) -> list[Any]:
-        return [self.body_p, self.body_q]
-
-    @property
-    def root_and_joints(self) -> list[Any]:
-        return [self.pivot, self.rotation, self.q]
-
-    @property
-    def dilation(self) -> list[Any]:
-        """Arguments of kernels that dilate the object."""
-        return [self.active, self.iteration, self.schedule.dilation, self.dilation_scale]
+        #: The same arrays, for kernels.
+        self.hands = kinematics.Hands()
+        for name in _HANDS:
+            setattr(self.hands, name, getattr(self, name))
 
     def set_state(self, state: HandState, *, dilation: Floats | None = None) -> None:
         """Load up to `capacity` hands; the rest is switched off. Optimiser moments are cleared.
@@ -158,34 +136,24 @@ class Data:
             self.schedule = Tables(schedule, self.unit)
 
     def deepest(self, n: int) -> Floats:
-        return np.max([kind.numpy()[:n] for kind in self.depths.kinds], axis=0)
+        return np.max([getattr(self.depths, kind).numpy()[:n] for kind in _DEPTHS], axis=0)
 
     def near_share(self, reach: float, n: int) -> Floats:
         """Return shares (n,) of hands' surface closer to the object than `reach` [m], at the last evaluation."""
-        c = self.contacts
-        inputs = [reach, float(REFERENCE_POINTS), c.count, c.distance, c.weight]
+        inputs = [reach, float(REFERENCE_POINTS), self.contacts]
         with wp.ScopedDevice(self.device):
             share = wp.empty(n, dtype=wp.float32)
             wp.launch(penalties.near_share, n, inputs=inputs, outputs=[share])
         return share.numpy().astype(float)
 
     def state(self, n: int) -> HandState:
-        pivot, rotation, q = (array.numpy()[:n].astype(float) for array in self.root_and_joints)
+        pivot, rotation, q = (array.numpy()[:n].astype(float) for array in (self.pivot, self.rotation, self.q))
         return HandState(pivot, to_wxyz(rotation), q)
 
     def _assign(self, array: Any, values: Floats) -> None:
         padded = np.zeros((self.capacity, values.shape[1]), dtype=np.float32)
         padded[: len(values)] = values
         array.assign(padded)
-
-
-def _solver_states(model: Model, capacity: int) -> Any:
-    """Allocate the motions that a contact solver stores for its reverse sweep; None: it stores none."""
-    options = model.options
-    if options.contact_solver == "direct":
-        return None
-    kept = model.count if options.contact_solver == "gauss_seidel" else options.passes
-    return wp.zeros((capacity, options.velocities, kept), dtype=contact.vec6)
 
 
 @dataclass

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import threading
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
 import warp as wp
-from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from graspd.service.model.transforms import Floats
 from graspd.worker.hands.jaws import slides
 from graspd.worker.hands.model import ConvexPiece, HandModel, JointType
+from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.grids import add_grid, faces_of
 from graspd.worker.simulation.kernels import chain as kernels
@@ -55,17 +54,18 @@ class DeviceHand:
     def create(cls, hand: HandModel, device: str) -> DeviceHand:
         tree = kinematics.Tree()
         with wp.ScopedDevice(device):
-            tree.parent = wp.array(hand.parent, dtype=wp.int32)
+            _add_joints(tree, hand, wp.vec3, wp.quat, wp.float32)
             tree.joint_type = wp.array(hand.joint_type, dtype=wp.int32)
-            tree.origin_p = wp.array(hand.origin[:, :3], dtype=wp.vec3)
-            tree.origin_q = wp.array(to_xyzw(hand.origin[:, 3:]), dtype=wp.quat)
-            tree.axis = wp.array(hand.axis, dtype=wp.vec3)
-            tree.dof = wp.array(hand.dof, dtype=wp.int32)
-            tree.multiplier = wp.array(hand.multiplier, dtype=wp.float32)
-            tree.offset = wp.array(hand.offset, dtype=wp.float32)
             tree.pivot = wp.vec3(*hand.palm.centre)
             lower, upper = (wp.array(limit, dtype=wp.float32) for limit in (hand.lower, hand.upper))
             return cls(hand, device, tree, _device_pieces(hand), lower, upper)
+
+
+def _add_joints(out: Any, hand: HandModel, vector: Any, quaternion: Any, number: Any) -> None:
+    out.parent, out.dof = (wp.array(index, dtype=wp.int32) for index in (hand.parent, hand.dof))
+    out.origin_p, out.axis = (wp.array(rows, dtype=vector) for rows in (hand.origin[:, :3], hand.axis))
+    out.origin_q = wp.array(to_xyzw(hand.origin[:, 3:]), dtype=quaternion)
+    out.multiplier, out.offset = (wp.array(values, dtype=number) for values in (hand.multiplier, hand.offset))
 
 
 def _device_pieces(hand: HandModel) -> Any:
@@ -153,9 +153,16 @@ class DeviceObject:
             if cell > 0:
                 add_grid(skin, obj, mesh, cell)
             centred = wp.array(samples - obj.centre_of_mass, dtype=wp.vec3)
-            bvh = wp.Bvh(centred, centred)
             cells = sorted_samples(samples - obj.centre_of_mass)
-        return cls(model=obj, device=device, surface=skin, mesh=mesh, samples=centred, bvh=bvh, sorted_samples=cells)
+        return cls(
+            model=obj,
+            device=device,
+            surface=skin,
+            mesh=mesh,
+            samples=centred,
+            bvh=wp.Bvh(centred, centred),
+            sorted_samples=cells,
+        )
 
     def thinned(self, count: int) -> DeviceObject:
         """Return the object with its first `count` samples: farthest-point samples are even at any length."""
@@ -183,35 +190,17 @@ def sorted_samples(samples: Floats) -> Any:
     return out
 
 
-@dataclass(frozen=True)
-class PosedBodies:
-    """The L bodies of a hand in P postures, object frame."""
-
-    chain: Any  # the hand, `kernels.chain.Chain`
-    bodies: Any  # poses (P, L) of the bodies, `kernels.chain.Bodies`
-
-    @classmethod
-    def of(cls, hand: HandModel, hand_pose: Floats, joint_positions: Floats, device: str = "cpu") -> PosedBodies:
-        """Place hands with roots (P, 7) and joint positions (P, J), as `body_poses` does."""
-        chain, count = chain_of(hand, device), len(hand_pose)
-        with wp.ScopedDevice(device):
-            root, joints = (
-                wp.array(np.ascontiguousarray(given, float), dtype=wp.float64, ndim=2)
-                for given in (hand_pose, joint_positions)
-            )
-            bodies = room_for_bodies(hand, count)
-            wp.launch(kernels.pose, count, inputs=[chain, root, joints], outputs=[bodies])
-        return cls(chain, bodies)
-
-    @property
-    def position(self) -> Any:
-        """(P, L) origins [m]."""
-        return self.bodies.position
-
-    @property
-    def rotation(self) -> Any:
-        """(P, L) quaternions."""
-        return self.bodies.rotation
+def posed_bodies(hand: HandModel, hand_pose: Floats, joint_positions: Floats, device: str = "cpu") -> Any:
+    """Return `kernels.chain.Bodies` (P, L) of roots (P, 7) and joint positions (P, J), placed as by `body_poses`."""
+    chain, count = chain_of(hand, device), len(hand_pose)
+    with wp.ScopedDevice(device):
+        root, joints = (
+            wp.array(np.ascontiguousarray(given, float), dtype=wp.float64, ndim=2)
+            for given in (hand_pose, joint_positions)
+        )
+        bodies = room_for_bodies(hand, count)
+        wp.launch(kernels.pose, count, inputs=[chain, root, joints], outputs=[bodies])
+    return bodies
 
 
 def room_for_bodies(hand: HandModel, count: int) -> Any:
@@ -222,20 +211,13 @@ def room_for_bodies(hand: HandModel, count: int) -> Any:
     return out
 
 
-_chains: LRUCache[tuple[str, str], Any] = LRUCache(8)
-_lock = threading.Lock()
-
-
+@cached_by_content(8)
 def chain_of(hand: HandModel, device: str) -> Any:
     """Return the hand on a device as `kernels.chain.Chain`, cached in memory."""
-    key = (hand.content, device)
-    with _lock:
-        if (found := _chains.get(key)) is None:
-            # Loading here prevents threads from compiling the same module at once.
-            wp.load_module(module=kernels, device=device)
-            with wp.ScopedDevice(device):
-                found = _chains[key] = _chain(hand)
-        return found
+    # Loading here prevents threads from compiling the same module at once.
+    wp.load_module(module=kernels, device=device)
+    with wp.ScopedDevice(device):
+        return _chain(hand)
 
 
 def _chain(hand: HandModel) -> Any:
@@ -243,14 +225,9 @@ def _chain(hand: HandModel) -> Any:
     joint = np.zeros(hand.bodies, np.int32)
     joint[hand.joint_body] = np.arange(len(hand.joint_body))
     order = np.argsort(features.body, kind="stable")
-    out.parent, out.joint = wp.array(hand.parent, dtype=wp.int32), wp.array(joint, dtype=wp.int32)
+    _add_joints(out, hand, wp.vec3d, wp.quatd, wp.float64)
+    out.joint = wp.array(joint, dtype=wp.int32)
     out.turns = wp.array(hand.joint_type == JointType.REVOLUTE, dtype=wp.int32)
-    out.origin_p = wp.array(hand.origin[:, :3], dtype=wp.vec3d)
-    out.origin_q = wp.array(to_xyzw(hand.origin[:, 3:]), dtype=wp.quatd)
-    out.axis = wp.array(hand.axis, dtype=wp.vec3d)
-    out.dof = wp.array(hand.dof, dtype=wp.int32)
-    out.multiplier = wp.array(hand.multiplier, dtype=wp.float64)
-    out.offset = wp.array(hand.offset, dtype=wp.float64)
     out.tip = wp.array(np.isin(np.arange(hand.bodies), hand.fingertips), dtype=wp.int32)
     out.first = wp.array(np.searchsorted(features.body[order], np.arange(hand.bodies + 1)), dtype=wp.int32)
     out.centre = wp.array(features.centre[order], dtype=wp.vec3d)

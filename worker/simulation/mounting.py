@@ -3,12 +3,10 @@ Planners use the clearance of the mounting's points, which is cheap; validity us
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
-from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, quat_conjugate, quat_rotate, spread_directions
@@ -17,6 +15,7 @@ from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.mounting import wrist_positions
 from graspd.worker.hands.surface import farthest_points
+from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.simulation.environment import CLEAR_M, Environment
 from graspd.worker.simulation.obstacles import MARGIN_M, obstacle_room
 
@@ -110,23 +109,15 @@ def point_room(mounting: HandModel, poses: Floats, scenes: Sequence[Environment]
     return out
 
 
-_points: LRUCache[str, Floats] = LRUCache(8)
-_lock = threading.Lock()
-
-
+@cached_by_content(8)
 def points_of(mounting: HandModel) -> Floats:
     """Return points (W, M, 3) of a mounting at each wrist position, the `OUTERMOST` first, root frame [m]."""
-    with _lock:
-        if (found := _points.get(mounting.content)) is None:
-            wrists = wrist_positions(mounting)
-            bodies = body_poses(mounting, np.tile(IDENTITY_POSE, (len(wrists), 1)), mounting.expand(wrists))
-            corners = [apply(bodies[:, p.body, None], p.vertices) for p in mounting.pieces]
-            every = np.concatenate(corners, axis=1)
-            far = (every @ spread_directions(OUTERMOST).T).argmax(axis=1)
-            spread = every[:, farthest_points(every[0], min(SPREAD, every.shape[1]))]
-            outermost = np.take_along_axis(every, far[..., None], axis=1)
-            found = _points[mounting.content] = np.concatenate([outermost, spread], axis=1)
-        return found
+    wrists = wrist_positions(mounting)
+    bodies = body_poses(mounting, np.tile(IDENTITY_POSE, (len(wrists), 1)), mounting.expand(wrists))
+    every = np.concatenate([apply(bodies[:, p.body, None], p.vertices) for p in mounting.pieces], axis=1)
+    far = (every @ spread_directions(OUTERMOST).T).argmax(axis=1)
+    spread = every[:, farthest_points(every[0], min(SPREAD, every.shape[1]))]
+    return np.concatenate([np.take_along_axis(every, far[..., None], axis=1), spread], axis=1)
 
 
 def wrist_room(

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 import warp as wp
-from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from graspd.service.model.transforms import Floats, quat_rotate
@@ -17,7 +15,8 @@ from graspd.worker.grasps import Posture
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.primitives import HandFeatures
-from graspd.worker.simulation.device import DeviceHand, PosedBodies, to_xyzw
+from graspd.worker.objects.memory_cache import cached_by_content
+from graspd.worker.simulation.device import DeviceHand, chain_of, posed_bodies, to_xyzw
 from graspd.worker.simulation.environment import CLEAR_M, Environment, Obstacle
 from graspd.worker.simulation.kernels import chain as chain_kernels
 from graspd.worker.simulation.kernels import obstacles as kernels
@@ -68,17 +67,11 @@ def _solid_distances(hand: HandModel, postures: Posture, scene: Environment) -> 
     return least.numpy().astype(float)
 
 
-_hands: LRUCache[str, DeviceHand] = LRUCache(8)
-_lock = threading.Lock()
-
-
+@cached_by_content(8)
 def _device_hand(hand: HandModel) -> DeviceHand:
-    with _lock:
-        if (found := _hands.get(hand.content)) is None:
-            # Loading here prevents threads from compiling the same module at once.
-            wp.load_module(module=solid_kernels, device="cpu")
-            found = _hands[hand.content] = DeviceHand.create(hand, "cpu")
-        return found
+    # Loading here prevents threads from compiling the same module at once.
+    wp.load_module(module=solid_kernels, device="cpu")
+    return DeviceHand.create(hand, "cpu")
 
 
 def body_room(
@@ -112,13 +105,13 @@ def _half_space_room(
 ) -> Floats:
     every = [[o for o in scene.obstacles if not len(o.corners)] for scene in scenes]
     flat, count = [o for one in every for o in one], len(postures)
-    posed, spaces = PosedBodies.of(hand, postures.hand_pose, postures.joint_positions), chain_kernels.HalfSpaces()
+    bodies, spaces = posed_bodies(hand, postures.hand_pose, postures.joint_positions), chain_kernels.HalfSpaces()
     with wp.ScopedDevice("cpu"):
         spaces.first = wp.array(_starts([len(one) for one in every]), dtype=wp.int32)
         spaces.planes = wp.array(np.concatenate([np.zeros((0, 4)), *(o.planes for o in flat)]), dtype=wp.vec4d)
         spaces.more = wp.array([_more(o) for o in flat], dtype=wp.float64)
         room = wp.full((count, hand.bodies), np.inf, dtype=wp.float64)
-        inputs = [posed.chain, spaces, wp.array(which, dtype=wp.int32), posed.position, posed.rotation]
+        inputs = [chain_of(hand, "cpu"), spaces, wp.array(which, dtype=wp.int32), bodies.position, bodies.rotation]
         launch(chain_kernels.rooms, (count, hand.bodies), inputs=inputs, outputs=[room], device="cpu")
     return np.asarray(room.numpy())
 

@@ -91,11 +91,8 @@ class Projection:
     def _validated(self, now: Any, best: Any) -> Launches:
         d, o = self.data, self.options
         out = record_placement(self.model, d, within=max(o.near, o.hold))
-        inputs, outputs = (
-            [*d.depths.kinds, wp.float64(BETTER_M), now],
-            [d.active, self.residuals.count, best, self._depth],
-        )
-        out.add(kernels.keep_best, d.capacity, inputs=inputs, outputs=outputs)
+        outputs = [d.active, self.residuals.count, best, self._depth]
+        out.add(kernels.keep_best, d.capacity, inputs=[d.depths, wp.float64(BETTER_M), now], outputs=outputs)
         return out
 
     def _states(self, state: HandState) -> Any:
@@ -115,27 +112,25 @@ class Projection:
 
     def _add_equations(self, out: Launches) -> None:
         m, d, o, outputs = self.model, self.data, self.options, [self.residuals]
-        c, pose = d.contacts, [d.active, *d.bodies]
-        points = [c.count, c.body, c.point, c.normal, c.distance]
-        inputs = [m.lane, d.active, *points, o.near, o.target, o.hold, o.hold_target, o.hold_weight]
+        inputs = [m.lane, d.hands, d.contacts, o.near, o.target, o.hold, o.hold_target, o.hold_weight]
         out.add(kernels.point_residuals, (d.capacity, m.lanes), inputs=inputs, outputs=outputs)
         over = (d.capacity, m.pieces)
-        inputs = [m.hand.pieces, m.obj.sorted_samples, *pose, o.sample_near, o.target]
+        inputs = [m.hand.pieces, m.obj.sorted_samples, d.hands, o.sample_near, o.target]
         out.add(kernels.sample_residuals, over, inputs=inputs, outputs=outputs)
-        inputs = [m.hand.pieces, m.body_points, *pose, o.self_near, o.self_target]
+        inputs = [m.hand.pieces, m.body_points, d.hands, o.self_near, o.self_target]
         out.add(kernels.self_residuals, over, inputs=inputs, outputs=outputs)
         if (around := m.obstacles) is not None:
-            terms = [d.active, d.scene, *d.bodies, o.obstacle_near, o.obstacle_target]
+            terms = [d.hands, o.obstacle_near, o.obstacle_target]
             out.add(obstacles.residuals, over, inputs=[around.features, around.solids, *terms], outputs=outputs)
             if around.any_solid:
                 inputs = [around.features, m.hand.pieces, around.solids, *terms]
                 out.add(solids.residuals, over, inputs=inputs, outputs=outputs)
-        inputs = [m.hand.tree, self._lane, d.active, d.pivot, d.body_p, d.axis, self.residuals]
+        inputs = [m.hand.tree, self._lane, d.hands, self.residuals]
         outputs = [self._row, self.matrix, self.vector]
         out.add(kernels.normal_equations, (d.capacity, self._lanes), inputs=inputs, outputs=outputs)
 
     def _add_step(self, out: Launches, now: Any) -> None:
         d, o = self.data, self.options
-        inputs = [*self._limits, self._scale, wp.float64(o.damping), wp.float64(o.step), d.active, self.residuals]
-        outputs = [self._factor, self._move, self.matrix, self.vector, now, *d.root_and_joints]
+        inputs = [*self._limits, self._scale, wp.float64(o.damping), wp.float64(o.step), self.residuals]
+        outputs = [self._factor, self._move, self.matrix, self.vector, now, d.hands]
         out.add(kernels.step, d.capacity, inputs=inputs, outputs=outputs)

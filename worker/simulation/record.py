@@ -58,91 +58,72 @@ def record_iteration(m: Model, d: Data, optimizer: str, *, patience: int = 0) ->
 
 def add_poses(out: Launches, m: Model, d: Data) -> None:
     """Add poses of all bodies; accumulators of an iteration are set to zero."""
-    counts = [d.contacts.count, d.contacts.near_count]
-    outputs = [*d.bodies, d.axis, d.wrench, *counts, d.depths.points, d.depths.object, d.depths.links]
-    out.add(kinematics.forward, d.capacity, inputs=[m.hand.tree, d.active, *d.root_and_joints], outputs=outputs)
+    outputs = [d.hands, d.contacts.count, d.contacts.near_count, d.depths]
+    out.add(kinematics.forward, d.capacity, inputs=[m.hand.tree], outputs=outputs)
 
 
 def add_distances(out: Launches, m: Model, d: Data, *, within: float | None = None) -> None:
     """Add candidate contacts: hand points near the object, their distances and normals."""
-    found, o = d.marked or d.contacts, m.options
+    o = m.options
     nearness = [o.band, o.exact_below, o.band] if within is None else [o.band, within, within]
     points = [m.point_body, m.point_position, m.point_weight]
-    inputs = [m.obj.surface, *nearness, NEAR_GAP, m.lane, *points, *d.dilation, *d.bodies]
-    out.add(surface.gather, (d.capacity, m.lanes), inputs=inputs, outputs=[*found.arrays, found.mark])
+    inputs = [m.obj.surface, *nearness, NEAR_GAP, m.lane, *points, d.schedule.dilation, d.hands]
+    out.add(surface.gather, (d.capacity, m.lanes), inputs=inputs, outputs=[d.marked or d.contacts])
     if (marked := d.marked) is not None:
-        counts = [marked.kept_in, marked.near_in]
-        out.add(packing.count_marks, marked.kept_in.shape, inputs=[d.active, marked.mark], outputs=counts)
-        measured = [marked.body, marked.point, marked.normal, marked.distance, marked.weight]
-        inputs = [d.active, marked.mark, *counts, *measured]
-        out.add(packing.pack, marked.mark.shape, inputs=inputs, outputs=d.contacts.arrays)
+        counts = d.chunk_counts
+        out.add(packing.count_marks, counts[0].shape, inputs=[d.active, marked.mark], outputs=counts)
+        out.add(packing.pack, marked.mark.shape, inputs=[d.active, marked, *counts], outputs=[d.contacts])
 
 
 def add_contact(out: Launches, m: Model, d: Data) -> None:
     """Add the contact step and its gradient with respect to distances, or their substitute.
     The direct solver has two launches: over simulations, then over contacts."""
     o, c = m.options, d.contacts
-    contacts = [c.count, c.point, c.normal, c.distance, c.weight]
     if not o.simulate:
-        inputs = [o.leak, o.leak_length, d.active, c.count, c.distance, c.weight]
-        out.add(penalties.attract, (d.capacity, m.count), inputs=inputs, outputs=[c.gradient])
+        out.add(penalties.attract, (d.capacity, m.count), inputs=[o.leak, o.leak_length, d.hands], outputs=[c])
         return
-    step, inputs = SOLVERS[o.contact_solver], [m.physics, m.motions, o.passes, *d.dilation, *contacts]
-    if o.contact_solver != "direct":
-        out.add(step, (d.capacity, o.velocities), inputs=inputs, outputs=[d.states, d.loss, d.end, c.gradient])
-        return
-    inputs += [c.near_count, c.near]
-    out.add(step, (d.capacity, o.velocities), inputs=inputs, outputs=[d.loss, d.end, d.adjoint])
-    inputs = [m.physics, m.lane, *d.dilation, *contacts, d.end, d.adjoint]
-    out.add(contact.direct_gradient, (d.capacity, m.lanes), inputs=inputs, outputs=[c.gradient])
+    inputs = [m.physics, m.motions, o.passes, d.schedule.dilation, d.hands, c]
+    outputs = [d.loss, d.end, d.adjoint] if o.contact_solver == "direct" else [d.states, d.loss, d.end]
+    out.add(SOLVERS[o.contact_solver], (d.capacity, o.velocities), inputs=inputs, outputs=outputs)
+    if o.contact_solver == "direct":
+        inputs = [m.physics, m.lane, d.schedule.dilation, d.hands, d.end, d.adjoint]
+        out.add(contact.direct_gradient, (d.capacity, m.lanes), inputs=inputs, outputs=[c])
 
 
 def add_penalties(out: Launches, m: Model, d: Data, *, room: float = 0.0) -> None:
     """Add penetration terms, and the gradient's transfer from points to bodies."""
-    add_object_penalty(out, m, d)
-    add_self_penalty(out, m, d, m.options.self_margin)
-    o, c = m.options, d.contacts
-    weight = [d.active, d.iteration, d.schedule.penetration]
-    contacts = [c.count, c.body, c.point, c.normal, c.distance, c.weight, c.gradient]
-    inputs, outputs = [o.pull, o.pull_length, m.lane, *weight, *contacts], [d.wrench, d.depths.points]
-    out.add(penalties.points_to_bodies, (d.capacity, m.lanes), inputs=inputs, outputs=outputs)
+    o, over = m.options, (d.capacity, m.pieces)
+    weight = [REFERENCE_SAMPLES / len(m.obj.samples), d.schedule.object_penetration]
+    inputs = [m.hand.pieces, m.obj.sorted_samples, *weight]
+    out.add(pieces.object_in_pieces, over, inputs=inputs, outputs=[d.hands, d.depths.object])
+    add_self_penalty(out, m, d, o.self_margin)
+    inputs = [o.pull, o.pull_length, m.lane, d.schedule.penetration, d.contacts]
+    out.add(penalties.points_to_bodies, (d.capacity, m.lanes), inputs=inputs, outputs=[d.hands, d.depths.points])
     if (around := m.obstacles) is None:
         return
-    out.add(obstacles.clear, d.capacity, inputs=[d.active], outputs=[d.depths.obstacles])
-    terms = [d.active, d.scene, d.iteration, d.schedule.penetration, *d.bodies, room]
-    outputs = [d.wrench, d.depths.obstacles]
-    inputs = [around.features, around.solids, *terms]
-    out.add(obstacles.penalty, (d.capacity, m.pieces), inputs=inputs, outputs=outputs)
+    terms, outputs = [d.schedule.penetration, room], [d.hands, d.depths.obstacles]
+    out.add(obstacles.penalty, over, inputs=[around.features, around.solids, *terms], outputs=outputs)
     if around.any_solid:
         inputs = [around.features, m.hand.pieces, around.solids, *terms]
-        out.add(solids.penalty, (d.capacity, m.pieces), inputs=inputs, outputs=outputs)
-
-
-def add_object_penalty(out: Launches, m: Model, d: Data) -> None:
-    """Add the term of the object's samples inside links."""
-    weight = [REFERENCE_SAMPLES / len(m.obj.samples), d.active, d.iteration, d.schedule.object_penetration]
-    inputs, outputs = [m.hand.pieces, m.obj.sorted_samples, *weight, *d.bodies], [d.wrench, d.depths.object]
-    out.add(pieces.object_in_pieces, (d.capacity, m.pieces), inputs=inputs, outputs=outputs)
+        out.add(solids.penalty, over, inputs=inputs, outputs=outputs)
 
 
 def add_self_penalty(out: Launches, m: Model, d: Data, margin: float) -> None:
     """Add the term of links inside links, or closer than `margin` [m]."""
-    weight = [m.self_scale, margin, d.active, d.iteration, d.schedule.self_penetration]
-    inputs, outputs = [m.hand.pieces, m.body_points, *weight, *d.bodies], [d.wrench, d.depths.links]
-    out.add(pieces.pieces_in_pieces, (d.capacity, m.pieces), inputs=inputs, outputs=outputs)
+    inputs = [m.hand.pieces, m.body_points, m.self_scale, margin, d.schedule.self_penetration]
+    out.add(pieces.pieces_in_pieces, (d.capacity, m.pieces), inputs=inputs, outputs=[d.hands, d.depths.links])
 
 
 def add_root_gradient(out: Launches, m: Model, d: Data) -> None:
     """Add the gradient with respect to root and joints, from the bodies' wrenches."""
-    inputs = [m.hand.tree, d.active, d.pivot, d.body_p, d.axis]
-    out.add(kinematics.backward, d.capacity, inputs=inputs, outputs=[d.wrench, d.gradient])
+    out.add(kinematics.backward, d.capacity, inputs=[m.hand.tree], outputs=[d.hands, d.gradient])
 
 
 def add_gradient(out: Launches, m: Model, d: Data) -> None:
     """Add the whole gradient: of the bodies' wrenches, and of the joints' penalties."""
     add_root_gradient(out, m, d)
     o = m.options
-    inputs = [m.hand.lower, m.hand.upper, o.range_weight, o.limit_weight, d.active, d.q]
+    inputs = [m.hand.lower, m.hand.upper, o.range_weight, o.limit_weight, d.hands]
     out.add(penalties.joints, (d.capacity, m.dofs), inputs=inputs, outputs=[d.gradient])
 
 
@@ -152,14 +133,11 @@ def add_step(
     """Add a step of the optimizer and advance the iteration; see `record_iteration`."""
     if optimizer not in OPTIMIZERS:
         raise InputError(f"unknown optimizer {optimizer!r}; choose one of {', '.join(OPTIMIZERS)}")
-    inputs = [m.hand.lower, m.hand.upper, d.active, d.iteration, d.schedule.rates, d.gradient]
-    if optimizer == "adam":
-        outputs = [d.first, d.second, *d.root_and_joints]
-        out.add(optimizers.adam, d.capacity, inputs=[*inputs, *betas], outputs=outputs)
-    else:
-        clamp = int(m.options.limit_weight == 0.0)
-        out.add(optimizers.gradient_descent, d.capacity, inputs=[*inputs, clamp], outputs=d.root_and_joints)
+    adam = optimizer == "adam"
+    kind = [int(adam), int(adam or m.options.limit_weight == 0.0), *betas]
+    inputs = [m.hand.lower, m.hand.upper, d.schedule.rates, d.gradient, *kind]
+    out.add(optimizers.descend, d.capacity, inputs=inputs, outputs=[d.first, d.second, d.hands])
     if patience:
-        inputs = [d.loss, d.depths.points, d.depths.object, d.depths.links, patience]
-        out.add(optimizers.converge, d.capacity, inputs=inputs, outputs=[d.best, d.waited, d.active])
+        inputs, outputs = [d.loss, d.depths, patience], [d.best, d.waited, d.active]
+        out.add(optimizers.converge, d.capacity, inputs=inputs, outputs=outputs)
     out.add(optimizers.advance, 1, inputs=[], outputs=[d.iteration])

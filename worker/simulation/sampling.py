@@ -9,6 +9,7 @@ import numpy as np
 from graspd.service.model.transforms import Floats
 from graspd.worker.hands import surface
 from graspd.worker.hands.surface import farthest_points
+from graspd.worker.objects import mesh_geometry
 from graspd.worker.objects.disk_cache import arrays_kept_or_made
 from graspd.worker.objects.model import ObjectModel
 
@@ -20,7 +21,7 @@ CANDIDATES, FEWER_CANDIDATES, MANY = 6, 3, 8_000
 
 def object_samples(obj: ObjectModel, count: int, *, seed: int = 0) -> Floats:
     """Return evenly spread points (count, 3) of the surface, its sharp edges included [m]; deterministic."""
-    code = (sys.modules[__name__], surface)
+    code = (sys.modules[__name__], mesh_geometry, surface)
     kept = arrays_kept_or_made(
         "object_samples", (obj.content, count, seed), code, lambda: {"points": _sampled(obj, count, seed)}
     )
@@ -34,11 +35,8 @@ def _sampled(obj: ObjectModel, count: int, seed: int) -> Floats:
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(cross, axis=1)
     faces = rng.choice(len(area), size=candidates, p=area / area.sum())
-    u, v = rng.random((2, candidates))
-    flip = u + v > 1
-    u, v = np.where(flip, 1 - u, u), np.where(flip, 1 - v, v)
-    a, b, c = (corners[faces, k] for k in range(3))
-    inner = a + u[:, None] * (b - a) + v[:, None] * (c - a)
+    u, v = rng.random((2, candidates, 1))
+    inner = mesh_geometry.points_in(corners[faces], u, v)
     edges = _edge_samples(obj, cross / area[:, None].clip(1e-18), count, rng)
     points = np.concatenate([edges, inner])
     return points[farthest_points(points, count)]

@@ -23,7 +23,7 @@ from graspd.worker.control.opening import (
     fingers_of_bodies,
     fingers_of_dofs,
 )
-from graspd.worker.control.postures import MAX_PRESSING, PRESSING_M
+from graspd.worker.control.postures import FRICTION, MAX_PRESSING, PRESSING_M
 from graspd.worker.control.squeeze import SPREAD, SUM, TORQUE
 from graspd.worker.grasps import Posture
 from graspd.worker.hands.jaws import slides
@@ -131,10 +131,8 @@ def _finger_depth(probe: Probe, hand_pose: Floats, paths: Floats) -> Floats:
     bodies = body_poses(probe.hand, np.repeat(hand_pose, steps, axis=0), joints)
     depth = probe.self_depth(bodies, probe.posed_points(bodies)).reshape(count, steps, -1).max(axis=1)
     out = np.zeros((count, count_fingers(probe.hand)))
-    for f in range(out.shape[1]):
-        mine = finger == f
-        if mine.any():
-            out[:, f] = depth[:, mine].max(axis=1)
+    for f in np.unique(finger[finger >= 0]):
+        out[:, f] = depth[:, finger == f].max(axis=1)
     return out
 
 
@@ -150,9 +148,7 @@ def _retreat(probe: Probe, hand_pose: Floats, q: Floats) -> Posture:
     return Posture(poses[np.arange(count), chosen], joints)
 
 
-def balanced(
-    probe: Probe, grasp: Posture, *, total_normal_force: float, friction: float, closing: float = 0.0
-) -> list[tuple[float, Floats]]:
+def balanced(probe: Probe, grasp: Posture, total: float, *, closing: float) -> list[tuple[float, Floats]]:
     """Residual and torques (D,) of the forces that balance in each grasp; least squares by SciPy."""
     found = probe.touch(grasp, reach=max(PRESSING_M, closing))
     pressing = probe.facing(found) & (found.distance < PRESSING_M)
@@ -165,19 +161,15 @@ def balanced(
         place, normal = found.closest[b], found.normal[b]
         chosen = choose_contacts(pressing[b], place, normal, scale=probe.obj.radius, limit=MAX_PRESSING)
         contacts = (found.bodies[b], probe.points.body[chosen], place[chosen], -normal[chosen])
-        out.append(_balanced(probe, *contacts, total_normal_force, friction) if len(chosen) else _nothing(probe.hand))
+        out.append(_balanced(probe, *contacts, total) if len(chosen) else (1.0, np.zeros(probe.hand.dofs)))
     return out
 
 
-def _nothing(hand: HandModel) -> tuple[float, Floats]:
-    return 1.0, np.zeros(hand.dofs)
-
-
 def _balanced(
-    probe: Probe, bodies: Floats, body: NDArray[np.int32], place: Floats, normal: Floats, total: float, friction: float
+    probe: Probe, bodies: Floats, body: NDArray[np.int32], place: Floats, normal: Floats, total: float
 ) -> tuple[float, Floats]:
     hand, obj = probe.hand, probe.obj
-    edge = wrenches(place, normal, friction=friction, centre=obj.centre_of_mass, radius=obj.radius)
+    edge = wrenches(place, normal, friction=FRICTION, centre=obj.centre_of_mass, radius=obj.radius)
     torque = generalized_forces(hand, bodies, body, place, edge[..., :3]).reshape(-1, hand.dofs)
     edge = edge.reshape(-1, 6)
     effort = torque / hand.effort

@@ -219,24 +219,21 @@ def test_hands_open_as_in_numpy(case: tuple[HandModel, Probe, Posture]) -> None:
     assert 0 < retreated.sum() < len(grasp)
 
 
-def test_forces_balance_as_in_numpy(case: tuple[HandModel, Probe, Posture]) -> None:
+def test_forces_balance_and_idle_fingers_close_as_in_numpy(case: tuple[HandModel, Probe, Posture]) -> None:
     hand, probe, grasp = case
     held = hold_forces(hand, OBJ, grasp, total_normal_force=20.0, friction=0.3)
-    wanted = reference.balanced(probe, grasp, total_normal_force=20.0, friction=0.3)
-    # Both least squares are exact but for rounding: see test_balance.
-    np.testing.assert_allclose(held.residual, [residual for residual, _ in wanted], atol=1e-8)
-    np.testing.assert_allclose(held.torque, [torque for _, torque in wanted], atol=1e-7)
-    assert 0 < np.count_nonzero(held.residual < 1.0) < len(grasp)
-
-
-def test_fingers_that_stand_off_close_as_in_numpy(case: tuple[HandModel, Probe, Posture]) -> None:
-    hand, probe, grasp = case
-    wanted = reference.balanced(probe, grasp, total_normal_force=20.0, friction=0.3, closing=CLOSING_M)
-    near = reference.balanced(probe, grasp, total_normal_force=20.0, friction=0.3)
     command = squeeze(hand, OBJ, grasp, total_normal_force=20.0)
     pressed = (hand.reduce(command.joint_positions) - hand.reduce(grasp.joint_positions)) * hand.stiffness
-    np.testing.assert_allclose(pressed, [torque for _, torque in wanted], atol=1e-7)
-    assert any(np.abs(a - b).max() > 1e-3 for (_, a), (_, b) in zip(near, wanted, strict=True))
+    (residual, torque), (_, closing) = (
+        map(np.array, zip(*reference.balanced(probe, grasp, 20.0, closing=reach), strict=True))
+        for reach in (0.0, CLOSING_M)
+    )
+    # Both least squares are exact but for rounding: see test_weights_are_scipy_s.
+    np.testing.assert_allclose(held.residual, residual, atol=1e-8)
+    np.testing.assert_allclose(held.torque, torque, atol=1e-7)
+    np.testing.assert_allclose(pressed, closing, atol=1e-7)
+    assert 0 < np.count_nonzero(held.residual < 1.0) < len(grasp)
+    assert np.abs(torque - closing).max() > 1e-3
 
 
 def test_links_in_contact_are_counted_as_in_numpy(case: tuple[HandModel, Probe, Posture]) -> None:

@@ -62,15 +62,9 @@ def taken(
     def seat(rows: np.ndarray, which: np.ndarray) -> Refinements:
         assert (rows // each == which[:, None]).all()
         seats.extend(rows.ravel().tolist())
-        state = HandState(
-            np.repeat(rows.ravel()[:, None], 3, axis=1).astype(float),
-            np.zeros((rows.size, 4)),
-            np.zeros((rows.size, 2)),
-        )
-        flat_rows = rows.ravel()
-        return Refinements(
-            state, flat_rows.astype(float), worth[flat_rows].astype(float), np.isin(flat_rows, infeasible)
-        )
+        each_row = rows.ravel().astype(float)
+        state = HandState(np.repeat(each_row[:, None], 3, axis=1), np.zeros((rows.size, 4)), np.zeros((rows.size, 2)))
+        return Refinements(state, each_row, worth[rows.ravel()].astype(float), np.isin(each_row, infeasible))
 
     placed = PlacedGrasps(TABLE, np.tile([0, 0, 0, 1.0, 0, 0, 0], (n, 1)), np.arange(n))
     found = candidates.tried(two_finger_hand(), ball(), np.arange(n * each).reshape(n, each), seat, placed, rollout)
@@ -119,11 +113,8 @@ def test_the_others_are_seated_only_where_the_first_two_fail(monkeypatch: pytest
 def scene():
     hand, obj = hand_from_path("barrett"), object_from_path("block", face_error_m=QUICK.face_error_m)
     spec = SceneSpec(kind="table")
-    return (
-        hand,
-        obj,
-        PlacedGrasps(supports_of(spec), rest_poses(spec, obj, count=2, seed=1)["scene/object_pose"], np.arange(4) % 2),
-    )
+    poses = rest_poses(spec, obj, count=2, seed=1)["scene/object_pose"]
+    return hand, obj, PlacedGrasps(supports_of(spec), poses, np.arange(4) % 2)
 
 
 def test_trial_keeps_what_holds_and_finds_more_whatever_threads(scene) -> None:
@@ -139,6 +130,11 @@ def test_trial_keeps_what_holds_and_finds_more_whatever_threads(scene) -> None:
     held, before = rollout(one, placed) < 1.0 + SLIPS, rollout(plain, placed) < 1.0 + SLIPS
     assert held.any()
     assert (held >= before).all()
+
+
+def always(score: float):
+    """A rollout in which every grasp has this score."""
+    return lambda grasps, *_: np.full(len(grasps), score)
 
 
 @pytest.fixture
@@ -158,7 +154,7 @@ def attempts(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 @pytest.mark.parametrize(("score", "made"), [(0.5, 1), (1.5, 3), (9.0, 6)])
 def test_in_scenes_a_grasp_sets_out_again_while_it_fails(scene, attempts: list[int], score: float, made: int) -> None:
     hand, obj, placed = scene
-    wanted = PlanRequest(4, QUICK, seed=4, placed=placed, rollout=lambda grasps, *_: np.full(len(grasps), score))
+    wanted = PlanRequest(4, QUICK, seed=4, placed=placed, rollout=always(score))
     found = synthesize(hand, obj, wanted, ExecutionContext(threads=1))
     assert sorted(attempts) == sorted([*range(made)] * 4)
     assert found.attempts == 4 * made
@@ -239,24 +235,17 @@ def test_a_grasp_nobody_holds_sets_out_as_often_as_it_may(free, attempts: list[i
     assert len(found) == 1
 
 
-@pytest.mark.parametrize(("score", "made"), [(0.1, 1), (0.7, 2), (1.5, 2)])
-def test_a_grasp_that_may_slip_at_half_friction_has_one_retry(
-    free, attempts: list[int], score: float, made: int
+@pytest.mark.parametrize(
+    ("score", "off", "made"),
+    [(0.1, False, 1), (0.7, False, 2), (1.5, False, 2), (0.1, True, 3), (1.5, True, 3), (2.5, True, 1 + len(FREE))],
+)
+def test_grasps_that_slip_or_stand_off_have_retries(
+    free, attempts: list[int], monkeypatch: pytest.MonkeyPatch, score: float, off: bool, made: int
 ) -> None:
     hand, obj, wanted, _ = free
-    rollout = lambda grasps, *_: np.full(len(grasps), score)  # noqa: E731
-    synthesize(hand, obj, replace(wanted, count=1, rollout=rollout), ExecutionContext(threads=1))
-    assert attempts == list(range(made))
-
-
-@pytest.mark.parametrize(("score", "made"), [(0.1, 3), (1.5, 3), (2.5, 1 + len(FREE))])
-def test_a_grasp_whose_finger_stands_off_sets_out_again(
-    free, attempts: list[int], monkeypatch: pytest.MonkeyPatch, score: float, made: int
-) -> None:
-    hand, obj, wanted, _ = free
-    monkeypatch.setattr(planner, "standing_off", lambda hand, obj, grasp, **_: np.ones(len(grasp), bool))
-    rollout = lambda grasps, *_: np.full(len(grasps), score)  # noqa: E731
-    synthesize(hand, obj, replace(wanted, count=1, rollout=rollout), ExecutionContext(threads=1))
+    if off:
+        monkeypatch.setattr(planner, "standing_off", lambda hand, obj, grasp, **_: np.ones(len(grasp), bool))
+    synthesize(hand, obj, replace(wanted, count=1, rollout=always(score)), ExecutionContext(threads=1))
     assert attempts == list(range(made))
 
 
@@ -289,7 +278,7 @@ def test_hands_are_drawn_to_an_object_at_their_first_start_alone(free, monkeypat
 
     monkeypatch.setattr(planner, "_work", watched)
     monkeypatch.setattr(planner, "FREE", (FAILED, FAILED))
-    never = replace(wanted, count=1, rollout=lambda grasps, *_: np.full(len(grasps), 9.0))
+    never = replace(wanted, count=1, rollout=always(9.0))
     synthesize(hand, obj, never, ExecutionContext(threads=1))
     assert pulls[0] == (PULL, PULL)
     assert len(pulls) > 1

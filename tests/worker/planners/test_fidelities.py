@@ -1,14 +1,9 @@
-"""One process that works at several fidelities gives what fresh ones give: no cache serves one's mesh to another.
-
-`python -m tests.worker.planners.test_fidelities method:fidelity ...` makes them in that order and prints their digests.
-"""
+"""One process that works at several fidelities gives what fresh ones give: no cache serves one's mesh to another."""
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from typing import Any
 
 import pytest
@@ -24,16 +19,8 @@ from graspd.worker.planners.port import PlanRequest
 from graspd.worker.quality.table import measure
 
 #: Knobs that make a call short; the mesh, which is what the fidelities here differ in, stays theirs.
-SHORT: dict[str, Any] = {
-    "starts": 1,
-    "finalists": 1,
-    "coarse_points": 64,
-    "fine_points": 64,
-    "object_points": 64,
-    "coarse_iterations": 3,
-    "fine_iterations": 2,
-    "polish_iterations": 1,
-}
+SHORT: dict[str, Any] = dict.fromkeys(("coarse_points", "fine_points", "object_points"), 64)
+SHORT |= {"starts": 1, "finalists": 1, "coarse_iterations": 3, "fine_iterations": 2, "polish_iterations": 1}
 METHODS = sorted(name for name in PLANNERS if method(name).free)
 PAIR = ("draft", "fine")
 
@@ -72,28 +59,16 @@ def all_made(wanted: list[str]) -> dict[str, dict[str, str]]:
     return found
 
 
-def in_a_fresh_process(wanted: list[str]) -> dict[str, dict[str, str]]:
-    command = [sys.executable, "-m", "tests.worker.planners.test_fidelities", *wanted]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=600)
-    assert done.returncode == 0, done.stderr
-    found: dict[str, dict[str, str]] = json.loads(done.stdout.splitlines()[-1])
-    return found
-
-
 @pytest.mark.slow
 def test_every_method_in_one_process_is_as_in_fresh_ones() -> None:
     apart = [[f"{name}:{level}" for name in METHODS] for level in PAIR]
     # The other way round in methods, so that what methods share is met in another order, too.
     mixed = [f"{name}:{level}" for name in reversed(METHODS) for level in PAIR]
-    with ThreadPoolExecutor(2) as pool:
-        told = pool.map(in_a_fresh_process, apart)
+    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
+        told = pool.map(all_made, apart)
         # This process has made other things before, and its caches are as full as any.
         together = all_made(mixed)
         fresh = list(told)
     assert together == {key: value for found in fresh for key, value in found.items()}
     coarse, fine = (fresh[k][f"autograsp:{level}"] for k, level in enumerate(PAIR))
     assert coarse["faces"] != fine["faces"] and coarse["grasp"] != fine["grasp"]
-
-
-if __name__ == "__main__":
-    print(json.dumps(all_made(sys.argv[1:])))

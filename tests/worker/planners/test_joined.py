@@ -32,8 +32,12 @@ def pair():
     return hand_from_path("barrett"), object_from_path("block", face_error_m=QUICK.face_error_m)
 
 
-def made(pair, asked: list[BatchRequest]) -> list[GraspSet | Exception]:
-    return plan_joined(*pair, asked)
+ONE = ExecutionContext(threads=1)
+
+
+def made(pair, wanted: list[PlanRequest], *runs: ExecutionContext) -> list[GraspSet | Exception]:
+    """The batches of one launch; those beyond the given contexts have one thread."""
+    return plan_joined(*pair, list(map(BatchRequest, wanted, [*runs, *[ONE] * (len(wanted) - len(runs))])))
 
 
 def assert_same(one: GraspSet | Exception, other: GraspSet) -> None:
@@ -45,14 +49,13 @@ def assert_same(one: GraspSet | Exception, other: GraspSet) -> None:
 @pytest.mark.parametrize("threads", [1, 2])
 def test_joined_batches_are_those_of_separate_launches(pair, threads: int) -> None:
     wanted = [PlanRequest(5, QUICK, 1, 0), PlanRequest(3, QUICK, 1, 1), PlanRequest(4, QUICK, 7, 1 << 20)]
-    joined = made(pair, [BatchRequest(one, ExecutionContext(threads=threads)) for one in wanted])
-    for one, alone in zip(joined, wanted, strict=True):
-        assert_same(one, synthesize(*pair, alone, ExecutionContext(threads=1)))
+    for one, alone in zip(made(pair, wanted, *[ExecutionContext(threads=threads)] * 3), wanted, strict=True):
+        assert_same(one, synthesize(*pair, alone, ONE))
 
 
 def test_a_launch_without_memory_is_halved_across_batches(pair, monkeypatch: pytest.MonkeyPatch) -> None:
     wanted = [PlanRequest(3, QUICK, 1, 0), PlanRequest(3, QUICK, 1, 1)]
-    alone = [synthesize(*pair, one, ExecutionContext(threads=1)) for one in wanted]
+    alone = [synthesize(*pair, one, ONE) for one in wanted]
 
     class Small(planner.Data):
         """Of a device with room for two grasps."""
@@ -63,9 +66,7 @@ def test_a_launch_without_memory_is_halved_across_batches(pair, monkeypatch: pyt
             super().__init__(model, capacity)  # type: ignore[arg-type]
 
     monkeypatch.setattr(planner, "Data", Small)
-    for one, other in zip(
-        made(pair, [BatchRequest(one, ExecutionContext(threads=1)) for one in wanted]), alone, strict=True
-    ):
+    for one, other in zip(made(pair, wanted), alone, strict=True):
         assert_same(one, other)
 
 
@@ -93,35 +94,29 @@ def test_what_is_matter_with_one_batch_leaves_others_as_they_are(pair) -> None:
         PlanRequest(2, QUICK, 1, 3, on_table(obj, 2, 3), good_enough),
         PlanRequest(3, QUICK, 2, 0, on_table(obj, 3, 4), good_enough),
     ]
-    asked = [
-        BatchRequest(one, ExecutionContext(threads=1, cancelled=lambda k=k: k == 3)) for k, one in enumerate(wanted)
-    ]
-    buried, first, broken, stopped, last = made(pair, asked)
+    stopping = ExecutionContext(threads=1, cancelled=lambda: True)
+    buried, first, broken, stopped, last = made(pair, wanted, ONE, ONE, ONE, stopping)
     assert isinstance(buried, InputError) and "nothing can reach" in str(buried)
     assert isinstance(broken, MeshError)
     assert isinstance(stopped, TaskCancelled)
     for joined, alone in ((first, wanted[1]), (last, wanted[4])):
-        assert_same(joined, synthesize(hand, obj, alone, ExecutionContext(threads=1)))
+        assert_same(joined, synthesize(hand, obj, alone, ONE))
 
 
 def test_a_batch_that_is_cancelled_leaves_the_others_alone(pair) -> None:
     wanted = [PlanRequest(2, QUICK, 1, 0), PlanRequest(2, QUICK, 1, 1)]
     told: list[str] = []
-    stopping = ExecutionContext(
-        threads=1,
-        progress=lambda done, total, message: told.append(message),
-        cancelled=lambda: any("coarse" in one for one in told),
-    )
-    stopped, kept = made(
-        pair, [BatchRequest(wanted[0], stopping), BatchRequest(wanted[1], ExecutionContext(threads=1))]
-    )
+
+    def tell(done: float, total: float, message: str) -> None:
+        told.append(message)
+
+    stopping = ExecutionContext(threads=1, progress=tell, cancelled=lambda: any("coarse" in one for one in told))
+    stopped, kept = made(pair, wanted, stopping)
     assert isinstance(stopped, TaskCancelled)
     assert told == ["starts", "coarse optimization"]
-    assert_same(kept, synthesize(*pair, wanted[1], ExecutionContext(threads=1)))
+    assert_same(kept, synthesize(*pair, wanted[1], ONE))
     # Where all are cancelled the launch ends.
     told.clear()
-    run = ExecutionContext(
-        threads=1, progress=lambda done, total, message: told.append(message), cancelled=lambda: bool(told)
-    )
-    assert all(isinstance(one, TaskCancelled) for one in made(pair, [BatchRequest(one, run) for one in wanted]))
+    run = ExecutionContext(threads=1, progress=tell, cancelled=lambda: bool(told))
+    assert all(isinstance(one, TaskCancelled) for one in made(pair, wanted, run, run))
     assert told == ["starts"]

@@ -38,9 +38,16 @@ SIDES = (0.1, 0.24, 0.24)
 HALF = SIDES[0] / 2
 
 
-def model_of(sides: tuple[float, float, float]) -> Model:
-    pair = pair_of(hand_from_path("allegro"), object_of(trimesh.creation.box(sides)), FIDELITIES["draft"], "cpu")
+DRAFT = FIDELITIES["draft"]
+
+
+def draft_model(hand: HandModel, obj: ObjectModel) -> Model:
+    pair = pair_of(hand, obj, DRAFT, "cpu")
     return pair.model(pair.coarse)
+
+
+def model_of(sides: tuple[float, float, float]) -> Model:
+    return draft_model(hand_from_path("allegro"), object_of(trimesh.creation.box(sides)))
 
 
 @pytest.fixture(scope="module")
@@ -69,23 +76,17 @@ def test_every_second_start_has_fingers_on_both_sides_of_a_box(model: Model) -> 
     assert reaching > looking + 0.2
 
 
-def test_a_start_does_not_depend_on_those_drawn_beside_it(model: Model) -> None:
+def test_starts_do_not_depend_on_others_and_draws_go_on(model: Model) -> None:
     reaching = ReachSampling.of(model)
     assert reaching is not None
-    seeds, first = np.array([5, 6, 7], np.int32), np.zeros(3, np.int32)
-    together, numbers = reaching.starts(seeds, first, np.array(RETREATS))
-    for i in range(3):
-        alone, number = reaching.starts(seeds[i : i + 1], first[:1], np.array(RETREATS))
-        assert number[0] == numbers[i]
+    seeds, first, retreats = np.arange(8, dtype=np.int32), np.zeros(8, np.int32), np.array(RETREATS)
+    found, number = reaching.starts(seeds, first, retreats)
+    for i in (0, 3, 7):
+        alone, draw = reaching.starts(seeds[i : i + 1], first[:1], retreats)
+        assert draw[0] == number[i]
         for name in ("pivot", "rotation", "q"):
-            np.testing.assert_array_equal(getattr(alone, name)[0], getattr(together, name)[i])
-
-
-def test_draws_go_on_where_the_last_one_ended(model: Model) -> None:
-    reaching = ReachSampling.of(model)
-    assert reaching is not None
-    seeds, retreats = np.arange(8, dtype=np.int32), np.array(RETREATS)
-    found, number = reaching.starts(seeds, np.zeros(8, np.int32), retreats)
+            np.testing.assert_array_equal(getattr(alone, name)[0], getattr(found, name)[i])
+    # Draws go on where the last one ended.
     again, same = reaching.starts(seeds, number, retreats)
     later, after = reaching.starts(seeds, number + 1, retreats)
     np.testing.assert_array_equal(same, number)
@@ -129,9 +130,6 @@ def test_draws_are_those_of_each_generator_alone_and_look_at_the_object() -> Non
         np.testing.assert_array_equal(alone.q[0], state.q[i])
 
 
-DRAFT = FIDELITIES["draft"]
-
-
 @pytest.fixture(scope="module")
 def cube() -> ObjectModel:
     return object_of(trimesh.creation.box((0.06, 0.06, 0.06)))
@@ -141,11 +139,6 @@ def cube() -> ObjectModel:
 def ring() -> HandModel:
     """Its six fingers stand side by side."""
     return ring_hand(6)
-
-
-def draft_model(hand: HandModel, obj: ObjectModel) -> Model:
-    pair = pair_of(hand, obj, DRAFT, "cpu")
-    return pair.model(pair.coarse)
 
 
 def test_a_ring_of_six_has_a_place_only_when_it_opens(ring: HandModel, cube: ObjectModel) -> None:
@@ -170,7 +163,7 @@ def test_a_hand_that_has_a_place_keeps_it(cube: ObjectModel) -> None:
 @pytest.mark.parametrize("threads", [1, 3])
 def test_a_grasp_that_opened_does_not_depend_on_its_batch(ring: HandModel, cube: ObjectModel, threads: int) -> None:
     run = ExecutionContext(threads=threads)
-    many = synthesize(ring, cube, PlanRequest(5, DRAFT, seed=3), run).grasp
-    few = synthesize(ring, cube, PlanRequest(2, DRAFT, seed=3), run).grasp
+    many = synthesize(ring, cube, PlanRequest(5, FIDELITIES["draft"], seed=3), run).grasp
+    few = synthesize(ring, cube, PlanRequest(2, FIDELITIES["draft"], seed=3), run).grasp
     np.testing.assert_array_equal(many.hand_pose[:2], few.hand_pose)
     np.testing.assert_array_equal(many.joint_positions[:2], few.joint_positions)

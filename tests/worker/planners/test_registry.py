@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from importlib import metadata
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import pytest
 
 from graspd.service.model.domain import FREE_ONLY_METHODS
 from graspd.service.model.errors import InputError
-from graspd.worker.planners import PLANNERS, method, method_names, planner, registry
+from graspd.worker.planners import PLANNERS, method, method_names, planner
 from graspd.worker.planners.port import Method
 
 
@@ -42,26 +43,26 @@ def test_a_wrong_option_is_refused_with_those_there_are(options: dict[str, objec
         planner("autograsp", options)
 
 
-def offer(monkeypatch: pytest.MonkeyPatch, name: str, value: str) -> None:
-    monkeypatch.setattr(registry, "entry_points", lambda group: [EntryPoint(name, value, group)])
-
-
-def test_a_planner_of_another_package_is_found_by_its_entry_point(monkeypatch: pytest.MonkeyPatch) -> None:
-    offer(monkeypatch, "theirs", "graspd.baselines.autograsp.method:METHOD")
-    assert "theirs" in method_names()
-    assert isinstance(method("theirs"), Method)
-
-
-def test_another_package_cannot_take_the_name_of_a_method_of_graspds_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    offer(monkeypatch, "fast_graspd", "graspd.baselines.autograsp.method:METHOD")
-    assert "Fast-Grasp'D" in method("fast_graspd").source
-
-
-@pytest.mark.parametrize("value", ["no.such.module:METHOD", "graspd.worker.planners:GROUP"])
-def test_an_entry_point_that_is_no_method_is_named_in_the_error(monkeypatch: pytest.MonkeyPatch, value: str) -> None:
-    offer(monkeypatch, "theirs", value)
-    with pytest.raises(InputError, match="theirs"):
-        method("theirs")
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("theirs", "graspd.baselines.autograsp.method:METHOD", None),
+        ("theirs", "no.such.module:METHOD", "theirs"),
+        ("theirs", "graspd.worker.planners:GROUP", "theirs"),
+        ("fast_graspd", "graspd.baselines.autograsp.method:METHOD", None),
+    ],
+)
+def test_entry_points_of_other_packages_are_methods_or_refused(
+    monkeypatch: pytest.MonkeyPatch, name: str, value: str, message: str | None
+) -> None:
+    monkeypatch.setattr(metadata, "entry_points", lambda group: [EntryPoint(name, value, group)])
+    assert name in method_names()
+    if message is None:
+        assert isinstance(method(name), Method)
+    else:
+        with pytest.raises(InputError, match=message):
+            method(name)
+    assert "Fast-Grasp'D" in method("fast_graspd").source, "nobody takes the name of a method of graspd's own"
     with pytest.raises(InputError, match=r"unknown method 'magic'.*fast_graspd"):
         method("magic")
 

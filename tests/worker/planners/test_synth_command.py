@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 
 import graspd
 from graspd.cli import build
+from graspd.commands.synth import _said
 from graspd.service.cli import write_output
 from graspd.service.model.errors import ConflictError, NotFoundError
 from graspd.service.readers import Grasps, open_shards
@@ -83,6 +84,8 @@ def test_grasps_that_nobody_validated_are_sound_and_never_valid(unvalidated: tup
     assert (said["grasps"], said["valid"], said["feasible"], said["validation"]) == (3, 0, 3, "none")
     assert shard.attributes["verdict_level"] == "none" and "quality/success" not in shard.arrays
     assert not shard["quality/valid"].any()
+    line = _said({"file": "g.h5", **said})
+    assert "3 feasible of" in line and "not validated" in line and not re.search(r"\bvalid\b", line)
 
 
 def test_evaluate_gives_a_verdict_of_each_grasp_that_agrees(validated: tuple[Path, Any]) -> None:
@@ -116,22 +119,11 @@ def test_export_and_pictures_take_grasps_that_nobody_validated_only_when_told(
     assert run(*words, "--unvalidated").exit_code == 0
 
 
-def test_the_line_for_people_says_that_nobody_validated(tmp_path: Path) -> None:
-    words = f"synth --hand allegro --object block -n 1 {DRAFT} --validation none -o"
-    done = run(*words.split(), tmp_path / "g.h5")
-    assert "1 feasible of" in done.stdout and "not validated" in done.stdout
-    assert not re.search(r"\bvalid\b", done.stdout)
-
-
 @pytest.mark.parametrize("words", [("--want", "good"), ("--validation", "validate")])
 def test_a_word_that_is_none_is_refused_before_the_files_are_read(words: tuple[str, str], tmp_path: Path) -> None:
     done = run("synth", "--hand", "absent.urdf", "--object", "block", "-o", tmp_path / "g.h5", *words)
     assert done.exit_code == 2
     assert f"{words[0]}: must be one of" in done.output
-
-
-def test_an_object_is_named_after_its_folder_where_the_file_says_nothing(of_own_mesh: Path) -> None:
-    assert read_shard(of_own_mesh).attributes["object"] == "brick"
 
 
 def elsewhere(file: Path, folder: Path) -> Shard:
@@ -166,6 +158,7 @@ def test_a_file_of_the_right_name_and_another_content_is_not_taken(
 
 def test_a_given_file_is_read_with_the_options_of_the_shard(of_own_mesh: Path, own_mesh: Path) -> None:
     shard = read_shard(of_own_mesh)
+    assert shard.attributes["object"] == "brick", "named after its folder"
     assert object_of_shard(shard, str(own_mesh)).digest == shard.attributes["object_digest"]
     with pytest.raises(ConflictError):
         object_of_shard(shard, "mug")

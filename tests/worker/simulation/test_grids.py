@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from graspd.service import user_cache
 from graspd.worker.objects import disk_cache
 from graspd.worker.simulation import grids, kernels
 from graspd.worker.simulation.device import DeviceObject
@@ -68,16 +67,6 @@ def test_another_cell_faces_or_binary_is_another_grid(computed: list[Any], monke
     assert len(computed) == 4 and coarse["field"].size < grid()["field"].size
 
 
-def test_a_file_that_was_cut_off_is_none(computed: list[Any], own_cache: Path) -> None:
-    first = grid()
-    (file,) = own_cache.iterdir()
-    whole = file.read_bytes()
-    for size in (0, 40, len(whole) - 1):
-        file.write_bytes(whole[:size])
-        assert same(grid(), first)
-    assert len(computed) == 4 and file.read_bytes() == whole
-
-
 @pytest.mark.parametrize(
     "harm",
     [
@@ -107,14 +96,3 @@ def test_an_entry_that_would_lead_kernels_astray_is_made_again(
     disk_cache._write(file, arrays)
     assert same(grid(), first) and len(computed) == 2
     assert same(grid(), first) and len(computed) == 2, "the entry is whole again"
-
-
-def test_where_nothing_can_be_kept_the_grid_is_the_same(computed: list[Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    first = grid()
-    monkeypatch.setattr(user_cache, "load", lambda file: None)
-    monkeypatch.setattr(user_cache, "write_whole", refused)
-    assert same(grid(), first) and len(computed) == 2
-
-
-def refused(file: Path, content: bytes) -> None:
-    raise OSError("read-only")

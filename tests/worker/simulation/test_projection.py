@@ -1,4 +1,4 @@
-"""The projection's steps against NumPy; the order of threads and CUDA graphs move no bit."""
+"""The projection's steps against NumPy, its sums in integers; the order of threads and CUDA graphs move no bit."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from graspd.worker.planners import PlanRequest
 from graspd.worker.planners.fast_graspd import planner
 from graspd.worker.planners.fast_graspd.candidates import posture_of
 from graspd.worker.simulation import launches
-from graspd.worker.simulation.data import Data, HandState, still_schedule
+from graspd.worker.simulation.data import Data, HandState, allocate_contacts, still_schedule
 from graspd.worker.simulation.device import DeviceHand, DeviceObject
 from graspd.worker.simulation.kernels import packing, wrenches
 from graspd.worker.simulation.kernels import projection as kernels
@@ -117,27 +117,6 @@ def test_a_step_solves_them() -> None:
         np.testing.assert_allclose(moved.q[b], q, atol=10 * SINGLE)
 
 
-def test_the_order_of_residuals_moves_no_bit() -> None:
-    state = pressing()
-    found = evaluated(state)
-    before = found.matrix.numpy().copy(), found.vector.numpy().copy()
-    rng = np.random.default_rng(0)
-    r: Any = found.residuals
-    for b, count in enumerate(r.count.numpy()):
-        order = rng.permutation(int(count))
-        for name in ("body", "other", "point", "direction", "value", "weight"):
-            array = getattr(r, name).numpy()
-            array[b, :count] = array[b, order]
-    for sums in (found.matrix, found.vector):
-        sums.zero_()
-    d, m = found.data, found.model
-    inputs = [m.hand.tree, found._lane, d.active, d.pivot, d.body_p, d.axis, r]
-    outputs = [found._row, found.matrix, found.vector]
-    wp.launch(kernels.normal_equations, (HANDS, found._lanes), inputs=inputs, outputs=outputs, device="cpu")
-    np.testing.assert_array_equal(found.matrix.numpy(), before[0])
-    np.testing.assert_array_equal(found.vector.numpy(), before[1])
-
-
 def test_hands_without_penetration_stay_where_they_are() -> None:
     state = pressing()
     state.pivot[:, 2] -= 0.2
@@ -174,10 +153,10 @@ def test_wrenches_add_up_with_the_same_bits_in_any_order() -> None:
     assert (plain != other).any()
     assert (summed(forces) == summed(shuffled)).all()
     forces = np.random.default_rng(6).normal(size=(300, 3)).astype(np.float32)
-    found = summed(forces) * wrenches.UNIT
+    force, torque = np.split(summed(forces) * wrenches.UNIT, 2)
     # Each addend loses less than one count, and the tenth is rounded to float32.
-    np.testing.assert_allclose(found[:3], forces.astype(float).sum(axis=0), atol=300 * wrenches.UNIT)
-    np.testing.assert_allclose(found[3:], 0.1 * forces.astype(float).sum(axis=0), atol=1e-5)
+    np.testing.assert_allclose(force, forces.astype(float).sum(axis=0), atol=300 * wrenches.UNIT)
+    np.testing.assert_allclose(torque, 0.1 * forces.astype(float).sum(axis=0), atol=1e-5)
     assert (summed(np.array([[np.nan, np.inf, -np.inf]])) == 0).all()
 
 
@@ -187,28 +166,25 @@ def test_marked_points_get_the_slots_of_a_counter(count: int) -> None:
     mark = rng.integers(0, 3, (4, count)).astype(np.int32)
     active = wp.array([1, 1, 0, 1], dtype=wp.int32)
     counts = [wp.zeros((4, -(-count // packing.CHUNK)), dtype=wp.int32) for _ in range(2)]
-    marked = wp.array(mark)
-    wp.launch(packing.count_marks, counts[0].shape, inputs=[active, marked], outputs=counts, device="cpu")
-    index = wp.array(np.tile(np.arange(count, dtype=np.int32), (4, 1)))
-    point, real = wp.zeros((4, count), dtype=wp.vec3), wp.zeros((4, count), dtype=wp.float32)
-    body, near = (wp.full((4, count), -1, dtype=wp.int32) for _ in range(2))
-    totals = [wp.full(4, -1, dtype=wp.int32) for _ in range(2)]
-    inputs = [active, marked, *counts, index, point, point, real, real]
-    outputs = [totals[0], body, point, point, real, real, real, totals[1], near]
-    wp.launch(packing.pack, (4, count), inputs=inputs, outputs=outputs, device="cpu")
+    marked, packed = allocate_contacts(4, count, marked=True), allocate_contacts(4, count)
+    marked.mark.assign(mark)
+    marked.body.assign(np.tile(np.arange(count, dtype=np.int32), (4, 1)))
+    packed.count.fill_(-1)
+    wp.launch(packing.count_marks, counts[0].shape, inputs=[active, marked.mark], outputs=counts, device="cpu")
+    wp.launch(packing.pack, (4, count), inputs=[active, marked, *counts], outputs=[packed], device="cpu")
     for b in (0, 1, 3):
         kept, close = np.flatnonzero(mark[b]), np.flatnonzero(mark[b] == packing.NEAR)
-        assert totals[0].numpy()[b] == len(kept)
-        assert totals[1].numpy()[b] == len(close)
-        assert (body.numpy()[b, : len(kept)] == kept).all()
-        assert (kept[near.numpy()[b, : len(close)]] == close).all()
-    assert totals[0].numpy()[2] == -1
+        assert packed.count.numpy()[b] == len(kept)
+        assert packed.near_count.numpy()[b] == len(close)
+        assert (packed.body.numpy()[b, : len(kept)] == kept).all()
+        assert (kept[packed.near.numpy()[b, : len(close)]] == close).all()
+    assert packed.count.numpy()[2] == -1
 
 
 def planned() -> planner.LaunchPart:
     box = object_from_mesh(trimesh.creation.box((0.05, 0.05, 0.08)))
     request, run = PlanRequest(2, FIDELITY, seed=3), ExecutionContext("cpu", threads=1)
-    (part,) = planner.optimise_batch(two_finger_hand(), box, request, run)
+    (part,) = planner.optimise_batch(HAND, box, request, run)
     return part
 
 
@@ -272,36 +248,24 @@ def forbid_the_host(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return broken
 
 
-def test_replayed_graphs_give_the_very_hands_of_plain_launches(monkeypatch: pytest.MonkeyPatch) -> None:
-    plain = planned()
-    graphs = Graphs(monkeypatch)
+def opened() -> Posture:
+    """Pregrasps of hands in touch: one that opens along its normals, one that has to open plainly."""
+    grasp = Posture(np.tile([0, 0, -0.095, 1.0, 0, 0, 0], (2, 1)), np.array([[0.4, 0.4], [0.1, 0.8]]))
+    return pregrasp(HAND, BOX, grasp)
+
+
+def test_replayed_graphs_give_the_hands_of_plain_launches(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing on the host is touched between two launches."""
+    plain, plainly_opened = planned(), opened()
+    graphs, broken = Graphs(monkeypatch), forbid_the_host(monkeypatch)
     replayed = planned()
     assert graphs.captured == 3  # the coarse and the fine phase, and the projection
     steps = FIDELITY.coarse_iterations + FIDELITY.fine_iterations + FIDELITY.polish_iterations
     assert graphs.replayed == steps
     check_same(plain.state, replayed.state)
-
-
-def opened() -> Posture:
-    """Pregrasps of hands in touch: one that opens along its normals, one that has to open plainly."""
-    hand, box = two_finger_hand(), object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))
-    grasp = Posture(np.tile([0, 0, -0.095, 1.0, 0, 0, 0], (2, 1)), np.array([[0.4, 0.4], [0.1, 0.8]]))
-    return pregrasp(hand, box, grasp)
-
-
-def test_replayed_graphs_open_hands_as_plain_launches_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    plain = opened()
-    graphs = Graphs(monkeypatch)
-    replayed = opened()
-    assert graphs.captured == 2  # along the normals, and plainly
-    assert graphs.replayed == 2 * (OPENING_STEPS + 1)
-    np.testing.assert_array_equal(plain.joint_positions, replayed.joint_positions)
-    np.testing.assert_array_equal(plain.hand_pose, replayed.hand_pose)
-
-
-def test_nothing_on_the_host_is_touched_between_two_launches(monkeypatch: pytest.MonkeyPatch) -> None:
-    Graphs(monkeypatch)
-    broken = forbid_the_host(monkeypatch)
-    planned()
-    opened()
+    reopened = opened()
+    assert graphs.captured == 3 + 2  # along the normals, and plainly
+    assert graphs.replayed == steps + 2 * (OPENING_STEPS + 1)
+    np.testing.assert_array_equal(plainly_opened.joint_positions, reopened.joint_positions)
+    np.testing.assert_array_equal(plainly_opened.hand_pose, reopened.hand_pose)
     assert broken == []

@@ -54,10 +54,11 @@ def around(rng: np.random.Generator, radius: float, gap: float, count: int = 400
     return direction * (radius + rng.uniform(-gap, gap, (count, 1)))
 
 
-def test_flat_distance_to_a_box_is_exact() -> None:
-    half = np.array([0.03, 0.02, 0.04])
-    box = object_of(trimesh.creation.box(2 * half))
+@pytest.mark.parametrize("half", [(0.03, 0.02, 0.04), (0.05, 0.04, 0.0005)], ids=["box", "thin plate"])
+def test_flat_distance_to_a_box_is_exact(half: tuple[float, ...]) -> None:
+    box = object_of(trimesh.creation.box(2 * np.array(half)))
     points = np.random.default_rng(0).uniform(-0.06, 0.06, (500, 3))
+    points[:100, 2] *= half[2] / 0.03
     a = np.abs(points) - half
     expected = np.linalg.norm(np.maximum(a, 0), axis=1) + np.minimum(a.max(axis=1), 0)
     found, _ = probe(box, points, alpha=0.0)
@@ -105,14 +106,9 @@ def test_normal_is_gradient_of_distance_away_from_the_surface(alpha: float) -> N
     obj = ball(0.035, subdivisions=4)
     points = around(np.random.default_rng(5), 0.05, 0.01, 100)
     _, normals = probe(obj, points, alpha=alpha)
-    step = 1e-4
-    numeric = np.stack(
-        [
-            (probe(obj, points + step * e, alpha=alpha)[0] - probe(obj, points - step * e, alpha=alpha)[0]) / (2 * step)
-            for e in np.eye(3)
-        ],
-        axis=1,
-    )
+    ends = points + 1e-4 * np.concatenate([np.eye(3), -np.eye(3)])[:, None]
+    forward, back = probe(obj, ends.reshape(-1, 3), alpha=alpha)[0].reshape(2, 3, -1)
+    numeric = (forward - back).T / 2e-4
     cosine = (numeric * normals).sum(axis=1) / np.linalg.norm(numeric, axis=1)
     assert np.median(cosine) > 0.9995 and cosine.min() > 0.99
 
@@ -127,13 +123,6 @@ def test_grid_agrees_with_the_mesh_and_is_not_asked_when_near() -> None:
     points = around(np.random.default_rng(7), 0.035, 0.004)
     mixed = probe(obj, points, alpha=0.5, cell=0.005, exact_below=0.004)[0]
     np.testing.assert_allclose(mixed, probe(obj, points, alpha=0.5)[0], atol=FLOAT32)
-
-
-def test_a_thin_plate_has_an_inside_and_two_outsides() -> None:
-    plate = object_of(trimesh.creation.box((0.1, 0.08, 0.001)))
-    z = np.array([-0.002, -0.0004, 0.0, 0.0004, 0.002])
-    found = probe(plate, np.column_stack([np.full((5, 2), 0.01), z]), alpha=0.5)[0]
-    np.testing.assert_allclose(found, np.abs(z) - 0.0005, atol=FLOAT32)
 
 
 def test_points_far_away_on_edges_and_vertices_are_finite() -> None:

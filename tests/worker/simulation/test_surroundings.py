@@ -61,14 +61,17 @@ def test_nonsense_is_refused(make) -> None:
         make()
 
 
+def random_postures(hand: HandModel, count: int, rng: np.random.Generator) -> Posture:
+    turn = rng.normal(size=(count, 4))
+    pose = np.column_stack([rng.normal(size=(count, 3)) * 0.12, turn / np.linalg.norm(turn, axis=1, keepdims=True)])
+    return Posture(pose, hand.expand(rng.uniform(hand.lower, hand.upper, (count, hand.dofs))))
+
+
 @pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
 def test_the_distance_of_a_hand_from_a_plane_is_mujocos(name: str) -> None:
     """1e-5 m: MuJoCo keeps meshes in float32 and its distances converge to 1e-6."""
-    hand, rng = hand_from_path(name), np.random.default_rng(3)
-    q = hand.lower + rng.random((8, hand.dofs)) * (hand.upper - hand.lower)
-    rotation = rng.normal(size=(8, 4))
-    rotation /= np.linalg.norm(rotation, axis=1, keepdims=True)
-    postures = Posture(np.column_stack([rng.normal(size=(8, 3)) * 0.1, rotation]), hand.expand(q))
+    hand = hand_from_path(name)
+    postures = random_postures(hand, 8, np.random.default_rng(3))
     plane = Obstacle.half_space([0.3, -0.5, 0.8], -0.2)
     found = obstacle_room(hand, postures, [Environment((plane,), plane.planes[0, :3])])
     np.testing.assert_allclose(found, mujoco_distances(hand, postures, plane), atol=1e-5)
@@ -92,10 +95,8 @@ def test_only_fingertips_have_more_room_over_what_they_may_touch() -> None:
 @pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
 def test_many_hands_have_the_room_of_each_ones_scene(name: str) -> None:
     """Against NumPy's features; both in double precision."""
-    hand, rng = hand_from_path(name), np.random.default_rng(4)
-    turned = rng.normal(size=(9, 4))
-    pose = np.column_stack([rng.normal(size=(9, 3)) * 0.1, turned / np.linalg.norm(turned, axis=1, keepdims=True)])
-    postures = Posture(pose, hand.expand(rng.uniform(hand.lower, hand.upper, (9, hand.dofs))))
+    hand = hand_from_path(name)
+    postures = random_postures(hand, 9, np.random.default_rng(4))
     one, other = Obstacle.half_space([0.3, -0.5, 0.8], -0.1), Obstacle.half_space([0, 1, 0], 0.05)
     up, which = np.array([0.0, 0, 1]), np.arange(9) % 3
     scenes = [Environment((one,), up), Environment((one, other), up), Environment((), up)]
@@ -203,11 +204,8 @@ ACROSS = (np.cos(np.pi / 8), 0, np.sin(np.pi / 8), 0)
 )
 def test_a_link_is_as_far_from_a_box_as_closed_forms_say(kind: str, at, turn, expected: float) -> None:
     assert distance(kind, at, BOX, turn) == pytest.approx(expected, abs=EXACT)
-
-
-@pytest.mark.parametrize(("kind", "reach"), [("sphere", R), ("capsule", L / 2 + R), ("box", R), ("hull", R)])
-def test_a_link_is_as_far_from_a_half_space_as_closed_forms_say(kind: str, reach: float) -> None:
-    assert distance(kind, (0.3, 0.2, 0.07), Obstacle.half_space(UP, 0.01)) == pytest.approx(0.06 - reach, abs=1e-12)
+    below, reach = Obstacle.half_space(UP, 0.01), L / 2 + R if kind == "capsule" else R
+    assert distance(kind, (0.3, 0.2, 0.07), below) == pytest.approx(0.06 - reach, abs=1e-12)
 
 
 @pytest.mark.parametrize("kind", ["capsule", "box", "hull"])
@@ -227,10 +225,7 @@ def test_no_hand_is_nearer_to_a_solid_than_it_says_by_mujoco(name: str) -> None:
     hand, rng = hand_from_path(name), np.random.default_rng(2)
     corners = rng.normal(size=(40, 3)) * [0.03, 0.05, 0.04]
     solid, _ = outer_solid(corners)
-    q = hand.lower + rng.random((60, hand.dofs)) * (hand.upper - hand.lower)
-    quaternion = rng.normal(size=(60, 4))
-    quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
-    postures = Posture(np.concatenate([rng.normal(size=(60, 3)) * 0.12, quaternion], axis=1), hand.expand(q))
+    postures = random_postures(hand, 60, rng)
     found = obstacle_room(hand, postures, [Environment((solid,), UP)])
     true = mujoco_distances(hand, postures, solid)
     apart = true > 0

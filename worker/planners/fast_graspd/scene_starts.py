@@ -26,11 +26,12 @@ from graspd.service.model.transforms import (
     spread_directions,
 )
 from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.mesh_geometry import points_in
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners.fast_graspd.antipodal_starts import NEAR_M, AntipodalHands, Openings, across, promising
 from graspd.worker.planners.fast_graspd.candidates import posture_of
 from graspd.worker.planners.fast_graspd.starts import CLEAR, POSTURE_NOISE, TILT, Probe, at_distances, frames_about, put
-from graspd.worker.planners.fitting import points_in, surface_of
+from graspd.worker.planners.fitting import surface_of
 from graspd.worker.planners.port import NoStartFound
 from graspd.worker.quality.contact import finger_of_body
 from graspd.worker.simulation.data import HandState

@@ -27,9 +27,10 @@ from graspd.service.model.transforms import (
 )
 from graspd.worker.hands.jaws import Jaws, jaws_of
 from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.mesh_geometry import points_in
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners.fast_graspd.antipodal_starts import LOOKS, ReachSampling
-from graspd.worker.planners.fitting import Pairs, fitting_pairs, points_in
+from graspd.worker.planners.fitting import Pairs, fitting_pairs
 from graspd.worker.simulation.data import Data, HandState
 from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.record import record_placement

@@ -13,6 +13,9 @@ object: with the paper's two-sided leak, opposite velocities cancel wherever not
 
 import warp as wp
 
+from graspd.worker.simulation.kernels.kinematics import Hands
+from graspd.worker.simulation.kernels.packing import Contacts
+
 wp.set_module_options({"enable_backward": False})
 
 vec6 = wp.types.vector(length=6, dtype=wp.float32)
@@ -128,17 +131,9 @@ def direct(
     physics_in: Physics,
     motion_in: wp.array(dtype=vec6),
     passes_in: wp.int32,
-    active_in: wp.array(dtype=wp.int32),
-    iteration_in: wp.array(dtype=wp.int32),
     dilation_in: wp.array(dtype=wp.float32),
-    dilation_scale_in: wp.array(dtype=wp.float32),
-    count_in: wp.array(dtype=wp.int32),
-    point_in: wp.array2d(dtype=wp.vec3),
-    normal_in: wp.array2d(dtype=wp.vec3),
-    distance_in: wp.array2d(dtype=wp.float32),
-    weight_in: wp.array2d(dtype=wp.float32),
-    near_count_in: wp.array(dtype=wp.int32),
-    near_in: wp.array2d(dtype=wp.int32),
+    hands_in: Hands,
+    contacts_in: Contacts,
     loss_out: wp.array2d(dtype=wp.float32),
     end_out: wp.array2d(dtype=vec6),
     adjoint_out: wp.array2d(dtype=vec6),
@@ -151,9 +146,9 @@ def direct(
     ignored unless the object moves farther. `adjoint` (B, M) is the derivative of the loss by forces on the object.
     """
     b, m = wp.tid()
-    if active_in[b] == 0:
+    if hands_in.active[b] == 0:
         return
-    r = dilation_scale_in[b] * dilation_in[iteration_in[0]]
+    r = hands_in.dilation_scale[b] * dilation_in[hands_in.iteration[0]]
     s0 = motion_in[m]
     s = s0
     k = physics_in.stiffness
@@ -168,22 +163,22 @@ def direct(
         # Bound on the motion of all points: points farther from the surface are skipped.
         motion = wp.length(wp.vec3(s[0], s[1], s[2])) + wp.length(wp.vec3(s[3], s[4], s[5])) * physics_in.radius
         all_near = motion <= physics_in.near_gap
-        count = count_in[b]
+        count = contacts_in.count[b]
         if all_near:
-            count = near_count_in[b]
+            count = contacts_in.near_count[b]
         for listed in range(count):
             i = listed
             if all_near:
-                i = near_in[b, listed]
-            rho = distance_in[b, i]
+                i = contacts_in.near[b, listed]
+            rho = contacts_in.distance[b, i]
             if rho - r > motion:
                 continue
-            n = normal_in[b, i]
-            p = point_in[b, i]
+            n = contacts_in.normal[b, i]
+            p = contacts_in.point[b, i]
             u = point_motion(s, p)
             c = r - rho + wp.dot(n, u)
             if c > 0.0:
-                kw = k * weight_in[b, i]
+                kw = k * contacts_in.weight[b, i]
                 tangent = u - wp.dot(n, u) * n
                 slide = wp.min(kw, kw * physics_in.friction * c / wp.max(wp.length(tangent), 1.0e-9))
                 j = row(n, p)
@@ -203,31 +198,24 @@ def direct(
 def direct_gradient(
     physics_in: Physics,
     lane_in: wp.int32,
-    active_in: wp.array(dtype=wp.int32),
-    iteration_in: wp.array(dtype=wp.int32),
     dilation_in: wp.array(dtype=wp.float32),
-    dilation_scale_in: wp.array(dtype=wp.float32),
-    count_in: wp.array(dtype=wp.int32),
-    point_in: wp.array2d(dtype=wp.vec3),
-    normal_in: wp.array2d(dtype=wp.vec3),
-    distance_in: wp.array2d(dtype=wp.float32),
-    weight_in: wp.array2d(dtype=wp.float32),
+    hands_in: Hands,
     end_in: wp.array2d(dtype=vec6),
     adjoint_in: wp.array2d(dtype=vec6),
-    gradient_out: wp.array2d(dtype=wp.float32),
+    contacts_inout: Contacts,
 ):
     """Compute dL/drho of each contact after `direct`, over all simulations in order. Over (B, N / lane)."""
     b, part = wp.tid()
-    if active_in[b] == 0:
+    if hands_in.active[b] == 0:
         return
-    r = dilation_scale_in[b] * dilation_in[iteration_in[0]]
+    r = hands_in.dilation_scale[b] * dilation_in[hands_in.iteration[0]]
     share = 1.0 / float(end_in.shape[1])
-    for i in range(part * lane_in, wp.min((part + 1) * lane_in, count_in[b])):
-        rho = distance_in[b, i]
-        n = normal_in[b, i]
-        p = point_in[b, i]
+    for i in range(part * lane_in, wp.min((part + 1) * lane_in, contacts_inout.count[b])):
+        rho = contacts_inout.distance[b, i]
+        n = contacts_inout.normal[b, i]
+        p = contacts_inout.point[b, i]
         j = row(n, p)
-        kw = physics_in.stiffness * weight_in[b, i]
+        kw = physics_in.stiffness * contacts_inout.weight[b, i]
         fade = physics_in.leak * wp.exp((r - rho) / physics_in.leak_length)
         total = float(0.0)
         for m in range(end_in.shape[1]):
@@ -246,7 +234,7 @@ def direct_gradient(
             else:
                 g = g * fade
             total += g
-        gradient_out[b, i] = share * kw * total
+        contacts_inout.gradient[b, i] = share * kw * total
 
 
 @wp.func
@@ -260,19 +248,12 @@ def gauss_seidel(
     physics_in: Physics,
     motion_in: wp.array(dtype=vec6),
     passes_in: wp.int32,
-    active_in: wp.array(dtype=wp.int32),
-    iteration_in: wp.array(dtype=wp.int32),
     dilation_in: wp.array(dtype=wp.float32),
-    dilation_scale_in: wp.array(dtype=wp.float32),
-    count_in: wp.array(dtype=wp.int32),
-    point_in: wp.array2d(dtype=wp.vec3),
-    normal_in: wp.array2d(dtype=wp.vec3),
-    distance_in: wp.array2d(dtype=wp.float32),
-    weight_in: wp.array2d(dtype=wp.float32),
+    hands_in: Hands,
+    contacts_inout: Contacts,
     states_out: wp.array3d(dtype=vec6),
     loss_out: wp.array2d(dtype=wp.float32),
     end_out: wp.array2d(dtype=vec6),
-    gradient_inout: wp.array2d(dtype=wp.float32),
 ):
     """Take the paper's step: one sweep of position-based dynamics over the contacts (Deul 2016), in order.
 
@@ -281,17 +262,17 @@ def gauss_seidel(
     ignored: a second sweep would need states as well. Launch over (B, M).
     """
     b, m = wp.tid()
-    if active_in[b] == 0:
+    if hands_in.active[b] == 0:
         return
-    r = dilation_scale_in[b] * dilation_in[iteration_in[0]]
+    r = hands_in.dilation_scale[b] * dilation_in[hands_in.iteration[0]]
     s = motion_in[m]
-    count = count_in[b]
+    count = contacts_inout.count[b]
     for i in range(count):
         states_out[b, m, i] = s
-        n = normal_in[b, i]
-        p = point_in[b, i]
+        n = contacts_inout.normal[b, i]
+        p = contacts_inout.point[b, i]
         j = row(n, p)
-        c = r - distance_in[b, i] + wp.dot(j, s)
+        c = r - contacts_inout.distance[b, i] + wp.dot(j, s)
         if c > 0.0:
             impulse = c / inverse_mass_along(physics_in, j)
             s = s - impulse * (physics_in.inverse_mass * j)
@@ -309,12 +290,12 @@ def gauss_seidel(
     for back in range(count):
         i = count - 1 - back
         before = states_out[b, m, i]
-        n = normal_in[b, i]
-        p = point_in[b, i]
+        n = contacts_inout.normal[b, i]
+        p = contacts_inout.point[b, i]
         j = row(n, p)
         mj = physics_in.inverse_mass * j
         w = wp.dot(j, mj)
-        c = r - distance_in[b, i] + wp.dot(j, before)
+        c = r - contacts_inout.distance[b, i] + wp.dot(j, before)
         if c > 0.0:
             impulse = c / w
             middle = before - impulse * mj
@@ -335,11 +316,11 @@ def gauss_seidel(
                     slip = physics_in.friction * along / w
             g = wp.dot(mj, y) / w + slip
             y = y - g * j
-            wp.atomic_add(gradient_inout, b, i, share * g)
+            wp.atomic_add(contacts_inout.gradient, b, i, share * g)
         else:
             g = leaked(wp.dot(mj, y) / w, -c, physics_in)
             if g != 0.0:
-                wp.atomic_add(gradient_inout, b, i, share * g)
+                wp.atomic_add(contacts_inout.gradient, b, i, share * g)
 
 
 @wp.kernel
@@ -347,19 +328,12 @@ def jacobi(
     physics_in: Physics,
     motion_in: wp.array(dtype=vec6),
     passes_in: wp.int32,
-    active_in: wp.array(dtype=wp.int32),
-    iteration_in: wp.array(dtype=wp.int32),
     dilation_in: wp.array(dtype=wp.float32),
-    dilation_scale_in: wp.array(dtype=wp.float32),
-    count_in: wp.array(dtype=wp.int32),
-    point_in: wp.array2d(dtype=wp.vec3),
-    normal_in: wp.array2d(dtype=wp.vec3),
-    distance_in: wp.array2d(dtype=wp.float32),
-    weight_in: wp.array2d(dtype=wp.float32),
+    hands_in: Hands,
+    contacts_inout: Contacts,
     states_out: wp.array3d(dtype=vec6),
     loss_out: wp.array2d(dtype=wp.float32),
     end_out: wp.array2d(dtype=vec6),
-    gradient_inout: wp.array2d(dtype=wp.float32),
 ):
     """Take averaged Jacobi passes, each with the mean correction of all active contacts, in any order.
 
@@ -367,20 +341,20 @@ def jacobi(
     number of contacts. The count of active contacts is taken as constant by the adjoint. Launch over (B, M).
     """
     b, m = wp.tid()
-    if active_in[b] == 0:
+    if hands_in.active[b] == 0:
         return
-    r = dilation_scale_in[b] * dilation_in[iteration_in[0]]
+    r = hands_in.dilation_scale[b] * dilation_in[hands_in.iteration[0]]
     s = motion_in[m]
-    count = count_in[b]
+    count = contacts_inout.count[b]
     for step in range(passes_in):
         states_out[b, m, step] = s
         total = vec6(0.0)
         touching = float(0.0)
         for i in range(count):
-            n = normal_in[b, i]
-            p = point_in[b, i]
+            n = contacts_inout.normal[b, i]
+            p = contacts_inout.point[b, i]
             j = row(n, p)
-            c = r - distance_in[b, i] + wp.dot(j, s)
+            c = r - contacts_inout.distance[b, i] + wp.dot(j, s)
             if c > 0.0:
                 touching += 1.0
                 mj = physics_in.inverse_mass * j
@@ -403,18 +377,22 @@ def jacobi(
         before = states_out[b, m, passes_in - 1 - back]
         touching = float(0.0)
         for i in range(count):
-            c = r - distance_in[b, i] + wp.dot(row(normal_in[b, i], point_in[b, i]), before)
+            c = (
+                r
+                - contacts_inout.distance[b, i]
+                + wp.dot(row(contacts_inout.normal[b, i], contacts_inout.point[b, i]), before)
+            )
             if c > 0.0:
                 touching += 1.0
         part = share / wp.max(touching, 1.0)
         carried = vec6(0.0)
         for i in range(count):
-            n = normal_in[b, i]
-            p = point_in[b, i]
+            n = contacts_inout.normal[b, i]
+            p = contacts_inout.point[b, i]
             j = row(n, p)
             mj = physics_in.inverse_mass * j
             w = wp.dot(j, mj)
-            c = r - distance_in[b, i] + wp.dot(j, before)
+            c = r - contacts_inout.distance[b, i] + wp.dot(j, before)
             g = wp.dot(mj, y) / w
             if c > 0.0:
                 carried -= g * j
@@ -434,6 +412,6 @@ def jacobi(
             else:
                 g = leaked(g, -c, physics_in)
             if g != 0.0:
-                wp.atomic_add(gradient_inout, b, i, part * g)
+                wp.atomic_add(contacts_inout.gradient, b, i, part * g)
         if touching > 0.0:
             y = y + carried / touching

@@ -41,6 +41,17 @@ class NearestPoint:
 
 
 @wp.func
+def coarse_distance(skin: Skin, p: wp.vec3):
+    """Return the distance at the node of the grid nearest to p, a point within it, and a bound on their separation."""
+    at = (p - skin.low) / skin.spacing
+    x = wp.min(int(at[0] + 0.5), skin.coarse.shape[0] - 1)
+    y = wp.min(int(at[1] + 0.5), skin.coarse.shape[1] - 1)
+    z = wp.min(int(at[2] + 0.5), skin.coarse.shape[2] - 1)
+    way = wp.length(p - (skin.low + skin.spacing * wp.vec3(float(x), float(y), float(z)))) + ROUNDING
+    return skin.coarse[x, y, z], way
+
+
+@wp.func
 def nearest(skin: Skin, p: wp.vec3, reach: wp.float32):
     """Return signed distance, closest point and gradient of the distance, an outward unit normal.
 
@@ -62,12 +73,7 @@ def nearest(skin: Skin, p: wp.vec3, reach: wp.float32):
     if inside:
         within = wp.length(high - low)
     if inside and skin.coarse.shape[0] > 0:
-        at = (p - low) / skin.spacing
-        x = wp.min(int(at[0] + 0.5), skin.coarse.shape[0] - 1)
-        y = wp.min(int(at[1] + 0.5), skin.coarse.shape[1] - 1)
-        z = wp.min(int(at[2] + 0.5), skin.coarse.shape[2] - 1)
-        way = wp.length(p - (low + skin.spacing * wp.vec3(float(x), float(y), float(z)))) + ROUNDING
-        coarse = skin.coarse[x, y, z]
+        coarse, way = coarse_distance(skin, p)
         if coarse - way > reach:
             return out
         if wp.abs(coarse) > way:
@@ -168,17 +174,6 @@ def self_distance(
                     wp.atomic_max(depth_inout, b, pieces_in.body[piece], -nd[3])
 
 
-@wp.func
-def known_beyond(skin: Skin, p: wp.vec3, reach: wp.float32):
-    """Check by the grid whether p, a point within it, is farther than this from the surface [m]."""
-    at = (p - skin.low) / skin.spacing
-    x = wp.min(int(at[0] + 0.5), skin.coarse.shape[0] - 1)
-    y = wp.min(int(at[1] + 0.5), skin.coarse.shape[1] - 1)
-    z = wp.min(int(at[2] + 0.5), skin.coarse.shape[2] - 1)
-    way = wp.length(p - (skin.low + skin.spacing * wp.vec3(float(x), float(y), float(z)))) + ROUNDING
-    return skin.coarse[x, y, z] - way > reach
-
-
 @wp.struct
 class BodyPoints:
     """Points of a hand, sorted by body."""
@@ -219,8 +214,10 @@ def body_gaps(
     outside = wp.length(wp.max(beyond, wp.vec3(0.0)))
     if outside > points_in.extent[body] and reach_in <= skin_in.coarse_reach:
         return
-    if outside == 0.0 and known_beyond(skin_in, middle, reach_in + points_in.extent[body]):
-        return
+    if outside == 0.0:
+        coarse, way = coarse_distance(skin_in, middle)
+        if coarse - way > reach_in + points_in.extent[body]:
+            return
     for i in range(points_in.first[body], points_in.first[body + 1]):
         x = placed_at(origin_in, place, turned, points_in.position[i])
         least = wp.min(least, nearest(skin_in, x, reach_in).distance)

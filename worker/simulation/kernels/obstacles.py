@@ -6,8 +6,9 @@ cylinders. They are exact against half-spaces; for solids see `solids`.
 
 import warp as wp
 
+from graspd.worker.simulation.kernels.kinematics import Hands
 from graspd.worker.simulation.kernels.projection import Residuals, emit
-from graspd.worker.simulation.kernels.wrenches import Wrenches, add_wrench
+from graspd.worker.simulation.kernels.wrenches import add_wrench
 
 wp.set_module_options({"enable_backward": False})
 
@@ -148,45 +149,33 @@ def may_meet(
 
 
 @wp.kernel
-def clear(active_in: wp.array(dtype=wp.int32), depth_out: wp.array(dtype=wp.float32)):
-    """Reset depths. Launch over B."""
-    b = wp.tid()
-    if active_in[b] != 0:
-        depth_out[b] = 0.0
-
-
-@wp.kernel
 def penalty(
     features_in: Features,
     obstacles_in: Obstacles,
-    active_in: wp.array(dtype=wp.int32),
-    scene_in: wp.array(dtype=wp.int32),
-    iteration_in: wp.array(dtype=wp.int32),
     weight_in: wp.array(dtype=wp.float32),
-    body_p_in: wp.array2d(dtype=wp.vec3),
-    body_q_in: wp.array2d(dtype=wp.quat),
     room_in: wp.float32,
-    wrench_inout: Wrenches,
+    hands_inout: Hands,
     depth_inout: wp.array(dtype=wp.float32),
 ):
     """Add the gradient of w sum w_i min(h_i - margin_i - room, 0)^2 of half-spaces; deepest shortfalls.
     Launch over (B, P)."""
     b, piece = wp.tid()
-    if active_in[b] == 0 or scene_in[b] < 0:
+    hands = hands_inout
+    if hands.active[b] == 0 or hands.scene[b] < 0:
         return
-    if not may_meet(features_in, obstacles_in, piece, scene_in[b], b, 0.0, room_in, body_p_in, body_q_in):
+    if not may_meet(features_in, obstacles_in, piece, hands.scene[b], b, 0.0, room_in, hands.body_p, hands.body_q):
         return
     for i in range(features_in.first[piece], features_in.first[piece + 1]):
-        f = posed(features_in, i, b, body_p_in, body_q_in)
-        weight = 2.0 * weight_in[iteration_in[0]]
-        for k in range(obstacles_in.first[scene_in[b]], obstacles_in.first_solid[scene_in[b]]):
+        f = posed(features_in, i, b, hands.body_p, hands.body_q)
+        weight = 2.0 * weight_in[hands.iteration[0]]
+        for k in range(obstacles_in.first[hands.scene[b]], obstacles_in.first_solid[hands.scene[b]]):
             nd = obstacle_distance(obstacles_in, k, f)
             short = nd[3] - kept(features_in, obstacles_in, i, k, room_in)
             if short < 0.0:
                 n = wp.vec3(nd[0], nd[1], nd[2])
                 if weight != 0.0:
                     force = (weight * short) * n
-                    add_wrench(wrench_inout, b, f.body, force, wp.cross(lowest_point(f, n), force))
+                    add_wrench(hands.wrench, b, f.body, force, wp.cross(lowest_point(f, n), force))
                 wp.atomic_max(depth_inout, b, -short)
 
 
@@ -194,23 +183,21 @@ def penalty(
 def residuals(
     features_in: Features,
     obstacles_in: Obstacles,
-    active_in: wp.array(dtype=wp.int32),
-    scene_in: wp.array(dtype=wp.int32),
-    body_p_in: wp.array2d(dtype=wp.vec3),
-    body_q_in: wp.array2d(dtype=wp.quat),
+    hands_in: Hands,
     near_in: wp.float32,
     target_in: wp.float32,
     residuals_out: Residuals,
 ):
     """Emit residuals: features within margin + near of a half-space move to margin + target. Over (B, P)."""
     b, piece = wp.tid()
-    if active_in[b] == 0 or scene_in[b] < 0:
+    hands = hands_in
+    if hands.active[b] == 0 or hands.scene[b] < 0:
         return
-    if not may_meet(features_in, obstacles_in, piece, scene_in[b], b, near_in, 0.0, body_p_in, body_q_in):
+    if not may_meet(features_in, obstacles_in, piece, hands.scene[b], b, near_in, 0.0, hands.body_p, hands.body_q):
         return
     for i in range(features_in.first[piece], features_in.first[piece + 1]):
-        f = posed(features_in, i, b, body_p_in, body_q_in)
-        for k in range(obstacles_in.first[scene_in[b]], obstacles_in.first_solid[scene_in[b]]):
+        f = posed(features_in, i, b, hands.body_p, hands.body_q)
+        for k in range(obstacles_in.first[hands.scene[b]], obstacles_in.first_solid[hands.scene[b]]):
             nd = obstacle_distance(obstacles_in, k, f)
             margin = kept(features_in, obstacles_in, i, k, 0.0)
             if nd[3] < margin + near_in:

@@ -2,6 +2,8 @@
 
 import warp as wp
 
+from graspd.worker.simulation.kernels.kinematics import Depths, Hands
+
 wp.set_module_options({"enable_backward": False})
 
 
@@ -14,45 +16,26 @@ def turn(rotation: wp.quat, w: wp.vec3):
     return wp.normalize(wp.quat_from_axis_angle(w / angle, angle) * rotation)
 
 
-@wp.func
-def move(
-    b: wp.int32,
-    column: wp.int32,
-    step: wp.float32,
-    lower: wp.array(dtype=wp.float32),
-    upper: wp.array(dtype=wp.float32),
-    clamp: wp.int32,
-    q: wp.array2d(dtype=wp.float32),
-):
-    """Add a step to a dof, inside its limits where `clamp` is 1."""
-    d = column - 6
-    value = q[b, d] + step
-    if clamp == 1:
-        value = wp.clamp(value, lower[d], upper[d])
-    q[b, d] = value
-
-
 @wp.kernel
-def adam(
+def descend(
     lower_in: wp.array(dtype=wp.float32),
     upper_in: wp.array(dtype=wp.float32),
-    active_in: wp.array(dtype=wp.int32),
-    iteration_in: wp.array(dtype=wp.int32),
     rate_in: wp.array2d(dtype=wp.float32),
     gradient_in: wp.array2d(dtype=wp.float32),
+    adam_in: wp.int32,
+    clamp_in: wp.int32,
     beta1_in: wp.float32,
     beta2_in: wp.float32,
     first_inout: wp.array2d(dtype=wp.float32),
     second_inout: wp.array2d(dtype=wp.float32),
-    pivot_inout: wp.array(dtype=wp.vec3),
-    rotation_inout: wp.array(dtype=wp.quat),
-    q_inout: wp.array2d(dtype=wp.float32),
+    hands_inout: Hands,
 ):
-    """Take a step of Adam (Kingma & Ba 2015); rates of translation, rotation, every dof. Over B."""
+    """Take a step of Adam (Kingma & Ba 2015), or where `adam` is 0 of the paper's plain gradient descent.
+    Rates of translation, rotation, every dof; `clamp` 1: dofs stay inside their limits. Launch over B."""
     b = wp.tid()
-    if active_in[b] == 0:
+    if hands_inout.active[b] == 0:
         return
-    it = iteration_in[0]
+    it = hands_inout.iteration[0]
     t = float(it + 1)
     correct1 = 1.0 / (1.0 - wp.pow(beta1_in, t))
     correct2 = 1.0 / (1.0 - wp.pow(beta2_in, t))
@@ -60,51 +43,25 @@ def adam(
     dw = wp.vec3(0.0)
     for column in range(gradient_in.shape[1]):
         g = gradient_in[b, column]
-        m = beta1_in * first_inout[b, column] + (1.0 - beta1_in) * g
-        v = beta2_in * second_inout[b, column] + (1.0 - beta2_in) * g * g
-        first_inout[b, column] = m
-        second_inout[b, column] = v
-        step = -m * correct1 / (wp.sqrt(v * correct2) + 1.0e-8)
+        step = -g
+        if adam_in == 1:
+            m = beta1_in * first_inout[b, column] + (1.0 - beta1_in) * g
+            v = beta2_in * second_inout[b, column] + (1.0 - beta2_in) * g * g
+            first_inout[b, column] = m
+            second_inout[b, column] = v
+            step = -m * correct1 / (wp.sqrt(v * correct2) + 1.0e-8)
         if column < 3:
             dx[column] = rate_in[it, 0] * step
         elif column < 6:
             dw[column - 3] = rate_in[it, 1] * step
         else:
-            move(b, column, rate_in[it, column - 4] * step, lower_in, upper_in, 1, q_inout)
-    pivot_inout[b] = pivot_inout[b] + dx
-    rotation_inout[b] = turn(rotation_inout[b], dw)
-
-
-@wp.kernel
-def gradient_descent(
-    lower_in: wp.array(dtype=wp.float32),
-    upper_in: wp.array(dtype=wp.float32),
-    active_in: wp.array(dtype=wp.int32),
-    iteration_in: wp.array(dtype=wp.int32),
-    rate_in: wp.array2d(dtype=wp.float32),
-    gradient_in: wp.array2d(dtype=wp.float32),
-    clamp_in: wp.int32,
-    pivot_inout: wp.array(dtype=wp.vec3),
-    rotation_inout: wp.array(dtype=wp.quat),
-    q_inout: wp.array2d(dtype=wp.float32),
-):
-    """Take a step of the paper's plain gradient descent. Launch over B."""
-    b = wp.tid()
-    if active_in[b] == 0:
-        return
-    it = iteration_in[0]
-    dx = wp.vec3(0.0)
-    dw = wp.vec3(0.0)
-    for column in range(gradient_in.shape[1]):
-        step = -gradient_in[b, column]
-        if column < 3:
-            dx[column] = rate_in[it, 0] * step
-        elif column < 6:
-            dw[column - 3] = rate_in[it, 1] * step
-        else:
-            move(b, column, rate_in[it, column - 4] * step, lower_in, upper_in, clamp_in, q_inout)
-    pivot_inout[b] = pivot_inout[b] + dx
-    rotation_inout[b] = turn(rotation_inout[b], dw)
+            d = column - 6
+            value = hands_inout.q[b, d] + rate_in[it, column - 4] * step
+            if clamp_in == 1:
+                value = wp.clamp(value, lower_in[d], upper_in[d])
+            hands_inout.q[b, d] = value
+    hands_inout.pivot[b] = hands_inout.pivot[b] + dx
+    hands_inout.rotation[b] = turn(hands_inout.rotation[b], dw)
 
 
 @wp.kernel
@@ -116,9 +73,7 @@ def advance(iteration_inout: wp.array(dtype=wp.int32)):
 @wp.kernel
 def converge(
     loss_in: wp.array2d(dtype=wp.float32),
-    point_depth_in: wp.array(dtype=wp.float32),
-    object_depth_in: wp.array(dtype=wp.float32),
-    self_depth_in: wp.array(dtype=wp.float32),
+    depths_in: Depths,
     patience_in: wp.int32,
     best_inout: wp.array(dtype=wp.float32),
     waited_inout: wp.array(dtype=wp.int32),
@@ -132,7 +87,7 @@ def converge(
     total = float(0.0)
     for m in range(loss_in.shape[1]):
         total += loss_in[b, m]
-    depth = point_depth_in[b] + object_depth_in[b] + self_depth_in[b]
+    depth = depths_in.points[b] + depths_in.object[b] + depths_in.links[b]
     merit = total / float(loss_in.shape[1]) + 1.0e3 * depth
     if merit < 0.99 * best_inout[b]:
         best_inout[b] = merit

@@ -15,6 +15,22 @@ NEAR = wp.constant(2)
 CHUNK = wp.constant(32)  # marks counted per thread
 
 
+@wp.struct
+class Contacts:
+    """Candidate contacts (B, N), packed at the front per hand in the order of its points."""
+
+    count: wp.array(dtype=wp.int32)
+    body: wp.array2d(dtype=wp.int32)
+    point: wp.array2d(dtype=wp.vec3)
+    normal: wp.array2d(dtype=wp.vec3)
+    distance: wp.array2d(dtype=wp.float32)
+    weight: wp.array2d(dtype=wp.float32)
+    gradient: wp.array2d(dtype=wp.float32)  # dL/d distance
+    near_count: wp.array(dtype=wp.int32)
+    near: wp.array2d(dtype=wp.int32)  # indices of contacts that the object may reach in its step
+    mark: wp.array2d(dtype=wp.int32)  # of contacts at their points' indices, not packed; else empty
+
+
 @wp.kernel
 def count_marks(
     active_in: wp.array(dtype=wp.int32),
@@ -55,45 +71,32 @@ def before(
 @wp.kernel
 def pack(
     active_in: wp.array(dtype=wp.int32),
-    mark_in: wp.array2d(dtype=wp.int32),
+    marked_in: Contacts,
     kept_in: wp.array2d(dtype=wp.int32),
     near_in: wp.array2d(dtype=wp.int32),
-    body_in: wp.array2d(dtype=wp.int32),
-    point_in: wp.array2d(dtype=wp.vec3),
-    normal_in: wp.array2d(dtype=wp.vec3),
-    distance_in: wp.array2d(dtype=wp.float32),
-    weight_in: wp.array2d(dtype=wp.float32),
-    count_out: wp.array(dtype=wp.int32),
-    body_out: wp.array2d(dtype=wp.int32),
-    point_out: wp.array2d(dtype=wp.vec3),
-    normal_out: wp.array2d(dtype=wp.vec3),
-    distance_out: wp.array2d(dtype=wp.float32),
-    weight_out: wp.array2d(dtype=wp.float32),
-    gradient_out: wp.array2d(dtype=wp.float32),
-    near_count_out: wp.array(dtype=wp.int32),
-    near_out: wp.array2d(dtype=wp.int32),
+    packed_out: Contacts,
 ):
     """Move marked points to their slots; `near` lists the slots of near ones. Launch over (B, N)."""
     b, i = wp.tid()
     if active_in[b] == 0:
         return
-    mark = mark_in[b, i]
-    last = i == mark_in.shape[1] - 1
+    mark = marked_in.mark[b, i]
+    last = i == marked_in.mark.shape[1] - 1
     if mark == NONE and not last:
         return
-    k = before(kept_in, mark_in, KEPT, b, i)
+    k = before(kept_in, marked_in.mark, KEPT, b, i)
     near = wp.int32(0)
     if mark == NEAR or last:
-        near = before(near_in, mark_in, NEAR, b, i)
+        near = before(near_in, marked_in.mark, NEAR, b, i)
     if mark == NEAR:
-        near_out[b, near] = k
+        packed_out.near[b, near] = k
     if mark != NONE:
-        body_out[b, k] = body_in[b, i]
-        point_out[b, k] = point_in[b, i]
-        normal_out[b, k] = normal_in[b, i]
-        distance_out[b, k] = distance_in[b, i]
-        weight_out[b, k] = weight_in[b, i]
-        gradient_out[b, k] = 0.0
+        packed_out.body[b, k] = marked_in.body[b, i]
+        packed_out.point[b, k] = marked_in.point[b, i]
+        packed_out.normal[b, k] = marked_in.normal[b, i]
+        packed_out.distance[b, k] = marked_in.distance[b, i]
+        packed_out.weight[b, k] = marked_in.weight[b, i]
+        packed_out.gradient[b, k] = 0.0
     if last:
-        count_out[b] = k + wp.min(mark, 1)
-        near_count_out[b] = near + mark // 2
+        packed_out.count[b] = k + wp.min(mark, 1)
+        packed_out.near_count[b] = near + mark // 2

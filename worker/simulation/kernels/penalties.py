@@ -2,7 +2,9 @@
 
 import warp as wp
 
-from graspd.worker.simulation.kernels.wrenches import Wrenches, add_wrench
+from graspd.worker.simulation.kernels.kinematics import Hands
+from graspd.worker.simulation.kernels.packing import Contacts
+from graspd.worker.simulation.kernels.wrenches import add_wrench
 
 wp.set_module_options({"enable_backward": False})
 
@@ -12,17 +14,9 @@ def points_to_bodies(
     pull_in: wp.float32,
     pull_length_in: wp.float32,
     lane_in: wp.int32,
-    active_in: wp.array(dtype=wp.int32),
-    iteration_in: wp.array(dtype=wp.int32),
     penetration_weight_in: wp.array(dtype=wp.float32),
-    count_in: wp.array(dtype=wp.int32),
-    body_in: wp.array2d(dtype=wp.int32),
-    point_in: wp.array2d(dtype=wp.vec3),
-    normal_in: wp.array2d(dtype=wp.vec3),
-    distance_in: wp.array2d(dtype=wp.float32),
-    weight_in: wp.array2d(dtype=wp.float32),
-    gradient_in: wp.array2d(dtype=wp.float32),
-    wrench_inout: Wrenches,
+    contacts_in: Contacts,
+    hands_inout: Hands,
     depth_inout: wp.array(dtype=wp.float32),
 ):
     """Compute the wrench gradient on bodies from dL/drho, penetration and attraction term.
@@ -32,21 +26,20 @@ def points_to_bodies(
     Launch over (B, N / lane).
     """
     b, part = wp.tid()
-    if active_in[b] == 0:
+    if hands_inout.active[b] == 0:
         return
-    penetration = 2.0 * penetration_weight_in[iteration_in[0]]
-    for i in range(part * lane_in, wp.min((part + 1) * lane_in, count_in[b])):
-        rho = distance_in[b, i]
-        g = gradient_in[b, i]
+    penetration = 2.0 * penetration_weight_in[hands_inout.iteration[0]]
+    for i in range(part * lane_in, wp.min((part + 1) * lane_in, contacts_in.count[b])):
+        rho = contacts_in.distance[b, i]
+        g = contacts_in.gradient[b, i]
         if rho < 0.0:
-            g += penetration * weight_in[b, i] * rho
+            g += penetration * contacts_in.weight[b, i] * rho
             wp.atomic_max(depth_inout, b, -rho)
         elif pull_in > 0.0:
-            g += penetration * pull_in * weight_in[b, i] * wp.exp(-rho / pull_length_in)
+            g += penetration * pull_in * contacts_in.weight[b, i] * wp.exp(-rho / pull_length_in)
         if g != 0.0:
-            body = body_in[b, i]
-            f = g * normal_in[b, i]
-            add_wrench(wrench_inout, b, body, f, wp.cross(point_in[b, i], f))
+            f = g * contacts_in.normal[b, i]
+            add_wrench(hands_inout.wrench, b, contacts_in.body[b, i], f, wp.cross(contacts_in.point[b, i], f))
 
 
 @wp.kernel
@@ -55,16 +48,15 @@ def joints(
     upper_in: wp.array(dtype=wp.float32),
     range_weight_in: wp.float32,
     limit_weight_in: wp.float32,
-    active_in: wp.array(dtype=wp.int32),
-    q_in: wp.array2d(dtype=wp.float32),
+    hands_in: Hands,
     gradient_inout: wp.array2d(dtype=wp.float32),
 ):
     """Add the gradient of L_range + L_limit (paper, section III-D). Launch over (B, D).
     L_range = w sum ((q - mid) / half)^2; L_limit = w sum max(lower - q, 0, q - upper)^2."""
     b, d = wp.tid()
-    if active_in[b] == 0:
+    if hands_in.active[b] == 0:
         return
-    q = q_in[b, d]
+    q = hands_in.q[b, d]
     lower = lower_in[d]
     upper = upper_in[d]
     half = wp.max(0.5 * (upper - lower), 1.0e-6)
@@ -75,38 +67,25 @@ def joints(
 
 @wp.kernel
 def near_share(
-    reach_in: wp.float32,
-    whole_in: wp.float32,
-    count_in: wp.array(dtype=wp.int32),
-    distance_in: wp.array2d(dtype=wp.float32),
-    weight_in: wp.array2d(dtype=wp.float32),
-    share_out: wp.array(dtype=wp.float32),
+    reach_in: wp.float32, whole_in: wp.float32, contacts_in: Contacts, share_out: wp.array(dtype=wp.float32)
 ):
     """Compute the share of the `whole` weight of a hand's points that is within `reach` [m].
     Points are summed in order, so that the sum is the same on every device. Launch over B."""
     b = wp.tid()
     total = float(0.0)
-    for i in range(count_in[b]):
-        if distance_in[b, i] < reach_in:
-            total += weight_in[b, i]
+    for i in range(contacts_in.count[b]):
+        if contacts_in.distance[b, i] < reach_in:
+            total += contacts_in.weight[b, i]
     share_out[b] = total / whole_in
 
 
 @wp.kernel
-def attract(
-    pull_in: wp.float32,
-    length_in: wp.float32,
-    active_in: wp.array(dtype=wp.int32),
-    count_in: wp.array(dtype=wp.int32),
-    distance_in: wp.array2d(dtype=wp.float32),
-    weight_in: wp.array2d(dtype=wp.float32),
-    gradient_out: wp.array2d(dtype=wp.float32),
-):
+def attract(pull_in: wp.float32, length_in: wp.float32, hands_in: Hands, contacts_inout: Contacts):
     """Attract free points to the object, fading with distance: control without simulation. Over (B, N)."""
     b, i = wp.tid()
-    if active_in[b] == 0 or i >= count_in[b]:
+    if hands_in.active[b] == 0 or i >= contacts_inout.count[b]:
         return
-    rho = distance_in[b, i]
-    gradient_out[b, i] = 0.0
+    rho = contacts_inout.distance[b, i]
+    contacts_inout.gradient[b, i] = 0.0
     if rho > 0.0:
-        gradient_out[b, i] = pull_in * weight_in[b, i] * wp.exp(-rho / length_in)
+        contacts_inout.gradient[b, i] = pull_in * contacts_inout.weight[b, i] * wp.exp(-rho / length_in)

@@ -3,7 +3,8 @@ Thin parts of an object pass between hand points; they do not pass between the p
 
 import warp as wp
 
-from graspd.worker.simulation.kernels.wrenches import Wrenches, add_wrench
+from graspd.worker.simulation.kernels.kinematics import Hands
+from graspd.worker.simulation.kernels.wrenches import add_wrench
 
 wp.set_module_options({"enable_backward": False})
 
@@ -116,15 +117,12 @@ def in_box(x: wp.vec3, half: wp.vec3):
 
 
 @wp.func
-def world_extent(q: wp.quat, half: wp.vec3):
-    """Return half extents along the world's axes of a box turned by q."""
-    ex = wp.quat_rotate(q, wp.vec3(half[0], 0.0, 0.0))
-    ey = wp.quat_rotate(q, wp.vec3(0.0, half[1], 0.0))
-    ez = wp.quat_rotate(q, wp.vec3(0.0, 0.0, half[2]))
+def world_extent(turn: wp.mat33, half: wp.vec3):
+    """Return half extents along the world's axes of a box turned by a matrix."""
     return wp.vec3(
-        wp.abs(ex[0]) + wp.abs(ey[0]) + wp.abs(ez[0]),
-        wp.abs(ex[1]) + wp.abs(ey[1]) + wp.abs(ez[1]),
-        wp.abs(ex[2]) + wp.abs(ey[2]) + wp.abs(ez[2]),
+        wp.abs(turn[0, 0]) * half[0] + wp.abs(turn[0, 1]) * half[1] + wp.abs(turn[0, 2]) * half[2],
+        wp.abs(turn[1, 0]) * half[0] + wp.abs(turn[1, 1]) * half[1] + wp.abs(turn[1, 2]) * half[2],
+        wp.abs(turn[2, 0]) * half[0] + wp.abs(turn[2, 1]) * half[1] + wp.abs(turn[2, 2]) * half[2],
     )
 
 
@@ -193,35 +191,25 @@ def object_in_pieces(
     pieces_in: Pieces,
     samples_in: Samples,
     sample_weight_in: wp.float32,
-    active_in: wp.array(dtype=wp.int32),
-    iteration_in: wp.array(dtype=wp.int32),
     weight_in: wp.array(dtype=wp.float32),
-    body_p_in: wp.array2d(dtype=wp.vec3),
-    body_q_in: wp.array2d(dtype=wp.quat),
-    wrench_inout: Wrenches,
+    hands_inout: Hands,
     depth_inout: wp.array(dtype=wp.float32),
 ):
     """Add the gradient of w sum depth^2 over object samples in a piece; deepest per grasp. Over (B, P).
     Moving the body by +n deepens a sample nearest to the face with outward normal n: its gradient is 2 w depth n."""
     b, piece = wp.tid()
-    if active_in[b] == 0:
+    if hands_inout.active[b] == 0:
         return
     body = pieces_in.body[piece]
-    q = piece_rotation(pieces_in, piece, b, body_q_in)
-    p = piece_centre(pieces_in, piece, b, body_p_in, body_q_in)
+    q = piece_rotation(pieces_in, piece, b, hands_inout.body_q)
+    p = piece_centre(pieces_in, piece, b, hands_inout.body_p, hands_inout.body_q)
     half = pieces_in.half[piece]
     turn = wp.quat_to_matrix(q)
-    # Half extents along the world's axes of a box turned by `turn`.
-    extent = wp.vec3(
-        wp.abs(turn[0, 0]) * half[0] + wp.abs(turn[0, 1]) * half[1] + wp.abs(turn[0, 2]) * half[2],
-        wp.abs(turn[1, 0]) * half[0] + wp.abs(turn[1, 1]) * half[1] + wp.abs(turn[1, 2]) * half[2],
-        wp.abs(turn[2, 0]) * half[0] + wp.abs(turn[2, 1]) * half[1] + wp.abs(turn[2, 2]) * half[2],
-    )
-    weight = 2.0 * sample_weight_in * weight_in[iteration_in[0]]
+    weight = 2.0 * sample_weight_in * weight_in[hands_inout.iteration[0]]
     force = wp.vec3(0.0)
     torque = wp.vec3(0.0)
     deepest = float(0.0)
-    cells = cells_around(samples_in, p, extent)
+    cells = cells_around(samples_in, p, world_extent(turn, half))
     for i in range(cells[0], cells[1] + 1):
         for j in range(cells[2], cells[3] + 1):
             mine = samples_of(samples_in, i, j, cells[4], cells[5])
@@ -243,7 +231,7 @@ def object_in_pieces(
                         torque += wp.cross(x, f)
                         deepest = wp.max(deepest, depth)
     if deepest > 0.0:
-        add_wrench(wrench_inout, b, body, force, torque)
+        add_wrench(hands_inout.wrench, b, body, force, torque)
         wp.atomic_max(depth_inout, b, deepest)
 
 
@@ -288,30 +276,26 @@ def pieces_in_pieces(
     points_in: BodyPoints,
     point_weight_in: wp.float32,
     margin_in: wp.float32,
-    active_in: wp.array(dtype=wp.int32),
-    iteration_in: wp.array(dtype=wp.int32),
     weight_in: wp.array(dtype=wp.float32),
-    body_p_in: wp.array2d(dtype=wp.vec3),
-    body_q_in: wp.array2d(dtype=wp.quat),
-    wrench_inout: Wrenches,
+    hands_inout: Hands,
     depth_inout: wp.array(dtype=wp.float32),
 ):
     """Add the gradient of w sum (depth + margin)^2 over hand points inside pieces of other bodies.
     Launch over (B, P)."""
     b, piece = wp.tid()
-    if active_in[b] == 0:
+    if hands_inout.active[b] == 0:
         return
     other = pieces_in.body[piece]
-    q = piece_rotation(pieces_in, piece, b, body_q_in)
-    p = piece_centre(pieces_in, piece, b, body_p_in, body_q_in)
-    weight = 2.0 * point_weight_in * weight_in[iteration_in[0]]
+    q = piece_rotation(pieces_in, piece, b, hands_inout.body_q)
+    p = piece_centre(pieces_in, piece, b, hands_inout.body_p, hands_inout.body_q)
+    weight = 2.0 * point_weight_in * weight_in[hands_inout.iteration[0]]
     half = pieces_in.half[piece] + wp.vec3(margin_in, margin_in, margin_in)
     reach = wp.length(pieces_in.half[piece]) + margin_in
-    for own in range(body_p_in.shape[1]):
-        if may_touch(pieces_in, points_in, other, p, reach, own, b, body_p_in, body_q_in):
+    for own in range(hands_inout.body_p.shape[1]):
+        if may_touch(pieces_in, points_in, other, p, reach, own, b, hands_inout.body_p, hands_inout.body_q):
             # From the body's frame straight into the piece's.
-            turn = wp.quat_to_matrix(wp.quat_inverse(q) * body_q_in[b, own])
-            shift = wp.quat_rotate_inv(q, body_p_in[b, own] - p)
+            turn = wp.quat_to_matrix(wp.quat_inverse(q) * hands_inout.body_q[b, own])
+            shift = wp.quat_rotate_inv(q, hands_inout.body_p[b, own] - p)
             force = wp.vec3(0.0)
             torque = wp.vec3(0.0)
             deepest = float(0.0)
@@ -331,6 +315,6 @@ def pieces_in_pieces(
                 f = wp.quat_rotate(q, force)
                 # About the object's origin: the sum was about the piece's.
                 t = wp.quat_rotate(q, torque) + wp.cross(p, f)
-                add_wrench(wrench_inout, b, other, f, t)
-                add_wrench(wrench_inout, b, own, -f, -t)
+                add_wrench(hands_inout.wrench, b, other, f, t)
+                add_wrench(hands_inout.wrench, b, own, -f, -t)
                 wp.atomic_max(depth_inout, b, deepest)

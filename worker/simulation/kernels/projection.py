@@ -7,7 +7,8 @@ sample to a link, or of a point of one link to another link.
 
 import warp as wp
 
-from graspd.worker.simulation.kernels.kinematics import Tree
+from graspd.worker.simulation.kernels.kinematics import Depths, Hands, Tree
+from graspd.worker.simulation.kernels.packing import Contacts
 from graspd.worker.simulation.kernels.pieces import (
     BodyPoints,
     Pieces,
@@ -65,12 +66,8 @@ def emit(
 @wp.kernel
 def point_residuals(
     lane_in: wp.int32,
-    active_in: wp.array(dtype=wp.int32),
-    count_in: wp.array(dtype=wp.int32),
-    body_in: wp.array2d(dtype=wp.int32),
-    point_in: wp.array2d(dtype=wp.vec3),
-    normal_in: wp.array2d(dtype=wp.vec3),
-    distance_in: wp.array2d(dtype=wp.float32),
+    hands_in: Hands,
+    contacts_in: Contacts,
     near_in: wp.float32,
     target_in: wp.float32,
     hold_in: wp.float32,
@@ -81,38 +78,38 @@ def point_residuals(
     """Emit residuals: points closer than `near` move to `target`, those within `hold` are weakly held.
     Launch over (B, N / lane)."""
     b, part = wp.tid()
-    if active_in[b] == 0:
+    if hands_in.active[b] == 0:
         return
-    for i in range(part * lane_in, wp.min((part + 1) * lane_in, count_in[b])):
-        rho = distance_in[b, i]
+    c = contacts_in
+    for i in range(part * lane_in, wp.min((part + 1) * lane_in, c.count[b])):
+        rho = c.distance[b, i]
         if rho < near_in:
-            emit(residuals_out, b, body_in[b, i], -1, point_in[b, i], normal_in[b, i], rho - target_in, 1.0)
+            emit(residuals_out, b, c.body[b, i], -1, c.point[b, i], c.normal[b, i], rho - target_in, 1.0)
         elif rho < hold_in:
             gap = rho - hold_target_in
-            emit(residuals_out, b, body_in[b, i], -1, point_in[b, i], normal_in[b, i], gap, hold_weight_in)
+            emit(residuals_out, b, c.body[b, i], -1, c.point[b, i], c.normal[b, i], gap, hold_weight_in)
 
 
 @wp.kernel
 def sample_residuals(
     pieces_in: Pieces,
     samples_in: Samples,
-    active_in: wp.array(dtype=wp.int32),
-    body_p_in: wp.array2d(dtype=wp.vec3),
-    body_q_in: wp.array2d(dtype=wp.quat),
+    hands_in: Hands,
     near_in: wp.float32,
     target_in: wp.float32,
     residuals_out: Residuals,
 ):
     """Emit residuals that move object samples within `near` of a link to `target`. Launch over (B, P)."""
     b, piece = wp.tid()
-    if active_in[b] == 0:
+    if hands_in.active[b] == 0:
         return
     body = pieces_in.body[piece]
-    q = piece_rotation(pieces_in, piece, b, body_q_in)
-    p = piece_centre(pieces_in, piece, b, body_p_in, body_q_in)
+    q = piece_rotation(pieces_in, piece, b, hands_in.body_q)
+    p = piece_centre(pieces_in, piece, b, hands_in.body_p, hands_in.body_q)
     half = pieces_in.half[piece] + wp.vec3(near_in, near_in, near_in)
-    back = wp.transpose(wp.quat_to_matrix(q))
-    cells = cells_around(samples_in, p, world_extent(q, half))
+    turn = wp.quat_to_matrix(q)
+    back = wp.transpose(turn)
+    cells = cells_around(samples_in, p, world_extent(turn, half))
     for i in range(cells[0], cells[1] + 1):
         for j in range(cells[2], cells[3] + 1):
             mine = samples_of(samples_in, i, j, cells[4], cells[5])
@@ -131,27 +128,25 @@ def sample_residuals(
 def self_residuals(
     pieces_in: Pieces,
     points_in: BodyPoints,
-    active_in: wp.array(dtype=wp.int32),
-    body_p_in: wp.array2d(dtype=wp.vec3),
-    body_q_in: wp.array2d(dtype=wp.quat),
+    hands_in: Hands,
     near_in: wp.float32,
     target_in: wp.float32,
     residuals_out: Residuals,
 ):
     """Emit residuals that move points of a link within `near` of another to `target`. Launch over (B, P)."""
     b, piece = wp.tid()
-    if active_in[b] == 0:
+    if hands_in.active[b] == 0:
         return
     other = pieces_in.body[piece]
-    q = piece_rotation(pieces_in, piece, b, body_q_in)
-    p = piece_centre(pieces_in, piece, b, body_p_in, body_q_in)
+    q = piece_rotation(pieces_in, piece, b, hands_in.body_q)
+    p = piece_centre(pieces_in, piece, b, hands_in.body_p, hands_in.body_q)
     half = pieces_in.half[piece] + wp.vec3(near_in, near_in, near_in)
     reach = wp.length(pieces_in.half[piece]) + near_in
-    for own in range(body_p_in.shape[1]):
-        if may_touch(pieces_in, points_in, other, p, reach, own, b, body_p_in, body_q_in):
+    for own in range(hands_in.body_p.shape[1]):
+        if may_touch(pieces_in, points_in, other, p, reach, own, b, hands_in.body_p, hands_in.body_q):
             # From the body's frame straight into the piece's.
-            turn = wp.quat_to_matrix(wp.quat_inverse(q) * body_q_in[b, own])
-            shift = wp.quat_rotate_inv(q, body_p_in[b, own] - p)
+            turn = wp.quat_to_matrix(wp.quat_inverse(q) * hands_in.body_q[b, own])
+            shift = wp.quat_rotate_inv(q, hands_in.body_p[b, own] - p)
             for i in range(points_in.first[own], points_in.first[own + 1]):
                 local = turn * points_in.position[i] + shift
                 if in_box(local, half):
@@ -197,10 +192,7 @@ def fixed(x: wp.float32):
 def normal_equations(
     tree_in: Tree,
     lane_in: wp.int32,
-    active_in: wp.array(dtype=wp.int32),
-    pivot_in: wp.array(dtype=wp.vec3),
-    body_p_in: wp.array2d(dtype=wp.vec3),
-    axis_in: wp.array2d(dtype=wp.vec3),
+    hands_in: Hands,
     residuals_in: Residuals,
     row_out: wp.array2d(dtype=wp.float32),
     matrix_inout: wp.array3d(dtype=wp.int64),
@@ -210,7 +202,7 @@ def normal_equations(
     Launch over (B, R / lane); `row` has a scratch row per thread."""
     b, part = wp.tid()
     count = wp.min(residuals_in.count[b], residuals_in.body.shape[1])
-    if active_in[b] == 0 or part * lane_in >= count:
+    if hands_in.active[b] == 0 or part * lane_in >= count:
         return
     n = row_out.shape[1]
     own = b * ((residuals_in.body.shape[1] + lane_in - 1) / lane_in) + part
@@ -221,12 +213,12 @@ def normal_equations(
         other = residuals_in.other[b, k]
         point = residuals_in.point[b, k]
         direction = residuals_in.direction[b, k]
-        add_chain(tree_in, b, own, body, point, direction, 1.0, body_p_in, axis_in, row_out)
+        add_chain(tree_in, b, own, body, point, direction, 1.0, hands_in.body_p, hands_in.axis, row_out)
         if other >= 0:
             # Both links move with the root: only the joints between them count.
-            add_chain(tree_in, b, own, other, point, direction, -1.0, body_p_in, axis_in, row_out)
+            add_chain(tree_in, b, own, other, point, direction, -1.0, hands_in.body_p, hands_in.axis, row_out)
         else:
-            turn = wp.cross(point - pivot_in[b], direction)
+            turn = wp.cross(point - hands_in.pivot[b], direction)
             for i in range(3):
                 row_out[own, i] = direction[i]
                 row_out[own, 3 + i] = turn[i]
@@ -253,10 +245,7 @@ class States:
 
 @wp.kernel
 def keep_best(
-    point_depth_in: wp.array(dtype=wp.float32),
-    object_depth_in: wp.array(dtype=wp.float32),
-    self_depth_in: wp.array(dtype=wp.float32),
-    obstacle_depth_in: wp.array(dtype=wp.float32),
+    depths_in: Depths,
     better_in: wp.float64,
     now_in: States,
     active_inout: wp.array(dtype=wp.int32),
@@ -270,13 +259,14 @@ def keep_best(
     if active_inout[b] == 0:
         return
     count_out[b] = 0
-    now = wp.max(wp.max(point_depth_in[b], object_depth_in[b]), wp.max(self_depth_in[b], obstacle_depth_in[b]))
+    d = depths_in
+    now = wp.max(wp.max(d.points[b], d.object[b]), wp.max(d.links[b], d.obstacles[b]))
     if wp.float64(now) < depth_inout[b] - better_in:
         depth_inout[b] = wp.float64(now)
         best_inout.pivot[b] = now_in.pivot[b]
         best_inout.rotation[b] = now_in.rotation[b]
-        for d in range(now_in.q.shape[1]):
-            best_inout.q[b, d] = now_in.q[b, d]
+        for k in range(now_in.q.shape[1]):
+            best_inout.q[b, k] = now_in.q[b, k]
     if depth_inout[b] <= better_in:
         active_inout[b] = 0
 
@@ -288,22 +278,19 @@ def step(
     scale_in: wp.array(dtype=wp.float64),
     damping_in: wp.float64,
     longest_in: wp.float64,
-    active_in: wp.array(dtype=wp.int32),
     residuals_in: Residuals,
     factor_out: wp.array3d(dtype=wp.float64),
     move_out: wp.array2d(dtype=wp.float64),
     matrix_inout: wp.array3d(dtype=wp.int64),
     vector_inout: wp.array2d(dtype=wp.int64),
     state_inout: States,
-    pivot_out: wp.array(dtype=wp.vec3),
-    rotation_out: wp.array(dtype=wp.quat),
-    q_out: wp.array2d(dtype=wp.float32),
+    hands_inout: Hands,
 ):
     """Take a damped Gauss-Newton step, at most `longest` in units of `scale` (n,).
     (S H S + d I) x = -S g by Cholesky, motion S x; d is `damping` times the number of residuals. The equations are
     reset. Launch over B."""
     b = wp.tid()
-    if active_in[b] == 0:
+    if hands_inout.active[b] == 0:
         return
     n = vector_inout.shape[1]
     unit = wp.float64(1.0) / wp.float64(FIXED)
@@ -341,9 +328,9 @@ def step(
     angle = wp.length(turn)
     axis = turn / wp.max(angle, wp.float64(1.0e-12))
     state_inout.rotation[b] = wp.normalize(wp.quat_from_axis_angle(axis, angle) * state_inout.rotation[b])
-    pivot_out[b] = wp.vec3(state_inout.pivot[b])
-    rotation_out[b] = wp.quat(state_inout.rotation[b])
+    hands_inout.pivot[b] = wp.vec3(state_inout.pivot[b])
+    hands_inout.rotation[b] = wp.quat(state_inout.rotation[b])
     for d in range(n - 6):
         value = wp.clamp(state_inout.q[b, d] + move_out[b, 6 + d], lower_in[d], upper_in[d])
         state_inout.q[b, d] = value
-        q_out[b, d] = wp.float32(value)
+        hands_inout.q[b, d] = wp.float32(value)

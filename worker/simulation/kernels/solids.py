@@ -9,10 +9,11 @@ edges cost two evaluations.
 
 import warp as wp
 
+from graspd.worker.simulation.kernels.kinematics import Hands
 from graspd.worker.simulation.kernels.obstacles import Features, Obstacles, kept, lowest_point, obstacle_distance, posed
 from graspd.worker.simulation.kernels.pieces import Pieces, piece_centre, piece_distance, piece_rotation
 from graspd.worker.simulation.kernels.projection import Residuals, emit
-from graspd.worker.simulation.kernels.wrenches import Wrenches, add_wrench
+from graspd.worker.simulation.kernels.wrenches import add_wrench
 
 wp.set_module_options({"enable_backward": False})
 
@@ -55,55 +56,6 @@ def balanced(n0: wp.vec3, g0: wp.float32, n1: wp.vec3, g1: wp.float32):
 
 
 @wp.func
-def edge_in_piece(pieces: Pieces, piece: wp.int32, a: wp.vec3, b: wp.vec3, limit: wp.float32):
-    """Return the nearest place of edge a b (piece frame) to the piece; a value >= `limit`: not nearer."""
-    along = b - a
-    at0 = piece_distance(pieces, piece, a)
-    at1 = piece_distance(pieces, piece, b)
-    n0 = wp.vec3(at0[0], at0[1], at0[2])
-    n1 = wp.vec3(at1[0], at1[1], at1[2])
-    f0 = at0[3]
-    f1 = at1[3]
-    t0 = float(0.0)
-    t1 = float(1.0)
-    out = EdgeMinimum()
-    if wp.dot(n0, along) >= 0.0:
-        out.value = f0
-        out.gradient = n0
-        return out
-    if wp.dot(n1, along) <= 0.0:
-        out.t = 1.0
-        out.value = f1
-        out.gradient = n1
-        return out
-    for _look in range(LOOKS):
-        g0 = wp.dot(n0, along)
-        g1 = wp.dot(n1, along)
-        t = meeting(t0, f0, g0, t1, f1, g1)
-        if f0 + g0 * (t - t0) >= wp.min(limit, wp.min(f0, f1) - EXACT):
-            break
-        at = piece_distance(pieces, piece, a + t * along)
-        n = wp.vec3(at[0], at[1], at[2])
-        if wp.dot(n, along) > 0.0:
-            t1 = t
-            f1 = at[3]
-            n1 = n
-        else:
-            t0 = t
-            f0 = at[3]
-            n0 = n
-            if wp.dot(n, along) == 0.0:
-                break
-    out.t = t1
-    out.value = f1
-    if f0 < f1:
-        out.t = t0
-        out.value = f0
-    out.gradient = balanced(n0, wp.dot(n0, along), n1, wp.dot(n1, along))
-    return out
-
-
-@wp.func
 def plane_over(obstacles: Obstacles, k: wp.int32, x: wp.vec3):
     """Return (normal, value) of the plane of obstacle k that x is farthest outside of."""
     out = wp.vec4(0.0, 0.0, 0.0, -1.0e9)
@@ -116,11 +68,22 @@ def plane_over(obstacles: Obstacles, k: wp.int32, x: wp.vec3):
 
 
 @wp.func
-def edge_in_obstacle(obstacles: Obstacles, k: wp.int32, a: wp.vec3, b: wp.vec3, limit: wp.float32):
-    """Return the deepest place of edge a b in obstacle k; a value of `limit` or more: not deeper."""
+def convex_distance(pieces: Pieces, piece: wp.int32, obstacles: Obstacles, k: wp.int32, x: wp.vec3):
+    """Return (gradient, signed distance) at x of a piece, in its frame; of obstacle k if `piece` is -1."""
+    if piece >= 0:
+        return piece_distance(pieces, piece, x)
+    return plane_over(obstacles, k, x)
+
+
+@wp.func
+def least_on_edge(
+    pieces: Pieces, piece: wp.int32, obstacles: Obstacles, k: wp.int32, a: wp.vec3, b: wp.vec3, limit: wp.float32
+):
+    """Return the place of edge a b nearest to a piece, or deepest in an obstacle, see `convex_distance`.
+    A value of at least `limit`: not nearer."""
     along = b - a
-    at0 = plane_over(obstacles, k, a)
-    at1 = plane_over(obstacles, k, b)
+    at0 = convex_distance(pieces, piece, obstacles, k, a)
+    at1 = convex_distance(pieces, piece, obstacles, k, b)
     n0 = wp.vec3(at0[0], at0[1], at0[2])
     n1 = wp.vec3(at1[0], at1[1], at1[2])
     f0 = at0[3]
@@ -143,7 +106,7 @@ def edge_in_obstacle(obstacles: Obstacles, k: wp.int32, a: wp.vec3, b: wp.vec3, 
         t = meeting(t0, f0, g0, t1, f1, g1)
         if f0 + g0 * (t - t0) >= wp.min(limit, wp.min(f0, f1) - EXACT):
             break
-        at = plane_over(obstacles, k, a + t * along)
+        at = convex_distance(pieces, piece, obstacles, k, a + t * along)
         n = wp.vec3(at[0], at[1], at[2])
         if wp.dot(n, along) > 0.0:
             t1 = t
@@ -213,7 +176,7 @@ def nearest_edge(
         end = obstacles.end[e]
         local_start = wp.quat_rotate_inv(q, start - p)
         local_end = wp.quat_rotate_inv(q, end - p)
-        found = edge_in_piece(pieces, piece, local_start, local_end, out.distance)
+        found = least_on_edge(pieces, piece, obstacles, k, local_start, local_end, out.distance)
         if found.value < out.distance:
             out.distance = found.value
             out.point = start + found.t * (end - start)
@@ -224,7 +187,7 @@ def nearest_edge(
         end = body_p[b, body] + wp.quat_rotate(body_q[b, body], features.end[e])
         thickness = features.thickness[e]
         # If separate, the obstacle's edges and the link's features give the distance: only penetration counts here.
-        deepest = edge_in_obstacle(obstacles, k, start, end, wp.min(out.distance, 0.0) + thickness)
+        deepest = least_on_edge(pieces, -1, obstacles, k, start, end, wp.min(out.distance, 0.0) + thickness)
         if deepest.value - thickness < wp.min(out.distance, 0.0):
             out.distance = deepest.value - thickness
             out.point = start + deepest.t * (end - start)
@@ -237,41 +200,37 @@ def penalty(
     features_in: Features,
     pieces_in: Pieces,
     obstacles_in: Obstacles,
-    active_in: wp.array(dtype=wp.int32),
-    scene_in: wp.array(dtype=wp.int32),
-    iteration_in: wp.array(dtype=wp.int32),
     weight_in: wp.array(dtype=wp.float32),
-    body_p_in: wp.array2d(dtype=wp.vec3),
-    body_q_in: wp.array2d(dtype=wp.quat),
     room_in: wp.float32,
-    wrench_inout: Wrenches,
+    hands_inout: Hands,
     depth_inout: wp.array(dtype=wp.float32),
 ):
     """Add the gradient of w sum min(d - margin - room, 0)^2 over features and nearest edges. Over (B, P)."""
     b, piece = wp.tid()
-    if active_in[b] == 0 or scene_in[b] < 0 or features_in.first[piece] == features_in.first[piece + 1]:
+    hands = hands_inout
+    if hands.active[b] == 0 or hands.scene[b] < 0 or features_in.first[piece] == features_in.first[piece + 1]:
         return
     body = pieces_in.body[piece]
     first = features_in.first[piece]
-    weight = 2.0 * weight_in[iteration_in[0]]
-    for k in range(obstacles_in.first_solid[scene_in[b]], obstacles_in.first[scene_in[b] + 1]):
+    weight = 2.0 * weight_in[hands.iteration[0]]
+    for k in range(obstacles_in.first_solid[hands.scene[b]], obstacles_in.first[hands.scene[b] + 1]):
         keep = kept(features_in, obstacles_in, first, k, room_in)
-        if apart(pieces_in, obstacles_in, piece, k, b, keep, body_p_in, body_q_in):
+        if apart(pieces_in, obstacles_in, piece, k, b, keep, hands.body_p, hands.body_q):
             continue
         for i in range(first, features_in.first[piece + 1]):
-            f = posed(features_in, i, b, body_p_in, body_q_in)
+            f = posed(features_in, i, b, hands.body_p, hands.body_q)
             nd = obstacle_distance(obstacles_in, k, f)
             short = nd[3] - keep
             if short < 0.0:
                 n = wp.vec3(nd[0], nd[1], nd[2])
                 force = (weight * short) * n
-                add_wrench(wrench_inout, b, body, force, wp.cross(lowest_point(f, n), force))
+                add_wrench(hands.wrench, b, body, force, wp.cross(lowest_point(f, n), force))
                 wp.atomic_max(depth_inout, b, -short)
-        near = nearest_edge(features_in, pieces_in, obstacles_in, piece, k, b, keep, body_p_in, body_q_in)
+        near = nearest_edge(features_in, pieces_in, obstacles_in, piece, k, b, keep, hands.body_p, hands.body_q)
         short = near.distance - keep
         if short < 0.0:
             force = (weight * short) * near.direction
-            add_wrench(wrench_inout, b, body, force, wp.cross(near.point, force))
+            add_wrench(hands.wrench, b, body, force, wp.cross(near.point, force))
             wp.atomic_max(depth_inout, b, -short)
 
 
@@ -280,33 +239,31 @@ def residuals(
     features_in: Features,
     pieces_in: Pieces,
     obstacles_in: Obstacles,
-    active_in: wp.array(dtype=wp.int32),
-    scene_in: wp.array(dtype=wp.int32),
-    body_p_in: wp.array2d(dtype=wp.vec3),
-    body_q_in: wp.array2d(dtype=wp.quat),
+    hands_in: Hands,
     near_in: wp.float32,
     target_in: wp.float32,
     residuals_out: Residuals,
 ):
     """Emit residuals: terms of `penalty` within margin + near move to margin + target. Over (B, P)."""
     b, piece = wp.tid()
-    if active_in[b] == 0 or scene_in[b] < 0 or features_in.first[piece] == features_in.first[piece + 1]:
+    hands = hands_in
+    if hands.active[b] == 0 or hands.scene[b] < 0 or features_in.first[piece] == features_in.first[piece + 1]:
         return
     body = pieces_in.body[piece]
     first = features_in.first[piece]
-    for k in range(obstacles_in.first_solid[scene_in[b]], obstacles_in.first[scene_in[b] + 1]):
+    for k in range(obstacles_in.first_solid[hands.scene[b]], obstacles_in.first[hands.scene[b] + 1]):
         margin = kept(features_in, obstacles_in, first, k, 0.0)
         keep = margin + near_in
         target = margin + target_in
-        if apart(pieces_in, obstacles_in, piece, k, b, keep, body_p_in, body_q_in):
+        if apart(pieces_in, obstacles_in, piece, k, b, keep, hands.body_p, hands.body_q):
             continue
         for i in range(first, features_in.first[piece + 1]):
-            f = posed(features_in, i, b, body_p_in, body_q_in)
+            f = posed(features_in, i, b, hands.body_p, hands.body_q)
             nd = obstacle_distance(obstacles_in, k, f)
             if nd[3] < keep:
                 n = wp.vec3(nd[0], nd[1], nd[2])
                 emit(residuals_out, b, body, -1, lowest_point(f, n), n, nd[3] - target, 1.0)
-        near = nearest_edge(features_in, pieces_in, obstacles_in, piece, k, b, keep, body_p_in, body_q_in)
+        near = nearest_edge(features_in, pieces_in, obstacles_in, piece, k, b, keep, hands.body_p, hands.body_q)
         if near.distance < keep:
             emit(residuals_out, b, body, -1, near.point, near.direction, near.distance - target, 1.0)
 

@@ -9,7 +9,9 @@ the surface. Corner normals stop at creases, so boxes and cylinders keep their e
 
 import warp as wp
 
+from graspd.worker.simulation.kernels.kinematics import Hands
 from graspd.worker.simulation.kernels.nearest import Cells, closest_in_cell
+from graspd.worker.simulation.kernels.packing import Contacts
 
 wp.set_module_options({"enable_backward": False})
 
@@ -84,16 +86,24 @@ def mesh_distance(surface: Surface, point: wp.vec3, reach: wp.float32):
 
 
 @wp.func
-def near_distance(surface: Surface, point: wp.vec3, reach: wp.float32):
-    """Return the result of `mesh_distance`, from the list of the point's cell if it has one."""
-    x = (point - surface.field_origin) / surface.field_cell
+def cell_at(surface: Surface, x: wp.vec3):
+    """Return the cell of a point in units of the grid's cells, and whether the grid has it."""
     i = int(wp.floor(x[0]))
     j = int(wp.floor(x[1]))
     k = int(wp.floor(x[2]))
     nx = surface.field.shape[0] - 1
     ny = surface.field.shape[1] - 1
     nz = surface.field.shape[2] - 1
-    if i >= 0 and j >= 0 and k >= 0 and i < nx and j < ny and k < nz:
+    return i, j, k, i >= 0 and j >= 0 and k >= 0 and i < nx and j < ny and k < nz
+
+
+@wp.func
+def near_distance(surface: Surface, point: wp.vec3, reach: wp.float32):
+    """Return the result of `mesh_distance`, from the list of the point's cell if it has one."""
+    i, j, k, inside = cell_at(surface, (point - surface.field_origin) / surface.field_cell)
+    if inside:
+        ny = surface.field.shape[1] - 1
+        nz = surface.field.shape[2] - 1
         centre = surface.field_origin + surface.field_cell * wp.vec3(float(i) + 0.5, float(j) + 0.5, float(k) + 0.5)
         found = closest_in_cell(surface.cells, (i * ny + j) * nz + k, centre, point)
         if found.face >= 0:
@@ -126,18 +136,9 @@ def cube_around(surface: Surface, point: wp.vec3):
     """Return the cell of a point; `inside` is whether the grid has one."""
     cube = Cube()
     x = (point - surface.field_origin) / surface.field_cell
-    i = int(wp.floor(x[0]))
-    j = int(wp.floor(x[1]))
-    k = int(wp.floor(x[2]))
-    cube.inside = (
-        i >= 0
-        and j >= 0
-        and k >= 0
-        and i + 1 < surface.field.shape[0]
-        and j + 1 < surface.field.shape[1]
-        and k + 1 < surface.field.shape[2]
-    )
-    if cube.inside:
+    i, j, k, inside = cell_at(surface, x)
+    cube.inside = inside
+    if inside:
         cube.at = wp.vec3(x[0] - float(i), x[1] - float(j), x[2] - float(k))
         cube.f000 = surface.field[i, j, k]
         cube.f100 = surface.field[i + 1, j, k]
@@ -243,22 +244,9 @@ def gather(
     body_in: wp.array(dtype=wp.int32),
     position_in: wp.array(dtype=wp.vec3),
     weight_in: wp.array(dtype=wp.float32),
-    active_in: wp.array(dtype=wp.int32),
-    iteration_in: wp.array(dtype=wp.int32),
     dilation_in: wp.array(dtype=wp.float32),
-    dilation_scale_in: wp.array(dtype=wp.float32),
-    body_p_in: wp.array2d(dtype=wp.vec3),
-    body_q_in: wp.array2d(dtype=wp.quat),
-    count_inout: wp.array(dtype=wp.int32),
-    contact_body_out: wp.array2d(dtype=wp.int32),
-    contact_point_out: wp.array2d(dtype=wp.vec3),
-    contact_normal_out: wp.array2d(dtype=wp.vec3),
-    contact_distance_out: wp.array2d(dtype=wp.float32),
-    contact_weight_out: wp.array2d(dtype=wp.float32),
-    gradient_out: wp.array2d(dtype=wp.float32),
-    near_count_inout: wp.array(dtype=wp.int32),
-    near_out: wp.array2d(dtype=wp.int32),
-    mark_out: wp.array2d(dtype=wp.int32),
+    hands_in: Hands,
+    contacts_inout: Contacts,
 ):
     """Pack candidate contacts per grasp: hand points closer than dilation + keep.
 
@@ -266,29 +254,29 @@ def gather(
     marked, for `packing.pack` to pack them. Launch over (B, N / lane).
     """
     b, part = wp.tid()
-    if active_in[b] == 0:
+    if hands_in.active[b] == 0:
         return
-    dilation = dilation_scale_in[b] * dilation_in[iteration_in[0]]
+    dilation = hands_in.dilation_scale[b] * dilation_in[hands_in.iteration[0]]
     reach = dilation + band_in
     keep = dilation + keep_in
-    apart = mark_out.shape[0] > 0
+    apart = contacts_inout.mark.shape[0] > 0
     for i in range(part * lane_in, wp.min((part + 1) * lane_in, body_in.shape[0])):
         body = body_in[i]
-        point = body_p_in[b, body] + wp.quat_rotate(body_q_in[b, body], position_in[i])
+        point = hands_in.body_p[b, body] + wp.quat_rotate(hands_in.body_q[b, body], position_in[i])
         sample = distance(surface_in, point, reach, exact_in, keep)
         kept = sample.distance < keep
         near = kept and sample.distance - dilation <= near_gap_in
         k = i
         if apart:
-            mark_out[b, i] = wp.int32(kept) + wp.int32(near)
+            contacts_inout.mark[b, i] = wp.int32(kept) + wp.int32(near)
         elif kept:
-            k = wp.atomic_add(count_inout, b, 1)
+            k = wp.atomic_add(contacts_inout.count, b, 1)
             if near:
-                near_out[b, wp.atomic_add(near_count_inout, b, 1)] = k
+                contacts_inout.near[b, wp.atomic_add(contacts_inout.near_count, b, 1)] = k
         if kept:
-            contact_body_out[b, k] = body
-            contact_point_out[b, k] = point
-            contact_normal_out[b, k] = sample.normal
-            contact_distance_out[b, k] = sample.distance
-            contact_weight_out[b, k] = weight_in[i]
-            gradient_out[b, k] = 0.0
+            contacts_inout.body[b, k] = body
+            contacts_inout.point[b, k] = point
+            contacts_inout.normal[b, k] = sample.normal
+            contacts_inout.distance[b, k] = sample.distance
+            contacts_inout.weight[b, k] = weight_in[i]
+            contacts_inout.gradient[b, k] = 0.0
