@@ -15,8 +15,8 @@ from httpx_sse import EventSource
 from pydantic import BaseModel, TypeAdapter
 
 from graspd.api.formatting import is_loopback
-from graspd.api.models import GraspQuery, Job, JobDetail
-from graspd.service.index.views import AssetView, CellView, DatasetView, GraspView, ObjectSetView, Page, SnapshotView
+from graspd.api.models import Job, JobDetail
+from graspd.service.index.views import AssetView, CellView, DatasetView, ObjectSetView, Page, SnapshotView
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.errors import ERRORS, GraspdError, InputError, RateError, UnavailableError, without_secrets
 from graspd.service.model.records import Snapshot
@@ -85,10 +85,6 @@ class Client:
 
     def retry(self, job_id: str) -> JobDetail:
         return self._document(JobDetail, "POST", path_of("jobs", job_id, "retry"))
-
-    def grasps(self, query: GraspQuery, *, limit: int = 50) -> Page[GraspView]:
-        params = query.model_dump(mode="json", exclude_none=True) | {"limit": limit}
-        return self._document(Page[GraspView], "GET", "/v1/grasps", params=params)
 
     def assets(self, kind: AssetKind, *, refused: bool = False) -> Iterator[AssetView]:
         """Yield all hands, objects or networks; refused ones only on request."""

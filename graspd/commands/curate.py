@@ -1,4 +1,4 @@
-"""Command line: `graspd grasps where`, `graspd datasets balance`, `diff`, and `graspd clouds`."""
+"""Command line: `graspd grasps where`, `graspd datasets balance` and `graspd clouds`."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from typing import Annotated
 
 import typer
 
-from graspd.service.cli import CommandGroup, JsonFlag, emit, plain_console, plain_table, report
+from graspd.service.cli import CommandGroup, JsonFlag, report
 from graspd.service.model.errors import InputError
 from graspd.service.readers import Pictures
 from graspd.service.readers.clouds import Frame
 from graspd.service.readers.depth_noise import NOISES
 from graspd.service.readers.where import parse
 from graspd.worker.files.clouds import hand_surface, write_clouds
-from graspd.worker.files.curation import KINDS, Balance, difference
+from graspd.worker.files.curation import KINDS, Balance
 from graspd.worker.files.subsets import Subset, shards_of, write_subset
 
 app = CommandGroup(no_args_is_help=True, add_completion=False)
@@ -73,41 +73,6 @@ def balance(
     chooser = Balance(kinds, at_most, min_distance, seed, hand)
     said = {"balance": kinds, "from": source, "at_most": at_most, "min_distance": min_distance, "seed": seed}
     _tell(write_subset(shards_of(source), chooser, out, said=said), out, json=json)
-
-
-@app.command(epilog="graspd datasets diff kitchen-v1 kitchen-v2 --json")
-def diff(first: SourceArgument, second: SourceArgument, json: JsonFlag = False) -> None:
-    """Compare two datasets, or two snapshots, given as NAME@SNAPSHOT."""
-    found = difference(*(shards_of(*_version(one)) for one in (first, second)))
-    if json:
-        emit({"a": first, "b": second, **found})
-        return
-    console = plain_console()
-    if not found["cells"] and not found["settings"]:
-        console.print(f"the same grasps in {found['same_cells']} cells")
-        return
-    table = plain_table("hand", "object", "grasps", "valid", "in both")
-    for one in found["cells"]:
-        counts = (f"{one['first']} | {one['second']}", f"{one['valid_first']} | {one['valid_second']}")
-        table.add_row(one["hand"], one["object"], *counts, str(one["common"]))
-    console.print(table if found["cells"] else "the same grasps")
-    for name, values in found["settings"].items():
-        console.print(f"{name}: {_listed(values['first'])} | {_listed(values['second'])}")
-    console.print(f"{found['same_cells']} cells have the same grasps")
-
-
-def _version(source: str) -> tuple[str, str | None]:
-    if "/" in source or "@" not in source or Path(source).exists():
-        return source, None
-    name, _, snapshot = source.partition("@")
-    if not snapshot:
-        raise InputError(f"{source}: write the digest of a snapshot after @")
-    return name, snapshot
-
-
-def _listed(values: list[str]) -> str:
-    shown = ", ".join(value[:40] for value in values[:4])
-    return (shown + (f" and {len(values) - 4} more" if len(values) > 4 else "")) or "-"
 
 
 def _tell(found: Subset, out: Path, *, json: bool) -> None:

@@ -32,7 +32,7 @@ class Subset:
     passed_over: int  # scene and views shards, whose rows refer to grasps by number and are not transferred
 
 
-def shards_of(source: str, snapshot: str | None = None) -> Shards:
+def shards_of(source: str) -> Shards:
     """Return the shards of a file or folder, or of a dataset in this machine's store by name.
     Raises NotFoundError: none of these exists."""
     if "/" in source or source in (".", "..") or Path(source).exists():
@@ -41,7 +41,7 @@ def shards_of(source: str, snapshot: str | None = None) -> Shards:
         store = open_store(load_settings().resolved_store_url, make=False)
     except NotFoundError as error:
         raise NotFoundError(f"{source} is no file or folder, and {error}") from None
-    return open_shards(store, dataset=source, snapshot=snapshot)
+    return open_shards(store, dataset=source)
 
 
 def base_shards(shards: Shards) -> Iterator[list[Shard]]:
