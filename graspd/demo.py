@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -26,19 +25,6 @@ from graspd.service.store.assets import builtin_files
 from graspd.service.store.shards import Shard, read_shard
 
 app = CommandGroup()
-
-
-@dataclass(frozen=True)
-class Results:
-    """Paths of the files that the demo writes."""
-
-    shards: list[Path]
-    pictures: list[Path]
-    page: Path
-
-    def as_json(self) -> dict[str, Any]:
-        several = {name: list(map(str, getattr(self, name))) for name in ("shards", "pictures")}
-        return several | {"page": str(self.page)}
 
 
 _SHOWN_GRASPS: Final = 12
@@ -72,7 +58,7 @@ def demo(
             job, files = run(client, request, out, console)
     results = write_pages(out, job, files)
     if json:
-        emit(job_summary(job) | results.as_json())
+        emit(job_summary(job) | results)
     else:
         print_results(console, job, results)
 
@@ -91,19 +77,20 @@ def run(client: Client, request: JobRequest, out: Path, console: Console) -> tup
     return job, sorted(files)
 
 
-def print_results(console: Console, job: JobDetail, paths: Results) -> None:
+def print_results(console: Console, job: JobDetail, paths: dict[str, list[str] | str]) -> None:
     """Print yield, means, worker time and the paths of all files."""
     console.print(f"{yield_of(job)}; {means_of(job)}")
     for stage in job.stages:
         console.print(f"{stage.stage.value:<11} {count(stage.tasks)} × {duration(stage.seconds / stage.tasks)}")
     console.print()
-    for what, some in (("shard", paths.shards), ("picture", paths.pictures), ("page", [paths.page])):
-        for path in some:
-            console.print(f"{what:<8} {path}", soft_wrap=True)
+    for what, some in paths.items():
+        for path in some if isinstance(some, list) else [some]:
+            console.print(f"{what.removesuffix('s'):<8} {path}", soft_wrap=True)
 
 
-def write_pages(out: Path, job: JobDetail, shards: list[Path]) -> Results:
-    """Write the contact sheet of the best grasps, views of the first batch, and an index.html with both."""
+def write_pages(out: Path, job: JobDetail, shards: list[Path]) -> dict[str, list[str] | str]:
+    """Write the contact sheet of the best grasps, views of the first batch, and an index.html with both.
+    Return the paths of shards, pictures and page."""
     from graspd.worker.rendering.sheets import views_page
 
     pages: dict[str, bytes] = {}
@@ -120,7 +107,7 @@ def write_pages(out: Path, job: JobDetail, shards: list[Path]) -> Results:
     pages["index.html"] = html_page(job, pictures, shards, out).encode()
     for name, content in pages.items():
         write_output(out / name, content)
-    return Results(shards, pictures, out / "index.html")
+    return {"shards": [*map(str, shards)], "pictures": [*map(str, pictures)], "page": str(out / "index.html")}
 
 
 def draw_grasps(job: JobDetail, base: Shard) -> bytes:

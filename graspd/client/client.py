@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import Any, Final, Self, TypeVar
+from typing import Any, Final, TypeVar
 from urllib.parse import quote
 
 import httpx
@@ -39,7 +39,7 @@ _WAITS_S: Final = (2.0, 5.0, 10.0, 20.0)
 View = TypeVar("View", bound=BaseModel)
 
 
-class Client:
+class Client(AbstractContextManager["Client"]):
     """Connection to one graspd API. Usable as a context manager. `transport` replaces the network in tests."""
 
     def __init__(self, url: str, *, key: str | None = None, transport: httpx.BaseTransport | None = None) -> None:
@@ -55,9 +55,6 @@ class Client:
             follow_redirects=True,
             trust_env=not is_local,
         )
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

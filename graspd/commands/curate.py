@@ -15,7 +15,7 @@ from graspd.service.readers.depth_noise import NOISES
 from graspd.service.readers.where import parse
 from graspd.worker.files.clouds import hand_surface, write_clouds
 from graspd.worker.files.curation import KINDS, Balance
-from graspd.worker.files.subsets import Subset, shards_of, write_subset
+from graspd.worker.files.subsets import UnvalidatedOption, shards_of, write_subset
 
 app = CommandGroup(no_args_is_help=True, add_completion=False)
 group = CommandGroup(no_args_is_help=True, help="Select grasps of files and datasets by their metrics.")
@@ -75,12 +75,11 @@ def balance(
     _tell(write_subset(shards_of(source), chooser, out, said=said), out, json=json)
 
 
-def _tell(found: Subset, out: Path, *, json: bool) -> None:
-    counts = {"looked_at": found.looked_at, "kept": found.kept, "shards": len(found.files)}
-    line = f"{out}: {found.kept} of {found.looked_at} grasps in {len(found.files)} shards"
-    report({"folder": str(out), **counts, "passed_over": found.passed_over}, line, json=json)
-    if found.passed_over and not json:
-        typer.echo(f"{found.passed_over} shards of scenes and pictures are not copied", err=True)
+def _tell(found: dict[str, int], out: Path, *, json: bool) -> None:
+    line = f"{out}: {found['kept']} of {found['looked_at']} grasps in {found['shards']} shards"
+    report({"folder": str(out), **found}, line, json=json)
+    if found["passed_over"] and not json:
+        typer.echo(f"{found['passed_over']} shards of scenes and pictures are not copied", err=True)
 
 
 @app.command(epilog="graspd clouds kitchen --points 1024 --noise stereo -o clouds")
@@ -101,9 +100,7 @@ def clouds(
     graspness: Annotated[
         bool, typer.Option("--graspness", help="Add graspness: share of grasps whose hand touches the point.")
     ] = False,
-    unvalidated: Annotated[
-        bool, typer.Option("--unvalidated", help="Select feasible grasps without validation instead of valid ones.")
-    ] = False,
+    unvalidated: UnvalidatedOption = False,
     seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same clouds.")] = 0,
     json: JsonFlag = False,
 ) -> None:

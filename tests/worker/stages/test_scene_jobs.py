@@ -132,15 +132,6 @@ def render_alone(bench: Bench, base: Shard) -> dict[str, Any]:
     return pictures(obj, np.asarray(base["scene/object_pose"]), **options, seed=batch_seed(message), extras=extras)
 
 
-def test_neighbours_that_overlap_fail_the_job_in_a_line(table: Bench) -> None:
-    bench = Bench(table.store)
-    one = {"object": "mug", "pose": [0.02, 0, 0, 1, 0, 0, 0]}
-    scene = {"supports": [{"kind": "half_space"}], "target": [0, 0, 0.045, 1, 0, 0, 0]}
-    kind, words = bench.run(**TABLE | {"scene": scene, "neighbours": [one]})
-    assert kind is EventKind.FAILED
-    assert re.search(r"block and mug overlap by [\d.]+ mm in scene 0; move one of them", words)
-
-
 def test_a_scene_without_a_way_in_fails_the_job_and_says_so(table: Bench) -> None:
     walls = [{"kind": "box", "size": [0.4, 0.02, 0.6], "pose": [0, s * 0.05, 0.3, 1, 0, 0, 0]} for s in (-1, 1)] + [
         {"kind": "box", "size": [0.02, 0.4, 0.6], "pose": [s * 0.07, 0, 0.3, 1, 0, 0, 0]} for s in (-1, 1)
@@ -165,10 +156,17 @@ def test_payload_out_of_reach_fails_job_with_what_the_hand_lifts(table: Bench, s
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
+        (
+            {
+                "scene": {"supports": [{"kind": "half_space"}], "target": [0, 0, 0.045, 1, 0, 0, 0]},
+                "neighbours": [{"object": "mug", "pose": [0.02, 0, 0, 1, 0, 0, 0]}],
+            },
+            r"block and mug overlap by [\d.]+ mm in scene 0; move one of them",
+        ),
         ({"scene": {"supports": [{"kind": "half_space", "offset": 0.5}], "target": DOWN}}, "deep in support 0"),
         ({"scene": "table", "method": "elsewhere"}, "unknown method"),
     ],
 )
 def test_what_only_a_worker_can_know_fails_the_job_in_a_line(table: Bench, changes: dict[str, Any], words: str) -> None:
     kind, said = Bench(table.store).run(**TABLE | {"views": 0, "grasps": 1} | changes)
-    assert kind is EventKind.FAILED and words in said
+    assert kind is EventKind.FAILED and re.search(words, said)
