@@ -68,7 +68,6 @@ JOINED: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("hands", "check", "graspd.commands.hands", "Check whether a hand can be used, and report guesses."),
     ("objects", "check", "graspd.commands.objects", "Check whether a mesh can be used, and report repairs."),
     ("datasets", "balance", "graspd.commands.curate", "Write a subset in which no kind of grasps dominates."),
-    ("datasets", "diff", "graspd.commands.curate", "Compare two datasets."),
     ("datasets", "card", "graspd.commands.exchange", "Write a dataset's card: contents, quality, biases, plots."),
 )
 

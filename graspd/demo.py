@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -10,15 +9,13 @@ from typing import Annotated, Any, Final
 import numpy as np
 import typer
 from rich.console import Console
-from rich.table import Table
 
-from graspd.api.formatting import count, duration, metric
-from graspd.api.models import GraspQuery, JobDetail
+from graspd.api.formatting import count, duration
+from graspd.api.models import JobDetail
 from graspd.client.client import Client
 from graspd.client.reports import JobDisplay, job_summary, means_of, yield_of
 from graspd.service.cli import CommandGroup, JsonFlag, emit, load_settings, plain_console, write_output
 from graspd.service.command_options import parsed_options
-from graspd.service.index.views import GraspView
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.errors import TaskError
 from graspd.service.model.states import AssetKind, State
@@ -28,19 +25,6 @@ from graspd.service.store.assets import builtin_files
 from graspd.service.store.shards import Shard, read_shard
 
 app = CommandGroup()
-
-
-@dataclass(frozen=True)
-class Results:
-    """Paths of the files that the demo writes."""
-
-    shards: list[Path]
-    pictures: list[Path]
-    page: Path
-
-    def as_json(self) -> dict[str, Any]:
-        several = {name: list(map(str, getattr(self, name))) for name in ("shards", "pictures")}
-        return several | {"page": str(self.page)}
 
 
 _SHOWN_GRASPS: Final = 12
@@ -71,51 +55,42 @@ def demo(
             service.wait_ready(say=lambda line: console.print(line, soft_wrap=True))
         console.print(f"the service runs at {service.api_url} until the job is done")
         with Client(service.api_url) as client:
-            job, top, files = run(client, request, out, console)
+            job, files = run(client, request, out, console)
     results = write_pages(out, job, files)
     if json:
-        emit(job_summary(job) | results.as_json())
+        emit(job_summary(job) | results)
     else:
-        print_results(console, top, job, results)
+        print_results(console, job, results)
 
 
-def run(
-    client: Client, request: JobRequest, out: Path, console: Console
-) -> tuple[JobDetail, list[GraspView], list[Path]]:
-    """Submit the job, watch it, and fetch its files: return it, its ten best grasps by epsilon, and its shards."""
+def run(client: Client, request: JobRequest, out: Path, console: Console) -> tuple[JobDetail, list[Path]]:
+    """Submit the job, watch it, and fetch its files: return it and its shards."""
     job = client.submit(request)
     console.print(f"job {job.id[:12]}: {request.grasps} grasps of {request.hand} on {request.object}")
     with JobDisplay(console) as display:
         job = client.wait(job.id, display.update)
     if job.state is not State.SUCCEEDED:
         raise TaskError(f"the job {job.state.value}: {job.reason or 'no reason recorded'}")
-    top = client.grasps(GraspQuery(job=job.id, valid=True), limit=10).items
     folder = out / "shards"
     folder.mkdir(exist_ok=True)
     files = [client.save(shard.file, folder / f"{shard.kind}-{shard.batch:04}.h5") for shard in job.shards]
-    return job, top, sorted(files)
+    return job, sorted(files)
 
 
-def print_results(console: Console, best: list[GraspView], job: JobDetail, paths: Results) -> None:
-    """Print the quality table and the paths of all files."""
-    table = Table(title="Best grasps by ε", title_justify="left", header_style="bold", box=None)
-    for name in ("rank", "ε", "contact (cm²)", "intersection (cm³)", "penetration (mm)", "shard:row"):
-        table.add_column(name, justify="right")
-    for rank, grasp in enumerate(best, start=1):
-        values = (grasp.epsilon, grasp.contact_area_cm2, grasp.intersection_volume_cm3, grasp.penetration_depth_mm)
-        table.add_row(str(rank), *(metric(value) for value in values), f"{grasp.shard_id[:8]}:{grasp.row}")
-    console.print(table)
-    console.print(f"\n{yield_of(job)}; {means_of(job)}")
+def print_results(console: Console, job: JobDetail, paths: dict[str, list[str] | str]) -> None:
+    """Print yield, means, worker time and the paths of all files."""
+    console.print(f"{yield_of(job)}; {means_of(job)}")
     for stage in job.stages:
         console.print(f"{stage.stage.value:<11} {count(stage.tasks)} × {duration(stage.seconds / stage.tasks)}")
     console.print()
-    for what, some in (("shard", paths.shards), ("picture", paths.pictures), ("page", [paths.page])):
-        for path in some:
-            console.print(f"{what:<8} {path}", soft_wrap=True)
+    for what, some in paths.items():
+        for path in some if isinstance(some, list) else [some]:
+            console.print(f"{what.removesuffix('s'):<8} {path}", soft_wrap=True)
 
 
-def write_pages(out: Path, job: JobDetail, shards: list[Path]) -> Results:
-    """Write the contact sheet of the best grasps, views of the first batch, and an index.html with both."""
+def write_pages(out: Path, job: JobDetail, shards: list[Path]) -> dict[str, list[str] | str]:
+    """Write the contact sheet of the best grasps, views of the first batch, and an index.html with both.
+    Return the paths of shards, pictures and page."""
     from graspd.worker.rendering.sheets import views_page
 
     pages: dict[str, bytes] = {}
@@ -132,7 +107,7 @@ def write_pages(out: Path, job: JobDetail, shards: list[Path]) -> Results:
     pages["index.html"] = html_page(job, pictures, shards, out).encode()
     for name, content in pages.items():
         write_output(out / name, content)
-    return Results(shards, pictures, out / "index.html")
+    return {"shards": [*map(str, shards)], "pictures": [*map(str, pictures)], "page": str(out / "index.html")}
 
 
 def draw_grasps(job: JobDetail, base: Shard) -> bytes:

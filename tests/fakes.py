@@ -25,7 +25,6 @@ from graspd.service.model.messages import TaskMessage
 from graspd.service.model.planning import PlannedTask, message_of, plan
 from graspd.service.model.records import AttemptRecord, JobRecord
 from graspd.service.model.states import AssetKind, Priority, Stage
-from graspd.service.model.version import STAGE_REVISIONS
 from graspd.service.model.workers import WorkerBeat
 from graspd.service.pipeline.backends import Services
 from graspd.service.store.integrity import put_document
@@ -231,16 +230,13 @@ def main() -> None:
     FAKE_POISON names a batch that kills its worker, FAKE_LEAK_MB is memory that each task keeps, FAKE_LOCK_S is how
     long each task holds the interpreter lock; while there is a file FAKE_HOLD no task ends, and while there is a file
     FAKE_BROKEN nothing works. With FAKE_DIE_UNTOLD the worker that puts the first shard is killed before it tells; a
-    file of that name says so. FAKE_REVISION is the revision of synthesize that worker and engine make. Of the options
-    of `graspd worker` it takes `--burst` and `--idle`.
+    file of that name says so. Of the options of `graspd worker` it takes `--burst` and `--idle`.
     """
     from graspd.service.cli import log_to_stderr
     from graspd.service.settings import Settings
     from graspd.worker.process import engine
     from graspd.worker.process.main import run_worker
 
-    if revision := os.environ.get("FAKE_REVISION"):
-        STAGE_REVISIONS["synthesize"] = int(revision)
     table = fake_stages()
     poison = os.environ.get("FAKE_POISON")
     leaked: list[bytes] = []

@@ -23,14 +23,6 @@ Progress = Callable[[float, float, str], None]
 Cancelled = Callable[[], bool]
 
 
-def _silent(done: float, total: float, message: str) -> None:
-    """Ignore progress."""
-
-
-def _never() -> bool:
-    return False
-
-
 class CoreSharing:
     """Number of parallel parts that share the cores; a part that ends frees its cores for the others."""
 
@@ -51,8 +43,8 @@ class ExecutionContext:
     device: str = "cpu"
     threads: int = 0
     """CPU threads; 0: one per core that this process may use."""
-    progress: Progress = _silent
-    cancelled: Cancelled = _never
+    progress: Progress = lambda done, total, message: None
+    cancelled: Cancelled = lambda: False
     prefilter: PrefilterMode = "auto"
     """Whether MuJoCo Warp decides clear verdicts; auto: on a GPU, if it is installed."""
     pool: Pool | None = None
@@ -75,7 +67,7 @@ class ExecutionContext:
         return replace(self, progress=tell)
 
     def quiet(self) -> ExecutionContext:
-        return replace(self, progress=_silent)
+        return replace(self, progress=DEFAULT_CONTEXT.progress)
 
     def check(self, what: str) -> None:
         if self.cancelled():
@@ -123,18 +115,12 @@ def parallel_map(
     parts: Sequence[T], work: Callable[[T, ExecutionContext], R], run: ExecutionContext, *, size: Callable[[T], int]
 ) -> list[R]:
     """Run `work` on every part in parallel; return the results in order.
-    Each part has its own share of the cores and, by `size`, of the progress. The first failure stops the others.
-
-    Raises:
-        Exception: the error of the first part that failed, after all parts have ended.
-    """
+    Each part has its own share of the cores and, by `size`, of the progress. The first failure stops the others; its
+    error is raised once all have ended."""
     if len(parts) == 1:
         return [work(parts[0], run)]
-    sharing, stop, shares = (
-        CoreSharing(len(parts)),
-        threading.Event(),
-        ProgressShares([size(part) for part in parts], run.progress),
-    )
+    sharing, stop = CoreSharing(len(parts)), threading.Event()
+    shares = ProgressShares([size(part) for part in parts], run.progress)
 
     def run_part(number: int) -> R:
         own = replace(

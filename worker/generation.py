@@ -13,9 +13,9 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
-from typing import Any, Final, Self
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,22 +108,11 @@ def validated_grasps(
     run: ExecutionContext = DEFAULT_CONTEXT,
     partial: bool = False,
 ) -> ValidatedBatch:
-    """Plan one batch of a job: `count` valid grasps, or as many as the budget finds.
+    """Plan batch number `batch` of a job: `count` valid grasps (without validation: feasible), or fewer at the budget.
 
-    Args:
-        request: method, fidelity, seed, friction, level, budget; and whether `count` grasps must be valid.
-        count: number of grasps wanted; without validation, of feasible grasps.
-        batch: number of the batch within its job.
-        scenes: scenes of the grasps, in turn; then valid means lifted out of the scene. None: free object.
-        pieces: computes the object's convex pieces; runs in parallel with the planning of the first round.
-        run: receives progress and is polled for cancellation; its device is the planner's.
-        partial: on cancellation, return the grasps that are validated so far.
-
-    Raises:
-        HandError: no two digits of the hand oppose each other.
-        InputError: the object does not fit into the gripper.
-        MeshError: the object has no usable convex pieces.
-        TaskCancelled: `run.cancelled()` returned True; with `partial`, before any grasp was validated.
+    `scenes` are used in turn; valid then means lifted out of the scene. `pieces` runs during the first round's
+    planning. With `partial`, a cancellation returns the grasps validated so far; TaskCancelled if there are none.
+    Raises also the errors of `require_graspable`, and MeshError: the object has no usable convex pieces.
     """
     require_graspable(hand, obj)
     with Scoring(hand, obj, request, scenes=scenes, pieces=pieces, run=run) as scoring:
@@ -155,12 +144,7 @@ def scored(
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> ValidatedBatch:
     """Validate and measure existing grasps as `request` specifies; return all of them.
-
-    With `scenes`, each grasp is validated in the scene with its number in `grasps.scene`.
-
-    Raises:
-        MeshError: the object has no usable convex pieces.
-    """
+    With `scenes`, each is validated in scene `grasps.scene`. Raises MeshError: no usable convex pieces."""
     request = request.model_copy(update={"want": "candidates"})
     with Scoring(hand, obj, request, scenes=scenes, pieces=pieces, run=run) as scoring:
         work = Batch(scoring, 0, len(grasps), run)
@@ -168,7 +152,7 @@ def scored(
         return work.finish()
 
 
-class Scoring:
+class Scoring(AbstractContextManager["Scoring"]):
     """Verdicts and metrics of a job's grasps; each grasp is scored independently of the others."""
 
     def __init__(
@@ -187,9 +171,6 @@ class Scoring:
         self.scenes = None if scenes is None else scenes.centred(obj)
         self.beside = ThreadPoolExecutor(1, thread_name_prefix="beside")
         self.pieces = self.beside.submit(pieces, self.obj) if request.validation != "none" else None
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *error: object) -> None:
         self.beside.shutdown()

@@ -43,20 +43,11 @@ def validated_batches(
     checked: Callable[[int, ValidatedBatch], None] | None = None,
     empty_on: tuple[type[Exception], ...] = (),
 ) -> list[ValidatedBatch]:
-    """Plan consecutive batches of a job; each has the same result as with `validated_grasps`.
+    """Plan consecutive batches of a job from number `first`; each has the same result as with `validated_grasps`.
 
-    Args:
-        sizes: number of grasps wanted for each batch.
-        first: number of the first batch within its job.
-        join: number of batches that are planned in one launch; 1: one batch after the other.
-        scenes: see `validated_grasps`; common to all batches, or one per batch.
-        pieces: computes the object's convex pieces; called once.
-        partial: on cancellation, return the batches validated so far; the last one may be incomplete.
-        checked: called with the number of each finished batch and its result; may raise.
-        empty_on: errors that give a batch without grasps; not for a job's first batch, nor if all batches fail.
-
-    Raises:
-        Exception: the error of the first batch that failed; the others are cancelled.
+    `join` batches are planned in one launch. `scenes` are common to all batches, or one per batch. With `partial`, a
+    cancellation returns the batches validated so far. `checked` receives each finished batch and may raise. An error
+    in `empty_on` gives a batch without grasps, except the job's first. Other errors cancel the other batches.
     """
     known: list[ConvexPieces] = []
 

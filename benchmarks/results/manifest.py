@@ -19,24 +19,6 @@ DOCS: Final = REPOSITORY / "docs"
 MANIFEST, INDEX = "results/MANIFEST.json", "results/README.md"
 _REVISIONS: Final = re.compile(r"^STAGE_REVISIONS[^=]*= (\{[^}]*\})", re.MULTILINE)
 
-#: Studies of the smallest and largest objects, and of hands of all kinds.
-EXTREMES: Final = frozenset({"stability", "scenes-stability"})
-ALL_HANDS: Final = frozenset({"hands-stability"})
-#: Studies whose grasps are all planned in scenes.
-SCENES_ONLY: Final = frozenset({"clutter", "scene-ways", "tables", "lift", "scene-pictures", "learned"})
-#: By stage and revision: an earlier revision with equal results bit for bit, except in the named studies.
-#: tests/front/test_same_figures.py has the reasons. Synthesize 19 differs for objects that are too small or too wide
-#: for the hand's pads, 20 for grippers with more than two digits, 21 to 23 for free objects. Pictures of render 4 equal
-#: those of render 3 (traced by Newton) except for rounding (tests/worker/rendering/test_tracer.py).
-SAME: Final[dict[tuple[str, int], tuple[int, frozenset[str]]]] = {
-    ("synthesize", 23): (22, frozenset(BY_NAME) - SCENES_ONLY),
-    ("synthesize", 22): (21, frozenset(BY_NAME) - SCENES_ONLY),
-    ("synthesize", 21): (20, frozenset(BY_NAME) - SCENES_ONLY),
-    ("synthesize", 20): (19, ALL_HANDS),
-    ("synthesize", 19): (18, EXTREMES),
-    ("render", 4): (3, frozenset()),
-}
-
 Manifest = dict[str, dict[str, Any]]
 
 
@@ -94,17 +76,8 @@ def staleness(study: Study, record: Mapping[str, Any] | None) -> str:
     made = record["stage_revisions"]
     if study.stages and made is None:
         return "of an unknown revision"
-    older = [f"{stage} {made.get(stage)}" for stage in study.stages if not _holds(study, stage, made.get(stage))]
+    older = [f"{stage} {made.get(stage)}" for stage in study.stages if made.get(stage) != STAGE_REVISIONS[stage]]
     return f"of {', '.join(older)}" if older else ""
-
-
-def _holds(study: Study, stage: str, made: int | None) -> bool:
-    now = STAGE_REVISIONS[stage]
-    while made != now and (stage, now) in SAME:
-        now, others = SAME[stage, now]
-        if study.name in others:
-            return False
-    return made == now
 
 
 def entered(study: Study, docs: Path) -> dict[str, Any]:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import Any, Final, Self, TypeVar
+from typing import Any, Final, TypeVar
 from urllib.parse import quote
 
 import httpx
@@ -15,8 +15,8 @@ from httpx_sse import EventSource
 from pydantic import BaseModel, TypeAdapter
 
 from graspd.api.formatting import is_loopback
-from graspd.api.models import GraspQuery, Job, JobDetail
-from graspd.service.index.views import AssetView, CellView, DatasetView, GraspView, ObjectSetView, Page, SnapshotView
+from graspd.api.models import Job, JobDetail
+from graspd.service.index.views import AssetView, CellView, DatasetView, ObjectSetView, Page, SnapshotView
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.errors import ERRORS, GraspdError, InputError, RateError, UnavailableError, without_secrets
 from graspd.service.model.records import Snapshot
@@ -39,7 +39,7 @@ _WAITS_S: Final = (2.0, 5.0, 10.0, 20.0)
 View = TypeVar("View", bound=BaseModel)
 
 
-class Client:
+class Client(AbstractContextManager["Client"]):
     """Connection to one graspd API. Usable as a context manager. `transport` replaces the network in tests."""
 
     def __init__(self, url: str, *, key: str | None = None, transport: httpx.BaseTransport | None = None) -> None:
@@ -55,9 +55,6 @@ class Client:
             follow_redirects=True,
             trust_env=not is_local,
         )
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
@@ -85,10 +82,6 @@ class Client:
 
     def retry(self, job_id: str) -> JobDetail:
         return self._document(JobDetail, "POST", path_of("jobs", job_id, "retry"))
-
-    def grasps(self, query: GraspQuery, *, limit: int = 50) -> Page[GraspView]:
-        params = query.model_dump(mode="json", exclude_none=True) | {"limit": limit}
-        return self._document(Page[GraspView], "GET", "/v1/grasps", params=params)
 
     def assets(self, kind: AssetKind, *, refused: bool = False) -> Iterator[AssetView]:
         """Yield all hands, objects or networks; refused ones only on request."""

@@ -1,4 +1,4 @@
-"""Command line: `graspd grasps where`, `graspd datasets balance`, `diff`, and `graspd clouds`."""
+"""Command line: `graspd grasps where`, `graspd datasets balance` and `graspd clouds`."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from typing import Annotated
 
 import typer
 
-from graspd.service.cli import CommandGroup, JsonFlag, emit, plain_console, plain_table, report
+from graspd.service.cli import CommandGroup, JsonFlag, report
 from graspd.service.model.errors import InputError
 from graspd.service.readers import Pictures
 from graspd.service.readers.clouds import Frame
 from graspd.service.readers.depth_noise import NOISES
 from graspd.service.readers.where import parse
 from graspd.worker.files.clouds import hand_surface, write_clouds
-from graspd.worker.files.curation import KINDS, Balance, difference
-from graspd.worker.files.subsets import Subset, shards_of, write_subset
+from graspd.worker.files.curation import KINDS, Balance
+from graspd.worker.files.subsets import UnvalidatedOption, shards_of, write_subset
 
 app = CommandGroup(no_args_is_help=True, add_completion=False)
 group = CommandGroup(no_args_is_help=True, help="Select grasps of files and datasets by their metrics.")
@@ -75,47 +75,11 @@ def balance(
     _tell(write_subset(shards_of(source), chooser, out, said=said), out, json=json)
 
 
-@app.command(epilog="graspd datasets diff kitchen-v1 kitchen-v2 --json")
-def diff(first: SourceArgument, second: SourceArgument, json: JsonFlag = False) -> None:
-    """Compare two datasets, or two snapshots, given as NAME@SNAPSHOT."""
-    found = difference(*(shards_of(*_version(one)) for one in (first, second)))
-    if json:
-        emit({"a": first, "b": second, **found})
-        return
-    console = plain_console()
-    if not found["cells"] and not found["settings"]:
-        console.print(f"the same grasps in {found['same_cells']} cells")
-        return
-    table = plain_table("hand", "object", "grasps", "valid", "in both")
-    for one in found["cells"]:
-        counts = (f"{one['first']} | {one['second']}", f"{one['valid_first']} | {one['valid_second']}")
-        table.add_row(one["hand"], one["object"], *counts, str(one["common"]))
-    console.print(table if found["cells"] else "the same grasps")
-    for name, values in found["settings"].items():
-        console.print(f"{name}: {_listed(values['first'])} | {_listed(values['second'])}")
-    console.print(f"{found['same_cells']} cells have the same grasps")
-
-
-def _version(source: str) -> tuple[str, str | None]:
-    if "/" in source or "@" not in source or Path(source).exists():
-        return source, None
-    name, _, snapshot = source.partition("@")
-    if not snapshot:
-        raise InputError(f"{source}: write the digest of a snapshot after @")
-    return name, snapshot
-
-
-def _listed(values: list[str]) -> str:
-    shown = ", ".join(value[:40] for value in values[:4])
-    return (shown + (f" and {len(values) - 4} more" if len(values) > 4 else "")) or "-"
-
-
-def _tell(found: Subset, out: Path, *, json: bool) -> None:
-    counts = {"looked_at": found.looked_at, "kept": found.kept, "shards": len(found.files)}
-    line = f"{out}: {found.kept} of {found.looked_at} grasps in {len(found.files)} shards"
-    report({"folder": str(out), **counts, "passed_over": found.passed_over}, line, json=json)
-    if found.passed_over and not json:
-        typer.echo(f"{found.passed_over} shards of scenes and pictures are not copied", err=True)
+def _tell(found: dict[str, int], out: Path, *, json: bool) -> None:
+    line = f"{out}: {found['kept']} of {found['looked_at']} grasps in {found['shards']} shards"
+    report({"folder": str(out), **found}, line, json=json)
+    if found["passed_over"] and not json:
+        typer.echo(f"{found['passed_over']} shards of scenes and pictures are not copied", err=True)
 
 
 @app.command(epilog="graspd clouds kitchen --points 1024 --noise stereo -o clouds")
@@ -136,9 +100,7 @@ def clouds(
     graspness: Annotated[
         bool, typer.Option("--graspness", help="Add graspness: share of grasps whose hand touches the point.")
     ] = False,
-    unvalidated: Annotated[
-        bool, typer.Option("--unvalidated", help="Select feasible grasps without validation instead of valid ones.")
-    ] = False,
+    unvalidated: UnvalidatedOption = False,
     seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same clouds.")] = 0,
     json: JsonFlag = False,
 ) -> None:

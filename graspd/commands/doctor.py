@@ -47,12 +47,7 @@ def run_child(arguments: Sequence[str]) -> subprocess.CompletedProcess[str]:
 
 
 def gpu(settings: Settings, *, child: Child = run_child, has_driver: Callable[[], bool] | None = None) -> Finding:
-    """Check which GPUs Warp finds, and whether their memory is free.
-
-    Args:
-        child: runs this module.
-        has_driver: whether the machine appears to have a GPU.
-    """
+    """Check which GPUs Warp finds, and whether their memory is free; `has_driver`: whether there appears to be one."""
     found, wrong = _answer(child, ["gpus"])
     if wrong:
         return bad(

@@ -18,6 +18,7 @@ from graspd.service.model.metrics import AXIS_MEANINGS, MOST_ROBUST_MODELS
 from graspd.service.store.shards import carried, json_attribute, read_shard, write_shard
 from graspd.studies.evaluation import Protocol, combine, evaluate
 from graspd.worker.execution_context import ExecutionContext
+from graspd.worker.files.subsets import require_empty
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.same_hand import TOLERANCE_M, same_hand
 from graspd.worker.validation.key import Level
@@ -166,8 +167,7 @@ def _copies(paths: list[Path], files: list[Path], out: Path | None, *, robust: i
     if other := next((file for file in files if file.suffix != ".h5"), None):
         raise InputError(f"{other} is no shard of graspd: only shards can store the shares")
     if paths[0].is_dir():
-        if out.exists() and (not out.is_dir() or any(out.iterdir())):
-            raise InputError(f"{out} already exists; choose a new or empty folder")
+        require_empty(out)
         return {file: out / file.relative_to(paths[0]) for file in files}
     if not out.parent.is_dir() or out.is_dir():
         raise InputError(f"{out} cannot be written: choose a file in an existing folder")

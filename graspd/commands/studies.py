@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from json import dumps, loads
@@ -74,13 +74,18 @@ def bench(
 
 def _fidelities(names: list[str] | None, points: list[int] | None, errors: list[float] | None) -> list[Fidelity]:
     """Return the named fidelities, then variants of the first one with one setting changed at a time."""
-    chosen = names or list(OFFERED)
-    if unknown := [name for name in chosen if name not in FIDELITIES]:
-        raise InputError(f"unknown fidelity {unknown[0]!r}; choose one of {one_of(unknown[0], FIDELITIES)}")
+    chosen = _known(names or OFFERED)
     found = [FIDELITIES[name] for name in chosen]
     changes: list[dict[str, Any]] = [{"fine_points": n, "name": f"{chosen[0]}/points={n}"} for n in points or []]
     changes += [{"face_error_m": e, "name": f"{chosen[0]}/error={dumps(e)}"} for e in errors or []]
     return found + [Fidelity(**(found[0].model_dump() | change)) for change in changes]
+
+
+def _known(fidelities: Sequence[str]) -> list[str]:
+    for name in fidelities:
+        if name not in FIDELITIES:
+            raise InputError(f"unknown fidelity {name!r}; choose one of {one_of(name, FIDELITIES)}")
+    return list(fidelities)
 
 
 STUDIES: Final = (
@@ -138,13 +143,19 @@ def _measured(names: tuple[str, ...], hand: str, obj: str, *, quick: bool, long:
     return Stability(timestamp(), command, {"graspd": PACKAGE_VERSION, "warp": wp.__version__}, maps)
 
 
-def _read_maps(path: Path) -> Stability:
+def _read(path: Path, kind: str, parse: Callable[[Any], Any]) -> Any:
+    """Parse a JSON file of `graspd KIND --out`; raise InputError for any other file."""
     try:
-        return from_json(loads(path.read_text()))
+        return parse(loads(path.read_text()))
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}") from None
     except (ValueError, RecursionError):
-        raise InputError(f"{path} is no stability.json; `graspd stability --out FOLDER` writes one") from None
+        raise InputError(f"{path} is no {kind}.json; `graspd {kind} --out FOLDER` writes one") from None
+
+
+def _read_maps(path: Path) -> Stability:
+    found: Stability = _read(path, "stability", from_json)
+    return found
 
 
 def _joined(parts: list[Stability]) -> Stability:
@@ -234,9 +245,7 @@ def chart(
     if quick:
         hands, objects, fidelities = (_parts(text)[0] for text in (hands, objects, fidelities))
         batches, baseline_batch, repeats, models_around = [4], 2, 1, 2
-    levels = _parts(fidelities)
-    if unknown := [name for name in levels if name not in FIDELITIES]:
-        raise InputError(f"unknown fidelity {unknown[0]!r}; choose one of {one_of(unknown[0], FIDELITIES)}")
+    levels = _known(_parts(fidelities))
     chosen = settings_of(
         _parts(methods),
         levels,
@@ -280,14 +289,13 @@ def _finish(result: dict[str, Any], out: Path | None, data_dir: Path | None, *, 
 
 
 def _read_chart(path: Path) -> dict[str, Any]:
-    try:
-        found = renamed_chart(loads(path.read_text()))
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}") from None
-    except ValueError:
-        found = None
-    if not isinstance(found, dict) or not {"created", "runs"} <= found.keys():
-        raise InputError(f"{path} is no chart.json; `graspd chart --out FOLDER` writes one")
+    def parse(document: Any) -> dict[str, Any]:
+        found = renamed_chart(document)
+        if not isinstance(found, dict) or not {"created", "runs"} <= found.keys():
+            raise ValueError("no chart")
+        return found
+
+    found: dict[str, Any] = _read(path, "chart", parse)
     if missing := [key for key in ("summary", "by_hand", "models") if key not in found]:
         raise InputError(f"{path} has no {missing[0]}, because an earlier graspd wrote it; measure again")
     return found

@@ -98,7 +98,7 @@ _TYPED = """
     synth --hand allegro --object mug --scene table --method learned --option network=FILE.npz -o OUT.h5
     evaluate FILE.h5; evaluate FILE.json; scene FILE.h5; render FILE.h5; view FILE.h5; pictures FILE.h5
     clouds FILE.h5 -o OUT; grasps where lift --from FILE.h5 -o OUT
-    datasets balance FILE.h5 -o OUT; datasets card FILE.h5/ -o OUT; datasets diff FILE.h5 FILE.h5
+    datasets balance FILE.h5 -o OUT; datasets card FILE.h5/ -o OUT
     datasets create x --spec FILE.toml; datasets estimate --spec FILE.json
     hands check FILE.urdf; hands check FILE.zip; objects check FILE.zip; objects check FILE.stl
     bench --hand FILE.urdf; admin gallery --hand FILE.urdf -o OUT

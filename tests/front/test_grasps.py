@@ -157,7 +157,7 @@ def test_a_table_has_poses_joints_and_metrics_by_name(grasps: graspd.Grasps) -> 
     assert set(grasps.metrics) <= set(table.columns) and len(grasps[[]].to_pandas()) == 0
 
 
-def test_without_pandas_one_line_says_how_to_get_it(grasps: graspd.Grasps, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_pandas_one_line_tells(grasps: graspd.Grasps, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(graspd.InputError, match=re.escape("pip install 'graspd[pandas]'")):
         grasps.to_pandas()
@@ -172,21 +172,18 @@ def test_a_notebook_shows_the_best_as_a_small_picture(known: graspd.Grasps) -> N
 
 
 def test_a_notebook_shows_a_table_where_nothing_can_be_drawn(
-    grasps: graspd.Grasps, known: graspd.Grasps, monkeypatch: pytest.MonkeyPatch
+    grasps: graspd.Grasps, known: graspd.Grasps, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # The best valid one first; the hand called claw is nowhere.
     assert "<tbody><tr><td>5</td><td>yes</td><td>5</td>" in grasps._repr_html_()
     assert "<table>" in grasps[[]]._repr_html_()
+    html = graspd.open(shard(tmp_path / "h.h5", obj="<script>", hand="<b>"))._repr_html_()
+    assert "<script>" not in html and "<b>" not in html
     for bound in ("PICTURE_S", "PICTURE_BYTES"):
         with monkeypatch.context() as tight:
             tight.setattr(showing, bound, -1)
             html = known._repr_html_()
             assert "<table>" in html and "<img" not in html
-
-
-def test_names_cannot_write_html(tmp_path: Path) -> None:
-    html = graspd.open(shard(tmp_path / "g.h5", obj="<script>", hand="<b>"))._repr_html_()
-    assert "<script>" not in html and "<b>" not in html
 
 
 def test_plot_is_a_picture_of_the_best(known: graspd.Grasps, grasps: graspd.Grasps) -> None:

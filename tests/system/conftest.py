@@ -6,7 +6,6 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -62,9 +61,10 @@ class System:
 Started = Callable[..., System]
 
 
-@contextmanager
-def starting(folder: Path, patch: pytest.MonkeyPatch) -> Iterator[Started]:
-    """Starts services on a folder; all are stopped at the end."""
+@pytest.fixture
+def start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Started]:
+    """Starts a service, of real workers if `fakes` is False; `environment` is for its workers' fakes.
+    Everything is stopped at the end."""
     running: list[System] = []
 
     def make(
@@ -75,10 +75,10 @@ def starting(folder: Path, patch: pytest.MonkeyPatch) -> Iterator[Started]:
         environment: dict[str, str] | None = None,
         **settings: Any,
     ) -> System:
-        for name, value in {"FAKE_HOLD": str(folder / "hold"), **(environment or {})}.items():
-            patch.setenv(name, value)
+        for name, value in {"FAKE_HOLD": str(tmp_path / "hold"), **(environment or {})}.items():
+            monkeypatch.setenv(name, value)
         wanted = Settings(
-            data_dir=folder / "data", port=0, device="cpu", controller_interval_s=0.5, **{"task_s": 0.0, **settings}
+            data_dir=tmp_path / "data", port=0, device="cpu", controller_interval_s=0.5, **{"task_s": 0.0, **settings}
         )
         command = ("-m", "tests.fakes") if fakes else ("-m", "graspd", "worker")
         supervisor = Supervisor(wanted, workers=workers, api=api, worker_command=(sys.executable, *command))
@@ -86,7 +86,7 @@ def starting(folder: Path, patch: pytest.MonkeyPatch) -> Iterator[Started]:
         supervisor.start()
         try:
             supervisor.wait_ready(PATIENCE_S)
-            running.append(System(supervisor, folder / "hold", fakes=fakes))
+            running.append(System(supervisor, tmp_path / "hold", fakes=fakes))
         except BaseException:
             supervisor.stop()
             raise
@@ -96,32 +96,6 @@ def starting(folder: Path, patch: pytest.MonkeyPatch) -> Iterator[Started]:
     for system in running:
         system.services.close()
         system.supervisor.stop()
-
-
-@pytest.fixture
-def start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Started]:
-    """Starts a service, of real workers if `fakes` is False; `environment` is for its workers' fakes.
-
-    Everything is stopped at the end.
-    """
-    with starting(tmp_path, monkeypatch) as make:
-        yield make
-
-
-@pytest.fixture(scope="module")
-def shared_system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
-    """A service of one worker that outlives what tests do to it; each gives its jobs seeds of its own."""
-    with pytest.MonkeyPatch.context() as patch, starting(tmp_path_factory.mktemp("shared"), patch) as make:
-        yield make()
-
-
-@pytest.fixture
-def system(shared_system: System, monkeypatch: pytest.MonkeyPatch) -> System:
-    """The shared service, with all of its parts there; processes that start anew find what the first ones found."""
-    monkeypatch.setenv("FAKE_HOLD", str(shared_system.hold))
-    shared_system.hold.unlink(missing_ok=True)
-    shared_system.supervisor.wait_ready(PATIENCE_S)
-    return shared_system
 
 
 def alive(pid: int) -> bool:

@@ -28,8 +28,8 @@ LEASE_S = 2.0
 class House:
     """Redis, controllers and a worker as processes, each with a log. While there is a file `hold` no task ends."""
 
-    def __init__(self, folder: Path, *, lease_s: float = LEASE_S) -> None:
-        self.settings = Settings(data_dir=folder / "data", lease_s=lease_s, controller_interval_s=0.3, task_s=0.0)
+    def __init__(self, folder: Path) -> None:
+        self.settings = Settings(data_dir=folder / "data", lease_s=LEASE_S, controller_interval_s=0.3, task_s=0.0)
         self._logs = folder / "logs"
         self._logs.mkdir()
         self.hold = folder / "hold"

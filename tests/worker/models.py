@@ -9,9 +9,8 @@ import trimesh
 
 from graspd.service.store.shards import json_attribute
 from graspd.worker.hands.model import ConvexPiece, HandModel, PalmFrame
+from graspd.worker.objects.mesh_geometry import corner_normals
 from graspd.worker.objects.model import ObjectModel
-
-CREASE_RAD = 0.6
 
 
 def object_from_mesh(mesh: trimesh.Trimesh, name: str = "thing") -> ObjectModel:
@@ -23,7 +22,7 @@ def object_from_mesh(mesh: trimesh.Trimesh, name: str = "thing") -> ObjectModel:
         digest=f"{mesh.identifier_hash[:32]:0>32}",
         vertices=np.asarray(mesh.vertices, float),
         faces=np.asarray(mesh.faces, np.int32),
-        corner_normals=corner_normals(mesh),
+        corner_normals=corner_normals(np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int32)),
         volume=mass,
         centre_of_mass=np.asarray(mesh.center_mass, float),
         inertia=np.asarray(mesh.moment_inertia, float) / mass,
@@ -31,14 +30,6 @@ def object_from_mesh(mesh: trimesh.Trimesh, name: str = "thing") -> ObjectModel:
         hull_vertices=np.asarray(hull.vertices, float),
         hull_faces=np.asarray(hull.faces, np.int32),
     )
-
-
-def corner_normals(mesh: trimesh.Trimesh) -> np.ndarray:
-    """(F, 3, 3): vertex normals where they lie close to the face normal, else the face normal."""
-    smooth = np.asarray(mesh.vertex_normals)[mesh.faces]
-    flat = np.repeat(np.asarray(mesh.face_normals)[:, None], 3, axis=1)
-    near = (smooth * flat).sum(-1, keepdims=True) > np.cos(CREASE_RAD)
-    return np.where(near, smooth, flat)
 
 
 def piece(

@@ -58,18 +58,27 @@ def test_a_batch_of_valid_grasps_holds_nothing_else(valid: ValidatedBatch) -> No
     assert valid.candidates == COUNT + sum(valid.rejected.values())
     assert valid.planned >= valid.candidates
     assert (valid.columns["quality/recheck"] >= 0).tolist() == [True] * 2 + [False] * (COUNT - 2)
+    assert "quality/robust_share" not in valid.columns and "not_robust" not in valid.rejected
+
+
+def judge(monkeypatch: pytest.MonkeyPatch, *pushes: Outcome, feasible: bool) -> None:
+    """Verdicts repeat these outcomes of the third push, and the gate passes all grasps or none."""
+
+    def verdicts(_hand: Any, _obj: Any, grasps: GraspSet, **__: Any) -> SimpleNamespace:
+        outcome = np.full((len(grasps), 6), Outcome.HELD, np.uint8)
+        outcome[:, 2] = np.resize(pushes, len(grasps))
+        held = (outcome[:, 2] == Outcome.HELD).astype(np.int8)
+        return SimpleNamespace(success=held, outcome=outcome, margin=np.zeros(len(grasps)), seconds=0.0)
+
+    monkeypatch.setattr(generation, "validate", verdicts)
+    gate = lambda columns: np.full(len(columns["quality/success"]), feasible, np.uint8)  # noqa: E731
+    monkeypatch.setattr(generation, "passes", gate)
 
 
 def test_tries_count_up_to_the_last_grasp_that_is_kept(
     hand: HandModel, block: ObjectModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def every_other(_hand: Any, _obj: Any, grasps: GraspSet, **__: Any) -> SimpleNamespace:
-        held = (np.arange(len(grasps)) % 2 == 0).astype(np.int8)
-        outcome = np.ones((len(grasps), 6), np.uint8)
-        return SimpleNamespace(success=held, outcome=outcome, margin=np.zeros(len(grasps)), seconds=0.0)
-
-    monkeypatch.setattr(generation, "validate", every_other)
-    monkeypatch.setattr(generation, "passes", lambda columns: np.ones(len(columns["quality/success"]), np.uint8))
+    judge(monkeypatch, Outcome.HELD, Outcome.DISPLACED, feasible=True)
     found = validated_grasps(hand, block, wish(rechecks=0), count=COUNT)
     # Six tries hold at 0, 2, 4; of the seven that promise to be enough the ones at 0, 2, 4 are.
     assert (found.candidates, found.planned, found.rejected["dropped"]) == (6 + 5, 6 + 7, 3 + 2)
@@ -78,16 +87,8 @@ def test_tries_count_up_to_the_last_grasp_that_is_kept(
 def test_what_the_validator_saw_of_each_try_is_counted(
     hand: HandModel, block: ObjectModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    seen = [Outcome.HELD, Outcome.DISPLACED, Outcome.ROTATED, Outcome.LOST_WHILE_CLOSING, Outcome.PENETRATION]
-
-    def each_otherwise(_hand: Any, _obj: Any, grasps: GraspSet, **__: Any) -> SimpleNamespace:
-        outcome = np.full((len(grasps), 6), Outcome.HELD, np.uint8)
-        outcome[:, 2] = [seen[k % len(seen)] for k in range(len(grasps))]
-        held = (outcome[:, 2] == Outcome.HELD).astype(np.int8)
-        return SimpleNamespace(success=held, outcome=outcome, margin=np.zeros(len(grasps)), seconds=0.0)
-
-    monkeypatch.setattr(generation, "validate", each_otherwise)
-    monkeypatch.setattr(generation, "passes", lambda columns: np.zeros(len(columns["quality/success"]), np.uint8))
+    seen = (Outcome.HELD, Outcome.DISPLACED, Outcome.ROTATED, Outcome.LOST_WHILE_CLOSING, Outcome.PENETRATION)
+    judge(monkeypatch, *seen, feasible=False)
     found = validated_grasps(
         hand, block, wish(rechecks=0, grasps=5, budget=1), count=5, run=ExecutionContext(threads=1)
     )
@@ -182,13 +183,8 @@ def test_a_budget_that_finds_nothing_ends_with_nothing(
         posture = Posture(np.tile([0.0, 0, 1, 1, 0, 0, 0], (count, 1)), np.zeros((count, len(hand.joint_names))))
         return GraspSet(posture, posture, posture, np.full(count, np.nan))
 
-    def drop(_hand: Any, _obj: Any, grasps: GraspSet, **__: Any) -> SimpleNamespace:
-        n = len(grasps)
-        outcome, nothing = np.full((n, 6), 4, np.uint8), np.zeros(n, np.int8)
-        return SimpleNamespace(success=nothing, outcome=outcome, margin=np.full(n, 9.0), seconds=0.0)
-
     monkeypatch.setattr(generation, "synthesize", plan)
-    monkeypatch.setattr(generation, "validate", drop)
+    judge(monkeypatch, Outcome.DISPLACED, feasible=True)
     found = validated_grasps(hand, block, wish(budget=3.0), count=COUNT)
     assert (len(found.grasps), found.candidates) == (0, 3 * COUNT)
     assert len(set(planned)) == len(planned), "each round draws other grasps"
@@ -251,8 +247,3 @@ def test_valid_grasps_that_hold_in_no_other_model_are_told_apart(
     assert (raw.columns["quality/robust_share"][held] == 0).all() and len(raw.grasps) == 4
     assert (raw.columns["quality/robust_weakest"][held] == Axis.POSE).all()
     assert raw.columns["quality/valid"].any(), "a grasp that is not robust is valid all the same"
-
-
-def test_without_models_nothing_is_said_of_them(valid: ValidatedBatch) -> None:
-    assert "quality/robust_share" not in valid.columns
-    assert "not_robust" not in valid.rejected

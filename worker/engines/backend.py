@@ -9,7 +9,6 @@ from __future__ import annotations
 import logging
 import os
 import pkgutil
-import shutil
 import sys
 import tempfile
 import threading
@@ -125,30 +124,17 @@ def bake(names: Iterable[str], *, architectures: Sequence[int] = ARCHITECTURES, 
     return sorted(file for file in Path(wp.config.kernel_cache_dir).glob("*/*") if file.is_file())
 
 
-def lay_out(cache: Path) -> int:
-    """Copy missing kernels from `$GRASPD_KERNELS` into the cache, if the folder is readable; return their number."""
-    named = os.environ.get(VARIABLE, "")
-    if not named:
-        return 0
-    source, copied = Path(named) / wp.config.version, 0
+def lay_out(cache: Path) -> None:
+    """Copy missing kernels from `$GRASPD_KERNELS` into the cache, if the folder is readable."""
+    if not (named := os.environ.get(VARIABLE, "")):
+        return
+    source = Path(named) / wp.config.version
     try:
         for file in sorted(source.glob("*/*")):
-            copied += _copied(file, cache / file.parent.name / file.name)
+            if not (target := cache / file.relative_to(source)).exists():
+                user_cache.write_whole(target, [file.read_bytes()])
     except OSError as error:
         log.warning("kernels of %s are not used: %s", source, error)
-    return copied
-
-
-def _copied(source: Path, target: Path) -> bool:
-    """Copy a file atomically; return whether it was missing."""
-    if target.exists():
-        return False
-    target.parent.mkdir(parents=True, exist_ok=True)
-    handle, partial = tempfile.mkstemp(dir=target.parent, suffix=".part")
-    os.close(handle)
-    shutil.copyfile(source, partial)
-    Path(partial).replace(target)
-    return True
 
 
 def binary_name(module: ModuleType) -> str:

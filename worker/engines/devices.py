@@ -35,9 +35,7 @@ class Device:
 
     def __init__(self, wanted: str, *, number: int | None = None) -> None:
         """`number`: index of a worker on its machine, see `take`.
-
-        Raises InputError for an invalid name, or a CUDA device that does not exist.
-        """
+        Raises InputError for an invalid name, or a CUDA device that does not exist."""
         if not re.fullmatch(r"auto|cpu|cuda:\d+", wanted):
             raise InputError(f"there is no device {wanted!r}; use cpu, cuda:0 (or another number), or auto")
         self.wanted, self._number = wanted, number
@@ -104,9 +102,7 @@ class Gpu:
 
 def take(gpus: Sequence[Gpu], folder: Path, *, number: int | None = None) -> Gpu:
     """Select one of the GPUs (at least one): that of worker `number`, else one with the fewest processes.
-
-    The GPU counts as taken until this process ends. Without a writable folder it is that of `number`, else the first.
-    """
+    The GPU counts as taken until this process ends. Without a writable folder: that of `number`, else the first."""
     eligible = [gpus[number % len(gpus)]] if number is not None else list(gpus)
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -12,12 +12,12 @@ import numpy as np
 from cachetools import LRUCache, cached
 from numpy.typing import NDArray
 
-from graspd.service.model.errors import ConflictError
 from graspd.service.model.transforms import Floats, apply
 from graspd.service.readers import Clouds
 from graspd.service.readers.clouds import OF_GRASPS
 from graspd.service.store.shards import Shard
 from graspd.worker.files.provenance import hand_of_shard
+from graspd.worker.files.subsets import require_empty
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.surface import sample_surface
@@ -31,8 +31,7 @@ def write_clouds(clouds: Clouds, folder: Path, said: Mapping[str, Any]) -> dict[
     An npz has the keys of a sample (docs/how-to/clouds.md) stacked over its C clouds. Arrays with a row per grasp are
     concatenated cloud by cloud; `grasp/count` (C,) is the number of rows of each cloud.
     Raises ConflictError: the folder exists and is not empty."""
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise ConflictError(f"{folder} exists already; name another folder")
+    require_empty(folder)
     folder.mkdir(parents=True, exist_ok=True)
     done = {"files": 0, "clouds": 0, "empty": 0}
     for _, samples in groupby(clouds, key=lambda sample: sample["shard_id"]):

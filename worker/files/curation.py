@@ -1,24 +1,19 @@
-"""Curation of datasets: balanced subsets (types, approaches, resting faces), and differences."""
+"""Balanced subsets of datasets: grasp types, approach directions, resting faces."""
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from itertools import chain
-from typing import Any, Final
+from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic_core import from_json
 
 from graspd.service.model.errors import InputError, one_of
 from graspd.service.model.transforms import quat_conjugate, quat_rotate
-from graspd.service.readers import Shards
 from graspd.service.store import validity
 from graspd.service.store.shards import Shard
 from graspd.worker.files.provenance import hand_of_shard
-from graspd.worker.files.subsets import base_shards
 from graspd.worker.grasps import Posture
 from graspd.worker.quality.diversity import distinct, hand_points
 
@@ -100,87 +95,3 @@ def faces(down: NDArray[np.float64]) -> NDArray[np.int64]:
             seen, near = np.concatenate([seen, down[row][None]]), np.array([len(seen)])
         found[row] = near[0]
     return found
-
-
-Row = dict[str, Any]
-#: Root attributes of base shards that are compared.
-_SETTINGS: Final = (
-    "method",
-    "fidelity",
-    "seed",
-    "want",
-    "mu",
-    "verdict_level",
-    "verdict_key",
-    "scene",
-    "code_version",
-    "hand_digest",
-    "object_digest",
-)
-_DIGITS: Final = 6  # grasps with equal pose and joints to this many digits (metres, radians) are identical
-
-
-@dataclass
-class _Side:
-    grasps: dict[tuple[str, str], Counter[bytes]] = field(default_factory=dict)
-    valid: Counter[tuple[str, str]] = field(default_factory=Counter)
-    settings: dict[str, set[str]] = field(default_factory=dict)
-
-    @classmethod
-    def of(cls, shards: Shards) -> _Side:
-        side = cls()
-        for shard in chain.from_iterable(base_shards(shards)):
-            side._add(shard)
-        return side
-
-    def _add(self, shard: Shard) -> None:
-        said = shard.attributes
-        pair = (str(said.get("hand", "")), str(said.get("object", "")))
-        rows = np.hstack([shard["grasp/hand_pose"], shard["grasp/joint_positions"]]).astype(float)
-        rounded = np.round(rows, _DIGITS) + 0.0  # no minus zero
-        self.grasps.setdefault(pair, Counter()).update(row.tobytes() for row in rounded)
-        self.valid[pair] += int(validity.valid(shard.arrays).sum())
-        for name in _SETTINGS:
-            if (value := said.get(name)) not in (None, ""):
-                self.settings.setdefault(name, set()).add(_short(name, value))
-
-
-def _short(name: str, value: object) -> str:
-    if name == "fidelity":
-        try:
-            return str(from_json(str(value))["name"])
-        except (ValueError, KeyError, TypeError):
-            return str(value)
-    return str(value)
-
-
-def difference(first: Shards, second: Shards) -> Row:
-    """Return the difference of two datasets as JSON values.
-
-    Keys: shards {first, second, common}; cells[] {hand, object, first, second: grasps, valid_first, valid_second,
-    common: grasps in both}, of those that differ; same_cells, the number of equal ones; settings
-    {name: {first, second}} of those that differ.
-    """
-    a, b = _Side.of(first), _Side.of(second)
-    ids = [{file.id for file in shards} for shards in (first, second)]
-    rows = []
-    same = 0
-    for pair in sorted({*a.grasps, *b.grasps}):
-        mine, theirs = a.grasps.get(pair, Counter()), b.grasps.get(pair, Counter())
-        if mine == theirs and a.valid[pair] == b.valid[pair]:
-            same += 1
-            continue
-        grasps = {"first": mine.total(), "second": theirs.total()}
-        valid = {"valid_first": a.valid[pair], "valid_second": b.valid[pair]}
-        rows.append({"hand": pair[0], "object": pair[1], **grasps, **valid, "common": (mine & theirs).total()})
-    settings = {
-        name: {"first": sorted(a.settings.get(name, ())), "second": sorted(b.settings.get(name, ()))}
-        for name in _SETTINGS
-        if a.settings.get(name) != b.settings.get(name)
-    }
-    return {
-        "shards": {"first": len(first), "second": len(second), "common": len(ids[0] & ids[1])},
-        "same_cells": same,
-        "cells": rows,
-        "settings": settings,
-    }

@@ -149,11 +149,7 @@ _MATTER: Final = {"object_mass_kg": MASS_KG, "object_friction": FRICTION}
 
 def hand_of_shard(shard: Shard, given: str | None) -> HandModel:
     """Load the hand `given` (a file or a built-in); by default the shard's own, see `find`.
-
-    Raises:
-        NotFoundError: there is no such file or built-in, or `find` does not find the hand.
-        ConflictError: the given hand is not that of the shard.
-    """
+    Raises NotFoundError: there is no such file, built-in or hand. ConflictError: it is not that of the shard."""
     if given:
         hand = hand_from_path(given)
         _check(shard, "hand", hand.digest, given)
@@ -208,11 +204,7 @@ def _wanted(shard: Shard, kind: AssetKind) -> AssetReference:
 
 def neighbours_of_shard(shard: Shard, given: Sequence[str]) -> Neighbours | None:
     """Load the other objects of a scene shard with their poses; None if the object is alone.
-
-    Raises:
-        NotFoundError: `find` does not find one of them.
-        ConflictError: the given objects are not those of the shard.
-    """
+    Raises NotFoundError: `find` does not find one. ConflictError: the given objects are not those of the shard."""
     names, digests = (shard.attributes.get(key, []) for key in ("neighbours", "neighbour_digests"))
     if "scene/neighbour_pose" not in shard.arrays or not isinstance(names, list) or not isinstance(digests, list):
         return None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any
@@ -14,7 +13,7 @@ import typer
 from numpy.typing import NDArray
 
 from graspd.service.cli import load_settings
-from graspd.service.model.errors import InputError, NotFoundError
+from graspd.service.model.errors import ConflictError, InputError, NotFoundError
 from graspd.service.readers import Shards, open_shards
 from graspd.service.store import validity
 from graspd.service.store.shards import Shard, part_of_shard, place_of, read_shard
@@ -24,15 +23,7 @@ from graspd.service.store.store import open_store
 Chooser = Callable[[list[Shard]], list[NDArray[np.bool_]]]
 
 
-@dataclass(frozen=True)
-class Subset:
-    looked_at: int
-    kept: int
-    files: list[Path]
-    passed_over: int  # scene and views shards, whose rows refer to grasps by number and are not transferred
-
-
-def shards_of(source: str, snapshot: str | None = None) -> Shards:
+def shards_of(source: str) -> Shards:
     """Return the shards of a file or folder, or of a dataset in this machine's store by name.
     Raises NotFoundError: none of these exists."""
     if "/" in source or source in (".", "..") or Path(source).exists():
@@ -41,7 +32,7 @@ def shards_of(source: str, snapshot: str | None = None) -> Shards:
         store = open_store(load_settings().resolved_store_url, make=False)
     except NotFoundError as error:
         raise NotFoundError(f"{source} is no file or folder, and {error}") from None
-    return open_shards(store, dataset=source, snapshot=snapshot)
+    return open_shards(store, dataset=source)
 
 
 def base_shards(shards: Shards) -> Iterator[list[Shard]]:
@@ -50,12 +41,18 @@ def base_shards(shards: Shards) -> Iterator[list[Shard]]:
         yield [read_shard(shards.path(file), kind="base") for file in files]
 
 
-def write_subset(shards: Shards, choose: Chooser, out: Path, *, said: Mapping[str, Any]) -> Subset:
+def require_empty(folder: Path) -> None:
+    """Raise ConflictError unless a folder to write is new or empty."""
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise ConflictError(f"{folder} exists already; choose another folder")
+
+
+def write_subset(shards: Shards, choose: Chooser, out: Path, *, said: Mapping[str, Any]) -> dict[str, int]:
     """Write base shards of selected grasps, `HAND/OBJECT/base-BATCH.h5`, and the selection, `subset.json`.
     Shards without selected grasps are left out. All columns of a grasp, including its scene, are unchanged.
-    Raises InputError: the folder contains files already or cannot be made; or nothing is selected."""
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(f"{out} exists already; choose another folder")
+    Return numbers: looked_at and kept grasps, shards written, and passed_over: shards of scenes and views, not copied.
+    Raises ConflictError: the folder contains files already. InputError: nothing is selected."""
+    require_empty(out)
     looked_at = kept = 0
     ready: list[tuple[PurePosixPath, bytes]] = []
     for together in base_shards(shards):
@@ -71,7 +68,8 @@ def write_subset(shards: Shards, choose: Chooser, out: Path, *, said: Mapping[st
         path.write_bytes(data)
     told = {**said, "looked_at": looked_at, "kept": kept, "shards": [str(path) for path, _ in ready]}
     (out / "subset.json").write_text(json.dumps(told, indent=1) + "\n")
-    return Subset(looked_at, kept, files, len(shards) - len(shards.of("base")))
+    passed_over = len(shards) - len(shards.of("base"))
+    return {"looked_at": looked_at, "kept": kept, "shards": len(ready), "passed_over": passed_over}
 
 
 UnvalidatedOption = Annotated[

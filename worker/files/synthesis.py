@@ -202,27 +202,12 @@ def synthesized(
     cancelled: Callable[[], bool] | None = None,
     partial: bool = False,
 ) -> SynthesisResult:
-    """Make the grasps of a job in one process, without a queue or a server.
+    """Make the grasps of a job in one process: `hand` and `obj` are files or built-in names, `place` is their scene.
 
-    Args:
-        hand: a URDF, a ZIP with one, or the name of a built-in hand.
-        obj: a mesh or the name of a built-in object.
-        request: number of grasps, planner and validation.
-        place: scene of the grasps.
-        scenes: number of scenes over which the grasps are distributed.
-        mesh: options for the object's file: units, scale_to, keep_largest, allow_open.
-        device: cpu, cuda:0 or auto.
-        threads: CPU threads; 0: one per core.
-        prefilter: whether MuJoCo Warp rejects clear failures; auto: on a GPU, if installed.
-        join: batches of 32 planned in one launch; None: as many as fill a GPU. The grasps are the same.
-        processes: number that validate and measure; 1: this one only; 0: on a GPU the cores less one, else 1.
-        progress: receives the number of finished grasps and the total.
-        cancelled: polled often; True: the work stops.
-        partial: whether grasps validated before a stop are returned.
-
-    Raises:
-        InputError: unknown method, option, hand, object or device, or a scene without space.
-        TaskCancelled: `cancelled` returned True; with `partial`, before any validation.
+    `mesh`: options for the object's file. `join`: batches of 32 planned in one launch; None: as many as fill a GPU.
+    `processes` that validate and measure; 1: this one only; 0: on a GPU the cores less one, else 1.
+    Raises InputError: an invalid argument, or a scene without space. TaskCancelled: `cancelled` returned True; with
+    `partial`, before any validation.
     """
     planner(request.method, request.options, in_scenes=place.kind != "free")  # before the files are read
     if request.shake and place.kind == "free":

@@ -94,20 +94,11 @@ class Pool(AbstractContextManager["Pool"]):
         cancelled: Callable[[], bool] = lambda: False,
         done: Callable[[int], None] = lambda number: None,
     ) -> list[Any]:
-        """Compute `work(shared, part)` for all parts, in their order.
+        """Compute `work(shared, part)` for all parts, in their order; `work` is importable, without side effects.
 
-        Args:
-            work: an importable function without side effects.
-            key: identifies `shared`, so that each process receives it once.
-            shared: data for all parts; pickled.
-            parts: each is processed by one process; callers are served in order.
-            cancelled: polled often; True: stop.
-            done: receives the number of each finished part, in another thread.
-
-        Raises:
-            ProcessLost: a process ended during a part.
-            TaskCancelled: `cancelled` returned True, or the pool was closed.
-            Exception: error of a part; the other parts are abandoned.
+        Each process receives the pickled `shared` once, under its `key`. `done` receives the number of each finished
+        part, in another thread. Raises ProcessLost: a process ended during a part. TaskCancelled: `cancelled` returned
+        True, or the pool was closed. An error of a part abandons the others.
         """
         self.start()
         request = _Request(work, key, shared, done)

@@ -227,14 +227,10 @@ def run_worker(
     max_tasks: int | None = None,
     start: StartEngine = start_engine,
 ) -> bool:
-    """Run tasks until a stop is requested; with `burst` until none waits, with `max_tasks` that many.
+    """Run tasks until a stop is requested; with `burst` until none came for `idle_s` [s], with `max_tasks` that many.
 
-    With `burst`, none waits after `idle_s` without a task [s]. Return False if the worker ended because of a failure.
-
-    Raises:
-        InputError: there is no such device.
-        BusyError: Redis belongs to another service than the store.
-        QueueUnavailable, StoreUnavailable: at the start.
+    Return False if the worker ended because of a failure. Raises InputError: there is no such device. BusyError: Redis
+    belongs to another service than the store. QueueUnavailable, StoreUnavailable: at the start.
     """
     does_all = not burst and max_tasks is None
     name = f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(3)}"

@@ -121,12 +121,10 @@ def _cached(key: Hashable, load: Callable[[], Any]) -> Any:
 
 def prepared_object(store: Store, digest: str, *, name: str, face_error_m: float) -> ObjectModel:
     """Load an object as `load_object` does, from the store if it was prepared to this bound before.
-
-    Raises:
-        MeshError: the mesh cannot be used.
-        StoreUnavailable: the store does not respond.
-    """
-    key = names.object_prepared(digest, _address(face_error_m))
+    Raises MeshError: the mesh cannot be used. StoreUnavailable."""
+    # A change of a prepared mesh changes its grasps, and with them the revision of their stage.
+    terms = {"face_error_m": face_error_m, "revision": STAGE_REVISIONS["synthesize"]}
+    key = names.object_prepared(digest, digest_json(terms))
     try:
         return prepare.from_bytes(get_sealed(store, key), name=name, digest=digest)
     except NotFoundError:
@@ -139,11 +137,6 @@ def prepared_object(store: Store, digest: str, *, name: str, face_error_m: float
     return obj
 
 
-def _address(face_error_m: float) -> str:
-    # A change of a prepared mesh changes its grasps, and with them the revision of their stage.
-    return digest_json({"face_error_m": face_error_m, "revision": STAGE_REVISIONS["synthesize"]})
-
-
 def _load(store: Store, digest: str, *, name: str, face_error_m: float) -> ObjectModel:
     files = load_asset_files(store, AssetKind.OBJECT, digest)
     return load_object(files, name=name, digest=digest, face_error_m=face_error_m)
@@ -154,11 +147,7 @@ _pieces_lock = threading.Lock()
 
 def pieces_of(store: Store, obj: ObjectModel) -> ConvexPieces:
     """Return an object's pieces from this machine's cache or the store, else compute and store them.
-
-    Raises:
-        MeshError: the object has no usable pieces.
-        StoreUnavailable: the store does not respond.
-    """
+    Raises MeshError: the object has no usable pieces. StoreUnavailable."""
     file = piece_file(obj)
     key = names.object_pieces(obj.digest, file.stem)
     with _pieces_lock:  # tasks of one object start at once: one of them makes the pieces
@@ -187,11 +176,7 @@ def input_of(message: TaskMessage, context: TaskContext, stage: Stage) -> Shard:
 
 def load_hand_files(store: Store, digest: str) -> dict[str, bytes]:
     """Load all files of a hand; a xacro file is replaced by the URDF from its first expansion.
-
-    Raises:
-        HandError: the options or the xacro file cannot be used.
-        NotFoundError, DamagedError: see `load_asset_files`.
-    """
+    Raises HandError: the options or the xacro file cannot be used; and the errors of `load_asset_files`."""
     files = load_asset_files(store, AssetKind.HAND, digest)
     settings = parse_options(files)
     main = main_file(files, settings)

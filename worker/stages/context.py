@@ -55,7 +55,7 @@ class TaskContext:
         self._tell = tell
         self._tell_again = 0.0
         self._stop = threading.Event()
-        self._reason: StopReason | None = None
+        self.stop_reason: StopReason | None = None
 
     def progress(self, done: float, total: float, message: str) -> None:
         """Report progress; most calls are dropped to limit the number of messages."""
@@ -69,17 +69,12 @@ class TaskContext:
 
     def check(self) -> None:
         if self._stop.is_set():
-            raise TaskCancelled(f"stopped: {self._reason}")
+            raise TaskCancelled(f"stopped: {self.stop_reason}")
 
     def stop(self, reason: StopReason) -> None:
         """Request the task to stop; the first reason is stored."""
-        if self._reason is None:
-            self._reason = reason
+        self.stop_reason = self.stop_reason or reason
         self._stop.set()
-
-    @property
-    def stop_reason(self) -> StopReason | None:
-        return self._reason
 
 
 @dataclass(frozen=True)

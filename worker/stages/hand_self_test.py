@@ -127,11 +127,7 @@ def self_test(
 ) -> SelfTest:
     """Test grasps of a sphere, a box and a cylinder with the defaults of `JobOptions`, in equal numbers.
     Then test grasps of the same objects on a table. A time limit would change the verdict on a busy machine.
-
-    Raises:
-        InputError: a hand finds no start around one of the objects.
-        TaskCancelled: `run.cancelled()` returned True.
-    """
+    Raises InputError: a hand finds no start around one of the objects. TaskCancelled."""
     width = fitting_width(hand)
     held: dict[str, list[bool]] = {}
     lost: list[bool] = []

@@ -78,14 +78,8 @@ def check_in_child(
     cpu_s: int = CPU_LIMIT_S,
 ) -> tuple[dict[str, Any], bytes]:
     """Check a hand or object; return the result, or a refusal that states how the check itself ended.
-
-    Returns:
-        the result, and the model for viewers (glTF); empty after a refusal or if making it would take too long.
-
-    Raises:
-        OSError: the machine ended the check; the file is not at fault.
-        TaskCancelled: the task should stop.
-    """
+    The model for viewers (glTF) is empty after a refusal, or if making it would take too long.
+    Raises OSError: the machine ended the check; the file is not at fault. TaskCancelled: the task should stop."""
     with tempfile.TemporaryDirectory(prefix="graspd-ingest-") as folder:
         source, target, errors = (Path(folder) / file for file in ("files.zip", "check.json", "errors.txt"))
         source.write_bytes(pack(files))

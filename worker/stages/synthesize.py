@@ -41,11 +41,8 @@ _OF_SCENES: Final = ("scene/object_pose", "scene/rest_probability", "scene/neigh
 
 def run(message: TaskMessage, context: TaskContext) -> Output:
     """Plan and validate `message.count` valid grasps within the job's budget.
-
-    Raises:
-        SceneError: no hand reaches into the scenes, the first batch finds no grasp, or the method cannot plan in them.
-        LoadError: a job's first batch finds none because the payload is far too small.
-    """
+    Raises SceneError: no hand reaches into the scenes, the first batch finds no grasp, or the method cannot plan in
+    them. LoadError: a job's first batch finds none because the payload is far too small."""
     hand, obj = hand_of(context.store, message), object_of(context.store, message)
     keep_network(context.store, message)
     columns = _scene_columns(message, context)

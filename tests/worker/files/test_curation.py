@@ -1,4 +1,4 @@
-"""Parts of datasets: chosen by an expression or by kind, balanced, compared, and as files of clouds."""
+"""Parts of datasets: chosen by an expression or by kind, balanced, and as files of clouds."""
 
 from __future__ import annotations
 
@@ -99,20 +99,6 @@ def test_faces_are_told_by_what_lies_below() -> None:
             Balance(by)
     tilted = [np.sin(0.1), 0.0, -np.cos(0.1)]
     assert faces(np.array([[0, 0, -1.0], [0, 1.0, 0], tilted, [0.0, 0, 0], [0, 0, 1.0]])).tolist() == [0, 1, 0, -1, 2]
-
-
-def test_a_difference_names_cells_counts_and_settings(folder: Path, tmp_path: Path) -> None:
-    other = tmp_path / "other"
-    shard(other / "a.h5", 1)
-    shard(other / "c.h5", 3, obj="drill", seed=9)
-    shard(other / "d.h5", 4, obj="block")
-    found = json.loads(run("diff", folder, other, "--json").stdout)
-    assert found["shards"] == {"first": 3, "second": 3, "common": 2} and found["same_cells"] == 1
-    cells = {one["object"]: (one["first"], one["second"], one["common"]) for one in found["cells"]}
-    assert cells == {"mug": (2 * COUNT, COUNT, COUNT), "block": (0, COUNT, 0)}
-    assert found["settings"] == {"seed": {"first": ["0"], "second": ["0", "9"]}}
-    assert "the same grasps in 2 cells" in run("diff", folder, folder).stdout
-    assert "write the digest of a snapshot after @" in run("diff", "kitchen@", folder).stderr
 
 
 def base_of(valid: list[int], feasible: list[int], success: list[int] | None) -> Shard:

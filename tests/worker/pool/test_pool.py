@@ -14,6 +14,7 @@ import pytest
 from graspd.service.model.errors import TaskCancelled
 from graspd.worker.engines.joins import BYTES_PER_PROCESS, PROCESS_SHARE, processes_at_once
 from graspd.worker.pool.pool import KEPT, Pool, ProcessLost
+from tests.service.model.test_cores import system
 from tests.waiting import until
 from tests.worker.pool import works
 
@@ -99,15 +100,9 @@ def test_processes_end_with_the_one_that_started_them(tmp_path: Path) -> None:
     until(lambda: not any(alive(pid) for pid in pids), "they end")
 
 
-def machine(root: Path, cores: float, memory: int) -> Path:
+def machine(root: Path, cores: int, memory: int) -> Path:
     """A root folder as a container of so many cores and so much memory sees it."""
-    group = root / "sys/fs/cgroup"
-    group.mkdir(parents=True)
-    (root / "proc/self").mkdir(parents=True)
-    (root / "proc/self/cgroup").write_text("0::/\n")
-    (group / "cpu.max").write_text(f"{round(cores * 100_000)} 100000\n")
-    (group / "memory.max").write_text(f"{memory}\n")
-    return root
+    return system(root, "0::/", {"cpu.max": f"{cores * 100_000} 100000", "memory.max": str(memory)})
 
 
 def test_how_many_there_are_where_nobody_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -29,10 +29,9 @@ from graspd.worker.process.heartbeat import Heartbeat
 from graspd.worker.process.link import EngineLost, Link, Setup, is_stopped
 from graspd.worker.process.main import GraspWorker
 from graspd.worker.stages.context import StopReason, TaskContext
-from tests.fakes import message_for
+from tests.fakes import beat_of, message_for
 from tests.waiting import until
 from tests.worker.pool import works
-from tests.worker.process.test_heartbeat import beat_of
 
 LEASE_S = 2.0
 TASK = message_for()
@@ -163,6 +162,7 @@ def test_a_worker_ends_with_its_engine_and_leaves_the_lease_to_the_controller(st
 def test_a_worker_in_quarantine_leaves_when_it_or_its_engine_ends(start: Start, tmp_path: Path, which: str) -> None:
     (broken := tmp_path / "broken").touch()
     worker = start({"FAKE_BROKEN": str(broken)}, state="quarantined")
+    worker.queue.enqueue([TASK], Priority.BULK)
     pid = worker.engine
     if which == "engine":
         os.kill(pid, signal.SIGKILL)

@@ -13,37 +13,7 @@ from rq.serializers import JSONSerializer
 from graspd.service.model.states import Priority, Stage
 from graspd.service.queue.port import EventKind
 from graspd.service.queue.rq_queue import RqQueue
-from graspd.worker.stages import scene
 from tests.fakes import fake_synthesize, message_for
-
-
-class Forged:
-    """A message that says what it likes."""
-
-    def __init__(self, nonsense: Any) -> None:
-        self._message, self._nonsense = message_for(Stage.SCENE, scene="table"), nonsense
-        self.stage, self.task_id, self.attempt = Stage.SCENE, self._message.task_id, 1
-
-    def model_dump(self, **how: Any) -> dict[str, Any]:
-        said = self._message.model_dump(**how)
-        return said | {"request": said["request"] | {"scene": self._nonsense}}
-
-
-@pytest.mark.parametrize(
-    "nonsense",
-    [
-        "moon",
-        {"supports": [{"kind": "mesh", "file": "/etc/passwd"}]},
-        {"supports": [{"kind": "box", "size": [1e300, 1, 1]}]},
-        {"supports": [{"kind": "half_space"}] * 100_000},
-    ],
-    ids=["kind", "path", "size", "number"],
-)
-def test_it_is_refused_and_the_worker_goes_on(rq_queue: RqQueue, work: Any, tmp_path: Path, nonsense: Any) -> None:
-    rq_queue.enqueue([Forged(nonsense)], Priority.BULK)
-    assert work({Stage.SCENE: scene.run}), "the worker is none the worse"
-    assert rq_queue.leases() == [] and sum(rq_queue.depths().values()) == 0
-    assert not list(tmp_path.rglob("*.h5")) and not list(tmp_path.rglob("attempts/*"))
 
 
 def _waits(redis: Any, entry: str | bytes) -> None:

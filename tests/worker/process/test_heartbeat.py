@@ -7,20 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from graspd.service.model.clock import timestamp
-from graspd.service.model.states import Stage
-from graspd.service.model.workers import WorkerBeat
 from graspd.service.queue.port import EventKind
 from graspd.service.queue.rq_queue import RqQueue
 from graspd.worker.process.heartbeat import Heartbeat
+from tests.fakes import beat_of
 from tests.waiting import until
 
 LEASE_S = 2.0
-
-
-def beat_of() -> WorkerBeat:
-    now = timestamp()
-    return WorkerBeat("w", "h", 1, "cpu", "CPU", tuple(Stage), "0", "idle", "", now, now)
 
 
 @pytest.fixture
@@ -33,7 +26,8 @@ def heart(rq_queue: RqQueue, redis_server: str, tmp_path: Path) -> Iterator[Hear
     heart.stop()
 
 
-def test_what_a_worker_is_at_is_shown_at_once(heart: Heartbeat, rq_queue: RqQueue) -> None:
+def test_what_a_worker_is_at_is_shown_at_once(heart: Heartbeat, rq_queue: RqQueue, tmp_path: Path) -> None:
+    until((tmp_path / "alive").exists, "its file is touched")
     heart.interval_s = 3600.0
     heart.update(state="busy", task_id="a")
     until(lambda: [(beat.state, beat.task_id) for beat in rq_queue.workers()] == [("busy", "a")], "the news")
@@ -55,7 +49,3 @@ def test_it_goes_on_when_redis_answers_again(heart: Heartbeat, rq_queue: RqQueue
     finally:
         rq_queue.connection.config_set("min-replicas-to-write", 0)
     until(rq_queue.workers, "it gives signs of life again")
-
-
-def test_a_worker_that_beats_touches_its_file(heart: Heartbeat, tmp_path: Path) -> None:
-    until((tmp_path / "alive").exists, "the file is touched")

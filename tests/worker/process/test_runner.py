@@ -89,42 +89,49 @@ def test_a_shard_left_without_its_manifest_is_described_as_it_is(bench: Bench) -
     assert (manifest.sha256, manifest.grasps, manifest.valid) == (first.sha256, first.grasps, first.valid)
 
 
-def test_an_error_is_recorded_with_its_trace_and_may_be_tried_again(bench: Bench) -> None:
+def test_an_error_is_recorded_with_its_trace(bench: Bench) -> None:
     message = message_for()
     outcome = bench.run(message, raising(ValueError("no\nway")))
-    assert (outcome.kind, outcome.last, outcome.message) == (EventKind.FAILED, False, "no way")
+    assert (outcome.kind, outcome.message) == (EventKind.FAILED, "no way")
     (attempt,) = task_attempts(bench.store, message.task_id)
     assert (attempt.number, attempt.kind, attempt.reason, attempt.worker) == (1, "ValueError", "no way", "w")
     assert "raise error" in attempt.trace
 
 
-def test_the_last_attempt_says_so(bench: Bench) -> None:
-    assert bench.run(message_for(attempt=3), raising(ValueError("no"))).last
+@pytest.mark.parametrize(
+    ("error", "attempt", "last"),
+    [
+        (ValueError("no"), 1, False),
+        (ValueError("no"), 3, True),
+        (InputError("bad"), 1, True),
+        (MeshError("torn"), 1, True),
+        (TaskRefused("unknown"), 1, True),
+    ],
+)
+def test_bad_input_and_last_attempts_are_final(bench: Bench, error: Exception, attempt: int, last: bool) -> None:
+    outcome = bench.run(message_for(attempt=attempt), raising(error))
+    assert (outcome.kind, outcome.last) == (EventKind.FAILED, last)
 
 
-@pytest.mark.parametrize("error", [InputError("bad"), MeshError("torn"), TaskRefused("unknown")])
-def test_bad_input_is_not_tried_again(bench: Bench, error: Exception) -> None:
-    outcome = bench.run(message_for(), raising(error))
-    assert (outcome.kind, outcome.last) == (EventKind.FAILED, True)
+def full_disk(message: TaskMessage, context: TaskContext) -> None:
+    try:
+        Path("/dev/full").write_text("a kernel, a picture")
+    except OSError as error:
+        raise RuntimeError("no file could be written") from error
 
 
-@pytest.mark.parametrize("error", [StoreUnavailable("full"), QueueUnavailable("away")])
-def test_a_part_that_is_away_costs_no_attempt(bench: Bench, error: Exception) -> None:
+@pytest.mark.parametrize(
+    ("stage", "said"),
+    [
+        (raising(StoreUnavailable("full")), "full"),
+        (raising(QueueUnavailable("away")), "away"),
+        (full_disk, "No space left on device: no file could be written"),
+    ],
+)
+def test_a_part_that_is_away_or_full_costs_no_attempt(bench: Bench, stage: Any, said: str) -> None:
     message = message_for(attempt=3)
-    assert bench.run(message, raising(error)).kind is EventKind.DEFERRED
-    assert task_attempts(bench.store, message.task_id) == []
-
-
-def test_a_disk_without_room_costs_no_attempt_wherever_it_is_found(bench: Bench) -> None:
-    def full(message: TaskMessage, context: TaskContext) -> None:
-        try:
-            Path("/dev/full").write_text("a kernel, a picture")
-        except OSError as error:
-            raise RuntimeError("no file could be written") from error
-
-    message = message_for(attempt=3)
-    outcome = bench.run(message, full)
-    assert (outcome.kind, outcome.message) == (EventKind.DEFERRED, "No space left on device: no file could be written")
+    outcome = bench.run(message, stage)
+    assert (outcome.kind, outcome.message) == (EventKind.DEFERRED, said)
     assert task_attempts(bench.store, message.task_id) == []
 
 
@@ -184,10 +191,24 @@ def test_what_another_version_must_do_is_handed_back_and_no_attempt_is_used_up(
     assert task_attempts(bench.store, message.task_id) == []
 
 
-@pytest.mark.parametrize("forged", [{"count": "many"}, {"output": "../../etc/passwd"}])
-def test_what_is_no_message_is_refused(bench: Bench, forged: dict[str, str]) -> None:
+@pytest.mark.parametrize(
+    "forged",
+    [
+        {"count": "many"},
+        {"output": "../../etc/passwd"},
+        {"scene": "moon"},
+        {"scene": {"supports": [{"kind": "mesh", "file": "/etc/passwd"}]}},
+        {"scene": {"supports": [{"kind": "box", "size": [1e300, 1, 1]}]}},
+        {"scene": {"supports": [{"kind": "half_space"}] * 100_000}},
+    ],
+    ids=["number", "path", "scene", "file", "size", "many"],
+)
+def test_what_is_no_message_is_refused(bench: Bench, forged: dict[str, Any]) -> None:
+    message = message_for(scene="table")
+    if "scene" in forged:
+        forged = {"request": message.request.model_dump(mode="json") | forged}
     with pytest.raises(TaskRefused, match="no task of graspd"):
-        bench.run(message_for(), **forged)
+        bench.run(message, **forged)
     assert bench.calls == 0
 
 
