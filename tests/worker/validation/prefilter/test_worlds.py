@@ -67,11 +67,7 @@ def test_outcomes_margins_and_depths_are_the_certificates(found: PrefilterOutcom
     np.testing.assert_allclose(found.margin[held], standard.margin[held], atol=2e-3)
     np.testing.assert_allclose(1e3 * found.penetration_m, standard.penetration_depth_mm, atol=1e-3)
     np.testing.assert_allclose(1e3 * found.self_penetration_m, standard.self_penetration_depth_mm, atol=1e-3)
-
-
-def test_a_grasp_that_holds_takes_the_steps_of_the_certificate(found: PrefilterOutcomes) -> None:
-    alone = validate(PADS, BOX, grasp_of(), pieces=WHOLE)
-    assert found.ticks[0] * 10 == alone.steps
+    assert found.ticks[0] * 10 == validate(PADS, BOX, grasp_of(), pieces=WHOLE).steps
 
 
 def test_verdicts_do_not_depend_on_which_world_takes_a_grasp(
