@@ -7,7 +7,6 @@ import contextlib
 import io
 import socket
 import threading
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -15,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspd.service.model.errors import InputError
-from graspd.service.model.scene_spec import Box, HalfSpace, SceneSpec, supports_in
+from graspd.service.model.scene_spec import Box, SceneSpec, supports_in
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, quat_rotate
 from graspd.service.readers.trajectories import Waypoint, point_at, scene_spec_of, stop_places, way_of, wrists_of
 from graspd.service.store.shards import Shard
@@ -23,8 +22,8 @@ from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.quality.probe import Probe, probe_of
-from graspd.worker.rendering.hands import drawn_parts, drawn_poses, without_visuals
-from graspd.worker.rendering.scenery import seen_share
+from graspd.worker.rendering.hands import drawn_parts, drawn_poses
+from graspd.worker.rendering.scenery import Supports, seen_share, slab_poses, slabs
 from graspd.worker.scenes.neighbours import Neighbours
 
 #: Hand points whose distance from the object is shown, and the largest distance shown [m].
@@ -34,47 +33,30 @@ _OBJECT: Final = (232, 184, 120)
 _NEIGHBOUR: Final = (180, 174, 191)
 _TABLE: Final = (207, 212, 214)
 _WALL: Final = (143, 163, 176)
-_DISC_M: Final = 0.32
 #: Signed distance [m] and colour: red inside, green touching, blue near; lightness varies too.
 _STOPS: Final = (-0.001, -0.0002, 0.0003, 0.002, NEAR_M)
 _COLOURS: Final = np.array([(209, 38, 60), (240, 128, 60), (20, 184, 122), (53, 162, 240), (185, 212, 245)], np.float64)
-
-Supports = Sequence[HalfSpace | Box]
 
 
 class Models:
     """Nodes under `/grasp` (the frame of the object at rest) and `/scene`."""
 
     def __init__(self, scene: Any, hand: HandModel, obj: ObjectModel, *, mounted: bool = False) -> None:
-        self._scene, self._hand, self._mounted = scene, hand, mounted
+        self._scene, self._hand = scene, hand
         self._probe: Probe = probe_of(hand, obj, hand_points=POINTS, object_points=64)
         scene.set_up_direction("+z")
         self.rest = scene.add_frame("/grasp", show_axes=False)
         self.thing = scene.add_frame("/grasp/object", show_axes=False)
         self._mesh("/grasp/object/mesh", obj, _OBJECT)
-        self.bodies = self._nodes(hand, "hand")
-        # The hand's collision shapes, where its visual meshes differ from them.
-        self._bare = without_visuals(hand) if hand.visuals.meshes else None
-        self.collisions = self._nodes(self._bare, "collision") if self._bare else []
-        self.show_collision(False)
+        self.bodies: list[Any] = []
+        for number, part in enumerate(drawn_parts(hand, mounted=mounted)):
+            colour = tuple(round(255 * _srgb(share)) for share in part.look.base)
+            self.bodies.append(self._mesh(f"/grasp/hand/{number}", part.solid, colour))
         self.contacts: Any = None
         self._around: list[Any] = []
 
     def _mesh(self, path: str, solid: Any, colour: tuple[int, ...]) -> Any:
         return self._scene.add_mesh_simple(path, solid.vertices, solid.faces, color=colour, flat_shading=True)
-
-    def _nodes(self, hand: HandModel, name: str) -> list[Any]:
-        nodes = []
-        for number, part in enumerate(drawn_parts(hand, mounted=self._mounted)):
-            colour = tuple(round(255 * _srgb(share)) for share in part.look.base)
-            nodes.append(self._mesh(f"/grasp/{name}/{number}", part.solid, colour))
-        return nodes
-
-    def show_collision(self, on: bool) -> None:
-        if self.collisions:
-            for nodes, shown in ((self.bodies, not on), (self.collisions, on)):
-                for node in nodes:
-                    node.visible = shown
 
     def surround(self, supports: Supports, object_pose: Floats, neighbours: Neighbours | None, number: int) -> None:
         """Rebuild the scene around an object at a pose (7,); `number` selects the scene's neighbour poses."""
@@ -82,16 +64,11 @@ class Models:
             node.remove()
         self._around = []
         _place(self.rest, object_pose)
-        for k, support in enumerate(supports):
-            if isinstance(support, Box):
-                node = self._scene.add_box(
-                    f"/scene/support{k}", color=_WALL, dimensions=support.size, opacity=0.35, cast_shadow=False
-                )
-                _place(node, np.asarray(support.pose, float))
-            else:
-                node = self._scene.add_mesh_simple(
-                    f"/scene/support{k}", *_disc(support, object_pose[:3]), color=_TABLE, side="front"
-                )
+        poses = slab_poses(supports, object_pose[:3], 0.0)
+        for k, (support, slab, pose) in enumerate(zip(supports, slabs(supports), poses, strict=True)):
+            look = {"color": _WALL, "opacity": 0.35} if isinstance(support, Box) else {"color": _TABLE}
+            node = self._scene.add_box(f"/scene/support{k}", dimensions=slab.size, cast_shadow=False, **look)
+            _place(node, pose)
             self._around.append(node)
         if neighbours is not None:
             for k, other in enumerate(neighbours.objects):
@@ -107,10 +84,8 @@ class Models:
         """Show a posture with wrist angles (1, U) of a mounted hand.
         Return distances (P,) of hand points from the object [m], at most the probe's reach."""
         posture = point.hand_pose[None], point.joint_positions[None]
-        for hand, nodes in ((self._hand, self.bodies), (self._bare, self.collisions)):
-            if hand is not None:
-                for node, pose in zip(nodes, drawn_poses(hand, *posture, wrist)[0], strict=True):
-                    _place(node, pose)
+        for node, pose in zip(self.bodies, drawn_poses(self._hand, *posture, wrist)[0], strict=True):
+            _place(node, pose)
         self.thing.position = point.carried
         # The probe's object stays at its rest pose.
         points = self._probe.posed_points(body_poses(self._hand, *posture))[0] - point.carried
@@ -135,20 +110,6 @@ def _place(node: Any, pose: Floats) -> None:
     node.wxyz = pose[3:] / np.linalg.norm(pose[3:])
 
 
-def _disc(plane: HalfSpace, middle: Floats) -> tuple[Floats, NDArray[np.int64]]:
-    """Return a disc in the plane of a half-space around the foot of a point, visible from outside only."""
-    corners, normal = 96, np.asarray(plane.normal, float)
-    length = float(np.linalg.norm(normal))
-    normal = normal / length
-    beside = np.cross(normal, [1.0, 0, 0] if abs(normal[0]) < 0.9 else [0, 1.0, 0])
-    beside /= np.linalg.norm(beside)
-    foot = middle + (plane.offset / length - normal @ middle) * normal
-    angle = np.linspace(0, 2 * np.pi, corners, endpoint=False)[:, None]
-    ring = foot + _DISC_M * (np.cos(angle) * beside + np.sin(angle) * np.cross(normal, beside))
-    turn = np.arange(corners)
-    return np.concatenate([foot[None], ring]), np.stack([0 * turn, 1 + turn, 1 + (turn + 1) % corners], axis=1)
-
-
 def _colours(distance: Floats) -> NDArray[np.uint8]:
     parts = [np.interp(distance, _STOPS, _COLOURS[:, k]) for k in range(3)]
     return np.stack(parts, axis=-1).astype(np.uint8)
@@ -158,9 +119,6 @@ def _srgb(linear: float) -> float:
     return 12.92 * linear if linear <= 0.0031308 else 1.055 * linear ** (1 / 2.4) - 0.055
 
 
-#: Playback: seconds between two named postures, and between two frames.
-STOP_S: Final = 1.2
-FRAME_S: Final = 0.04
 _QUOTED_M: Final = 0.005  # contact threshold at which epsilon is quoted [m]
 #: Distance of the first view from the object [m], and the angle between candidate views [rad].
 _EYE_M: Final = 0.7
@@ -197,8 +155,7 @@ class Viewer:
         self._shown, self._arrays = shown, shown.shard.arrays
         self._choices = _choices(shown.shard)
         self._rows = next(iter(self._choices.values()))
-        self._at, self._lock, self._ended = 0, threading.RLock(), threading.Event()
-        self._playing: threading.Thread | None = None
+        self._at, self._lock = 0, threading.RLock()
         spec = scene_spec_of(shown.shard) or SceneSpec()
         self._supports: Supports = supports_in(spec)
         self.server = _served(host, port)
@@ -227,9 +184,6 @@ class Viewer:
 
     def close(self) -> None:
         """Stop the server."""
-        self._ended.set()
-        if self._playing is not None:
-            self._playing.join()
         with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()
 
@@ -257,7 +211,6 @@ class Viewer:
             point, contacts = point_at(self._way, place), bool(self._contacts.value)
             distance = self.models.pose(point, wrist=self._wrist, contacts=contacts)
             self.models.show_scene(bool(self._scene.value))
-            self.models.show_collision(bool(self._collision.value))
             touching, least = int((distance < 0.001).sum()), 1e3 * float(distance.min())
             self._said.content = f"**{_doing(self._way, place)}**: {touching} points of the hand within 1 mm, " + (
                 f"deepest {-least:.2f} mm inside"
@@ -267,21 +220,6 @@ class Viewer:
                 else "free"
             )
             self.server.flush()
-
-    def play(self) -> None:
-        """Run the slider once over the trajectory, in its own thread."""
-        with self._lock:
-            if self._playing is not None and self._playing.is_alive():
-                return
-            self._playing = threading.Thread(target=self._run, daemon=True)
-            self._playing.start()
-
-    def _run(self) -> None:
-        last = float(stop_places(self._way)[-1])
-        for place in np.linspace(0, last, max(2, round(last * STOP_S / FRAME_S))):
-            self.slider.value = float(place)
-            if self._ended.wait(FRAME_S):
-                return
 
     def _controls(self) -> None:
         gui = self.server.gui
@@ -294,16 +232,13 @@ class Viewer:
         marks = tuple((float(place), point.name) for place, point in zip(places, self._way, strict=True) if point.name)
         start = next(place for place, name in marks if name == "grasp")
         self.slider = gui.add_slider("way", 0.0, float(places[-1]), 0.01, start, marks=marks)
-        play = gui.add_button("play")
         self._said = gui.add_markdown("")
         self._contacts = gui.add_checkbox("contacts", True)
         self._scene = gui.add_checkbox("scene", True, visible=bool(self._supports))
-        self._collision = gui.add_checkbox("collision shapes", False, visible=bool(self.models.collisions))
         self._figures = gui.add_markdown("")
         turn.on_click(lambda event: self.step(1 if event.target.value == "next" else -1))
         choice.on_update(lambda event: self.choose(str(event.target.value)))
-        play.on_click(lambda _: self.play())
-        for control in (self.slider, self._contacts, self._scene, self._collision):
+        for control in (self.slider, self._contacts, self._scene):
             control.on_update(lambda _: self.show())
 
     def _load(self) -> None:

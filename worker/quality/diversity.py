@@ -18,8 +18,6 @@ from graspd.worker.hands.surface import sample_surface
 POINTS: Final = 64
 #: Pairs of grasps compared at a time.
 _PAIRS: Final = 4096
-#: Largest set with a comparison of all pairs. For larger sets a SciPy tree finds near pairs; SciPy is slow to import.
-FEW: Final = 256
 
 
 def explained_variance(posture: Posture) -> Floats:
@@ -59,7 +57,7 @@ def nearest(points: Floats) -> float | None:
     """Return the least distance between two of N grasps (N, P, 3) [m]; None for fewer than two."""
     if len(points) < 2:
         return None
-    from scipy.spatial import cKDTree
+    from scipy.spatial import cKDTree  # slow to import
 
     middles = cKDTree(points.mean(axis=1))
     near = np.asarray(middles.query(middles.data, k=2)[1])
@@ -77,25 +75,16 @@ def distinct(points: Floats, least: float, *, given: int = 0) -> NDArray[np.bool
     kept = np.ones(len(points), bool)
     if least <= 0 or len(points) < 2:
         return kept
+    from scipy.spatial import cKDTree
+
     # The mean distance of points is at least the distance of their means.
-    pairs = _near(points.mean(axis=1), least)
+    pairs = np.asarray(cKDTree(points.mean(axis=1)).query_pairs(least, output_type="ndarray"), np.intp)
     near = pairs[distances(points, pairs[:, 0], pairs[:, 1]) < least]
     near = near[near[:, 1] >= given]
     for first, second in near[np.lexsort((near[:, 0], near[:, 1]))].tolist():
         if kept[first]:
             kept[second] = False
     return kept
-
-
-def _near(places: Floats, reach: float) -> NDArray[np.intp]:
-    """Return pairs (K, 2) of places (N, 3) within `reach` [m] of each other, the lower index first."""
-    if len(places) > FEW:
-        from scipy.spatial import cKDTree
-
-        return np.asarray(cKDTree(places).query_pairs(reach, output_type="ndarray"), np.intp)
-    one, other = np.triu_indices(len(places), 1)
-    near = np.linalg.norm(places[one] - places[other], axis=1) <= reach
-    return np.stack([one[near], other[near]], axis=1)
 
 
 def _rotation_vector(quaternion: Floats) -> Floats:

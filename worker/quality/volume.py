@@ -33,7 +33,11 @@ class SharedVolume:
 
     def __init__(self, hand: HandModel, obj: ObjectModel) -> None:
         self.hand, self.obj = hand, obj
-        self._pieces = [_solid(p.vertices, p.faces) or _hull(p) for p in hand.pieces]
+        self._pieces = [
+            _solid(p.vertices, p.faces)
+            or m3d.Manifold.hull_points(np.ascontiguousarray(p.vertices * _UNIT, np.float32))
+            for p in hand.pieces
+        ]
         self._body = np.array([p.body for p in hand.pieces], np.intp)
         self._object = _solid(obj.vertices - obj.centre_of_mass, obj.faces)
 
@@ -50,7 +54,7 @@ class SharedVolume:
         if not len(pieces):
             return 0.0
         if self._object is None:
-            return self._voxels.volume_cm3(bodies, pieces)
+            return self.by_voxels(bodies, pieces)
         matrices = pose_to_matrix(bodies[self._body[pieces]])[:, :3]
         matrices[..., 3] = (matrices[..., 3] - self.obj.centre_of_mass) * _UNIT
         posed = [self._pieces[p].transform(matrix) for p, matrix in zip(pieces, matrices, strict=True)]
@@ -62,47 +66,27 @@ class SharedVolume:
         return float(whole.volume()) / _UNIT**3 * 1e6
 
     @cached_property
-    def _voxels(self) -> VoxelVolume:
-        return VoxelVolume(self.hand, self.obj)
+    def _probe(self) -> Probe:
+        return Probe(self.hand, self.obj, hand_points=self.hand.bodies * 16, object_points=64)
 
-
-class VoxelVolume:
-    """Intersection volume by counting voxel centres of the object that lie inside the pieces."""
-
-    def __init__(self, hand: HandModel, obj: ObjectModel) -> None:
-        self.hand = hand
-        self._probe = Probe(hand, obj, hand_points=hand.bodies * 16, object_points=64)
-
-    def volume_cm3(self, bodies: Floats, pieces: NDArray[np.intp]) -> float:
-        low, high = self._box(bodies, pieces)
+    def by_voxels(self, bodies: Floats, pieces: NDArray[np.intp]) -> float:
+        """Count the voxel centres of the object that lie inside the pieces [cm^3]."""
+        matrices = pose_to_matrix(bodies[self._body[pieces]])
+        solids = [self.hand.pieces[p] for p in pieces]
+        posed = [piece.vertices @ m[:3, :3].T + m[:3, 3] for piece, m in zip(solids, matrices, strict=True)]
+        corners, vertices = np.concatenate(posed), self.obj.vertices
+        low, high = np.maximum(corners.min(0), vertices.min(0)), np.minimum(corners.max(0), vertices.max(0))
         if (high <= low).any():
             return 0.0
         axes = [np.arange(a + VOXEL_M / 2, b, VOXEL_M) for a, b in zip(low, high, strict=True)]
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
         inside = np.zeros(len(grid), dtype=bool)
-        for p in pieces:
-            piece = self.hand.pieces[p]
-            matrix = pose_to_matrix(bodies[piece.body])
-            local = (grid - matrix[:3, 3]) @ matrix[:3, :3]
-            inside |= _inside(piece, local)
+        for piece, m in zip(solids, matrices, strict=True):
+            inside |= piece_distance(piece, (grid - m[:3, 3]) @ m[:3, :3]) < 0
         if not inside.any():
             return 0.0
         depth = self._probe.signed_distance(grid[inside])[0]
         return float((depth < 0).sum()) * VOXEL_M**3 * 1e6
-
-    def _box(self, bodies: Floats, pieces: NDArray[np.intp]) -> tuple[Floats, Floats]:
-        posed = []
-        for piece in (self.hand.pieces[p] for p in pieces):
-            rotation = pose_to_matrix(bodies[piece.body])[:3, :3]
-            posed.append(piece.vertices @ rotation.T + bodies[piece.body, :3])
-        corners = np.concatenate(posed)
-        vertices = self._probe.obj.vertices
-        return np.maximum(corners.min(0), vertices.min(0)), np.minimum(corners.max(0), vertices.max(0))
-
-
-def _inside(piece: ConvexPiece, points: Floats) -> NDArray[np.bool_]:
-    inside: NDArray[np.bool_] = piece_distance(piece, points) < 0
-    return inside
 
 
 def _solid(vertices: Floats, faces: NDArray[np.int32]) -> m3d.Manifold | None:
@@ -113,10 +97,6 @@ def _solid(vertices: Floats, faces: NDArray[np.int32]) -> m3d.Manifold | None:
     solid = m3d.Manifold(mesh)
     feasible = solid.status() == m3d.Error.NoError and not solid.is_empty() and solid.volume() > 0
     return solid if feasible else None
-
-
-def _hull(piece: ConvexPiece) -> m3d.Manifold:
-    return m3d.Manifold.hull_points(np.ascontiguousarray(piece.vertices * _UNIT, dtype=np.float32))
 
 
 #: Planes are distinct if they differ in this many digits [m, and of unit normals].
@@ -197,6 +177,4 @@ def penetration_depth(found: Distances) -> Floats:
     One direction alone misses cases: a thin wall passes between hand points, a small fingertip between object
     points."""
     hand_in_object = np.maximum(0.0, -found.distance).max(axis=1)
-    object_in_hand = np.maximum(0.0, -found.piece_distance).max(axis=1)
-    deepest: Floats = np.maximum(hand_in_object, object_in_hand)
-    return deepest
+    return np.asarray(np.maximum(hand_in_object, np.maximum(0.0, -found.piece_distance).max(axis=1)))

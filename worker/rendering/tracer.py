@@ -58,7 +58,9 @@ class Tracer:
             if isinstance(solid, Box):
                 shapes["half"][k] = 0.5 * np.asarray(solid.size)
             else:
-                self._meshes.append(_mesh(solid, device))
+                points = wp.array(np.asarray(solid.vertices, np.float32), dtype=wp.vec3f, device=device)
+                faces = wp.array(np.ravel(solid.faces).astype(np.int32), dtype=wp.int32, device=device)
+                self._meshes.append(wp.Mesh(points, faces))
                 normals.append(np.reshape(solid.corner_normals, (-1, 3)))
                 shapes["mesh"][k], shapes["first_corner"][k] = self._meshes[-1].id, first
                 first += len(normals[-1])
@@ -140,11 +142,6 @@ class _Film:
 
         list(pool.map(rows, range(threads)))
         return tuple(array.numpy() for array in outputs)
-
-
-def _mesh(solid: Solid, device: str) -> Any:
-    points = wp.array(np.asarray(solid.vertices, np.float32), dtype=wp.vec3f, device=device)
-    return wp.Mesh(points, wp.array(np.ravel(solid.faces).astype(np.int32), dtype=wp.int32, device=device))
 
 
 def _corners(solid: Solid | Box) -> Floats:

@@ -36,8 +36,8 @@ from graspd.worker.scenes.simulate import (
     TIMESTEP_S,
     add_hull,
     drop,
+    model_above_table,
     rest_probability,
-    spec_above_table,
     steadied,
 )
 from graspd.worker.simulation.environment import Obstacle
@@ -105,11 +105,7 @@ class _Heap:
     def __init__(self, objects: Sequence[ObjectModel]) -> None:
         self.objects = objects
         self.faces = [resting_faces(obj) for obj in objects]
-        try:
-            self.model = spec_above_table(objects).compile()
-        except ValueError as error:
-            reason = str(error).splitlines()[0]
-            raise MeshError(f"these objects cannot be dropped: {reason}; check that each mesh has volume") from None
+        self.model = model_above_table(objects)
         self.data = mujoco.MjData(self.model)
 
     def redo_until_rest(self, key: tuple[int, int]) -> tuple[Floats, int, float]:
@@ -198,8 +194,7 @@ def neighbour_clearance(hand: HandModel, path: Posture, object_pose: Floats, nei
     model = spec.compile()
     data = mujoco.MjData(model)
     pieces = len(hand.pieces)
-    body = np.array([piece.body for piece in hand.pieces])
-    in_object = body_poses(hand, path.hand_pose, path.joint_positions)[:, body]
+    in_object = body_poses(hand, path.hand_pose, path.joint_positions)[:, [piece.body for piece in hand.pieces]]
     clearance = np.full((len(object_pose), len(path)), FARTHEST_M)
     for s, pose in enumerate(object_pose):
         for p, bodies in enumerate(compose(pose, in_object)):
@@ -253,7 +248,9 @@ def lay_beside(
     Raises:
         SceneError: the neighbours do not all fit.
         MeshError: a neighbour never comes to rest, or is flat."""
-    resting = [drop(one, count=count, seed=_seed_of(seed, k))["scene/object_pose"] for k, one in enumerate(others)]
+    # Copies of one object must not rest in the same pose.
+    seeds = [int(np.random.SeedSequence([seed, 1 + k]).generate_state(1)[0]) for k in range(len(others))]
+    resting = [drop(one, count=count, seed=own)["scene/object_pose"] for one, own in zip(others, seeds, strict=True)]
     hulls = _Hulls([obj, *others], supports, within)
     poses = np.zeros((count, 1 + len(others), 7))
     for scene in range(count):
@@ -270,11 +267,6 @@ def lay_beside(
             )
     poses = moved(poses, np.zeros(3))
     return poses[:, 0], poses[:, 1:]
-
-
-def _seed_of(seed: int, number: int) -> int:
-    """Return the seed of one neighbour: copies of one object must not rest in the same pose."""
-    return int(np.random.SeedSequence([seed, 1 + number]).generate_state(1)[0])
 
 
 def _drawn(

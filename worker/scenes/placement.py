@@ -218,7 +218,8 @@ def outer_solid(corners: Floats) -> tuple[Obstacle, float]:
     try:
         hull = ConvexHull(corners)
         faces = np.column_stack([hull.equations[:, :3], -hull.equations[:, 3]])
-        planes = _box(corners)
+        axes = np.concatenate([np.eye(3), -np.eye(3)])
+        planes = np.column_stack([axes, (corners @ axes.T).max(axis=0)])
         middle = corners[hull.vertices].mean(axis=0)
         found = HalfspaceIntersection(_as_qhull(planes), middle, incremental=True)
         while len(planes) < MOST_PLANES:
@@ -234,11 +235,6 @@ def outer_solid(corners: Floats) -> tuple[Obstacle, float]:
     except QhullError:
         raise MeshError("a convex piece of this object is flat; an object needs some thickness") from None
     return solid, _stands_out(solid.corners, corners, hull)
-
-
-def _box(corners: Floats) -> Floats:
-    normals = np.concatenate([np.eye(3), -np.eye(3)])
-    return np.column_stack([normals, (corners @ normals.T).max(axis=0)])
 
 
 def _as_qhull(planes: Floats) -> Floats:

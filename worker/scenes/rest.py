@@ -99,7 +99,9 @@ def resting_faces(obj: ObjectModel) -> RestingFaces:
     import trimesh  # slow to import
 
     mesh = trimesh.Trimesh(obj.hull_vertices, obj.hull_faces, process=False)
-    label = _merge_coplanar(mesh)
+    # The flat face that each hull triangle belongs to.
+    pairs = mesh.face_adjacency[mesh.face_adjacency_angles < COPLANAR_ANGLE]
+    label = np.asarray(trimesh.graph.connected_component_labels(pairs, node_count=len(mesh.faces)), np.int32)
     count = int(label.max()) + 1
     weighted = np.zeros((count, 3))
     np.add.at(weighted, label, mesh.face_normals * mesh.area_faces[:, None])
@@ -108,7 +110,8 @@ def resting_faces(obj: ObjectModel) -> RestingFaces:
         raise MeshError(f"the convex hull of {obj.name!r} is flat; an object needs some thickness to be put on a table")
     normal = weighted / length
     offset = np.full(count, -np.inf)
-    np.maximum.at(offset, np.repeat(label, 3), _support(normal[np.repeat(label, 3)], mesh.vertices[mesh.faces.ravel()]))
+    of_corner = np.repeat(label, 3)
+    np.maximum.at(offset, of_corner, np.einsum("ij,ij->i", normal[of_corner], mesh.vertices[mesh.faces.ravel()]))
     sides, margin, width = _edges(mesh, label, normal, obj.centre_of_mass)
     successor = np.arange(count, dtype=np.int32)
     farthest = np.full(count, STABILITY_MARGIN * float(np.linalg.norm(mesh.extents)))
@@ -116,19 +119,6 @@ def resting_faces(obj: ObjectModel) -> RestingFaces:
         if overhang > farthest[here]:
             farthest[here], successor[here] = overhang, there
     return RestingFaces(normal, offset, successor, offset - normal @ obj.centre_of_mass, sides, margin, width)
-
-
-def _support(normals: Floats, points: Floats) -> Floats:
-    return np.einsum("ij,ij->i", normals, points)
-
-
-def _merge_coplanar(mesh: trimesh.Trimesh) -> Ints:
-    """Return the index (F,) of the flat face that each hull triangle belongs to."""
-    from trimesh.graph import connected_component_labels
-
-    pairs = mesh.face_adjacency[mesh.face_adjacency_angles < COPLANAR_ANGLE]
-    label = connected_component_labels(pairs, node_count=len(mesh.faces))
-    return np.asarray(label, np.int32)
 
 
 def _edges(mesh: trimesh.Trimesh, label: Ints, normal: Floats, centre: Floats) -> tuple[Ints, Floats, Floats]:

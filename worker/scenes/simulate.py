@@ -146,6 +146,15 @@ def _steady_faces(obj: ObjectModel) -> tuple[int, ...]:
     return tuple(face for face in _reference_faces(obj) if not faces.rolls(face))
 
 
+def model_above_table(objects: Sequence[ObjectModel]) -> Any:
+    """Compile objects above a table; raise MeshError if MuJoCo refuses one."""
+    try:
+        return spec_above_table(objects).compile()
+    except ValueError as error:
+        names, reason = ", ".join(repr(obj.name) for obj in objects), str(error).splitlines()[0]
+        raise MeshError(f"{names} cannot be dropped: {reason}; check that each mesh has volume") from None
+
+
 def spec_above_table(objects: Sequence[ObjectModel]) -> Any:
     spec = mujoco.MjSpec()
     spec.option.timestep = TIMESTEP_S
@@ -172,11 +181,7 @@ def add_hull(spec: Any, body: Any, name: str, vertices: Floats, faces: NDArray[A
 
 
 def _build(obj: ObjectModel) -> _Table:
-    try:
-        model = spec_above_table([obj]).compile()
-    except ValueError as error:
-        reason = str(error).splitlines()[0]
-        raise MeshError(f"{obj.name!r} cannot be dropped: {reason}; check that its mesh has volume") from None
+    model = model_above_table([obj])
     return _Table(model, mujoco.MjData(model), resting_faces(obj), obj)
 
 

@@ -118,7 +118,8 @@ def _load_or_make(obj: ObjectModel, file: Path) -> ConvexPieces:
         parts = _make(obj)
         keep_parts(file, parts)
     volume = union_volume(parts)
-    return ConvexPieces(parts, volume / obj.volume, _excess(volume, obj), _digest(parts))
+    digest = digest_json([hashlib.sha256(np.round(part, 9).tobytes()).hexdigest() for part in parts])
+    return ConvexPieces(parts, volume / obj.volume, _excess(volume, obj), digest)
 
 
 def _excess(volume: float, obj: ObjectModel) -> float:
@@ -138,16 +139,8 @@ def _make(obj: ObjectModel) -> tuple[Floats, ...]:
                 "%s: more than %d pieces need %s; the coarser ones are used", obj.name or "an object", len(best), error
             )
             break
-        parts = tuple(part for part in made if _solid(part))
+        parts = tuple(part for part in made if len(part) >= 4 and union_volume((part,)) > _MIN_VOLUME)
         found = _excess(union_volume(parts), obj)
         if parts and found < excess:
             best, excess = parts, found
     return best
-
-
-def _solid(part: Floats) -> bool:
-    return len(part) >= 4 and union_volume((part,)) > _MIN_VOLUME
-
-
-def _digest(parts: tuple[Floats, ...]) -> str:
-    return digest_json([hashlib.sha256(np.round(part, 9).tobytes()).hexdigest() for part in parts])

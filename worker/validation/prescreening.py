@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from functools import partial
 from typing import Final, TypeVar
 
 import numpy as np
@@ -63,25 +63,21 @@ SLIPS: Final = 1.0
 DEEP: Final = 20.0
 
 
-@dataclass(frozen=True)
-class Frictions:
-    """Compiled scenes at half and at full friction, with `PHYSICS`; everything else is the same."""
-
-    half: Scene
-    whole: Scene
+#: Scenes compiled at half and at full friction; everything else is the same.
+Frictions = tuple[Scene, Scene]
 
 
 class LiftRollout(Lift):
     """Short lifts of grasps in one scene. Not thread-safe."""
 
     def __init__(self, scenes: Frictions, placed: PlacedGrasps) -> None:
-        super().__init__(scenes.half, placed)
-        self._scenes = scenes
+        super().__init__(scenes[0], placed)
+        self._half, self._whole = scenes
 
     def score(self, grasps: GraspSet, row: int, beat: float = np.inf) -> float:
         """Return displacement or rotation over its limit after hanging at half friction; below 1: lifted. If it is not
         below 1, return the same at full friction plus `SLIPS`, or `beat` if `beat` is below 1 + `SLIPS`."""
-        self.scene = self._scenes.half
+        self.scene = self._half
         if self._begin(grasps, row).outcome is not LiftOutcome.NOT_TRIED:
             return DEEP
         if not self._close(grasps, row, give_up=True, stages=CLOSING) or void(self.data):
@@ -92,7 +88,7 @@ class LiftRollout(Lift):
             return hung
         if beat < SLIPS + 1.0:
             return beat
-        self.scene = self._scenes.whole
+        self.scene = self._whole
         self._restore()
         return SLIPS + self._hung(HANGS_WHOLE)
 
@@ -108,13 +104,13 @@ class PushRollout(Test):
     """Short pushes of grasps of a free object. Not thread-safe."""
 
     def __init__(self, scenes: Frictions) -> None:
-        super().__init__(scenes.half)
-        self._scenes = scenes
+        super().__init__(scenes[0])
+        self._half, self._whole = scenes
 
     def score(self, grasps: GraspSet, row: int) -> float:
         """Return the worst displacement or rotation over its limit in pushes at half friction; below 1: held.
         If it is not below 1, return the same at full friction plus `SLIPS`."""
-        self.scene = self._scenes.half
+        self.scene = self._half
         if self._start(grasps, row).outcomes[0] is Outcome.PENETRATION:
             return DEEP
         if not self._close(grasps, row, give_up=True, stages=FREE_CLOSING) or void(self.data):
@@ -123,7 +119,7 @@ class PushRollout(Test):
         pushed = self._pushed()
         if pushed < 1.0:
             return pushed
-        self.scene = self._scenes.whole
+        self.scene = self._whole
         return SLIPS + self._pushed()
 
     def _pushed(self) -> float:
@@ -154,42 +150,37 @@ class _Shorts:
         self, count: int, placed: PlacedGrasps | None, make: Callable[[Frictions], T], score: Callable[[T, int], float]
     ) -> Floats:
         """Return scores (count,) of grasps by tests that `make` creates."""
-        scenes = self._compiled(placed)
-        found = answers(range(count), lambda: make(scenes), score, threads=self.threads, name="short-test")
-        return np.array(found, float)
-
-    def _compiled(self, placed: PlacedGrasps | None) -> Frictions:
         with self._lock:
             if self._scenes is None:
-                pieces = self._pieces()
                 around = (placed.supports, placed.neighbours) if placed is not None else ()
-                whole = PHYSICS if placed is None else LIFTING
-                self._scenes = Frictions(
-                    *(scene_of(self.hand, self.obj, pieces, physics, *around) for physics in (whole.hardened(), whole))
+                whole, pieces = PHYSICS if placed is None else LIFTING, self._pieces()
+                half, full = (
+                    scene_of(self.hand, self.obj, pieces, physics, *around) for physics in (whole.hardened(), whole)
                 )
-            return self._scenes
+                self._scenes = half, full
+        scenes = self._scenes
+        found = answers(range(count), lambda: make(scenes), score, threads=self.threads, name="short-test")
+        return np.array(found, float)
 
 
 class LiftRollouts(_Shorts):
     def scores(self, grasps: GraspSet, placed: PlacedGrasps, beat: Floats | None = None) -> Floats:
         least = np.full(len(grasps), np.inf) if beat is None else beat
-
-        def score(test: LiftRollout, row: int) -> float:
-            return test.score(grasps, row, float(least[row]))
-
-        return self.scored(len(grasps), placed, lambda scenes: LiftRollout(scenes, placed), score)
+        return self.scored(
+            len(grasps),
+            placed,
+            partial(LiftRollout, placed=placed),
+            lambda test, row: test.score(grasps, row, float(least[row])),
+        )
 
 
 def push_rollout(
-    hand: HandModel, obj: ObjectModel, pieces: Callable[[], ConvexPieces], *, threads: int = 1
+    hand: HandModel, obj: ObjectModel, pieces: Callable[[], ConvexPieces]
 ) -> Callable[[GraspSet, PlacedGrasps | None, Floats], Floats]:
     """Return a `worker.planners.Rollout` that scores free grasps (N,) by short pushes.
     Scores are below 1 for grasps that hold at half the friction, and below 2 at full friction.
-
-    Args:
-        threads: per call; planners on the CPU already call from all their threads.
-    """
-    shorts = _Shorts(hand, obj, pieces, threads=threads)
+    Each call uses one thread: planners on the CPU already call from all their threads."""
+    shorts = _Shorts(hand, obj, pieces)
 
     def rollout(grasps: GraspSet, placed: PlacedGrasps | None, beat: Floats | None = None) -> Floats:
         return shorts.scored(len(grasps), None, PushRollout, lambda test, row: test.score(grasps, row))

@@ -53,7 +53,7 @@ def fits_of(hand: HandModel) -> frozenset[Fit]:
         found.add("hull")
     if any(piece.kind == "hull" for piece in hand.pieces):
         found.add("primitive")
-    if any(piece.kind not in ("capsule", "sphere") and _thickness(piece)[1] for piece in hand.pieces):
+    if any(piece.kind not in ("capsule", "sphere") and _is_round(piece) for piece in hand.pieces):
         found.add("capsule")
     return frozenset(found)
 
@@ -102,8 +102,7 @@ def _fitted(piece: ConvexPiece, fit: Fit) -> ConvexPiece:
             return piece
         found = [_like(piece, kind) for kind in _PRIMITIVES]
         return min(found, key=lambda one: _distance(one, piece))
-    _, round_ = _thickness(piece)
-    return piece if piece.kind in ("capsule", "sphere") or not round_ else _like(piece, "capsule")
+    return piece if piece.kind in ("capsule", "sphere") or not _is_round(piece) else _like(piece, "capsule")
 
 
 def _moments(piece: ConvexPiece) -> tuple[float, Floats, Floats, Floats]:
@@ -118,12 +117,10 @@ def _moments(piece: ConvexPiece) -> tuple[float, Floats, Floats, Floats]:
     return float(solid.volume), np.asarray(solid.center_mass), spread, axes
 
 
-def _thickness(piece: ConvexPiece) -> tuple[float, bool]:
-    """Return the least half thickness [m] of a box of the same second moments, and whether the
-    width of the section is similar to its thickness."""
-    _, _, spread, _ = _moments(piece)
-    low, middle, _ = np.sqrt(3 * spread)
-    return float(low), bool(middle <= WIDE * low)
+def _is_round(piece: ConvexPiece) -> bool:
+    """Check whether a box of the same second moments has a section of similar width and thickness."""
+    low, middle, _ = np.sqrt(3 * _moments(piece)[2])
+    return bool(middle <= WIDE * low)
 
 
 def _like(piece: ConvexPiece, kind: str) -> ConvexPiece:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from graspd.service.model.metrics import ROBUST_MODELS, Axis
 from graspd.service.model.transforms import Floats, compose, invert, quat_from_axis_angle
 from graspd.worker.execution_context import DEFAULT_CONTEXT, Count, ExecutionContext
-from graspd.worker.grasps import GraspSet, Posture
+from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.environment import PlacedGrasps
@@ -187,8 +187,10 @@ def robustness(
     tried = np.arange(len(grasps)) if held is None else np.flatnonzero(np.asarray(held) == 1)
     if not len(tried) or repeats < 1:
         return out
-    moves = np.array([_noise(obj, (seed, k, int(i))) for k in range(repeats) for i in tried])
-    noisy = _moved(grasps, np.tile(tried, repeats), invert(moves))
+    moves = invert(np.array([_noise(obj, (seed, k, int(i))) for k in range(repeats) for i in tried]))
+    noisy = grasps.take(np.tile(tried, repeats))
+    for part in (noisy.grasp, noisy.pregrasp, noisy.squeeze):
+        part.hand_pose = compose(moves, part.hand_pose)
     verdicts = validate(hand, obj, noisy, level="fast", pieces=pieces, run=run)
     out[tried] = verdicts.success.reshape(repeats, len(tried)).mean(axis=0)
     return out
@@ -199,12 +201,3 @@ def _noise(obj: ObjectModel, seed: tuple[int, ...]) -> Floats:
     shift, axis = rng.normal(size=(2, 3))
     rotation = quat_from_axis_angle(axis / np.linalg.norm(axis), np.array(NOISE_RAD))
     return about_centre(obj, NOISE_M * shift / np.linalg.norm(shift), rotation)
-
-
-def _moved(grasps: GraspSet, rows: NDArray[np.intp], motion: Floats) -> GraspSet:
-    def moved(part: Posture) -> Posture:
-        pose, joints = np.asarray(part.hand_pose, float), np.asarray(part.joint_positions, float)
-        return Posture(compose(motion, pose[rows]), joints[rows])
-
-    loss = np.asarray(grasps.stability_loss)[rows]
-    return GraspSet(moved(grasps.grasp), moved(grasps.pregrasp), moved(grasps.squeeze), loss)

@@ -111,7 +111,8 @@ def draw(axis: Axis, hand: HandModel, rng: np.random.Generator) -> Variant:
     """
     match axis:
         case Axis.SHAPES:
-            fit, grown = SHAPES[int(rng.choice(_shapes(hand)))]
+            fits = {"own", *fits_of(hand)}
+            fit, grown = SHAPES[int(rng.choice([i for i, (fit, _) in enumerate(SHAPES) if fit in fits]))]
             return Variant(fit=fit, grown_m=grown)
         case Axis.JOINTS:
             armature, dry = (float(rng.random() < 0.5) * _factor(rng) for _ in range(2))
@@ -154,12 +155,6 @@ SHAPES: Final[tuple[tuple[Fit, float], ...]] = (
     ("own", GROWTH_M),
     ("own", -GROWTH_M),
 )
-
-
-def _shapes(hand: HandModel) -> list[int]:
-    """Return the rows of `SHAPES` that change something in this hand."""
-    fits = fits_of(hand)
-    return [i for i, (fit, _) in enumerate(SHAPES) if fit == "own" or fit in fits]
 
 
 def _factor(rng: np.random.Generator) -> float:

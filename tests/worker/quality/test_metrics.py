@@ -25,7 +25,7 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.surface import sample_surface
 from graspd.worker.objects import disk_cache
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.quality import diversity, probe
+from graspd.worker.quality import probe
 from graspd.worker.quality.contact import contact_distance_consistency_mm, finger_of_body, spread_contacts
 from graspd.worker.quality.diversity import (
     POINTS,
@@ -41,7 +41,7 @@ from graspd.worker.quality.gate import MAX_PENETRATION_MM, MAX_SELF_PENETRATION_
 from graspd.worker.quality.intervals import wilson, wilson_of_mean
 from graspd.worker.quality.probe import HAND_POINTS, REACH_M, Probe
 from graspd.worker.quality.table import measure
-from graspd.worker.quality.volume import VOXEL_M, Overlap, SharedVolume, VoxelVolume
+from graspd.worker.quality.volume import VOXEL_M, Overlap, SharedVolume
 from tests.worker.models import object_from_mesh, two_finger_hand
 from tests.worker.quality.helpers import choose_contacts, grasp_set, pad_hand, plate_hand, posture
 from tests.worker.simulation.rigs import ball
@@ -87,10 +87,9 @@ def test_volume_of_overlapping_balls_is_the_lens() -> None:
 def test_voxels_agree_with_the_exact_volume() -> None:
     hand = plate_hand((0.03, 0.03, 0.01))
     bodies = Probe(hand, BOX).measure(closed_on_box(0.004)).bodies[0]
-    voxels = VoxelVolume(hand, BOX)
     surface_cm2 = 2 * (2 * 9 + 4 * 3 * 0.4)
     bound = surface_cm2 * VOXEL_M * 100 / 2
-    assert voxels.volume_cm3(bodies, np.array([1, 2])) == pytest.approx(7.2, abs=bound)
+    assert SharedVolume(hand, BOX).by_voxels(bodies, np.array([1, 2])) == pytest.approx(7.2, abs=bound)
     # Pieces that overlap are counted once.
     twice = dataclasses.replace(hand, pieces=(*hand.pieces, hand.pieces[1]))
     once = SharedVolume(hand, BOX).of(bodies[None], np.ones((1, 3), bool))
@@ -228,11 +227,6 @@ def gate(**changes: float) -> bool:
     return bool(passes({f"quality/{name}": np.array([value]) for name, value in (GOOD | changes).items()})[0])
 
 
-def test_a_good_grasp_passes_and_an_unmeasured_one_does_not() -> None:
-    assert gate()
-    assert not any(gate(**{name: math.nan}) for name in ("penetration_depth_mm", "self_penetration_depth_mm"))
-
-
 @pytest.mark.parametrize(
     ("name", "bound", "worse"),
     [
@@ -243,7 +237,7 @@ def test_a_good_grasp_passes_and_an_unmeasured_one_does_not() -> None:
 )
 def test_each_bound_is_inclusive_and_decides_alone(name: str, bound: float, worse: float) -> None:
     assert gate(**{name: bound})
-    assert not gate(**{name: bound + worse})
+    assert not gate(**{name: bound + worse}) and not gate(**{name: math.nan})
 
 
 def test_bars_of_shares_and_means_cover_the_truth() -> None:
@@ -296,7 +290,7 @@ def test_a_piece_in_the_object_and_an_object_in_a_piece_are_kept() -> None:
 FINGERS, BALL = two_finger_hand(), ball(subdivisions=2)
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture
 def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     return tmp_path / "graspd" / "coarse_grids"
@@ -363,9 +357,7 @@ def test_shifted_hand_is_off_by_the_shift_a_joint_by_its_points() -> None:
     assert distances(points, FIRST, SECOND) == pytest.approx([0.010 * slid.mean()], abs=1e-12)
 
 
-@pytest.mark.parametrize("few", [0, 1000])
-def test_of_grasps_that_are_near_the_first_is_kept(few: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(diversity, "FEW", few)
+def test_of_grasps_that_are_near_the_first_is_kept() -> None:
     rng = np.random.default_rng(11)
     points = rng.normal(0, 0.02, (200, 1, 3)) + rng.normal(0, 0.002, (200, 8, 3))
     kept = distinct(points, 0.01)
@@ -429,8 +421,6 @@ def test_a_ball_is_held_in_a_power_grasp_in_the_palm_or_by_pads() -> None:
 def test_fingers_that_touch_by_their_sides_are_a_lateral_grasp() -> None:
     """A thin card between two straight fingers: what they touch it with looks along their axes of flexion."""
     hand = hand_from_path("allegro")
-    from graspd.worker.hands.kinematics import body_poses
-
     straight = np.clip(np.zeros(hand.dofs), hand.lower, hand.upper)
     poses = body_poses(hand, np.array([[0.0, 0, 0, 1, 0, 0, 0]]), hand.expand(straight[None]))[0]
     first, second = (poses[body, :3] for body in hand.fingertips[:2])

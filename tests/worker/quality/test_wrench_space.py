@@ -14,7 +14,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from graspd.worker.quality import wrench_space
-from graspd.worker.quality.wrench_space import MAX_POINTS, cone_edges, measure_hulls, measure_spaces, tangents, wrenches
+from graspd.worker.quality.wrench_space import MAX_POINTS, cone_edges, measure_hulls, measure_spaces, wrenches
 
 #: The table of reference values is printed with six digits.
 PRINTED = 1e-5
@@ -38,14 +38,6 @@ def hull_of(points: np.ndarray, whole: bool = True) -> tuple[float, float]:
 
 def sphere_space(points: np.ndarray, friction: float, *, radius: float = 1.0, edges: int = 8) -> tuple[float, float]:
     return measure_space(wrenches(points, -points, friction=friction, centre=ORIGIN, radius=radius, edges=edges))
-
-
-def test_tangents_form_a_right_handed_orthonormal_frame() -> None:
-    normals = Rotation.random(50, rng=1).apply([0, 0, 1.0])
-    t1, t2 = tangents(normals)
-    frames = np.stack([t1, t2, normals], axis=-1)
-    assert np.allclose(np.linalg.det(frames), 1)
-    assert np.allclose(frames.transpose(0, 2, 1) @ frames, np.eye(3), atol=1e-12)
 
 
 def test_spaces_of_closed_form() -> None:
@@ -81,18 +73,6 @@ def test_contacts_on_the_unit_sphere(
     points: np.ndarray, options: dict[str, Any], friction: float, epsilon: float, volume: float
 ) -> None:
     assert sphere_space(points, friction, **options) == pytest.approx((epsilon, volume), abs=PRINTED)
-
-
-@pytest.mark.parametrize(
-    ("points", "friction", "bound"),
-    [(TETRAHEDRON, 0.2, 0.142), (TETRAHEDRON, 0.5, 0.370), (TETRAHEDRON, 1.0, 0.747),
-     (TRIPOD, 0.2, 0.1055), (TRIPOD, 0.5, 0.2887), (TRIPOD, 1.0, 0.5787)],
-)  # fmt: skip
-def test_more_edges_approach_the_cone_limit_from_below(points: np.ndarray, friction: float, bound: float) -> None:
-    eight, many = (sphere_space(points, friction, edges=edges)[0] for edges in (8, 32))
-    assert eight <= many <= bound * 1.001
-    # A pyramid of 8 edges holds a cone of cos(pi/8) of the friction.
-    assert eight >= 0.9 * math.cos(math.pi / 8) * bound
 
 
 def test_size_order_and_rotation_of_contacts_do_not_matter() -> None:

@@ -58,19 +58,23 @@ def pictures(block) -> np.ndarray:
     return grasp_pictures(HAND, block, POSES, JOINTS, (80, 64), THREE_SIDES, samples=4)
 
 
-def hues(picture: np.ndarray) -> np.ndarray:
-    hsv = np.asarray(Image.fromarray(picture).convert("HSV")).reshape(-1, 3).astype(int)
-    return hsv[(hsv[:, 1] > 90) & (hsv[:, 2] > 30)][:, 0]
+def coloured_pixels(picture: np.ndarray, low: int, high: int) -> np.ndarray:
+    """Mask of the pixels of a hue between two, in 256 steps."""
+    hue, saturation, value = np.moveaxis(np.asarray(Image.fromarray(picture).convert("HSV")).astype(int), -1, 0)
+    return (hue > low) & (hue < high) & (saturation > 90) & (value > 30)
+
+
+def orange(picture: np.ndarray) -> np.ndarray:
+    """Mask of the pixels that show the object."""
+    return coloured_pixels(picture, 8, 30)
 
 
 def test_every_side_shows_object_and_fingertips_in_their_colours(pictures) -> None:
     assert pictures.shape == (2, 3, 64, 80, 3)
     assert len({picture.tobytes() for picture in pictures.reshape(6, -1)}) == 6
     for picture in pictures.reshape(6, 64, 80, 3):
-        hue = hues(picture)
-        # Orange object, teal fingertips, hue in 256 steps.
-        assert np.sum((hue > 8) & (hue < 30)) > 60
-        assert np.sum((hue > 115) & (hue < 135)) > 5
+        assert orange(picture).sum() > 60, "the object"
+        assert coloured_pixels(picture, 115, 135).sum() > 5, "teal fingertips"
 
 
 def test_grasp_looks_the_same_whatever_grasps_are_drawn_with_it(block, pictures):
@@ -151,12 +155,6 @@ def at(name: str, height: float = 0.0) -> Waypoint:
     """The hand over the block, both raised."""
     rise = np.array([0, 0, height])
     return Waypoint(name, DOWN + np.append(rise, np.zeros(4)), np.full(2, 0.1), rise)
-
-
-def orange(picture: np.ndarray) -> np.ndarray:
-    """Mask of the pixels that show the object: hues between red and yellow."""
-    hue, saturation, value = np.moveaxis(np.asarray(Image.fromarray(picture).convert("HSV")).astype(int), -1, 0)
-    return (hue > 8) & (hue < 30) & (saturation > 90) & (value > 30)
 
 
 def test_every_posture_of_every_grasp_is_drawn_from_every_side(block):

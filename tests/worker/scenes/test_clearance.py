@@ -111,7 +111,6 @@ def test_no_grasps_are_empty_too_many_are_refused() -> None:
 #: MuJoCo stores meshes in float32 and its GJK stops at 1e-6 of the size.
 ENGINE_M = 5e-6
 DOWN = np.concatenate([[0, 0, 0.25], quat_from_axis_angle(np.array([1.0, 0, 0]), np.asarray(np.pi))])
-LEVEL = np.array([[0.0, 0, 0, 1, 0, 0, 0]])
 
 
 def box(*size: float):
@@ -129,7 +128,7 @@ def test_same_seed_gives_same_scenes_and_more_scenes_keep_first():
 def test_clearance_from_a_box_is_the_gap_or_the_depth(height):
     # Tips end 0.25 - 0.079 above the table, over the box below them or in it.
     neighbours = Neighbours([box(0.3, 0.3, height)], np.array([[[0, 0, height / 2, 1.0, 0, 0, 0]]]))
-    found = neighbour_clearance(HAND, Posture(DOWN[None], np.zeros((1, 2))), LEVEL, neighbours)
+    found = neighbour_clearance(HAND, Posture(DOWN[None], np.zeros((1, 2))), IDENTITY, neighbours)
     assert found[0, 0] == pytest.approx(0.25 - 0.079 - height, abs=ENGINE_M)
 
 
@@ -137,11 +136,11 @@ def test_clearance_is_a_capped_lower_bound_of_corner_distances():
     rng = np.random.default_rng(0)
     block = box(0.04, 0.05, 0.06)
     posture, poses = postures(rng, 12), np.array([[[0.15, 0.1, 0.03, 1.0, 0, 0, 0]]])
-    found = neighbour_clearance(HAND, posture, LEVEL, Neighbours([block], poses))[0]
+    found = neighbour_clearance(HAND, posture, IDENTITY, Neighbours([block], poses))[0]
     surface = apply(
         poses[0, 0], trimesh.sample.sample_surface_even(trimesh.Trimesh(block.vertices, block.faces), 800, seed=0)[0]
     )
-    bodies = compose(LEVEL, body_poses(HAND, posture.hand_pose, posture.joint_positions))
+    bodies = compose(IDENTITY, body_poses(HAND, posture.hand_pose, posture.joint_positions))
     for k in range(12):
         corners = np.concatenate([apply(bodies[k, p.body], p.vertices) for p in HAND.pieces])
         nearest = np.linalg.norm(corners[:, None] - surface, axis=-1).min()
@@ -157,7 +156,7 @@ def test_grasp_that_neighbour_blocks_is_rejected_with_the_reason():
 
     def reason(grasp: np.ndarray, pregrasp: np.ndarray, place: list[float]) -> tuple[int, int]:
         neighbours = Neighbours([tower], np.array([[[*place, 1.0, 0, 0, 0]]]))
-        result = transfer(HAND, Posture(grasp, still), Posture(pregrasp, still), LEVEL, neighbours)
+        result = transfer(HAND, Posture(grasp, still), Posture(pregrasp, still), IDENTITY, neighbours)
         return int(result["grasp/rejection"][0]), int(result["grasp/valid"][0])
 
     assert reason(low, high, [0.3, 0, 0.075]) == (Rejection.NONE, 1)
@@ -171,4 +170,4 @@ def test_the_table_comes_before_the_neighbours_among_the_reasons():
     into_table = np.array([[0, 0, 0.05, *DOWN[3:]]])
     tower = Neighbours([box(0.02, 0.02, 0.15)], np.array([[[0.04, 0, 0.075, 1.0, 0, 0, 0]]]))
     posture = Posture(into_table, np.zeros((1, 2)))
-    assert transfer(HAND, posture, posture, LEVEL, tower)["grasp/rejection"][0] == Rejection.TABLE_AT_CONTACT
+    assert transfer(HAND, posture, posture, IDENTITY, tower)["grasp/rejection"][0] == Rejection.TABLE_AT_CONTACT

@@ -175,8 +175,8 @@ def test_a_flat_object_is_refused_by_name():
 UP = np.array([0.0, 0, 1])
 
 
-def plate(thickness: float) -> ObjectModel:
-    return object_from_mesh(trimesh.creation.box([0.06, 0.06, thickness]))
+def box(*size: float, name: str = "box") -> ObjectModel:
+    return object_from_mesh(trimesh.creation.box(size), name)
 
 
 def rolling_can() -> ObjectModel:
@@ -190,7 +190,7 @@ def face_along(faces: RestingFaces, normal: tuple[float, float, float]) -> int:
 def test_plate_topples_from_an_edge_whose_tilt_passes_its_middle() -> None:
     # Height 30 mm, half the thickness t / 2 inside: 1 mm of change tilts by 1 / t, so t t / 2 must pass 30 mm^2.
     for thickness, falls in ((0.0074, True), (0.0080, False)):
-        faces = resting_faces(plate(thickness))
+        faces = resting_faces(box(0.06, 0.06, thickness))
         assert faces.topples(face_along(faces, (1, 0, 0))) is falls
         assert not faces.topples(face_along(faces, (0, 0, 1)))
 
@@ -207,44 +207,39 @@ def test_a_can_rolls_on_its_side_and_stands_on_its_bottom() -> None:
     assert rolling_note(0, 3) is None
 
 
-def test_a_can_is_put_on_its_ends_and_a_ball_stays_as_it_lies() -> None:
-    # Half as high as wide: about a half of the drops end on its side.
-    stout = object_from_mesh(trimesh.creation.cylinder(radius=0.03, height=0.05, sections=60))
-    free = [
-        drop(stout, count=12, seed=1)["scene/object_pose"],
-        rest_poses(SceneSpec(kind="table", faces="all"), stout, count=1, seed=0)["scene/object_pose"],
-        drop_together(plate(0.05), [stout], count=8, seed=3)["scene/neighbour_pose"][:, 0],
+@pytest.mark.parametrize(
+    ("obj", "height", "seeds"),
+    [
+        # Half as high as wide: about a half of the drops end on its side.
+        (object_from_mesh(trimesh.creation.cylinder(radius=0.03, height=0.05, sections=60)), 0.025, (1, 3)),
+        (box(0.06, 0.06, 0.007), 0.0035, (8, 35)),
+    ],
+    ids=["can", "plate"],
+)
+def test_what_rolls_or_topples_is_put_on_its_ends(obj: ObjectModel, height: float, seeds: tuple[int, int]) -> None:
+    poses = [
+        drop(obj, count=12, seed=seeds[0])["scene/object_pose"],
+        rest_poses(SceneSpec(kind="table", faces="all"), obj, count=1, seed=0)["scene/object_pose"],
+        drop_together(box(0.06, 0.06, 0.05), [obj], count=8, seed=seeds[1])["scene/neighbour_pose"][:, 0],
     ]
-    for pose in np.concatenate(free):
+    for pose in np.concatenate(poses):
         assert abs(quat_rotate(quat_conjugate(pose[3:]), UP)[2]) == pytest.approx(1.0, abs=1e-6)
-        assert pose[2] == pytest.approx(0.025, abs=1e-6)
+        assert pose[2] == pytest.approx(height, abs=1e-6)
+
+
+def test_a_ball_stays_as_it_lies() -> None:
     ball = object_from_mesh(trimesh.creation.icosphere(2, 0.03))
     assert rolling_poses(ball, drop(ball, count=3, seed=1)["scene/object_pose"]) == 3
 
 
-def test_drops_and_faces_leave_out_what_topples() -> None:
-    thin = plate(0.007)
-    poses = [
-        drop(thin, count=12, seed=8)["scene/object_pose"],
-        rest_poses(SceneSpec(kind="table", faces="all"), thin, count=1, seed=0)["scene/object_pose"],
-        drop_together(plate(0.05), [thin], count=8, seed=35)["scene/neighbour_pose"][:, 0],
-    ]
-    for pose in np.concatenate(poses):
-        assert abs(quat_rotate(quat_conjugate(pose[3:]), UP)[2]) == pytest.approx(1.0, abs=1e-6)
-
-
-BLOCK = object_from_mesh(trimesh.creation.box((0.05, 0.07, 0.11)), "block")
-
-
-def corners(pose: np.ndarray) -> np.ndarray:
-    return quat_rotate(pose[3:], BLOCK.hull_vertices) + pose[:3]
+BLOCK = box(0.05, 0.07, 0.11, name="block")
 
 
 @pytest.mark.parametrize("kind", ["table", "bin", "shelf"])
 def test_the_object_stands_on_its_support_and_in_nothing_else(kind: str) -> None:
     spec = SceneSpec(kind=kind)
     for pose in rest_poses(spec, BLOCK, count=6, seed=3)["scene/object_pose"]:
-        distances = [support.distance(corners(pose)).min() for support in supports_of(spec)]
+        distances = [support.distance(apply(pose, BLOCK.hull_vertices)).min() for support in supports_of(spec)]
         assert min(distances) == pytest.approx(0.0, abs=1e-6), "rest poses are exact"
         assert sorted(distances)[1:] == sorted(d for d in distances if d > 1e-4)[-len(distances) + 1 :]
 
@@ -263,7 +258,7 @@ def test_all_faces_are_those_that_enough_drops_end_on() -> None:
 
 
 def test_object_too_large_for_a_bin_is_refused_with_both_sizes() -> None:
-    plank = object_from_mesh(trimesh.creation.box((0.5, 0.05, 0.05)), "plank")
+    plank = box(0.5, 0.05, 0.05, name="plank")
     with pytest.raises(InputError, match=r"plank needs .* mm and there is room for 380 x 280 mm"):
         rest_poses(SceneSpec(kind="bin"), plank, count=2, seed=0)
 
@@ -277,20 +272,12 @@ def test_a_target_stands_where_told_and_not_under_its_support() -> None:
         rest_poses(spec, BLOCK, count=1, seed=0)
 
 
-def box(*size: float, name: str = "box"):
-    return object_from_mesh(trimesh.creation.box(size), name)
-
-
 THING, LOW, TALL = box(0.05, 0.05, 0.05), box(0.08, 0.06, 0.03, name="low"), box(0.03, 0.04, 0.12, name="tall")
 
 
 def laid(kind: str, others, *, count: int, faces: str = "drawn", thing=THING):
     spec = SceneSpec(kind=kind, faces=faces, neighbours=tuple({"object": one.name} for one in others))
     return spec, *scenes_of(spec, thing, others, count=count, seed=5)
-
-
-def corners_of(obj, poses: np.ndarray) -> np.ndarray:
-    return np.stack([quat_rotate(pose[3:], obj.hull_vertices) + pose[:3] for pose in poses])
 
 
 @pytest.mark.parametrize("kind", ["bin", "shelf"])
@@ -300,7 +287,7 @@ def test_neighbours_stand_within_walls_apart_and_on_the_floor(kind: str) -> None
     room = np.asarray(room_in(spec)) / 2 - GAP
     together = np.concatenate([poses["scene/object_pose"][:, None], poses["scene/neighbour_pose"]], axis=1)
     for number, one in enumerate([THING, *others]):
-        found = corners_of(one, together[:, number])
+        found = apply(together[:, number, None], one.hull_vertices)
         assert (np.abs(found[..., :2]) <= room + 1e-9).all()
         np.testing.assert_allclose(found[..., 2].min(axis=1), 0.0, atol=1e-9)
         # The supports' own planes, the boards above and below among them.

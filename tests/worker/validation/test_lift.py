@@ -72,12 +72,6 @@ def test_a_firm_squeeze_lifts_the_box_and_none_leaves_it(level: str) -> None:
     assert firm.margin < 0.5
 
 
-def test_glue_lifts_what_the_same_squeeze_does_not_hold() -> None:
-    weak = grasp(0.0005)
-    assert lift_test(MujocoOptions(friction=(0.05, 0.001))).lift(weak, 0).outcome is LiftOutcome.NOT_LIFTED
-    assert lift_test(MujocoOptions(friction=(50.0, 1.0))).lift(weak, 0).outcome is LiftOutcome.LIFTED
-
-
 def test_a_lift_ends_where_its_object_is_lost() -> None:
     test = lift_test()
     lost, held = (test.lift(grasp(squeeze), 0) for squeeze in (-0.01, 0.05))
@@ -206,15 +200,9 @@ def test_the_box_falls_by_what_friction_does_not_carry() -> None:
     assert 0.0 <= firm < 0.05
 
 
-def test_half_the_friction_needs_twice_the_squeeze() -> None:
-    slips, holds = scores(0.9 * LEAST_AT_HALF, 1.1 * LEAST_AT_HALF)
-    assert SLIPS <= slips < SLIPS + 0.05
-    assert holds < 0.05
-
-
-def test_half_friction_to_be_better_is_not_asked_of_the_whole() -> None:
+def test_half_friction_needs_twice_the_squeeze_unless_beaten() -> None:
     placed = PlacedGrasps(PLACED.supports, PLACED.object_pose, np.zeros(3, int))
-    grasps = joined([grasp(squeeze) for squeeze in (1.1 * LEAST, 2.4 * LEAST, 1.1 * LEAST)])
+    grasps = joined([grasp(share * LEAST_AT_HALF) for share in (0.9, 1.1, 0.9)])
     found = LiftRollouts(HAND, BOX, lambda: WHOLE).scores(grasps, placed, np.array([1.5, 1.5, np.inf]))
     assert found[0] == 1.5
     assert found[1] < 0.05
@@ -229,20 +217,20 @@ def test_pads_that_start_in_the_box_are_no_candidates() -> None:
     assert push_rollout(HAND, BOX, lambda: WHOLE)(deep, None) == [DEEP]
 
 
-@pytest.mark.parametrize("test", ["scores", "pushed"])
-def test_threads_and_the_other_grasps_change_no_score(test: str) -> None:
-    squeezes, score = (0.02, -0.005, 0.05), globals()[test]
-    assert np.array_equal(score(*squeezes, threads=3), score(*squeezes))
-    assert np.array_equal(score(*squeezes)[1:2], score(squeezes[1]))
+def test_threads_and_the_other_grasps_change_no_score() -> None:
+    squeezes = (0.02, -0.005, 0.05)
+    assert np.array_equal(scores(*squeezes, threads=3), scores(*squeezes))
+    for score in (scores, pushed):
+        assert np.array_equal(score(*squeezes)[1:2], score(squeezes[1]))
 
 
 #: Of a push towards a corner what two pads must hold by friction, across their normals; the rest one of them carries.
 ACROSS = float(np.sqrt(2.0 / 3.0))
 
 
-def pushed(*squeezes: float, threads: int = 1) -> np.ndarray:
+def pushed(*squeezes: float) -> np.ndarray:
     grasps: GraspSet = joined([grasp(squeeze) for squeeze in squeezes])
-    return push_rollout(HAND, BOX, lambda: WHOLE, threads=threads)(grasps, None)
+    return push_rollout(HAND, BOX, lambda: WHOLE)(grasps, None)
 
 
 def test_free_box_is_pushed_away_the_less_the_firmer_it_is_held() -> None:
@@ -251,11 +239,8 @@ def test_free_box_is_pushed_away_the_less_the_firmer_it_is_held() -> None:
     assert (np.diff(found[1:]) < 0).all()
     # Nothing holds it, or less than a third of what is needed: at the whole friction as well.
     assert (found[:2] >= SLIPS + 1.0).all()
-
-
-def test_free_box_hardly_moves_where_friction_carries_the_pushes() -> None:
     # Twice the squeeze that holds at the whole friction holds at half of it; pads and their drives give a little.
-    assert pushed(2.4 * ACROSS * LEAST_PUSHED)[0] < 0.2
+    assert found[-1] < 0.2
 
 
 def test_a_free_box_that_nothing_holds_flies_as_far_as_pushed() -> None:

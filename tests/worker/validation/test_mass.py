@@ -61,6 +61,11 @@ def pinch() -> GraspSet:
     return found
 
 
+def bears(friction: float) -> float:
+    """Mass that the friction of the pinch bears [kg]."""
+    return 2 * friction * TORQUE / LEVER_M / ACCELERATION
+
+
 def payload(friction: float) -> float:
     (found,) = payloads(HAND, BOX.weighing(mass=0.02, friction=friction), pinch(), pieces=PIECES, placed=TABLE)
     return float(found)
@@ -68,8 +73,7 @@ def payload(friction: float) -> float:
 
 @pytest.mark.parametrize("friction", [0.3, FRICTION, 1.0])
 def test_the_payload_of_a_pinch_is_what_its_friction_bears(friction: float) -> None:
-    bears = 2 * friction * TORQUE / LEVER_M / ACCELERATION
-    assert 0.95 * bears < payload(friction) < bears
+    assert 0.95 * bears(friction) < payload(friction) < bears(friction)
 
 
 def test_what_is_slippery_or_out_of_touch_bears_nothing_stop_all() -> None:
@@ -84,25 +88,20 @@ def test_what_is_slippery_or_out_of_touch_bears_nothing_stop_all() -> None:
 def test_what_friction_bears_of_the_shake_survives_it(friction: float) -> None:
     # Along the line of the fingers an acceleration takes from the forces that press: mg <= friction (2 F - ma).
     accelerated = AMPLITUDE_M * (2 * np.pi * FREQUENCY_HZ) ** 2
-    bears = 2 * friction * TORQUE / LEVER_M / (ACCELERATION + friction * accelerated)
+    borne = 2 * friction * TORQUE / LEVER_M / (ACCELERATION + friction * accelerated)
     survives, lost = (
-        shake_margins(HAND, BOX.weighing(mass=share * bears, friction=friction), pinch(), TABLE, pieces=PIECES)[0]
+        shake_margins(HAND, BOX.weighing(mass=share * borne, friction=friction), pinch(), TABLE, pieces=PIECES)[0]
         for share in (0.92, 1.15)
     )
     assert survives < 0.2 and lost >= 1
     # Gravity alone loses neither.
-    assert 1.15 * bears < payload(friction)
+    assert 1.15 * borne < payload(friction)
 
 
 def test_a_lift_has_the_mass_and_the_friction_of_the_object() -> None:
-    bears = 2 * FRICTION * TORQUE / LEVER_M / ACCELERATION
-    for mass, friction, lifted in (
-        (0.8 * bears, FRICTION, 1),
-        (1.2 * bears, FRICTION, 0),
-        (1.2 * bears, 1.5 * FRICTION, 1),
-    ):
-        obj = BOX.weighing(mass=mass, friction=friction)
-        assert validate_lifts(HAND, obj, pinch(), TABLE, pieces=PIECES).success.tolist() == [lifted], (mass, friction)
+    for share, friction, lifted in ((0.8, FRICTION, 1), (1.2, FRICTION, 0), (1.2, 1.5 * FRICTION, 1)):
+        obj = BOX.weighing(mass=share * bears(FRICTION), friction=friction)
+        assert validate_lifts(HAND, obj, pinch(), TABLE, pieces=PIECES).success.tolist() == [lifted], (share, friction)
 
 
 def test_verdicts_of_other_masses_have_other_keys() -> None:
@@ -158,10 +157,6 @@ def test_a_job_counts_grasps_that_lift_the_wanted_payload(
 
 
 UP = np.array([[[0.0, 1.0, 0.0]]])
-
-
-def bears(friction: float) -> float:
-    return 2 * friction * TORQUE / LEVER_M / ACCELERATION
 
 
 @pytest.mark.parametrize("friction", [0.01, 0.3, FRICTION, 1.0])

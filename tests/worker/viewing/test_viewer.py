@@ -22,12 +22,11 @@ from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.transforms import quat_from_axis_angle
 from graspd.service.store.shards import Shard, json_attribute, write_shard
 from graspd.worker.hands.kinematics import body_poses
-from graspd.worker.hands.load import hand_from_path, load_hand
+from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.rendering.hands import drawn_bodies
-from tests.worker.hands.urdfs import BOX, joint, link, robot
 from tests.worker.models import attributes_of, object_from_mesh, quality_columns, two_finger_hand
 
 viser = pytest.importorskip("viser", reason="needs the extra: pip install graspd[view]")
@@ -202,17 +201,3 @@ def test_links_above_the_root_are_drawn_at_each_grasps_wrist(block) -> None:
                 np.testing.assert_allclose(node.position, poses[body, :3], atol=1e-6)
                 assert abs(node.wxyz @ poses[body, 3:]) == pytest.approx(1, abs=1e-6)
             made.step(1)
-
-
-def test_collision_shapes_take_place_of_what_the_hand_looks_like(block) -> None:
-    seen = '<visual><geometry><sphere radius="0.03"/></geometry></visual>'
-    urdf = robot(link("palm", BOX + seen), link("a"), joint("j", "palm", "a"))
-    with viewing(load_hand({"h.urdf": urdf}, name="h", digest=""), block, arrays(1)) as made:
-        assert [node.visible for node in made.models.bodies] == [True, True]
-        assert [node.visible for node in made.models.collisions] == [False, False]
-        made._collision.value = True
-        made.show()
-        assert [node.visible for node in made.models.bodies] == [False, False]
-        assert [node.visible for node in made.models.collisions] == [True, True]
-        for looks, shape in zip(made.models.bodies, made.models.collisions, strict=True):
-            np.testing.assert_allclose(looks.position, shape.position)

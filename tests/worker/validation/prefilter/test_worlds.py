@@ -67,11 +67,7 @@ def test_outcomes_margins_and_depths_are_the_certificates(found: PrefilterOutcom
     np.testing.assert_allclose(found.margin[held], standard.margin[held], atol=2e-3)
     np.testing.assert_allclose(1e3 * found.penetration_m, standard.penetration_depth_mm, atol=1e-3)
     np.testing.assert_allclose(1e3 * found.self_penetration_m, standard.self_penetration_depth_mm, atol=1e-3)
-
-
-def test_a_grasp_that_holds_takes_the_steps_of_the_certificate(found: PrefilterOutcomes) -> None:
-    alone = validate(PADS, BOX, grasp_of(), pieces=WHOLE)
-    assert found.ticks[0] * 10 == alone.steps
+    assert found.ticks[0] * 10 == validate(PADS, BOX, grasp_of(), pieces=WHOLE).steps
 
 
 def test_verdicts_do_not_depend_on_which_world_takes_a_grasp(
@@ -142,19 +138,18 @@ def verdicts(run: ExecutionContext, level: Level = "standard", grasps: GraspSet 
     return validate(PADS, BOX, grasps or every_kind(), level=level, pieces=WHOLE, run=run)
 
 
-def test_at_level_certificate_the_first_judge_only_refuses() -> None:
-    alone, found = verdicts(ExecutionContext()), verdicts(ON)
-    np.testing.assert_array_equal(found.outcome, alone.outcome)
+def test_at_level_certificate_the_first_judge_only_refuses(standard: Verdicts) -> None:
+    found = verdicts(ON)
+    np.testing.assert_array_equal(found.outcome, standard.outcome)
     assert (found.validated_by[found.success == 1] == ValidatedBy.MUJOCO).all()
     assert (found.validated_by == ValidatedBy.MUJOCO_WARP).any()
-    assert (alone.validated_by == ValidatedBy.MUJOCO).all()
+    assert (standard.validated_by == ValidatedBy.MUJOCO).all()
 
 
-def test_at_level_screen_clear_verdicts_stand_both_ways(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_at_level_screen_clear_verdicts_stand_both_ways(standard: Verdicts, monkeypatch: pytest.MonkeyPatch) -> None:
     first = verdicts(ON, "fast")
     for held in (0, 1):
         assert (first.validated_by[first.success == held] == ValidatedBy.MUJOCO_WARP).any()
-    standard = verdicts(ExecutionContext())
     assert first.level == "fast"
     np.testing.assert_array_equal(first.success, standard.success)
     monkeypatch.setattr(screening, "BAND", (0.0, 1e9))
@@ -165,24 +160,18 @@ def test_at_level_screen_clear_verdicts_stand_both_ways(monkeypatch: pytest.Monk
 
 
 def test_the_letter_and_grippers_are_the_cpus(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = verdicts(ON, "dexgraspbench")
+    found = verdicts(ON, "dexgraspbench", grasp_of())
     assert (found.validated_by == ValidatedBy.MUJOCO).all()
-    assert found.terms == verdicts(ExecutionContext(), "dexgraspbench").terms
+    assert found.terms == verdicts(ExecutionContext(), "dexgraspbench", grasp_of()).terms
     monkeypatch.setattr(screening, "jaws_of", lambda hand: object())
     assert screening.first_terms(PADS, "standard", ON) == []
 
 
 def test_the_key_says_who_judges() -> None:
-    keys = {
-        verdicts(run).terms
-        for run in (
-            ExecutionContext(),
-            ExecutionContext(prefilter="off"),
-            ExecutionContext(device="cpu", prefilter="auto"),
-        )
-    }
+    runs = (ExecutionContext(), ExecutionContext(prefilter="off"), ExecutionContext(device="cpu", prefilter="auto"))
+    keys = {verdicts(run, grasps=grasp_of()).terms for run in runs}
     assert len(keys) == 1
-    assert verdicts(ON).terms not in keys
+    assert verdicts(ON, grasps=grasp_of()).terms not in keys
 
 
 def test_who_insists_on_it_is_told_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -199,7 +188,7 @@ def lies(found: PrefilterOutcomes) -> PrefilterOutcomes:
 
 
 def test_a_first_judge_that_the_cpu_contradicts_is_not_believed(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    standard: Verdicts, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     true = screening.WorldPool.validate
     monkeypatch.setattr(screening.WorldPool, "validate", lambda *some, **more: lies(true(*some, **more)))
@@ -212,7 +201,7 @@ def test_a_first_judge_that_the_cpu_contradicts_is_not_believed(
     assert found.contradicted > 1
     assert found.rechecked >= found.contradicted
     assert (found.validated_by == ValidatedBy.MUJOCO).all()
-    np.testing.assert_array_equal(found.success, verdicts(ExecutionContext()).success)
+    np.testing.assert_array_equal(found.success, standard.success)
     assert "the CPU validates all" in caplog.text
 
 
