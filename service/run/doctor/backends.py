@@ -20,6 +20,7 @@ from graspd.service.index.index import Index
 from graspd.service.index.rebuild import differences
 from graspd.service.index.sample import IndexCondition, compare, draw, look
 from graspd.service.index.tables import shards
+from graspd.service.model.base import first_line
 from graspd.service.model.errors import (
     GraspdError,
     IndexDamaged,
@@ -68,7 +69,7 @@ def redis(settings: Settings) -> Finding:
         with redis_connection(settings) as client:
             return _check_redis(settings, client, dict(client.info()))
     except (RedisError, OSError) as error:
-        return bad(f"{_shown(settings)} does not answer: {_line(error)}", _fix(error, settings))
+        return bad(f"{_shown(settings)} does not answer: {first_line(error)}", _fix(error, settings))
 
 
 def _check_redis(settings: Settings, client: Redis, info: Mapping[str, Any]) -> Finding:
@@ -159,10 +160,6 @@ def _fix(error: Exception, settings: Settings) -> str:
     if settings.redis_url is None:
         return "the service of this data folder crashed: start `graspd up` again"
     return _START
-
-
-def _line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]
 
 
 _NONE_HERE: Final = (
