@@ -182,7 +182,7 @@ def format_of(name: str, data: bytes) -> Format | None:
 
 def text_of(data: bytes) -> str:
     """Decode XML or YAML by byte order mark or declaration, and strip both. Invalid UTF-8 is Latin 1."""
-    coding = json.detect_encoding(data)  # by the byte order mark, or the zeros in the first characters
+    coding: str = json.detect_encoding(data)  # by the byte order mark, or the zeros in the first characters
     if (declared := _DECLARED.match(data)) and _NAMED.match(said := declared[1].decode()):
         coding = said
     try:

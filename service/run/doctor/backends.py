@@ -186,12 +186,8 @@ def index(settings: Settings) -> Finding:
     except UnavailableError as error:
         fix = "start the database; see host, user, password and database in GRASPD_INDEX_URL"
         return bad(str(error), fix if settings.index_url is not None else "see who may read the file")
-    if found is None:
-        return _absent(settings)
-    return _check_index(settings, found)
-
-
-def _absent(settings: Settings) -> Finding:
+    if found is not None:
+        return _check_index(settings, found)
     if settings.index_url is None:
         return skipped(_NONE_HERE)
     where = existing(Path(str(make_url(settings.resolved_index_url).database)).resolve())
