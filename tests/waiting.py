@@ -35,8 +35,6 @@ def until_a_worker_is_idle(address: str) -> None:
 
 
 class Clock:
-    """Time that passes when told to."""
-
     now = 1000.0
 
     def __call__(self) -> float:

@@ -29,11 +29,6 @@ def executable(path: Path) -> Path:
     return path
 
 
-def test_a_url_in_the_settings_goes_before_everything(tmp_path: Path) -> None:
-    settings = Settings(data_dir=tmp_path, redis_url="redis://elsewhere:6379/3")
-    assert redis_url(settings) == "redis://elsewhere:6379/3"
-
-
 @pytest.mark.parametrize("name", ["redis-server", "valkey-server"])
 def test_a_server_on_the_path_goes_before_the_wheels(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str

@@ -25,23 +25,12 @@ from graspd.service.run.address import record_address
 from graspd.service.run.doctor.backends import persistence, redis
 from graspd.service.run.doctor.checks import Condition
 from graspd.service.run.doctor.fleet import clocks, controller, port, workers
-from graspd.service.run.embedded import find_server, server_command
+from graspd.service.run.embedded import find_server
 from graspd.service.settings import Settings
 from tests.fakes import beat_of
 from tests.servers import free_ports
 from tests.service.conftest import wait_for_redis
 from tests.service.queue.test_queue import task
-
-
-@pytest.fixture(scope="module")
-def own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Settings]:
-    settings = Settings(data_dir=tmp_path_factory.mktemp("own"))
-    with subprocess.Popen(server_command(settings), stdout=subprocess.DEVNULL) as process:
-        queue = RqQueue(connect(redis_url(settings), patience=0))
-        wait_for_redis(queue)
-        queue.close()
-        yield settings
-        process.terminate()
 
 
 @pytest.fixture(autouse=True)
@@ -51,9 +40,9 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def client(own: Settings) -> Iterator[Redis]:
+def client(redis_settings: Settings) -> Iterator[Redis]:
     """A client whose changes of the configuration are taken back."""
-    client = connect(redis_url(own))
+    client = connect(redis_url(redis_settings))
     before = {name: client.config_get(name)[name] for name in ("maxmemory", "maxmemory-policy", "appendonly")}
     yield client
     client.replicaof("no", "one")
@@ -62,12 +51,12 @@ def client(own: Settings) -> Iterator[Redis]:
     client.close()
 
 
-def test_the_redis_of_graspd_up_is_good_and_keeps_its_tasks(own: Settings, client: Redis) -> None:
-    found = redis(own)
+def test_the_redis_of_graspd_up_is_good_and_keeps_its_tasks(redis_settings: Settings, client: Redis) -> None:
+    found = redis(redis_settings)
     assert found.condition is Condition.GOOD, found
     assert "Redis" in found.message
-    assert str(own.data_dir) in found.message
-    assert persistence(own).condition is Condition.GOOD
+    assert str(redis_settings.data_dir) in found.message
+    assert persistence(redis_settings).condition is Condition.GOOD
     assert client.keys("graspd:doctor:*") == [], "a probe was left behind"
 
 
@@ -80,30 +69,30 @@ def test_a_redis_never_started_is_skipped_and_a_lost_one_bad(tmp_path: Path) -> 
     assert persistence(away).condition is Condition.SKIPPED
 
 
-def test_a_policy_that_evicts_is_bad_once_memory_is_bounded(own: Settings, client: Redis) -> None:
+def test_a_policy_that_evicts_is_bad_once_memory_is_bounded(redis_settings: Settings, client: Redis) -> None:
     client.config_set("maxmemory-policy", "allkeys-lru")
-    assert redis(own).condition is Condition.GOOD, "without a bound nothing is evicted"
+    assert redis(redis_settings).condition is Condition.GOOD, "without a bound nothing is evicted"
     client.config_set("maxmemory", "64mb")
-    found = redis(own)
+    found = redis(redis_settings)
     assert not found.ok and "allkeys-lru" in found.message
     assert "maxmemory-policy noeviction" in found.fix
 
 
-def test_a_full_memory_is_bad(own: Settings, client: Redis) -> None:
+def test_a_full_memory_is_bad(redis_settings: Settings, client: Redis) -> None:
     client.config_set("maxmemory", str(client.info("memory")["used_memory"]))
-    found = redis(own)
+    found = redis(redis_settings)
     assert not found.ok and "MiB are used" in found.message
 
 
-def test_a_replica_is_bad(own: Settings, client: Redis) -> None:
+def test_a_replica_is_bad(redis_settings: Settings, client: Redis) -> None:
     client.replicaof("127.0.0.1", str(free_ports(1)[0]))
-    found = redis(own)
+    found = redis(redis_settings)
     assert not found.ok and "primary" in found.fix
 
 
-def test_without_a_log_of_writes_a_crash_costs_a_pause(own: Settings, client: Redis) -> None:
+def test_without_a_log_of_writes_a_crash_costs_a_pause(redis_settings: Settings, client: Redis) -> None:
     client.config_set("appendonly", "no")
-    found = persistence(own)
+    found = persistence(redis_settings)
     assert (found.ok, found.condition) == (True, Condition.WARNING)
     assert "appendonly yes" in found.fix
 
