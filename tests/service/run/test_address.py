@@ -50,7 +50,7 @@ def test_the_client_asks_the_service_of_its_data_folder(folder: Path, monkeypatc
         assert client.url == "http://127.0.0.1:99"
 
 
-_WRONG = ({"api_url": 5}, {"api_url": "file:///x"}, {"pid": str(os.getpid())}, {"pid": os.getppid()}, {"pid": 10**40})
+_WRONG = ({"api_url": 5}, {"api_url": "file:///x"}, {"pid": str(os.getpid())}, {"pid": 1}, {"pid": 10**40})
 
 
 @pytest.mark.parametrize("change", [*_WRONG, {"pid": 2**22 + 1}, {"started": ""}, {"started": None}, "", "[]", "3"])
