@@ -36,7 +36,7 @@ def doctor(
     data_dir: Annotated[Path | None, typer.Option(help="Data folder of graspd; default: GRASPD_DATA_DIR.")] = None,
     json: JsonFlag = False,
 ) -> None:
-    """Check disk, clocks, versions, Redis, store, index, GPU, kernels and ports, and suggest fixes.
+    """Check disk, clocks, Redis, store, index, GPU, kernels and ports, and suggest fixes.
 
     Changes nothing, and may run next to the service. Exit code 1: something needs a fix.
     """
@@ -115,7 +115,6 @@ def checks_of(settings: Settings, *, full: bool = False) -> list[Check]:
         Check("disk", partial(machine.disk, settings)),
         Check("data-folder", partial(machine.data_folder, settings)),
         Check("limits", machine.limits),
-        Check("versions", machine.versions),
         Check("redis", partial(backends.redis, settings)),
         Check("redis-persistence", partial(backends.persistence, settings)),
         Check("store", partial(backends.store, settings), limit_s=120.0),

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 P = ParamSpec("P")
 R = TypeVar("R")
 
+DataDir = Annotated[Path | None, typer.Option("--data-dir", help="Data folder of graspd; default: GRASPD_DATA_DIR.")]
 JsonFlag = Annotated[bool, typer.Option("--json", help="Print one JSON object on the last line.")]
 
 

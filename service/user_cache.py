@@ -6,11 +6,9 @@ Damaged or foreign entries count as absent; a failed write only costs time.
 
 from __future__ import annotations
 
-import atexit
 import hashlib
 import logging
 import os
-import shutil
 import stat
 import tempfile
 from collections.abc import Iterable
@@ -52,7 +50,7 @@ def keep(file: Path, content: bytes, *, limit_bytes: int = _LIMIT_BYTES) -> None
 
 
 def write_whole(file: Path, pieces: Iterable[bytes]) -> None:
-    """Write a file atomically, and create its folder; nothing if the iteration raises."""
+    """Write a file atomically, readable by this user only, and create its folder; nothing if the iteration raises."""
     file.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(dir=file.parent, suffix=".part")
     partial = Path(name)
@@ -98,17 +96,11 @@ def _root(xdg: str, home: str, temporary: str) -> Path:
 
 
 def _private(temporary: Path) -> Path:
-    """Create a folder writable by this user only; reject one that another user has put there."""
+    """Create a folder writable by this user only. If another user has put one there, nothing is stored or found."""
     mine = temporary / f"graspd-cache-{os.geteuid()}"
     with suppress(OSError):
         mine.mkdir(mode=0o700, exist_ok=True)
         facts = mine.lstat()
         if stat.S_ISDIR(facts.st_mode) and facts.st_uid == os.geteuid() and not facts.st_mode & 0o077:
             return mine
-    try:
-        own = tempfile.mkdtemp(prefix="graspd-cache-", dir=temporary)
-    except OSError:
-        # This path stores nothing and finds nothing.
-        return Path(os.devnull)
-    atexit.register(shutil.rmtree, own, ignore_errors=True)
-    return Path(own)
+    return Path(os.devnull)

@@ -56,7 +56,6 @@ def shared_data() -> Path:
 
 @pytest.fixture(scope="session")
 def s3_server() -> Iterator[S3Server]:
-    """A real S3 server that belongs to this test process."""
     try:
         server = S3Server()
     except MissingServer as missing:
@@ -67,7 +66,6 @@ def s3_server() -> Iterator[S3Server]:
 
 @pytest.fixture(scope="session")
 def postgres_server() -> Iterator[PostgresServer]:
-    """A real PostgreSQL that belongs to this test process."""
     try:
         with PostgresServer() as server:
             yield server

@@ -12,22 +12,18 @@ from graspd.service.store.store import Store
 
 
 def overwrite(store: Store, key: str, data: bytes) -> None:
-    """Put other bytes under a name, which graspd itself never does."""
     obstore.put(store._backend, key, data, mode="overwrite")
 
 
 def remove(store: Store, key: str) -> None:
-    """Lose an object."""
     obstore.delete(store._backend, key)
 
 
 def flip(store: Store, key: str) -> None:
-    """Turn some bits in the middle of an object."""
     overwrite(store, key, flipped(store.get(key)))
 
 
 def cut(store: Store, key: str) -> None:
-    """Lose the second half of an object."""
     data = store.get(key)
     overwrite(store, key, data[: len(data) // 2])
 

@@ -1,19 +1,15 @@
 """The commands that README and docs print: found, checked against the command line, and run.
 
-usage: python -m tests.docs_commands [PAGE ...] [--list] [--again]    (make docs-commands; hours of two cores for all)
+usage: python -m tests.docs_commands [PAGE ...] [--list]    (make docs-commands; hours of two cores for all)
 
 Each page gets a folder with the files that a reader would have (`tests/docs_files.py`), and where a line asks one a
 service of its own; its lines run in their order, as they are printed, and what is shown below one is held against what
 came. What is not run is told with its reason. Ends with 1 if a line failed.
-
-A page that ended well is not run again until it, or a file of the sources, is another (`--again`: all the same).
 """
 
 from __future__ import annotations
 
 import argparse
-import hashlib
-import json
 import os
 import re
 import shlex
@@ -40,7 +36,7 @@ PAGES: Final = (
     *sorted(page for page in DOCS.rglob("*.md") if not {"results", "adr"} & set(page.relative_to(DOCS).parts)),
 )
 LIMIT_S: Final = 3600.0
-#: What came, a file for each page, and which pages ended well.
+#: What came, a file for each page.
 KEPT: Final = REPOSITORY / "build" / "docs-commands"
 #: Where a page says that the service is; each run has a port of its own.
 _PRINTED_URL: Final = "http://127.0.0.1:8000"
@@ -145,7 +141,6 @@ def _words(text: str) -> list[str]:
 
 
 def lines_of(page: Path) -> Iterator[Line]:
-    """The commands of a page, from its `sh` blocks and from indented blocks that begin with one."""
     text = page.read_text()
     blocks = []
     fenced = list(_FENCED.finditer(text))
@@ -183,7 +178,6 @@ def _commands(text: str) -> Iterator[list[str]]:
 
 
 def _graspd_fault(words: Sequence[str]) -> str:
-    """An unknown command or option of `graspd WORDS`."""
     if not words or words[0].startswith("-"):
         return ""
     module = next((module for name, module, *_ in graspd.cli.COMMANDS if name == words[0]), None)
@@ -217,15 +211,13 @@ def _resolved(command: Any, words: list[str]) -> tuple[Any, list[str]]:
     return command, words
 
 
-def run_page(page: Path, leave: str, keep: Path) -> list[str]:
-    """Run the lines of a page; returns what failed."""
+def run_page(page: Path) -> list[str]:
     from graspd.service.run.supervisor import Supervisor
     from graspd.service.settings import Settings
 
-    left = re.compile(leave or r"(?!)")
-    lines = [(line, line.reason or ("--leave" if left.search(line.text) else "")) for line in lines_of(page)]
+    lines = list(lines_of(page))
     failed = []
-    record = keep / f"{page.stem}.txt"
+    record = KEPT / f"{page.stem}.txt"
     record.parent.mkdir(parents=True, exist_ok=True)
     with record.open("w"), tempfile.TemporaryDirectory() as scratch:
         folder, data = Path(scratch) / "here", Path(scratch) / "data"
@@ -235,17 +227,16 @@ def run_page(page: Path, leave: str, keep: Path) -> list[str]:
         (folder / ".curlrc").write_text("fail-with-body\nsilent\n")
         with ExitStack() as stack:
             url = _NOBODY
-            # Lines that --leave leaves count as well: the page's files may be made by its service.
-            if any(_ASKS.search(line.text) for line, _ in lines if not line.reason):
+            if any(_ASKS.search(line.text) for line in lines if not line.reason):
                 supervisor = stack.enter_context(Supervisor(Settings(data_dir=data, port=0), workers=1))
                 supervisor.wait_ready(say=say)
                 url = supervisor.api_url
             kept |= {"GRASPD_API_URL": url, "GRASPD_DATA_DIR": str(data), "CURL_HOME": str(folder)}
             kept |= {"API": url, "GRASPD_API_KEY": "none"}
             files_for(page, folder, data, kept)
-            for line, why in lines:
-                if why:
-                    say(f"  -    {line.text}   ({why})")
+            for line in lines:
+                if line.reason:
+                    say(f"  -    {line.text}   ({line.reason})")
                     continue
                 started = time.monotonic()
                 code, came = run_line(line.text.replace(_PRINTED_URL, url), folder, kept)
@@ -276,18 +267,6 @@ def run_line(text: str, folder: Path, environment: Mapping[str, str]) -> tuple[i
     return done.returncode, done.stdout
 
 
-def state_of(page: Path) -> str:
-    """Digest of a page, and of the files that its lines run."""
-    whole = hashlib.sha256(page.read_bytes())
-    for room in sorted(_OURS - {"tests"}):
-        for file in sorted((REPOSITORY / room).rglob("*")):
-            if file.is_file() and "__pycache__" not in file.parts:
-                whole.update(file.read_bytes())
-    for file in (Path(__file__), Path(files_for.__code__.co_filename)):
-        whole.update(file.read_bytes())
-    return whole.hexdigest()
-
-
 def say(text: str) -> None:
     sys.stdout.write(text + "\n")
     sys.stdout.flush()
@@ -297,12 +276,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("pages", nargs="*", help="names of pages; default: all")
     parser.add_argument("--list", action="store_true", help="only say what would be run, and why something is not")
-    parser.add_argument("--leave", default="", metavar="PATTERN", help="leave out lines that match, too")
-    parser.add_argument("--keep", type=Path, default=KEPT, metavar="FOLDER", help="what came, a file for each page")
-    parser.add_argument("--again", action="store_true", help="also pages that ended well as they are now")
     given = parser.parse_args(arguments)
-    passed_file = given.keep / "passed.json"
-    passed = json.loads(passed_file.read_text()) if passed_file.is_file() else {}
     failed = []
     for page in PAGES:
         if (given.pages and page.name not in given.pages) or not (lines := list(lines_of(page))):
@@ -312,16 +286,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             for line in lines:
                 say(f"  {'-  ' if line.reason else 'run'} {line.text}" + (f"   ({line.reason})" if line.reason else ""))
             continue
-        # As it is now: what is edited while the page runs was not all run.
-        state = state_of(page)
-        if not given.again and passed.get(page.name) == state:
-            say("  ended well, and nothing has changed since; --again runs it")
-            continue
-        found = run_page(page, given.leave, given.keep)
-        failed += found
-        if not found and not given.leave:
-            given.keep.mkdir(parents=True, exist_ok=True)
-            passed_file.write_text(json.dumps(passed := passed | {page.name: state}, indent=1))
+        failed += run_page(page)
     say("\n".join(failed) or "all that was run ended well")
     return int(bool(failed))
 

@@ -93,7 +93,6 @@ def _hands(folder: Path) -> None:
 
 @cache
 def _made(*names: str) -> tempfile.TemporaryDirectory[str]:
-    """Some of `_MADE`, made once for all pages."""
     place = tempfile.TemporaryDirectory()
     alone = {name: value for name, value in os.environ.items() if not name.startswith("GRASPD_")}
     for name in names:
@@ -126,12 +125,10 @@ def _for_million(text: str, folder: Path, graspd: Graspd) -> None:
 
 
 def _printed(text: str, begin: str) -> str:
-    """The first block of a page that begins so."""
     return text[text.index(begin) :].partition("\n")[2].partition("```")[0]
 
 
 def _for_scaling(text: str, folder: Path, graspd: Graspd) -> None:
-    """Results in the service, to be measured."""
     del text, folder
     few = ("--hand", "barrett", "--object", "block", "--grasps", "8", "--fidelity", "draft")
     graspd("submit", *few, "--scenes", "1", "--views", "1", "--wait")

@@ -78,7 +78,6 @@ def _batch_of_grasps(message: TaskMessage, context: TaskContext) -> Output:
 
 
 def fake_scene(message: TaskMessage, context: TaskContext) -> Output:
-    """A scene shard of as many rows as a real one would have."""
     _pretend_to_work(context)
     parts = batches_of(message)
     if message.request.in_scene:
@@ -106,7 +105,6 @@ def _scenes_of_batch(message: TaskMessage) -> Output:
 
 
 def fake_stages() -> dict[Stage, Any]:
-    """The stage table of these."""
     return {Stage.SYNTHESIZE: fake_synthesize, Stage.SCENE: fake_scene}
 
 
@@ -120,7 +118,6 @@ def make_shard(store: Store, message: TaskMessage, *, worker: str = "w") -> Shar
 
 
 def add_assets(services: Services) -> None:
-    """A hand and an object that were found good, named `gripper` and `ball`."""
     for kind, name, files in ((AssetKind.HAND, "gripper", HAND_FILES), (AssetKind.OBJECT, "ball", OBJECT_FILES)):
         asset = publish_asset(services.store, kind, name, files)
         check = {"verdict": "accept", "message": "fine", "repairs": [], "facts": {}}
@@ -129,12 +126,10 @@ def add_assets(services: Services) -> None:
 
 
 def with_settings(services: Services, **changes: Any) -> Services:
-    """The same service with other settings."""
     return replace(services, settings=services.settings.model_copy(update=changes))
 
 
 def record_of(services: Services, job: str) -> JobRecord:
-    """What the store says of a job."""
     return read_record(JobRecord, services.store, names.job_record(job))
 
 
@@ -164,22 +159,23 @@ def fail_task(services: Services, job: str, task: PlannedTask | TaskView, number
 
 
 def beat_of(name: str = "w", **changes: Any) -> WorkerBeat:
-    """An idle worker on a CPU."""
     now = timestamp()
     beat = WorkerBeat(name, "host", 1, "cpu", "CPU", tuple(Stage), "0", "idle", "", now, now)
     return replace(beat, **changes)
 
 
 def request(**changes: Any) -> JobRequest:
-    """A job of one batch on these."""
     return JobRequest(**{"hand": "gripper", "object": "ball", "grasps": 32, **changes})
 
 
-def message_for(stage: Stage = Stage.SYNTHESIZE, *, attempt: int = 1, **changes: Any) -> TaskMessage:
-    """The message of the first task of that stage of such a job."""
-    wanted = request(**changes)
+def job_record(wanted: JobRequest, job: str = "c" * 32) -> JobRecord:
+    """A job of a hand and an object that nobody stored."""
     digests = {"hand_digest": "a" * 32, "object_digest": "b" * 32}
-    job = JobRecord(id="c" * 32, request=wanted, priority=Priority.BULK, created=timestamp(), **digests)
+    return JobRecord(id=job, request=wanted, priority=Priority.BULK, created=timestamp(), **digests)
+
+
+def message_for(stage: Stage = Stage.SYNTHESIZE, *, attempt: int = 1, **changes: Any) -> TaskMessage:
+    job = job_record(request(**changes))
     task = next(task for task in plan(job) if task.stage is stage)
     return message_of(job, task, attempt=attempt, max_attempt=3)
 
@@ -214,8 +210,6 @@ def _die_untold(once: Path) -> None:
 
 
 def engine_of(table: Mapping[Stage, StageFunction], check: Check | None = None) -> StartEngine:
-    """Starts engines in threads of this process."""
-
     def start(setup: Setup) -> Link:
         ours, theirs = Pipe()
         Thread(target=Engine(theirs, setup, table, check).serve, name="engine", daemon=True).start()

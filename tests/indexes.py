@@ -60,14 +60,12 @@ class EmptySchemas:
 
     @contextmanager
     def lent(self) -> Iterator[str]:
-        """URL of an index that holds nothing."""
         with self._engine.connect() as connection:
             url = self._emptied(connection) or self._made(connection)
         yield url
         self._returned.append(url)
 
     def close(self) -> None:
-        """Give the connection back."""
         self._engine.dispose()
 
     def _emptied(self, connection: Connection) -> str | None:

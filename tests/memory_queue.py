@@ -17,8 +17,6 @@ from graspd.service.queue.rq_queue import RqQueue
 
 @dataclass
 class Delivery:
-    """A task in a worker's hands."""
-
     message: Message
     worker: str
     key: str
@@ -51,7 +49,6 @@ class MemoryQueue(RqQueue):
     def enqueue(
         self, messages: Sequence[Message], priority: Priority, *, again: bool = False, apart: bool = False
     ) -> int:
-        # Its workers are those of a test, which take what they want.
         known = {(m.task_id, m.attempt) for waiting in self._priorities.values() for m in waiting}
         if not again:
             known |= {(held.message.task_id, held.message.attempt) for held in self._held.values()}
@@ -95,8 +92,7 @@ class MemoryQueue(RqQueue):
 
     def publish(self, *events: Event) -> None:
         with self._changed:
-            for event in events:
-                self._stream.append(event)
+            self._stream += events
             self._changed.notify_all()
 
     def consume(self, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
@@ -110,7 +106,6 @@ class MemoryQueue(RqQueue):
         self._acknowledged |= set(event_ids)
 
     def restart_consumer(self) -> None:
-        """What a new controller sees: everything that was not acknowledged."""
         left = (i for i in range(len(self._stream)) if str(i + 1) not in self._acknowledged)
         self._read = next(left, len(self._stream))
 
@@ -164,20 +159,16 @@ class MemoryQueue(RqQueue):
     def close(self) -> None:
         """Nothing to give back."""
 
-    def take(self, worker: str, *, wait_s: float = 0.0) -> Delivery | None:
-        """The next task, in the order of `lane_order`; it is leased to the worker."""
-        deadline = time.monotonic() + wait_s
-        while True:
-            for priority in priority_order(self._taken[worker]):
-                if self._priorities[priority]:
-                    self._taken[worker] += 1
-                    message = self._priorities[priority].pop(0)
-                    delivery = Delivery(message, worker, f"{message.task_id}/{next(self._numbers)}")
-                    self._held[delivery.key] = delivery
-                    return delivery
-            if time.monotonic() >= deadline:
-                return None
-            time.sleep(0.01)
+    def take(self, worker: str) -> Delivery | None:
+        """The next task, in the order of `priority_order`; it is leased to the worker."""
+        for priority in priority_order(self._taken[worker]):
+            if self._priorities[priority]:
+                self._taken[worker] += 1
+                message = self._priorities[priority].pop(0)
+                delivery = Delivery(message, worker, f"{message.task_id}/{next(self._numbers)}")
+                self._held[delivery.key] = delivery
+                return delivery
+        return None
 
     def beat(self, delivery: Delivery) -> tuple[bool, bool]:
         """A sign of life. Returns whether the task was cancelled, and whether the lease is lost."""
@@ -185,5 +176,4 @@ class MemoryQueue(RqQueue):
         return delivery.message.task_id in self._cancelled, delivery.key not in self._held
 
     def finish(self, delivery: Delivery) -> None:
-        """The worker is done with the task, whatever came of it."""
         self._held.pop(delivery.key, None)

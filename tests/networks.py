@@ -44,5 +44,4 @@ def random_network(
 
 
 def network_files(network: ProposalNetwork) -> dict[str, bytes]:
-    """The files of a network as the service keeps them."""
     return {"asset.json": f'{{"file": "{NETWORK_FILE}"}}'.encode(), NETWORK_FILE: to_bytes(network)}

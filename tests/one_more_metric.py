@@ -22,7 +22,6 @@ ROW = metrics.GraspMetric(
 
 
 def main(folder: Path, older_index: str) -> None:
-    """Print what is found of the metric, by place."""
     metrics.GRASP_METRICS = (*metrics.GRASP_METRICS, ROW)  # type: ignore[misc]
     from fastapi.testclient import TestClient
     from sqlalchemy import inspect

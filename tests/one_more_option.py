@@ -33,7 +33,6 @@ def add_row() -> None:
 
 
 def main(folder: Path) -> None:
-    """Print what is found of the option, by place."""
     add_row()
     from fastapi.testclient import TestClient
     from typer.testing import CliRunner

@@ -8,27 +8,21 @@ import struct
 from collections.abc import Sequence
 from itertools import accumulate
 
-from graspd.service.model.clock import timestamp
 from graspd.service.model.digests import digest_bytes, digest_json
-from graspd.service.model.domain import JobRequest
 from graspd.service.model.messages import TaskMessage
 from graspd.service.model.planning import message_of, plan
 from graspd.service.model.records import JobRecord
-from graspd.service.model.states import Priority, Stage
+from graspd.service.model.states import Stage
 from graspd.service.store.manifests import ShardManifest
 from graspd.service.store.store import Store, open_store
-from tests.fakes import make_shard, request
+from tests.fakes import job_record, make_shard, request
 
 
 def batches(count: int, **changes: object) -> list[TaskMessage]:
-    """The first tasks of a job of so many batches."""
-    wanted: JobRequest = request(grasps=32 * count, **changes)
-    digests = {"hand_digest": "a" * 32, "object_digest": "b" * 32}
-    return tasks_of(JobRecord(id="c" * 32, request=wanted, priority=Priority.BULK, created=timestamp(), **digests))
+    return tasks_of(job_record(request(grasps=32 * count, **changes)))
 
 
 def tasks_of(job: JobRecord) -> list[TaskMessage]:
-    """The messages of a job's first tasks."""
     tasks = [task for task in plan(job) if task.stage is Stage.SYNTHESIZE]
     return [message_of(job, task, attempt=1, max_attempt=3) for task in tasks]
 

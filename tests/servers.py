@@ -66,17 +66,14 @@ class Server:
         self.close()
 
     def start(self) -> None:
-        """Start the process and wait until it serves."""
         raise NotImplementedError
 
     def kill(self) -> None:
-        """kill -9, as a crash."""
         assert self.process is not None
         os.killpg(self.process.pid, signal.SIGKILL)
         self.process.wait()
 
     def close(self) -> None:
-        """Stop the process and remove its folder."""
         if self.process is not None and self.process.poll() is None:
             self.process.send_signal(self.stop_signal)
             try:
@@ -145,7 +142,6 @@ class S3Server(Server):
             file.unlink(missing_ok=True)
 
     def client(self, **changes: str) -> S3Store:
-        """A plain S3 client of the bucket, with other credentials if given."""
         options = {name.lower(): value for name, value in (self.environment | changes).items()}
         return S3Store(
             self.bucket,
@@ -183,7 +179,6 @@ class PostgresServer(Server):
         self._run(command, self._ask, cwd=self.folder, **self._user)
 
     def url(self, database: str = "postgres") -> str:
-        """SQLAlchemy URL of a database."""
         return f"postgresql+psycopg://graspd:{self._password}@127.0.0.1:{self.port}/{database}"
 
     def database(self) -> str:
@@ -217,7 +212,6 @@ class PostgresServer(Server):
 
 
 def schema_of(url: str) -> str:
-    """Name of the schema that `PostgresServer.database` made."""
     return str(make_url(url).query["application_name"])
 
 
@@ -248,7 +242,6 @@ def free_ports(count: int) -> list[int]:
 
 
 def _lock_port(port: int) -> bool:
-    """Whether it is free, and of this process from now on."""
     lock = (_PORT_LOCKS / str(port)).open("w")
     with socket.socket() as probe:
         try:

@@ -9,5 +9,4 @@ from typing import Any
 
 
 def completed(command: Sequence[str | Path], **options: Any) -> subprocess.CompletedProcess[str]:
-    """A command that has ended, however it did, with what it said."""
     return subprocess.run(command, capture_output=True, text=True, check=False, **options)

@@ -49,8 +49,6 @@ class Pauses(threading.Event):
 
 
 class Clock:
-    """Time that passes when told to."""
-
     now = 1000.0
 
     def __call__(self) -> float:

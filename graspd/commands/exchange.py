@@ -13,7 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from graspd.exchange.opening import opened
 from graspd.exchange.plan import ExportSummary
-from graspd.service.cli import CommandGroup, JsonFlag, load_settings, plain_console, report
+from graspd.service.cli import CommandGroup, DataDir, JsonFlag, load_settings, plain_console, report
 from graspd.service.model.errors import InputError, one_of
 from graspd.service.store import validity
 from graspd.service.store.shards import read_shard
@@ -252,9 +252,7 @@ def card(
     assets: Annotated[
         Path | None, typer.Option(help="JSON file with missing licences and sources of hands and objects.")
     ] = None,
-    data_dir: Annotated[
-        Path | None, typer.Option("--data-dir", help="Data folder of graspd; default: GRASPD_DATA_DIR.")
-    ] = None,
+    data_dir: DataDir = None,
     json: JsonFlag = False,
 ) -> None:
     """Write a dataset's card: contents, origin, quality and biases; with plots and checksums."""

@@ -104,6 +104,11 @@ def words(entry: Mapping[str, Any]) -> str:
     return said.format(**bounds) if said else message
 
 
+def first_line(error: BaseException) -> str:
+    """Return the first line of a library's message, which may be followed by a dump of its internals."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+
+
 def why(error: Exception) -> str:
     """Return a library's message about a file; for a system error, only its text without number and path."""
     return getattr(error, "strerror", None) or str(error)

@@ -1,28 +1,5 @@
 """Errors that graspd raises on purpose.
 
-    GraspdError
-    ├── InputError                the caller's mistake: exit 2, HTTP 422
-    │   ├── NotFoundError         unknown job, hand, object, shard: exit 2, HTTP 404
-    │   ├── ConflictError         the request conflicts with the present state: exit 2, HTTP 409
-    │   ├── MeshError             an object mesh that cannot be used
-    │   ├── HandError             a hand description that cannot be used
-    │   ├── SceneError            a scene without space for the object, or without any grasp
-    │   ├── LoadError             a mass beyond the hand's limit
-    │   ├── LimitError            too large, too many: exit 2, HTTP 413
-    │   └── QuotaError            the key has reached its quota: exit 2, HTTP 429
-    ├── UnavailableError          a part of the service does not answer: exit 1, HTTP 503
-    │   ├── QueueUnavailable
-    │   ├── StoreUnavailable
-    │   ├── IndexUnavailable
-    │   │   └── IndexDamaged      its file is damaged: a new one replaces it
-    │   └── RateError             too many requests: exit 1, HTTP 429
-    ├── BusyError                 another graspd owns the data folder, or a port is taken: exit 1, HTTP 409
-    ├── DamagedError              a record in the store does not match its name: exit 1, HTTP 500
-    │   └── DamagedShard          a shard's file does not match its checksum, or is missing: exit 1, HTTP 500
-    └── TaskError                 a task ended without a result: exit 1, HTTP 500
-        ├── TaskCancelled
-        └── TaskRefused           unknown schema or function: never retried
-
 A message is one line that states the problem and the fix. `exit_code` and `status` map errors to exit codes and HTTP
 statuses; `slug` names the problem type (RFC 9457).
 

@@ -36,7 +36,15 @@ _Extent = Annotated[float, Field(gt=1e-4, le=2 * FARTHEST_M, allow_inf_nan=False
 _Number = Annotated[float, Field(ge=-2.0, le=2.0, allow_inf_nan=False)]
 Touch = Annotated[float, Field(ge=LEAST_TOUCH, le=MOST_TOUCH, allow_inf_nan=False)]
 Vector = tuple[_Metres, _Metres, _Metres]
-Pose = tuple[_Metres, _Metres, _Metres, _Number, _Number, _Number, _Number]
+
+
+def _turned(pose: tuple[float, ...]) -> tuple[float, ...]:
+    if abs(math.hypot(*pose[3:]) - 1.0) > 1e-3:
+        raise ValueError("the quaternion w x y z of a pose must have unit length")
+    return pose
+
+
+Pose = Annotated[tuple[_Metres, _Metres, _Metres, _Number, _Number, _Number, _Number], AfterValidator(_turned)]
 
 
 class HalfSpace(Model):
@@ -63,11 +71,6 @@ class Box(Model):
     """Full extents x y z [m]."""
     pose: Pose = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
-    @model_validator(mode="after")
-    def _turned(self) -> Self:
-        check_quaternion(self.pose)
-        return self
-
 
 class NeighbourSpec(Model):
     """Another object in the scene."""
@@ -80,11 +83,6 @@ class NeighbourSpec(Model):
     digest: Digest | None = Field(
         None, exclude_if=lambda value: value is None, description="digest of the object's files; set by the service"
     )
-
-    @model_validator(mode="after")
-    def _turned(self) -> Self:
-        check_quaternion(self.pose)
-        return self
 
 
 Supports = tuple[Annotated[HalfSpace | Box, Field(discriminator="kind")], ...]
@@ -115,7 +113,6 @@ class SceneSpec(Model):
             raise ValueError("a free object lies on no face: choose table, bin or shelf")
         if self.kind == "free" and self.touch != TOUCH:
             raise ValueError("a free object has no supports to touch: choose table, bin or shelf")
-        check_quaternion(self.target)
         if self.target is not None and self.faces == "all":
             raise ValueError("a target with a pose lies on one face: faces all requires a dropped target")
         return self
@@ -196,11 +193,6 @@ def _loaded(text: str, path: Path) -> object:
         mark, reason = getattr(error, "problem_mark", None), " ".join(str(error).split())
         reason = f"{getattr(error, 'problem', None) or reason} (line {mark.line + 1})" if mark else reason
         raise InputError(f"the scene file {path} is not {path.suffix[1:].upper()}: {reason[:200]}") from None
-
-
-def check_quaternion(pose: Pose | None) -> None:
-    if pose is not None and abs(math.hypot(*pose[3:]) - 1.0) > 1e-3:
-        raise ValueError("the quaternion w x y z of a pose must have unit length")
 
 
 #: Inner size of a bin, height and thickness of its walls [m].
@@ -293,11 +285,6 @@ class SceneDocument(Model):
         exclude_if=lambda value: value == TOUCH,
         description="clearance of fingertips to the supports [mm], unless the request has its own",
     )
-
-    @model_validator(mode="after")
-    def _turned(self) -> Self:
-        check_quaternion(self.target)
-        return self
 
 
 def _form(value: object) -> str:

@@ -22,6 +22,7 @@ from rq.executions import Execution
 from rq.job import Job
 from rq.serializers import JSONSerializer
 
+from graspd.service.model.base import first_line
 from graspd.service.model.clock import age_of
 from graspd.service.model.errors import QueueUnavailable
 from graspd.service.model.renamed import for_worker_of
@@ -434,5 +435,5 @@ def _mapped() -> Iterator[None]:
     try:
         yield
     except (RedisError, OSError) as error:
-        line = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        raise QueueUnavailable(f"Redis does not answer ({line}); start `graspd up`, or set GRASPD_REDIS_URL") from None
+        said = f"Redis does not answer ({first_line(error)}); start `graspd up`, or set GRASPD_REDIS_URL"
+        raise QueueUnavailable(said) from None

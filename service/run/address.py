@@ -15,7 +15,6 @@ import os
 import secrets
 import shlex
 import socket
-import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -23,6 +22,7 @@ from typing import Final
 from graspd.service.model.errors import InputError, UnavailableError
 from graspd.service.run.children import start_of
 from graspd.service.settings import Settings
+from graspd.service.user_cache import write_whole
 
 _FILE: Final = "api.json"
 
@@ -30,21 +30,13 @@ _FILE: Final = "api.json"
 def record_address(folder: Path, url: str) -> None:
     """Record that this process's service has the address `url`."""
     record = {"api_url": url, "pid": os.getpid(), "started": start_of(os.getpid())}
-    write_private(folder / _FILE, json.dumps(record))
+    write_whole(folder / _FILE, [json.dumps(record).encode()])
 
 
-def write_private(file: Path, text: str) -> None:
-    """Write a file atomically, readable by this user only."""
-    handle, name = tempfile.mkstemp(dir=file.parent, prefix=f".{file.name}.")
-    try:
-        with os.fdopen(handle, "w") as opened:
-            opened.write(text)
-            opened.flush()
-            os.fsync(opened.fileno())
-        Path(name).replace(file)
-    except OSError:
-        Path(name).unlink(missing_ok=True)
-        raise
+def local_url(host: str, port: int) -> str:
+    """Return the URL at which this machine reaches an API that binds to a host; for all addresses the loopback's."""
+    shown = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(host, f"[{host}]" if ":" in host else host)
+    return f"http://{shown}:{port}"
 
 
 def forget_address(folder: Path) -> None:
@@ -58,7 +50,7 @@ def forget_address(folder: Path) -> None:
 def recorded_address(folder: Path) -> str | None:
     """Return the URL of a data folder's service; None if not recorded, or the recording process is gone."""
     record = _read(folder)
-    return record[0] if record is not None and _lives(*record[1:]) else None
+    return record[0] if record is not None and start_of(record[1]) == record[2] else None
 
 
 def _read(folder: Path) -> tuple[str, int, str] | None:
@@ -68,24 +60,11 @@ def _read(folder: Path) -> tuple[str, int, str] | None:
         if file.stat().st_uid not in (os.getuid(), 0):
             return None
         record = json.loads(file.read_text())
-        url, pid, started = record["api_url"], record["pid"], str(record.get("started", ""))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        url, pid, started = record["api_url"], record["pid"], record["started"]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
-    known = isinstance(url, str) and url.startswith(("http://", "https://")) and isinstance(pid, int) and pid > 0
+    known = isinstance(url, str) and url.startswith(("http://", "https://")) and isinstance(pid, int) and started
     return (url, pid, started) if known else None
-
-
-def _lives(pid: int, started: str) -> bool:
-    """Check whether the process lives. Records of an older graspd have no start time."""
-    if started:
-        return start_of(pid) == started
-    try:
-        os.kill(pid, 0)
-    except PermissionError:
-        return True
-    except (OSError, OverflowError):
-        return False
-    return True
 
 
 @dataclass(frozen=True)
@@ -112,8 +91,7 @@ class ListenAddress:
         }
         text = "".join(f"{name}={shlex.quote(value)}\n" for name, value in said.items())
         try:
-            self.file.parent.mkdir(parents=True, exist_ok=True)
-            write_private(self.file, text)
+            write_whole(self.file, [text.encode()])
         except OSError as error:
             raise UnavailableError(f"{self.file} cannot be written: {error.strerror}") from None
 

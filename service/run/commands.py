@@ -13,7 +13,17 @@ from typing import Annotated
 
 import typer
 
-from graspd.service.cli import CommandGroup, JsonFlag, emit, keep_private, load_settings, log_to_stderr, plain_console
+from graspd.service.cli import (
+    CommandGroup,
+    DataDir,
+    JsonFlag,
+    emit,
+    keep_private,
+    load_settings,
+    log_to_stderr,
+    plain_console,
+    report,
+)
 from graspd.service.model import names
 from graspd.service.model.errors import IndexDamaged, QueueUnavailable, UnavailableError, without_secrets
 from graspd.service.settings import Settings
@@ -24,8 +34,6 @@ log = logging.getLogger(__name__)
 app = CommandGroup(no_args_is_help=True)
 index_app = CommandGroup(no_args_is_help=True, help="Rebuild the index from the store or export its tables.")
 app.add_typer(index_app, name="index")
-
-DataDir = Annotated[Path | None, typer.Option("--data-dir", help="Data folder of graspd; default: GRASPD_DATA_DIR.")]
 
 
 @app.command(epilog="graspd up --workers 2 --port 8000")
@@ -187,11 +195,7 @@ def export(
 
     with closing(Index(load_settings(data_dir=data_dir).resolved_index_url)) as index:
         rows = write(index.database, output)
-    if json:
-        emit(rows)
-    else:
-        for name, count in rows.items():
-            typer.echo(f"{output / name}.parquet  {count} rows")
+    report(rows, "\n".join(f"{output / name}.parquet  {count} rows" for name, count in rows.items()), json=json)
 
 
 @index_app.command(epilog="graspd admin index path")

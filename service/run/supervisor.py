@@ -25,7 +25,7 @@ from graspd.service.pipeline.identity import identify_if_redis_answers, recorded
 from graspd.service.pipeline.leading import PART
 from graspd.service.queue.connection import redis_url
 from graspd.service.queue.rq_queue import RqQueue, open_queue
-from graspd.service.run.address import ListenAddress, forget_address, record_address
+from graspd.service.run.address import ListenAddress, forget_address, local_url, record_address
 from graspd.service.run.children import Child, end_leftovers, keep_alive, stop_children
 from graspd.service.run.embedded import find_server, give_up_log, lock_file, own_redis, server_command, set_log_aside
 from graspd.service.settings import Settings
@@ -80,9 +80,7 @@ class Supervisor:
     @property
     def api_url(self) -> str:
         """URL of the API, e.g. http://127.0.0.1:8000."""
-        host = self.settings.host
-        shown = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(host, f"[{host}]" if ":" in host else host)
-        return f"http://{shown}:{self.settings.port}"
+        return local_url(self.settings.host, self.settings.port)
 
     @property
     def pids(self) -> dict[str, int]:

@@ -54,17 +54,7 @@ def pack_into(files: Mapping[str, bytes], target: IO[bytes]) -> None:
 
 def unpack(data: bytes, *, limit_bytes: int) -> dict[str, bytes]:
     """Unpack a ZIP in memory; InputError for a bad archive or name, LimitError above `limit_bytes` or `MAX_FILES`."""
-    archive = _open_zip(io.BytesIO(data))
-    files: dict[str, bytes] = {}
-    total = 0
-    for name, entry in _entries(archive).items():
-        with _damage_said(entry), archive.open(entry) as stream:
-            content = stream.read(limit_bytes - total + 1)  # not trusting the size in its header
-        total += len(content)
-        if total > limit_bytes:
-            raise LimitError(f"the archive unpacks to more than {limit_bytes} bytes")
-        files[name] = content
-    return files
+    return dict(ZipFiles(io.BytesIO(data), limit_bytes=limit_bytes))
 
 
 def unpack_file(path: Path) -> dict[str, bytes]:

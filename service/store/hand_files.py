@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import posixpath
 import re
 from collections.abc import Iterable, Iterator, Mapping
@@ -161,17 +162,6 @@ _ROOT: Final = re.compile(r"\s*<([A-Za-z_][\w:.-]*)")
 _COMMENT: Final = re.compile(r"<!--.*?-->", re.DOTALL)
 _MACROS: Final = ("<xacro:", "${", "$(")
 _FORMATS_OF: Final[dict[str, Format]] = {"robot": "urdf", "mujoco": "mjcf"}
-#: Beginnings of files by encoding: byte order mark, or encoded `<`; longer ones first.
-_MARKS: Final = (
-    (b"\xff\xfe\0\0", "utf-32"),
-    (b"\0\0\xfe\xff", "utf-32"),
-    (b"\xff\xfe", "utf-16"),
-    (b"\xfe\xff", "utf-16"),
-    (b"<\0\0\0", "utf-32-le"),
-    (b"\0\0\0<", "utf-32-be"),
-    (b"<\0", "utf-16-le"),
-    (b"\0<", "utf-16-be"),
-)
 _DECLARED: Final = re.compile(rb"""\s*<\?xml[^>]{0,100}encoding\s*=\s*["']([\w.:-]{1,40})""")
 _DECLARATION: Final = re.compile(r"<\?xml\s[^>]{0,200}\?>")
 #: Encodings accepted from a declaration; all other files are read as UTF-8.
@@ -192,11 +182,9 @@ def format_of(name: str, data: bytes) -> Format | None:
 
 def text_of(data: bytes) -> str:
     """Decode XML or YAML by byte order mark or declaration, and strip both. Invalid UTF-8 is Latin 1."""
-    coding = next((name for mark, name in _MARKS if data.startswith(mark)), "")
-    if not coding:
-        declared = _DECLARED.match(data)
-        said = declared[1].decode() if declared else ""
-        coding = said if _NAMED.match(said) else "utf-8-sig"
+    coding: str = json.detect_encoding(data)  # by the byte order mark, or the zeros in the first characters
+    if (declared := _DECLARED.match(data)) and _NAMED.match(said := declared[1].decode()):
+        coding = said
     try:
         text = data.decode(coding)
     except (UnicodeError, LookupError):

@@ -38,6 +38,7 @@ from graspd.service.store.integrity import get_document, is_sealed, put_document
 from graspd.service.store.store import Store
 
 RecordT = TypeVar("RecordT", bound=BaseModel)
+EventT = TypeVar("EventT", JobEvent, DatasetEvent)
 #: Function that writes a record under an absent key; returns whether it wrote.
 Put = Callable[[str, BaseModel], bool]
 
@@ -71,6 +72,15 @@ def _records(model: type[RecordT], store: Store, prefix: str) -> list[RecordT]:
     return [read_record(model, store, key) for key in _keys(store, prefix)]
 
 
+def _added(make: Callable[..., EventT], store: Store, folder: str, put: Put | None) -> EventT:
+    """Write an event under the next free number; another process may take that number at the same time."""
+    while True:
+        number = max((int(key.rpartition("/")[2].partition("-")[0]) for key in _keys(store, folder)), default=0) + 1
+        event = make(number=number, at=timestamp())
+        if (put or partial(put_record, store))(names.event(folder, number, event.what), event):
+            return event
+
+
 def job_events(store: Store, job: str) -> list[JobEvent]:
     return _records(JobEvent, store, names.job_events(job))
 
@@ -84,12 +94,8 @@ def add_job_event(
     cause: str = "",
     put: Put | None = None,
 ) -> JobEvent:
-    put = put or partial(put_record, store)
-    while True:
-        number = max((event.number for event in job_events(store, job)), default=0) + 1
-        event = JobEvent(number=number, what=what, at=timestamp(), retried=retried or {}, cause=cause)
-        if put(names.event(names.job_events(job), number, what), event):
-            return event
+    make = partial(JobEvent, what=what, retried=retried or {}, cause=cause)
+    return _added(make, store, names.job_events(job), put)
 
 
 def task_attempts(store: Store, task: str) -> list[AttemptRecord]:
@@ -107,12 +113,7 @@ def dataset_events(store: Store, name: str) -> list[DatasetEvent]:
 def add_dataset_event(
     store: Store, name: str, what: Literal["cancelled", "retried"], *, put: Put | None = None
 ) -> DatasetEvent:
-    put = put or partial(put_record, store)
-    while True:
-        number = max((event.number for event in dataset_events(store, name)), default=0) + 1
-        event = DatasetEvent(number=number, what=what, at=timestamp())
-        if put(names.event(names.dataset_events(name), number, what), event):
-            return event
+    return _added(partial(DatasetEvent, what=what), store, names.dataset_events(name), put)
 
 
 def load_snapshot(store: Store, dataset: str, digest: str) -> Snapshot:

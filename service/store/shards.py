@@ -15,6 +15,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from graspd.service.model.base import first_line
 from graspd.service.model.clock import timestamp
 from graspd.service.model.digests import digest_json
 from graspd.service.model.errors import DamagedShard, InputError, NotFoundError
@@ -144,7 +145,7 @@ def open_shard(source: bytes | Path, *, name: str = "") -> Iterator[h5py.File]:
             _check_contents(file, name)
             yield file
         except _UNREADABLE as error:
-            raise DamagedShard(f"{name} is damaged and cannot be read: {_line(error)}") from error
+            raise DamagedShard(f"{name} is damaged and cannot be read: {first_line(error)}") from error
 
 
 def _check_contents(file: h5py.File, name: str) -> None:
@@ -196,10 +197,6 @@ def read_column(file: h5py.File, path: str, name: str) -> NDArray[Any]:
 
 def _digest(data: NDArray[Any]) -> str:
     return hashlib.sha256(np.ascontiguousarray(data).data).hexdigest()
-
-
-def _line(error: BaseException) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]
 
 
 def _attribute(value: object) -> Attribute:

@@ -25,6 +25,7 @@ import obstore
 from obstore.exceptions import AlreadyExistsError, BaseError
 from obstore.store import LocalStore, MemoryStore, from_url
 
+from graspd.service.model.base import first_line
 from graspd.service.model.errors import InputError, NotFoundError, StoreUnavailable
 
 _KEY: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._=-]*(/[A-Za-z0-9][A-Za-z0-9._=-]*)*")
@@ -255,7 +256,4 @@ def _mapped(key: str, url: str) -> Iterator[None]:
 
 
 def _line(error: Exception) -> str:
-    """Return the first line of an error: obstore appends a dump of its internals."""
-    if isinstance(error, OSError) and error.strerror:
-        return error.strerror
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+    return getattr(error, "strerror", None) or first_line(error)

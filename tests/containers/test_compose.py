@@ -7,14 +7,15 @@ so.
 from __future__ import annotations
 
 import json
-import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import httpx
 import pytest
 
+from tests import waiting
 from tests.containers.engine import NoEngine, Project, docker, look_for_engine
 from tests.servers import free_ports
 from tests.shell import completed
@@ -56,65 +57,40 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Project]:
 
 
 def until(met: Callable[[], object], what: str, project: Project, seconds: float = PATIENCE_S) -> None:
-    """Wait for a fact; fails with the containers' logs."""
-    end = time.monotonic() + seconds
-    while not met():
-        assert time.monotonic() < end, f"still not: {what}\n{project.logs()}"
-        time.sleep(0.5)
+    waiting.until(met, what, seconds=seconds, logs=project.logs)
+
+
+def is_healthy(project: Project, container: str) -> bool:
+    return bool(project.looked_at(container)["State"]["Health"]["Status"] == "healthy")
 
 
 def test_profiles_of_the_env_file_bring_s3_and_postgresql(project: Project) -> None:
-    assert set(project.compose("config", "--services").split()) == {
-        "api",
-        "controller",
-        "worker-cpu",
-        "redis",
-        "postgres",
-        "s3",
-    }
+    wanted = "api controller worker-cpu redis postgres s3"
+    assert set(project.compose("config", "--services").split()) == set(wanted.split())
 
 
 def test_any_user_plans_on_a_read_only_disk(project: Project) -> None:
     """No cache volume, no network, a user that the image does not know; it says where its cache is instead."""
-    wanted = "--hand allegro --object mug --grasps 2 --fidelity draft --out /tmp/out.h5"
-    done = completed(
-        [
-            "docker",
-            "run",
-            "--rm",
-            "--network",
-            "none",
-            "--read-only",
-            "--tmpfs",
-            "/tmp:size=1g",
-            "--user",
-            "4321:4321",
-            "--cap-drop",
-            "ALL",
-            "graspd-worker-cpu:test",
-            "synth",
-            *wanted.split(),
-        ],
-        timeout=PATIENCE_S,
-    )
+    limits = "--network none --read-only --tmpfs /tmp:size=1g --user 4321:4321 --cap-drop ALL"
+    wanted = "synth --hand allegro --object mug --grasps 2 --fidelity draft --out /tmp/out.h5"
+    command = f"docker run --rm {limits} graspd-worker-cpu:test {wanted}"
+    done = completed(command.split(), timeout=PATIENCE_S)
     said = done.stdout + done.stderr
     assert done.returncode == 0 and "Traceback" not in said, said[-3000:]
     assert "kept in /tmp/graspd-cache-4321" in said, said[-3000:]
 
 
 def test_a_change_of_code_is_a_small_layer(project: Project) -> None:
-    sizes = docker(
-        "history", "--format", "{{.Size}} {{.CreatedBy}}", "--human=false", "graspd-worker-cpu:test"
-    ).splitlines()
+    shown = ("--format", "{{.Size}} {{.CreatedBy}}", "--human=false")
+    sizes = docker("history", *shown, "graspd-worker-cpu:test").splitlines()
     (code,) = (int(line.split()[0]) for line in sizes if "COPY /code" in line)
     (libraries,) = (int(line.split()[0]) for line in sizes if "COPY /opt/graspd /opt/graspd" in line)
     assert code < 40e6 < libraries
 
 
 def test_a_job_over_http_outlives_two_killed_workers(project: Project) -> None:
-    made = project.compose(
-        "run", "--rm", "-T", "--no-deps", "api", "keys", "add", "admin", "--scope", "admin", "--json"
-    )
+    command = "run --rm -T --no-deps api keys add admin --scope admin --json"
+    made = project.compose(*command.split())
     key = json.loads(made)["key"]
     project.compose("up", "-d", timeout=PATIENCE_S)
     project.compose("up", "-d", "--no-recreate", "--scale", "worker-cpu=4", timeout=PATIENCE_S)
@@ -128,20 +104,10 @@ def test_a_job_over_http_outlives_two_killed_workers(project: Project) -> None:
                 return {}
             return answer.json() if answer.status_code == 200 else {}
 
-        until(
-            lambda: get("/readyz") and get("/v1/objects").get("items"),
-            "the API is ready, and the controller published objects",
-            project,
-        )
+        until(lambda: get("/readyz") and get("/v1/objects").get("items"), "the API has the objects", project)
         assert httpx.get(f"{url}/v1/jobs", trust_env=False).status_code == 401
-        wanted = {
-            "hand": "allegro",
-            "object": "mug",
-            "grasps": 32 * BATCHES,
-            "fidelity": "draft",
-            "want": "candidates",
-            "validation": "none",
-        }
+        wanted = {"hand": "allegro", "object": "mug", "grasps": 32 * BATCHES, "fidelity": "draft"}
+        wanted |= {"want": "candidates", "validation": "none"}
         job = client.post("/v1/jobs", json=wanted)
         assert job.status_code == 202, job.text
         place = job.headers["location"]
@@ -174,12 +140,7 @@ def test_a_job_over_http_outlives_two_killed_workers(project: Project) -> None:
     for service in ("api", "controller", "worker-cpu", "redis", "postgres", "s3"):
         for container in project.containers(service):
             found = project.looked_at(container)
-            until(
-                lambda one=container: project.looked_at(one)["State"]["Health"]["Status"] == "healthy",  # type: ignore[misc]
-                f"{service} is healthy",
-                project,
-                300,
-            )
+            until(partial(is_healthy, project, container), f"{service} is healthy", project, 300)
             if service in ("api", "controller", "worker-cpu"):
                 assert found["HostConfig"]["ReadonlyRootfs"] and found["Config"]["User"] == "10001:10001"
 

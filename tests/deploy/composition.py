@@ -18,11 +18,6 @@ _VARIABLE: Final = re.compile(r"\$(?:\$|\{(?P<name>\w+)(?:(?P<kind>:[-?])(?P<res
 
 
 def load(variables: Mapping[str, str]) -> dict[str, Any]:
-    """The compose file with its variables put in.
-
-    Raises:
-        KeyError: a variable that must be set is not, or is empty.
-    """
     return interpolated(yaml.safe_load(COMPOSE.read_text()), variables)
 
 
@@ -49,7 +44,6 @@ def interpolated(node: Any, variables: Mapping[str, str]) -> Any:
 
 
 def names_asked_for(text: str) -> set[str]:
-    """Variables that a file takes from `.env`."""
     return {found["name"] for found in _VARIABLE.finditer(text) if found["name"]}
 
 
@@ -60,13 +54,11 @@ def example() -> dict[str, str]:
 
 
 def seconds(duration: str) -> float:
-    """Seconds of a duration such as 1m30s."""
     units = {"h": 3600.0, "m": 60.0, "s": 1.0}
     return sum(float(number) * units[unit] for number, unit in re.findall(r"(\d+(?:\.\d+)?)([hms])", duration))
 
 
 def environment(service: Mapping[str, Any], data: Path, moved: Mapping[str, str]) -> dict[str, str]:
-    """What the process of a service finds in its environment."""
     kept = {name: os.environ[name] for name in ("PATH", "HOME", "WARP_CACHE_PATH") if name in os.environ}
     given = {name: str(value) for name, value in service["environment"].items()}
     for old, new in moved.items():
@@ -75,7 +67,6 @@ def environment(service: Mapping[str, Any], data: Path, moved: Mapping[str, str]
 
 
 def redis_command(service: Mapping[str, Any], server: Path, port: int, folder: Path) -> Sequence[str]:
-    """The command of the Redis container on a loopback port."""
     where = {"bind": "127.0.0.1", "port": str(port), "dir": str(folder)}
     return [
         str(server),

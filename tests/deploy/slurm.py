@@ -11,6 +11,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -56,7 +57,6 @@ class Element:
     """Exit codes of the runs that ended."""
 
     def start(self) -> None:
-        """Run the script in a process group of its own, as a step's processes are."""
         environment = {**self.environment, "SLURM_JOB_ID": str(self.id), "SLURM_RESTART_COUNT": str(self.restarts)}
         with self.log.open("ab") as log:
             self.process = subprocess.Popen(
@@ -69,7 +69,6 @@ class Element:
         (os.killpg if everybody else os.kill)(self.process.pid, number)
 
     def wait(self, seconds: float) -> int:
-        """Exit code of the run."""
         assert self.process is not None
         code = self.process.wait(seconds)
         self.ended.append(code)
@@ -89,7 +88,6 @@ class FakeSlurm:
         scontrol.chmod(0o755)
 
     def sbatch(self, script: Path, environment: Mapping[str, str], *, array: int = 0) -> list[Element]:
-        """Start a script, `array` times over."""
         options = directives(script)
         first = 1000 + len(self.elements)
         base = {
@@ -136,7 +134,6 @@ class FakeSlurm:
         return "\n".join(f"--- {file.name}\n{file.read_text()[-1500:]}" for file in sorted(self.folder.glob("*.log")))
 
     def close(self) -> None:
-        """Cancel what still runs."""
         for element in self.elements:
             if element.process is not None and element.process.poll() is None:
                 element.signal(signal.SIGKILL, everybody=True)
@@ -144,16 +141,12 @@ class FakeSlurm:
 
     def _again(self, element: Element) -> None:
         assert element.process is not None
-        if element.process.poll() is None:
-            element.signal(signal.SIGKILL, everybody=True)
-            element.process.wait()
         # Whatever of the job outlived its shell goes with it.
         deadline = time.monotonic() + 60
-        while time.monotonic() < deadline:
-            try:
-                os.killpg(element.process.pid, signal.SIGKILL)
-            except ProcessLookupError:
-                break
-            time.sleep(0.01)
+        with suppress(ProcessLookupError):
+            while time.monotonic() < deadline:
+                element.signal(signal.SIGKILL, everybody=True)
+                element.process.poll()
+                time.sleep(0.01)
         element.restarts += 1
         element.start()

@@ -8,9 +8,11 @@ import sys
 
 import pytest
 
+from graspd.service.model.version import PACKAGE_VERSION
 from graspd.service.settings import Settings
 from tests.conftest import REPOSITORY
 from tests.deploy import composition
+from tests.deploy.test_dockerfile import COMMANDS, IMAGES
 from tests.shell import completed
 
 FILLED = {"REDIS_PASSWORD": "secret"}
@@ -57,20 +59,24 @@ def test_the_environment_is_made_of_settings_that_can_be_read(name: str, monkeyp
 
 
 @pytest.mark.parametrize("name", OURS)
-def test_docker_waits_for_our_containers_without_rights(name: str) -> None:
+def test_our_containers_have_no_rights_and_time_to_stop(name: str) -> None:
     service = SERVICES[name]
-    wait = composition.seconds(service["stop_grace_period"])
-    assert wait > float(service["environment"]["GRASPD_STOP_GRACE_S"])
-    assert wait > float(composition.example()["GRASPD_STOP_GRACE_S"])
-    assert service["read_only"] is True
-    assert service["cap_drop"] == ["ALL"]
+    grace = max(float(one["GRASPD_STOP_GRACE_S"]) for one in (service["environment"], composition.example()))
+    assert composition.seconds(service["stop_grace_period"]) > grace
+    assert (service["read_only"], service["cap_drop"]) == (True, ["ALL"])
     assert "no-new-privileges:true" in service["security_opt"]
+    assert service["image"].endswith(f":{PACKAGE_VERSION}")
+    assert service["build"]["target"] in IMAGES
+    assert service["command"][0] in COMMANDS
 
 
-def test_only_loopback_ports_are_published() -> None:
+def test_volumes_ports_and_password_are_named_and_private() -> None:
+    used = {volume.partition(":")[0] for service in SERVICES.values() for volume in service.get("volumes", ())}
+    assert used == composition.load(FILLED)["volumes"].keys()
     ports = [port for service in SERVICES.values() for port in service.get("ports", ())]
-    assert ports
-    assert all(port.startswith("127.0.0.1:") for port in ports)
+    assert ports and all(port.startswith("127.0.0.1:") for port in ports)
+    with pytest.raises(KeyError, match="REDIS_PASSWORD"):
+        composition.load({})
 
 
 @pytest.mark.parametrize("name", sorted(SERVICES))
@@ -84,41 +90,22 @@ def test_it_waits_for_services_that_tell_their_health(name: str) -> None:
         assert wanted.get("required", True) is not bool(needs_profile), "a part that may be absent is not required"
 
 
-def test_every_named_volume_is_declared_and_used() -> None:
-    used = {volume.partition(":")[0] for service in SERVICES.values() for volume in service.get("volumes", ())}
-    assert used == composition.load(FILLED)["volumes"].keys()
-
-
-def test_a_missing_password_stops_compose() -> None:
-    with pytest.raises(KeyError, match="REDIS_PASSWORD"):
-        composition.load({})
-
-
 def test_the_example_names_what_the_file_asks_for() -> None:
     asked = composition.names_asked_for(composition.COMPOSE.read_text())
     example = composition.example().keys()
     assert example - {"COMPOSE_PROFILES"} <= asked, "a variable of the example has no effect"
     # The rest has a default that fits everybody.
     assert {name for name in asked - example if name not in SETTINGS and name not in {"AWS_REGION"}} == set()
+    profiles = {profile for service in SERVICES.values() for profile in service.get("profiles", ())}
+    assert profiles == {"cpu", "gpu", "s3", "postgres"}
+    assert set(composition.example()["COMPOSE_PROFILES"].split(",")) <= profiles
+    assert composition.example()["GRASPD_VERSION"] == PACKAGE_VERSION
 
 
 @pytest.mark.parametrize("page", ["docker-compose.yml", ".env.example", "README.md", "docs/how-to/install.md"])
 def test_profiles_are_named_in_one_place(page: str) -> None:
     """`docker compose --profile cpu` would drop those that COMPOSE_PROFILES in .env asks for."""
     assert "--profile " not in (REPOSITORY / page).read_text()
-
-
-def test_the_example_enables_profiles_that_exist() -> None:
-    profiles = {profile for service in SERVICES.values() for profile in service.get("profiles", ())}
-    assert profiles == {"cpu", "gpu", "s3", "postgres"}
-    assert set(composition.example()["COMPOSE_PROFILES"].split(",")) <= profiles
-
-
-def test_the_version_is_that_of_the_package() -> None:
-    from graspd.service.model.version import PACKAGE_VERSION
-
-    assert composition.example()["GRASPD_VERSION"] == PACKAGE_VERSION
-    assert all(SERVICES[name]["image"].endswith(f":{PACKAGE_VERSION}") for name in OURS)
 
 
 def test_secrets_stay_out_of_the_repository() -> None:

@@ -36,7 +36,6 @@ Document = dict[str, Any]
 
 @functools.cache
 def _files() -> dict[str, list[Document]]:
-    """Documents of every file, as written."""
     found = {}
     for path in sorted(FOLDER.rglob("*.yaml")):
         if path.name not in ("kustomization.yaml", "images.yaml"):
@@ -45,7 +44,6 @@ def _files() -> dict[str, list[Document]]:
 
 
 def documents(*kinds: str) -> list[Document]:
-    """All documents of some kinds, or all."""
     return [found for file in _files().values() for found in file if not kinds or found["kind"] in kinds]
 
 
@@ -54,7 +52,6 @@ def job_template(found: Document) -> Document:
 
 
 def pods() -> Iterator[tuple[str, Document]]:
-    """Name and pod spec of everything that runs pods."""
     for found in documents("Deployment", "StatefulSet", "ScaledJob"):
         holder = job_template(found) if found["kind"] == "ScaledJob" else found["spec"]
         yield found["metadata"]["name"], holder["template"]["spec"]

@@ -31,13 +31,11 @@ ADDED = {"instance", "job", "le"}
 
 
 def expressions() -> list[tuple[str, str]]:
-    """Who asks, and what."""
     of_panels = [(panel["title"], target["expr"]) for panel in PANELS for target in panel["targets"]]
     return [*((rule["alert"], rule["expr"]) for rule in RULES), *of_panels]
 
 
 def nodes(node: Any) -> Iterator[Any]:
-    """An expression and all inside it."""
     yield node
     for name in ("lhs", "rhs", "expr", "vector_selector", "param"):
         if (inner := getattr(node, name, None)) is not None:

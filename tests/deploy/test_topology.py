@@ -139,14 +139,6 @@ def test_the_services_of_the_compose_file_do_a_job_together(
         assert differences(index, open_store(topology.variables["GRASPD_STORE_URL"])) == []
 
 
-@pytest.mark.s3
-def test_a_check_fails_where_nothing_lives(topology: Topology) -> None:
-    for service, command in (("controller", "controller"), ("worker-cpu", "worker")):
-        done = topology.graspd(service, command, "--check")
-        assert done.returncode == 1
-        assert len(done.stderr.splitlines()) == 1
-
-
 def test_redis_refuses_those_without_the_password(tmp_path: Path) -> None:
     (port,) = free_ports(1)
     service = composition.SERVICES["redis"]

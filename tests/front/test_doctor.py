@@ -17,7 +17,7 @@ from tests.conftest import REPOSITORY
 from tests.servers import free_ports
 from tests.shell import completed
 
-QUICK = "disk,data-folder,limits,versions,redis,store,index,port,keys"
+QUICK = "disk,data-folder,limits,redis,store,index,port,keys"
 
 
 def run(*arguments: str, folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:

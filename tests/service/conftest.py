@@ -25,25 +25,27 @@ DATABASES = ["sqlite", pytest.param("postgres", marks=pytest.mark.postgres)]
 
 
 @pytest.fixture(scope="session")
-def redis_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """URL of a Redis that belongs to this test process."""
+def redis_settings(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Settings]:
+    """Settings of a data folder with the Redis of `graspd up`, which belongs to this test process."""
     settings = Settings(data_dir=tmp_path_factory.mktemp("redis"))
     with subprocess.Popen(server_command(settings), stdout=subprocess.DEVNULL) as process:
-        url = redis_url(settings)
-        queue = RqQueue(connect(url, patience=0))
+        queue = RqQueue(connect(redis_url(settings), patience=0))
         wait_for_redis(queue)
         queue.close()
-        yield url
+        yield settings
         process.terminate()
 
 
+@pytest.fixture(scope="session")
+def redis_server(redis_settings: Settings) -> str:
+    return redis_url(redis_settings)
+
+
 def wait_for_redis(queue: RqQueue) -> None:
-    """Until it answers."""
     until(lambda: is_up(queue), "Redis answers")
 
 
 def is_up(queue: RqQueue) -> bool:
-    """Whether it answers now."""
     try:
         return queue.ping() >= 0
     except QueueUnavailable:
@@ -52,7 +54,6 @@ def is_up(queue: RqQueue) -> bool:
 
 @pytest.fixture
 def rq_queue(redis_server: str) -> Iterator[RqQueue]:
-    """The Redis adapter on an empty database."""
     queue = RqQueue(connect(redis_server))
     queue.connection.flushdb()
     yield queue

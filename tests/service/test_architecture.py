@@ -24,7 +24,6 @@ def test_every_fault_in_the_table_has_its_test() -> None:
 
 
 def rows_of(heading: str) -> list[list[str]]:
-    """Cells of the table of ARCHITECTURE.md that begins with a heading."""
     _, _, rest = (REPOSITORY / "ARCHITECTURE.md").read_text().partition(f"| {heading} |")
     table = rest.partition("\n\n")[0].splitlines()[2:]
     return [[cell.strip() for cell in line.strip("|").split(" | ")] for line in table]
@@ -70,7 +69,6 @@ def test_the_task_engine_stays_within_its_budget_of_lines() -> None:
 
 @pytest.fixture(scope="module")
 def product() -> dict[str, str]:
-    """Texts of all modules of the product."""
     files = [file for package in PACKAGES for file in (REPOSITORY / package).rglob("*.py")]
     return {str(file): text for file in files if (text := file.read_text())}
 

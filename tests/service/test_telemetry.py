@@ -79,7 +79,6 @@ def test_on_a_terminal_a_message_is_one_line_of_text(written: Callable[[], str])
 
 
 def is_healthy(file: Path) -> bool:
-    """What the health checks of the images say."""
     command = ["sh", "-c", AGE_OF_THE_FILE]
     done = subprocess.run(
         command, env={**os.environ, "GRASPD_HEARTBEAT_FILE": str(file)}, capture_output=True, check=False

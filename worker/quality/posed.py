@@ -8,7 +8,6 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from graspd.service.model.integers import distinct_values
 from graspd.service.model.transforms import Floats
 from graspd.worker.grasps import Posture
 from graspd.worker.hands.model import HandModel
@@ -84,7 +83,7 @@ class PostureData:
     def _gaps(self, posture: Posture, reach: float, part: NDArray[np.int32]) -> Floats:
         """Return least distances (N, P) of hand points grouped by `part` (points,), at most `reach` [m]; -1:
         ignored."""
-        parts = distinct_values(part[part >= 0])
+        parts = sorted(set(part[part >= 0].tolist()))
         found = np.full((len(posture), len(parts)), reach)
         for rows in self.parts(len(posture)):
             distance = self.touch(posture.take(rows), reach)[1].distance.numpy()

@@ -28,7 +28,6 @@ from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from graspd.service.model.errors import InputError
-from graspd.service.model.integers import distinct_values
 from graspd.service.model.metrics import GRASP_METRICS, GraspType
 from graspd.service.model.transforms import Floats
 from graspd.service.store.manifests import INDEX_THRESHOLD_M
@@ -222,7 +221,7 @@ def grasp_types(probe: Probe, found: Distances) -> NDArray[np.int32]:
     hand = probe.hand
     finger = finger_of_body(hand)
     touching = probe.body_distance(found) < LINK_CONTACT_M
-    digits = np.array(distinct_values(finger[finger >= 0]), finger.dtype)
+    digits = np.array(sorted(set(finger[finger >= 0].tolist())), finger.dtype)
     inner = np.array([body for body in np.flatnonzero(finger >= 0) if body not in hand.fingertips], np.intp)
     palm = touching[:, finger < 0].any(axis=1)
     touches = np.stack([touching[:, finger == digit].any(axis=1) for digit in digits], axis=1)

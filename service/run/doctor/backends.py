@@ -20,6 +20,7 @@ from graspd.service.index.index import Index
 from graspd.service.index.rebuild import differences
 from graspd.service.index.sample import IndexCondition, compare, draw, look
 from graspd.service.index.tables import shards
+from graspd.service.model.base import first_line
 from graspd.service.model.errors import (
     GraspdError,
     IndexDamaged,
@@ -68,7 +69,7 @@ def redis(settings: Settings) -> Finding:
         with redis_connection(settings) as client:
             return _check_redis(settings, client, dict(client.info()))
     except (RedisError, OSError) as error:
-        return bad(f"{_shown(settings)} does not answer: {_line(error)}", _fix(error, settings))
+        return bad(f"{_shown(settings)} does not answer: {first_line(error)}", _fix(error, settings))
 
 
 def _check_redis(settings: Settings, client: Redis, info: Mapping[str, Any]) -> Finding:
@@ -161,10 +162,6 @@ def _fix(error: Exception, settings: Settings) -> str:
     return _START
 
 
-def _line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]
-
-
 _NONE_HERE: Final = (
     "no index is here: GRASPD_INDEX_URL is unset and there is no index.sqlite; only api and controller need one"
 )
@@ -189,12 +186,8 @@ def index(settings: Settings) -> Finding:
     except UnavailableError as error:
         fix = "start the database; see host, user, password and database in GRASPD_INDEX_URL"
         return bad(str(error), fix if settings.index_url is not None else "see who may read the file")
-    if found is None:
-        return _absent(settings)
-    return _check_index(settings, found)
-
-
-def _absent(settings: Settings) -> Finding:
+    if found is not None:
+        return _check_index(settings, found)
     if settings.index_url is None:
         return skipped(_NONE_HERE)
     where = existing(Path(str(make_url(settings.resolved_index_url).database)).resolve())

@@ -1,4 +1,4 @@
-"""Checks of the fleet: controller, capable workers, the API's port, and clocks.
+"""Checks of the fleet: controller, capable workers, the API, and clocks.
 
 Leases use each process's own monotonic clock, so work continues with wrong clocks. They affect displayed and sorted
 times, expiry of keys, the grace time of shards, and S3, which refuses requests off by fifteen minutes.
@@ -13,23 +13,20 @@ import time
 import urllib.error
 import urllib.request
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
 from datetime import datetime
 from typing import Any, Final
 
 from redis.exceptions import RedisError
-from sqlalchemy import URL, make_url, text
-from sqlalchemy.exc import SQLAlchemyError
 
-from graspd.service.index.database import connect_postgres
 from graspd.service.model.errors import GraspdError, QueueUnavailable
 from graspd.service.model.states import Stage
 from graspd.service.model.version import PACKAGE_VERSION
 from graspd.service.model.workers import WorkerBeat
 from graspd.service.pipeline.leading import PART
 from graspd.service.queue.rq_queue import RqQueue, open_queue
-from graspd.service.run.address import recorded_address
+from graspd.service.run.address import local_url, recorded_address
 from graspd.service.run.doctor.backends import is_there, redis_connection
 from graspd.service.run.doctor.checks import Finding, bad, good, skipped, warning
 from graspd.service.run.doctor.machine import local_store
@@ -37,35 +34,29 @@ from graspd.service.settings import Settings
 from graspd.service.store.store import open_store
 
 _HTTP_S: Final = 5.0
-_IDLE: Final = "no service runs on this data folder"
-_AWAY: Final = "Redis does not answer"
+
+
+def _asked(settings: Settings, look: Callable[[RqQueue], Finding]) -> Finding:
+    if not is_there(settings):
+        return skipped("no service runs on this data folder")
+    try:
+        with closing(open_queue(settings, patience=0)) as queue:
+            return look(queue)
+    except QueueUnavailable:
+        return skipped("Redis does not answer")
 
 
 def controller(settings: Settings) -> Finding:
     """Check for a recent heartbeat of a controller."""
-    if not is_there(settings):
-        return skipped(_IDLE)
-    try:
-        with closing(open_queue(settings, patience=0)) as queue:
-            lives = queue.announced(PART)
-    except QueueUnavailable:
-        return skipped(_AWAY)
-    if not lives:
-        return bad(
-            "no heartbeat from a controller: finished tasks are not indexed, and nothing is queued", "graspd controller"
-        )
-    return good("a controller lives")
+    dead = bad(
+        "no heartbeat from a controller: finished tasks are not indexed, and nothing is queued", "graspd controller"
+    )
+    return _asked(settings, lambda queue: good("a controller lives") if queue.announced(PART) else dead)
 
 
 def workers(settings: Settings) -> Finding:
     """Check whether every stage has a healthy worker of this version."""
-    if not is_there(settings):
-        return skipped(_IDLE)
-    try:
-        with closing(open_queue(settings, patience=0)) as queue:
-            return _check_workers(queue.workers(), _waiting(queue))
-    except QueueUnavailable:
-        return skipped(_AWAY)
+    return _asked(settings, lambda queue: _check_workers(queue.workers(), _waiting(queue)))
 
 
 def _waiting(queue: RqQueue) -> Counter[Stage]:
@@ -98,28 +89,21 @@ def _check_workers(beats: list[WorkerBeat], waiting: Counter[Stage]) -> Finding:
 
 
 def port(settings: Settings) -> Finding:
-    """Check whether this service's API answers, or its port is free."""
+    """Check whether this service's API answers and is ready."""
     url = recorded_address(settings.data_dir)
     if url is None and "api_url" in settings.model_fields_set:
         url = settings.api_url
-    if url is not None:
-        return _check_api(url)
-    where = f"{settings.host}:{settings.port}"
-    if settings.port and (found := _readyz(f"http://{_reachable(settings.host)}:{settings.port}")) is not None:
-        if found:
-            return _check_api(f"http://{_reachable(settings.host)}:{settings.port}")
-        return bad(f"{where} is used by another program", "stop it, or set GRASPD_PORT (0: any free one)")
-    return _bind(settings, where)
-
-
-def _check_api(url: str) -> Finding:
+    expected = url is not None
+    url = url or local_url(settings.host, settings.port)
     found = _readyz(url)
+    if found is None and not expected:
+        return skipped(f"no API runs at {url}")
     if found is None:
         return bad(
             f"no API answers at {url}", "start graspd up or graspd api there; check proxy, firewall and GRASPD_API_URL"
         )
     if not found:
-        return bad(f"the server at {url} is not graspd", "set GRASPD_API_URL to the address of the API")
+        return bad(f"the server at {url} is not graspd", "stop it; or set GRASPD_PORT, or GRASPD_API_URL to the API")
     if not found.get("ok"):
         away = [part for part, state in found["parts"].items() if not state.get("ok")]
         return bad(f"the API at {url} is not ready: {', '.join(away)}", "see the checks of these parts above")
@@ -146,19 +130,6 @@ def _readyz(url: str) -> dict[str, Any] | None:
     except ValueError:
         return {}
     return found if isinstance(found, dict) and isinstance(found.get("parts"), dict) else {}
-
-
-def _reachable(host: str) -> str:
-    return {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(host, host)
-
-
-def _bind(settings: Settings, where: str) -> Finding:
-    try:
-        with closing(socket.create_server((settings.host, settings.port))):
-            return good(f"{where} is free")
-    except OSError as error:
-        fix = "set GRASPD_HOST to an address of this machine, and GRASPD_PORT to a port above 1023"
-        return bad(f"{where} cannot be bound: {error.strerror or error}", fix)
 
 
 _OFF_S: Final = 2.0
@@ -195,24 +166,10 @@ def _offsets(settings: Settings) -> Iterator[tuple[str, float]]:
             due = 4 / 3 * settings.lease_s
             ages = {beat.host: time.time() - _seconds(beat.seen) for beat in beats}
             yield from ((host, -age if age < 0 else min(0.0, due - age)) for host, age in ages.items())
-    if settings.index_url is not None and make_url(settings.resolved_index_url).get_backend_name() == "postgresql":
-        with suppress(SQLAlchemyError, GraspdError):
-            yield "PostgreSQL", _of_postgres(settings.resolved_index_url)
     folder = local_store(settings)
     if folder is None or folder.exists():
         with suppress(GraspdError):
             yield "store", _of_store(settings)
-
-
-def _of_postgres(url: str | URL) -> float:
-    engine = connect_postgres(url)
-    try:
-        with engine.connect() as connected:
-            before = time.time()
-            theirs = float(connected.scalar(text("SELECT extract(epoch FROM clock_timestamp())")))
-            return theirs - (before + time.time()) / 2
-    finally:
-        engine.dispose()
 
 
 def _of_store(settings: Settings) -> float:

@@ -1,10 +1,9 @@
-"""Checks of the machine: disk space, data folder, versions, limits of the process."""
+"""Checks of the machine: disk space, data folder, limits of the process."""
 
 from __future__ import annotations
 
-import importlib.metadata
 import os
-import platform
+import re
 import resource
 import shutil
 import stat
@@ -13,13 +12,8 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Final
 
-from packaging.requirements import Requirement
-from packaging.specifiers import SpecifierSet
-from packaging.version import Version
-
 from graspd.service import user_cache
 from graspd.service.model.cores import available_cores, available_memory
-from graspd.service.model.version import PACKAGE_VERSION
 from graspd.service.run.doctor.checks import Finding, bad, good, warning
 from graspd.service.settings import Settings
 from graspd.service.store.store import local_folder
@@ -32,29 +26,10 @@ _FEW_INODES: Final = 10_000
 _MEMORY_LOW: Final = 2 * _GIB
 _FILES_LOW: Final = 1024
 #: Network file systems: locks of SQLite and sockets are unreliable or fail there.
-_NETWORK: Final = {
-    "nfs",
-    "nfs4",
-    "cifs",
-    "smb3",
-    "smbfs",
-    "lustre",
-    "gpfs",
-    "beegfs",
-    "ceph",
-    "glusterfs",
-    "9p",
-    "afs",
-    "wekafs",
-    "panfs",
-    "orangefs",
-    "fuse.sshfs",
-    "fuse.s3fs",
-    "fuse.glusterfs",
-    "fuse.ceph-fuse",
-}
-#: Extras with libraries of the running service; the others are tools.
-_EXTRAS: Final = ("api", "worker", "embedded", "postgres", "otel", "usd", "arm", "view")
+_NETWORK: Final = re.compile(
+    r"nfs4?|cifs|smb3|smbfs|lustre|gpfs|beegfs|ceph|glusterfs|9p|afs|wekafs|panfs|orangefs|"
+    r"fuse\.(sshfs|s3fs|glusterfs|ceph-fuse)"
+)
 
 
 def local_store(settings: Settings) -> Path | None:
@@ -104,7 +79,7 @@ def data_folder(settings: Settings, *, mounts: Path = Path("/proc/self/mounts"))
         what for what, url in (("the index (SQLite)", settings.index_url), ("Redis", settings.redis_url)) if url is None
     ]
     kind = filesystem(there, mounts)
-    if kind in _NETWORK and kept_here:
+    if _NETWORK.fullmatch(kind) and kept_here:
         return warning(
             f"{folder} is a network folder ({kind}) and would contain {' and '.join(kept_here)}: locks may fail",
             "set GRASPD_DATA_DIR to a disk of this machine and GRASPD_STORE_URL=file:///SHARED/FOLDER; or name a "
@@ -132,45 +107,6 @@ def filesystem(folder: Path, mounts: Path = Path("/proc/self/mounts")) -> str:
         if folder.is_relative_to(at := Path(where.replace("\\040", " ")))
     ]
     return max(found)[2] if found else ""
-
-
-def versions(requirements: Iterable[str] | None = None) -> Finding:
-    """Check Python and library versions against `requirements`, by default those of the installed graspd."""
-    try:
-        own = importlib.metadata.distribution("graspd")
-    except importlib.metadata.PackageNotFoundError:
-        return bad("graspd runs from a folder and is not installed", "pip install -e '.[all]' in that folder")
-    if own.version != PACKAGE_VERSION:
-        fix = "install it again: pip install -e '.[all]', or the wheel"
-        return bad(f"the code is graspd {PACKAGE_VERSION}, its install says {own.version}", fix)
-    python = SpecifierSet(str(own.metadata["Requires-Python"]))
-    if platform.python_version() not in python:
-        return bad(
-            f"Python {platform.python_version()} does not satisfy {python}", "make an environment with Python 3.12"
-        )
-    wrong = [
-        line for text in (requirements if requirements is not None else own.requires or ()) if (line := _unmet(text))
-    ]
-    if wrong:
-        needed = " ".join(f"'{line.partition(' (')[0]}'" for line in wrong)
-        return bad(f"incompatible libraries: {'; '.join(wrong)}", f"pip install {needed}")
-    return good(f"graspd {PACKAGE_VERSION}, Python {platform.python_version()}, compatible libraries")
-
-
-def _unmet(text: str) -> str:
-    """Return required and found version of an unmet requirement; missing extras are not an error."""
-    wanted = Requirement(text)
-    extra = next((extra for extra in _EXTRAS if wanted.marker and wanted.marker.evaluate({"extra": extra})), "")
-    if wanted.marker and not extra and not wanted.marker.evaluate({"extra": ""}):
-        return ""
-    if wanted.name == "graspd":
-        return ""
-    try:
-        found = importlib.metadata.version(wanted.name)
-    except importlib.metadata.PackageNotFoundError:
-        return "" if extra else f"{wanted.name}{wanted.specifier} (absent)"
-    fits = wanted.specifier.contains(Version(found), prereleases=True)
-    return "" if fits else f"{wanted.name}{wanted.specifier} (found {found})"
 
 
 def limits(*, files: int | None = None, memory: int | None = None) -> Finding:

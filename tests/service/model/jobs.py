@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from graspd.service.model.clock import timestamp
 from graspd.service.model.digests import job_id, shard_id
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.records import JobRecord
-from graspd.service.model.states import Priority, Stage
+from graspd.service.model.states import Stage
+from tests.fakes import job_record
 
 HAND, OBJECT = "a" * 32, "b" * 32
 DIGESTS = {"hand_digest": HAND, "object_digest": OBJECT}
 
 
 def record(wanted: JobRequest) -> JobRecord:
-    job = job_id(wanted, HAND, OBJECT)
-    return JobRecord(id=job, request=wanted, priority=Priority.BULK, created=timestamp(), **DIGESTS)
+    return job_record(wanted, job_id(wanted, HAND, OBJECT))
 
 
 def shard(stage: Stage, wanted: JobRequest) -> str:

@@ -8,11 +8,9 @@ import sys
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from graspd.service.model import libraries
-from graspd.service.model.integers import distinct_values
 from graspd.service.model.libraries import _distributions, imports, own_process, version_of
 
 
@@ -80,14 +78,3 @@ def test_the_command_line_is_such_a_process() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stderr.split() == ["True", "True"]
-
-
-def test_distinct_values_are_numpys_without_its_masked_arrays() -> None:
-    rng = np.random.default_rng(0)
-    for values in (rng.integers(-5, 5, (7, 3)), np.zeros(0, int), np.array([2, 2, -1], np.int32)):
-        assert distinct_values(values) == np.unique(values).tolist()
-    code = (
-        "import sys, numpy as np; from graspd.service.model.integers import distinct_values\n"
-        "distinct_values(np.arange(3)); sys.exit('numpy.ma' in sys.modules)"
-    )
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -22,7 +22,6 @@ Found = dict[str, Any]
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory: pytest.TempPathFactory) -> Found:
-    """What a process finds of the metric that is in its table alone."""
     folder = tmp_path_factory.mktemp("metric")
     older = f"sqlite:///{folder / 'older.sqlite'}"
     index = Index(older)

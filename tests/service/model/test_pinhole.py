@@ -12,7 +12,6 @@ WIDTH, HEIGHT = 64, 48
 
 
 def plane_depth(normal: np.ndarray, offset: float) -> np.ndarray:
-    """Depth of the plane n.x = offset."""
     return offset / (pixel_rays(K, WIDTH, HEIGHT) @ normal)
 
 

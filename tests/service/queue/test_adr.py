@@ -38,7 +38,6 @@ LEASE_S = 60
 
 @pytest.fixture
 def held(services: Services, rq_queue: RqQueue) -> tuple[Services, Job]:
-    """A task that a worker of RQ took just now, and beats for."""
     services = replace(services, queue=rq_queue)
     job, _ = job_actions.submit(services, request())
     (task,) = services.index.jobs.tasks(job=job.id).items

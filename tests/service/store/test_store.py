@@ -19,7 +19,6 @@ from tests.servers import S3Server, free_ports
 
 @pytest.fixture(params=["memory", "file", pytest.param("s3", marks=pytest.mark.s3)])
 def store(request: pytest.FixtureRequest, tmp_path: Path) -> Store:
-    """Each adapter in turn."""
     if request.param == "s3":
         return open_store(request.getfixturevalue("s3_url"))
     return open_store("memory://" if request.param == "memory" else (tmp_path / "store").as_uri())
@@ -128,15 +127,6 @@ def test_a_large_object_comes_in_chunks_and_is_written_once(s3_url: str) -> None
     chunks = list(store.stream("shards/views/large.h5"))
     assert b"".join(chunks) == data and max(map(len, chunks)) <= 2**20
     assert store.get_range("shards/views/large.h5", 2**24 - 3, 7) == data[2**24 - 3 : 2**24 + 4]
-
-
-@pytest.mark.s3
-def test_a_listing_goes_on_behind_a_thousand_objects(s3_url: str) -> None:
-    store, keys = open_store(s3_url), [f"tasks/t/attempts/{number:04}.json" for number in range(1005)]
-    for key in keys:
-        store.put(key, b"{}")
-    assert sorted(entry.key for entry in store.list("tasks")) == keys
-    assert sorted(entry.key for entry in store.list("tasks", offset=keys[1001])) == keys[1002:]
 
 
 @pytest.mark.s3

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from graspd.service.model.errors import InputError, TaskCancelled
 from graspd.service.model.fidelity import Fidelity
-from graspd.service.model.integers import distinct_values
 from graspd.service.model.transforms import Floats
 from graspd.worker.grasps import GraspSet
 from graspd.worker.objects.model import ObjectModel
@@ -113,7 +112,7 @@ class Batches:
         Grasps of stopped batches count as good enough."""
         owners, scores = self.owner[rows], np.zeros(len(grasps))
         placed = self.placed.take(rows) if self.placed is not None else None
-        for owner in distinct_values(owners):
+        for owner in sorted(set(owners.tolist())):
             rollout, own = self.asked[owner].wanted.rollout, np.flatnonzero(owners == owner)
             if rollout is None or owner in self.errors:
                 continue

@@ -16,7 +16,6 @@ import warp as wp
 from numpy.typing import NDArray
 
 from graspd.service.model.fidelity import Fidelity
-from graspd.service.model.integers import distinct_values
 from graspd.service.model.transforms import Floats
 from graspd.worker.control.postures import standing_off, touching_links
 from graspd.worker.execution_context import ExecutionContext
@@ -275,7 +274,7 @@ def _with_place(launch: _Launch, begun: _Begun) -> Rows:
     batches = launch.batches
     deep = begun.depth.reshape(len(begun.rows), -1)
     owners = batches.owner[begun.rows]
-    for owner in distinct_values(owners):
+    for owner in sorted(set(owners.tolist())):
         own = deep[owners == owner]
         if batches.placed is None and own.max() > NO_PLACE:
             batches.put_out(owner, starts.no_place(launch.coarse))

@@ -32,7 +32,6 @@ Look = Callable[[], Finding]
 
 @pytest.fixture
 def kept(tmp_path: Path) -> Iterator[Services]:
-    """A data folder with a job of two batches, done."""
     services = open_services(Settings(data_dir=tmp_path))
     add_assets(services)
     finish(services, job_actions.submit(services, request(grasps=64))[0].id)
@@ -43,7 +42,6 @@ def kept(tmp_path: Path) -> Iterator[Services]:
 
 @pytest.fixture(params=["whole", "sample"])
 def look(request: pytest.FixtureRequest, kept: Services, monkeypatch: pytest.MonkeyPatch) -> Look:
-    """The comparison of all rows, and that of a sample."""
     if request.param == "sample":
         monkeypatch.setattr(backends, "_ALL_SHARDS", 0)
     return lambda: backends.index_is_store(kept.settings, settles_s=0.0)

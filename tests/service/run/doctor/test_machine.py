@@ -15,7 +15,7 @@ from obstore.store import MemoryStore
 from graspd.service.model.errors import StoreUnavailable
 from graspd.service.run.doctor.backends import check_store, store
 from graspd.service.run.doctor.checks import Check, Condition, Finding, good, run_checks
-from graspd.service.run.doctor.machine import data_folder, disk, filesystem, limits, versions
+from graspd.service.run.doctor.machine import data_folder, disk, filesystem, limits
 from graspd.service.settings import Settings
 from graspd.service.store.store import Entry, Store, open_store
 
@@ -63,29 +63,6 @@ def test_a_data_folder_on_a_network_is_told(tmp_path: Path) -> None:
 def test_a_data_folder_that_cannot_be_written_is_bad(tmp_path: Path) -> None:
     tmp_path.chmod(0o500)
     assert not data_folder(Settings(data_dir=tmp_path / "data")).ok
-
-
-def test_this_install_has_the_libraries_it_asks_for() -> None:
-    assert versions().condition is Condition.GOOD, versions()
-
-
-@pytest.mark.parametrize(
-    ("requirement", "told"),
-    [
-        ("redis>=99", "redis>=99 (found "),
-        ("no-such-library>=1", "no-such-library>=1 (absent)"),
-        ('fastapi<0.1; extra == "api"', "fastapi<0.1 (found "),
-        ('no-such-library>=1; extra == "api"', ""),
-        ('ruff<0.1; extra == "dev"', ""),
-        ('redis>=99; sys_platform == "win32"', ""),
-    ],
-)
-def test_a_library_that_does_not_fit_is_named_with_the_command(requirement: str, told: str) -> None:
-    found = versions([requirement])
-    assert found.ok is (not told)
-    if told:
-        assert told in found.message
-        assert found.fix == f"pip install '{told.partition(' (')[0]}'"
 
 
 def test_few_files_and_little_memory_are_told() -> None:
