@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from sqlalchemy import ColumnElement, Connection, Integer, cast, func, select
 
 from graspd.service.index.database import IndexPart
@@ -21,17 +19,6 @@ class MetricSummary:
     mean: float
     low: float
     high: float
-
-
-@dataclass(frozen=True)
-class Distribution:
-    """Histogram of one metric over the sampled grasps: equal bins from `low` to `high`, inclusive."""
-
-    count: int
-    mean: float
-    low: float
-    high: float
-    counts: list[int]
 
 
 @dataclass(frozen=True)
@@ -74,33 +61,11 @@ class Statistics(IndexPart):
                 counts[min(int(at), bins - 1)] += int(count)
         return counts
 
-    def side_by_side(
-        self, filters: Sequence[GraspFilter], metrics: Sequence[Metric], *, bins: int = 20, at_most: int = 20_000
-    ) -> dict[Metric, list[Distribution | None]]:
-        """Return one distribution per metric and filter in common bins, from at most about `at_most` grasps each.
-
-        None without grasps. The id of a shard is a digest, so ids below a bound are a fair sample, and they are
-        adjacent in the index.
-        """
-        samples = [self._values(where, metrics, at_most) for where in filters]
-        found: dict[Metric, list[Distribution | None]] = {}
-        for at, metric in enumerate(metrics):
-            columns = [values[:, at] for values in samples]
-            known = np.concatenate([column[np.isfinite(column)] for column in columns])
-            if known.size:
-                ends = (float(known.min()), float(known.max()))
-                found[metric] = [_distribution(column, bins, ends) for column in columns]
-        return found
-
-    def _values(self, where: GraspFilter, metrics: Sequence[Metric], at_most: int) -> NDArray[np.float64]:
-        """Return the metrics (N, M) of the sampled grasps; nan: not measured."""
-        with self.database.reading() as connection:
-            query = select(*(grasps.c[metric] for metric in metrics)).where(*_sampled(connection, where, at_most))
-            rows = [tuple(row) for row in connection.execute(query)]
-        return np.array(rows, float).reshape(-1, len(metrics))
-
     def kinds(self, where: GraspFilter, *, at_most: int = 20_000) -> GraspKinds:
-        """Return types and directions, from about `at_most` grasps as sampled by `side_by_side`."""
+        """Return types and directions, from about `at_most` grasps.
+
+        The id of a shard is a digest, so ids below a bound are a fair sample, and they are adjacent in the index.
+        """
         columns = grasps.c.grasp_type, grasps.c.approach_cell
         with self.database.reading() as connection:
             query = select(*columns, func.count()).where(*_sampled(connection, where, at_most)).group_by(*columns)
@@ -134,12 +99,3 @@ def _size(connection: Connection, where: GraspFilter) -> int:
         pair = {"hand": where.hand, "object": where.object}
         query = query.where(*(shards.c[name] == value for name, value in pair.items() if value is not None))
     return int(connection.scalar(query) or 0)
-
-
-def _distribution(values: NDArray[np.float64], bins: int, ends: tuple[float, float]) -> Distribution | None:
-    known = values[np.isfinite(values)]
-    if not known.size:
-        return None
-    low, high = ends
-    counts, _ = np.histogram(known, bins, (low, high)) if high > low else ([known.size] + [0] * (bins - 1), None)
-    return Distribution(known.size, float(known.mean()), low, high, [int(n) for n in counts])
