@@ -275,13 +275,6 @@ class Worker(WorkerView):
     lease_age_s: float | None = Field(None, description="time since its last heartbeat [s]; absent once it is gone")
 
 
-class LossCurve(BaseModel):
-    """Planner's loss over its iterations."""
-
-    iterations: list[int]
-    losses: list[float]
-
-
 class Histogram(BaseModel):
     """Distribution of one metric over valid grasps."""
 

@@ -17,7 +17,7 @@ from graspd.api import models
 from graspd.api.access.auth import project_scope
 from graspd.service.index.queries.grasps import GraspFilter, GraspSort, Metric
 from graspd.service.index.queries.statistics import GraspKinds
-from graspd.service.index.views import GraspView, JobView, Page, ShardView
+from graspd.service.index.views import GraspView, JobView, Page
 from graspd.service.model.errors import InputError, LimitError, NotFoundError
 from graspd.service.model.metrics import (
     DIRECTION_CELLS,
@@ -35,9 +35,10 @@ from graspd.service.readers.trajectories import scene_spec_of, stop_places, way_
 from graspd.service.store.columns import SCHEMAS
 from graspd.service.store.integrity import read_checked
 from graspd.service.store.shards import Shard, read_shard
-from graspd.service.store.store import Store
 
 _KEPT_STATISTICS: Final = 256
+#: Number of cached base shards. A shard of 32 grasps takes about 60 kB; a page needs at most one shard per row.
+_KEPT_SHARDS: Final = 64
 _BINS: Final = 20
 #: Filters of the index with equal names in requests.
 _SHARED: Final = GraspFilter.model_fields.keys() & models.GraspQuery.model_fields.keys()
@@ -49,7 +50,8 @@ class Grasps:
 
     def __init__(self, services: Services) -> None:
         self._index = services.index
-        self._files = GraspFiles(services.store)
+        self._store = services.store
+        self._shard = lru_cache(maxsize=_KEPT_SHARDS)(self._read_shard)
         self._statistics = lru_cache(maxsize=_KEPT_STATISTICS)(self._read_statistics)
 
     def page(self, query: models.GraspQuery, *, limit: int = 50, cursor: str | None = None) -> Page[GraspView]:
@@ -81,7 +83,34 @@ class Grasps:
 
     def one(self, shard_id: str, row: int) -> models.GraspDetail:
         grasp, shard = self._index.grasps.get(shard_id, row, scope=project_scope()), self._index.shards.get(shard_id)
-        return self._files.detail(grasp, shard)
+        file = self._shard(shard.key, shard.sha256)
+        return models.GraspDetail(
+            **grasp.model_dump(),
+            hand_digest=shard.hand_digest,
+            object_digest=shard.object_digest,
+            joint_names=_texts(file.attributes.get("joint_names")),
+            postures={name: _posture(file, name, row) for name in _POSTURES},
+            thresholds_m=_numbers(file["quality/thresholds_m"]),
+            sweep={
+                metric.name: _numbers(file[metric.path][row])
+                for metric in GRASP_METRICS
+                if metric.swept and metric.path in file.arrays
+            },
+            way=_way(file, row),
+            scene=_scene(file, row),
+            pushes=_pushes(file, row),
+            verdict_margin=_value(file, "quality/verdict_margin", row),
+            validated_by=validated_by(file, row),
+            recheck=_verdict(file, "quality/recheck", row),
+            friction=_number(file.attributes.get("mu")),
+        )
+
+    def _read_shard(self, key: str, sha256: str) -> Shard:
+        data = read_checked(self._store, key, sha256)
+        try:
+            return read_shard(data, kind="base", name=key)
+        except InputError as error:
+            raise NotFoundError(f"{key} holds no grasps that can be shown: {error}") from None
 
     def statistics(self, job: JobView | models.JobDetail) -> tuple[list[models.Histogram], models.Diversity | None]:
         """Return distributions and diversity of a job's valid grasps, or of all stored ones if not validated.
@@ -125,8 +154,6 @@ def _bounds(query: models.GraspQuery, end: Literal["min", "max"]) -> dict[Metric
     return found if query.type is None else {"grasp_type": float(GraspType[query.type.upper()])} | found
 
 
-#: Number of cached base shards. A shard of 32 grasps takes about 60 kB; a page needs at most one shard per row.
-_KEPT_SHARDS: Final = 64
 _POSTURES: Final = ("pregrasp", "grasp", "squeeze")
 _OUTCOME: Final = "quality/verdict_outcome"
 _LIFT: Final = "quality/lift_outcome"
@@ -136,45 +163,6 @@ _OUTCOMES, _LIFT_OUTCOMES = (
     for column in (_OUTCOME, _LIFT)
 )
 _DIRECTIONS: Final = ("+x", "−x", "+y", "−y", "+z", "−z")
-
-
-class GraspFiles:
-    """Reads base shards, with a cache of the most recent ones."""
-
-    def __init__(self, store: Store) -> None:
-        self._store = store
-        self._read = lru_cache(maxsize=_KEPT_SHARDS)(self._fetch)
-
-    def detail(self, grasp: GraspView, shard: ShardView) -> models.GraspDetail:
-        file = self._read(shard.key, shard.sha256)
-        row = grasp.row
-        return models.GraspDetail(
-            **grasp.model_dump(),
-            hand_digest=shard.hand_digest,
-            object_digest=shard.object_digest,
-            joint_names=_texts(file.attributes.get("joint_names")),
-            postures={name: _posture(file, name, row) for name in _POSTURES},
-            thresholds_m=_numbers(file["quality/thresholds_m"]),
-            sweep={
-                metric.name: _numbers(file[metric.path][row])
-                for metric in GRASP_METRICS
-                if metric.swept and metric.path in file.arrays
-            },
-            way=_way(file, row),
-            scene=_scene(file, row),
-            pushes=_pushes(file, row),
-            verdict_margin=_value(file, "quality/verdict_margin", row),
-            validated_by=validated_by(file, row),
-            recheck=_verdict(file, "quality/recheck", row),
-            friction=_number(file.attributes.get("mu")),
-        )
-
-    def _fetch(self, key: str, sha256: str) -> Shard:
-        data = read_checked(self._store, key, sha256)
-        try:
-            return read_shard(data, kind="base", name=key)
-        except InputError as error:
-            raise NotFoundError(f"{key} holds no grasps that can be shown: {error}") from None
 
 
 def _posture(file: Shard, name: str, row: int) -> models.Posture:

@@ -8,13 +8,12 @@ import threading
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Collection, Iterator, Sequence
-from functools import lru_cache
 from typing import Final, Literal
 
 from graspd.api.access.auth import caller, caller_id, must_own, project_scope
 from graspd.api.access.quotas import Idempotency, Quotas
 from graspd.api.catalog.grasps import MEAN_METRICS, Grasps
-from graspd.api.models import Job, JobDetail, LossCurve, MeanMetrics, Shard, StageStatus, stage_state
+from graspd.api.models import Job, JobDetail, MeanMetrics, Shard, StageStatus, stage_state
 from graspd.service.index.views import JobView, Page, ShardView, StageProgress, TaskView
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.states import Stage, State
@@ -28,10 +27,8 @@ _PAGE: Final = 200
 #: Most waiting tasks for which the reason of waiting is determined.
 _LOOKED_AT: Final = 20
 _ORDER: Final = {stage: place for place, stage in enumerate(Stage)}
-_KEPT_LOSSES: Final = 256
 _SHARED: Final = Job.model_fields.keys() & JobView.model_fields.keys() - {"reason", "stages"}
 _DETAILS: Final = ("request", "choice", "note", "outcomes", "rechecked", "recheck_held", "hand_digest", "object_digest")
-_LOSS_BATCHES: Final = 8
 
 
 class Shards:
@@ -96,7 +93,6 @@ class Jobs:
         self._grasps = grasps
         self._shards = shards
         self._paces = TaskRates()
-        self._loss = lru_cache(maxsize=_KEPT_LOSSES)(self._read_loss)
 
     def submit(self, request: JobRequest, *, idempotency_key: str | None = None) -> JobDetail:
         """Record a job, or return the existing identical one."""
@@ -154,22 +150,6 @@ class Jobs:
     def moving(self, job_id: str) -> Job:
         """Return a job with only the progress of its stages, for event streams."""
         return self._job(self._services.index.jobs.get(job_id, scope=project_scope()), self._running(job_id))
-
-    def loss_curve(self, job: JobDetail) -> LossCurve | None:
-        """Return the planner's mean loss over a job's first batches; None if the planner records none."""
-        batches = [shard.id for shard in job.shards if shard.kind == "base"][:_LOSS_BATCHES]
-        curves = [curve for shard in batches if (curve := self._loss(shard)) is not None]
-        if not curves:
-            return None
-        length = min(len(losses) for _, losses in curves)
-        means = [sum(losses[i] for _, losses in curves) / len(curves) for i in range(length)]
-        return LossCurve(iterations=[(i + 1) * curves[0][0] for i in range(length)], losses=means)
-
-    def _read_loss(self, shard_id: str) -> tuple[int, list[float]] | None:
-        """Return iterations between two values, and the values; None if the planner records none."""
-        info = self._services.index.shards.get(shard_id).manifest.get("info", {})
-        curve = [value for value in info.get("loss_curve") or [] if value is not None]
-        return (int(info.get("chunk", 1)), curve) if curve else None
 
     def _owned(self, job_id: str) -> JobView:
         job = self._services.index.jobs.get(job_id, scope=project_scope())

@@ -9,7 +9,6 @@ import logging
 import zipfile
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
 from pathlib import PurePosixPath
 from tempfile import TemporaryFile
 from typing import IO, Any, Final, Literal
@@ -103,16 +102,6 @@ _CHUNK: Final = 1 << 20
 _COLUMNS: Final = (*GraspView.model_fields, "tags")
 
 
-@dataclass(frozen=True)
-class Export:
-    """File ready to be sent."""
-
-    media_type: str
-    filename: str
-    size: int
-    chunks: Iterator[bytes]
-
-
 class GraspExports:
     """Writes selected grasps to files, which stay on the service's disk until they are sent."""
 
@@ -121,8 +110,11 @@ class GraspExports:
         self._grasps = grasps
         self._tags = tags
 
-    def made(self, places: Sequence[Grasp], format: Format, said: Mapping[str, Any]) -> Export:
-        """Write a file of these grasps, which must be visible to the caller; `said` describes the selection."""
+    def made(self, places: Sequence[Grasp], format: Format, said: Mapping[str, Any]) -> tuple[int, Iterator[bytes]]:
+        """Write a file of these grasps, which must be visible to the caller; return its size and its bytes.
+
+        `said` describes the selection.
+        """
         file = TemporaryFile()  # noqa: SIM115 (it is closed once it is sent)
         try:
             {"csv": self._csv, "json": self._json, "zip": self._zip}[format](file, places, said)
@@ -131,7 +123,7 @@ class GraspExports:
         except BaseException:
             file.close()
             raise
-        return Export(MEDIA_TYPES[format], f"grasps.{format}", size, _sent(file))
+        return size, _sent(file)
 
     def _rows(self, places: Sequence[Grasp]) -> Iterator[dict[str, Any]]:
         tags = self._tags.of(places)

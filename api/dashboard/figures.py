@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
 from urllib.parse import urlencode
 
 from graspd.api.models import Histogram
-from graspd.service.index.queries.statistics import Distribution
 from graspd.service.index.views import CellView, DatasetView, MatrixCell
 from graspd.service.model import studies
 from graspd.service.model.errors import DamagedError
@@ -25,7 +23,7 @@ HEIGHT: Final = 160.0
 
 @dataclass(frozen=True)
 class Plot:
-    """Line or bars: SVG points for display without scripts, and numbers for the script."""
+    """Bars: SVG points for display without scripts, and numbers for the script."""
 
     label: str
     points: str
@@ -46,23 +44,6 @@ class Bar:
     href: str
 
 
-def line(xs: Sequence[float], ys: Sequence[float], *, x: str, y: str, unit: str = "", log: bool = False) -> Plot:
-    """Draw a line of `y` [unit] over `x`; a logarithmic axis omits values at or below zero."""
-    kept = [(a, b) for a, b in zip(xs, ys, strict=True) if math.isfinite(b) and (b > 0 or not log)]
-    scaled = [(a, math.log10(b) if log else b) for a, b in kept]
-    low, high = (min(b for _, b in scaled), max(b for _, b in scaled)) if scaled else (0.0, 1.0)
-    low = low if log else min(0.0, low)
-    first, last = (scaled[0][0], scaled[-1][0]) if scaled else (0.0, 1.0)
-    points = " ".join(
-        f"{_share(a, first, last) * WIDTH:.1f},{HEIGHT - _share(b, low, high) * HEIGHT:.1f}" for a, b in scaled
-    )
-    data = {"kind": "line", "xs": [a for a, _ in kept], "ys": [b for _, b in kept], "x": x, "y": y, "unit": unit}
-    label = f"{y} over {x}"
-    if kept:
-        label += f", from {kept[0][1]:.3g} to {kept[-1][1]:.3g} {unit}".rstrip()
-    return Plot(label, points, json.dumps(data | {"log": log}))
-
-
 def minutes(values: Sequence[int], start: float) -> Plot:
     """Draw bars of the grasps made in each minute from `start` [s since 1970]."""
     top = max([*values, 1])
@@ -72,15 +53,8 @@ def minutes(values: Sequence[int], start: float) -> Plot:
         f"{(i + 0.85) * width:.1f},{HEIGHT * (1 - v / top):.1f} {(i + 0.85) * width:.1f},{HEIGHT:.0f}"
         for i, v in enumerate(values)
     )
-    data = {
-        "kind": "bars",
-        "xs": [start + i * 60 for i in range(len(values))],
-        "ys": list(values),
-        "x": "Time",
-        "y": "Valid grasps",
-        "unit": "/min",
-        "log": False,
-    }
+    times = [start + i * 60 for i in range(len(values))]
+    data = {"xs": times, "ys": list(values), "x": "Time", "y": "Valid grasps", "unit": "/min"}
     return Plot(f"Valid grasps per minute in the last hour; maximum {max(values, default=0)}", points, json.dumps(data))
 
 
@@ -94,35 +68,6 @@ def bars(histogram: Histogram, path: str, where: dict[str, str]) -> list[Bar]:
         query = where | {f"min_{histogram.metric}": f"{low:.6g}", f"max_{histogram.metric}": f"{high:.6g}"}
         made.append(Bar(10.0 * index + 1, 63 - tall, 8.0, tall, number, low, high, f"{path}?{urlencode(query)}"))
     return made
-
-
-@dataclass(frozen=True)
-class TwinBar:
-    """Shares of two sets of grasps in one bin."""
-
-    x: float
-    one: float
-    other: float
-    """Heights of both bars."""
-    low: float
-    high: float
-    shares: tuple[float, float]
-
-
-def twins(both: Sequence[Distribution | None]) -> list[TwinBar]:
-    """Return the bins of two distributions over the same range, each as shares of its own grasps."""
-    first = next(each for each in both if each is not None)
-    bins = len(first.counts)
-    shares = [[n / each.count for n in each.counts] if each is not None else [0.0] * bins for each in both]
-    most, width = max(map(max, shares)) or 1.0, (first.high - first.low) / bins
-    return [
-        TwinBar(10.0 * at, 60 * a / most, 60 * b / most, first.low + at * width, first.low + (at + 1) * width, (a, b))
-        for at, (a, b) in enumerate(zip(*shares, strict=True))
-    ]
-
-
-def _share(value: float, low: float, high: float) -> float:
-    return (value - low) / (high - low) if high > low else 0.5
 
 
 #: Steps of the colour scale; the style sheet has a class for each.

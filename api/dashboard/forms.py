@@ -30,6 +30,7 @@ from graspd.service.model.options import Form, Row, rows
 from graspd.service.model.projects import ProjectScope
 from graspd.service.model.states import AssetKind, Stage
 from graspd.service.pipeline.datasets.cost import estimate
+from graspd.service.pipeline.datasets.estimate import Estimate
 from graspd.service.pipeline.datasets.spec import Matrix
 
 router = APIRouter(include_in_schema=False)
@@ -203,21 +204,6 @@ WORDS: Final = {
 }
 
 
-@dataclass(frozen=True)
-class FidelityPrice:
-    """Fidelity and its estimated cost."""
-
-    name: str
-    words: str
-    seconds: float | None
-    """Time of one worker for the whole job [s]; None: unknown."""
-    low: float | None
-    high: float | None
-    """Interval of the estimated time [s]."""
-    valid_yield: float | None
-    origin: str
-
-
 def listed(text: str) -> list[str]:
     """Split names of a form field at commas or spaces."""
     return text.replace(",", " ").split()
@@ -231,23 +217,21 @@ class Expectations:
         self._read: dict[tuple[Stage, ProjectScope], tuple[float, list[BatchCost]]] = {}
         self._lock = threading.Lock()
 
-    def of(self, form: Mapping[str, Any]) -> list[FidelityPrice]:
-        """Estimate the cost of every offered fidelity for a form; without numbers if that is not possible."""
+    def of(self, form: Mapping[str, Any]) -> list[tuple[str, str, Estimate | None]]:
+        """Return each offered fidelity, its description, and its estimate for a form; None if that is not possible."""
         # Ignore empty fields.
         wanted = {
             key: value for key, value in form.items() if key not in ("hand", "object", "fidelity") and value != ""
         }
         wanted["neighbours"] = listed(str(form.get("neighbours", "")))
-        return [self._one(name, wanted, str(form["hand"]), str(form["object"])) for name in OFFERED]
+        wanted |= {"hands": (str(form["hand"]),), "objects": (str(form["object"]),)}
+        return [(name, WORDS[name], self._one(wanted | {"fidelity": name})) for name in OFFERED]
 
-    def _one(self, name: str, wanted: dict[str, Any], hand: str, obj: str) -> FidelityPrice:
+    def _one(self, wanted: dict[str, Any]) -> Estimate | None:
         try:
-            matrix = Matrix.model_validate(wanted | {"hands": (hand,), "objects": (obj,), "fidelity": name})
-            cost = estimate(self._index, matrix, costs=self._costs, scope=project_scope())
+            return estimate(self._index, Matrix.model_validate(wanted), costs=self._costs, scope=project_scope())
         except (ValidationError, GraspdError):
-            return FidelityPrice(name, WORDS[name], None, None, None, None, "")
-        share, origin = (cost.rates[0].valid_yield, cost.rates[0].origin) if cost.rates else (None, "")
-        return FidelityPrice(name, WORDS[name], cost.seconds, cost.seconds_low, cost.seconds_high, share, origin)
+            return None
 
     def _costs(self, stage: Stage) -> list[BatchCost]:
         with self._lock:

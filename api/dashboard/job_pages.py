@@ -1,4 +1,4 @@
-"""Page of a job: stages, loss, metrics, best grasps, attempts, files; pictures as PNG or thumbnail."""
+"""Page of a job: stages, metrics, best grasps, attempts, files; pictures as PNG or thumbnail."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ router = APIRouter(include_in_schema=False)
 @router.get("/jobs/{job_id}", dependencies=READ)
 def job_page(request: Request, job_id: str, jobs: JobsOf, grasps: GraspsOf, tags: TagsOf) -> HTMLResponse:
     job = jobs.one(job_id)
-    pictures, loss = _pictures(job), jobs.loss_curve(job)
+    pictures = _pictures(job)
     shown = {key: (label, unit) for key, label, unit in COLUMNS}
     validated = job.request.validation != "none"
     query = GraspQuery(job=job_id, valid=True if validated else None)
@@ -47,7 +47,6 @@ def job_page(request: Request, job_id: str, jobs: JobsOf, grasps: GraspsOf, tags
         histograms=[
             (*shown[data.metric], data, figures.bars(data, "/grasps", where)) for data in grasps.statistics(job)[0]
         ],
-        loss=figures.line(loss.iterations, loss.losses, x="iteration", y="Loss", log=True) if loss else None,
         pictures=pictures[:_SHOWN_PICTURES],
         picture_count=len(pictures),
         rows=rows,

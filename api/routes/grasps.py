@@ -55,13 +55,13 @@ async def exported(
 ) -> StreamingResponse:
     """Return the file of a selection as a response."""
     said = selection.model_dump(mode="json", exclude_none=True)
-    made = await request.app.state.exports.run(lambda: exports.made(tags.chosen(selection), format, said))
+    size, chunks = await request.app.state.exports.run(lambda: exports.made(tags.chosen(selection), format, said))
     headers = {
-        "Content-Length": str(made.size),
-        "Content-Disposition": f'attachment; filename="{made.filename}"',
+        "Content-Length": str(size),
+        "Content-Disposition": f'attachment; filename="grasps.{format}"',
         "Cache-Control": "private, no-store",
     }
-    return StreamingResponse(made.chunks, media_type=made.media_type, headers=headers)
+    return StreamingResponse(chunks, media_type=MEDIA_TYPES[format], headers=headers)
 
 
 @router.get("", dependencies=READ, responses=responses(404))

@@ -10,32 +10,26 @@ from functools import cache
 from typing import Any
 
 import pytest
+from fastapi import FastAPI
 from pydantic import TypeAdapter
 from starlette.testclient import TestClient
 
-from graspd.api.app import create_app
 from graspd.api.metrics import Metrics, Snapshot
 from graspd.api.server import bind
 from graspd.service.model.series import SERIES
-from graspd.service.pipeline.backends import Services
 from graspd.service.queue.port import QueueStatus
-from graspd.service.settings import Settings
+from tests.api.conftest import BASE_URL
 from tests.conftest import REPOSITORY
 from tests.fakes import beat_of
 
 
-@pytest.mark.parametrize("path", ["/v1/jobs", "/v1/datasets", "/", "/healthz"])
-def test_the_first_request_builds_no_route(
-    settings: Settings, services: Services, path: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    app = create_app(settings, services)
-
+def test_the_first_requests_build_no_route(app: FastAPI, monkeypatch: pytest.MonkeyPatch) -> None:
     def built_late(self: TypeAdapter[Any], *arguments: Any, **named: Any) -> None:
         raise AssertionError("a field of a route is built while a request waits")
 
     monkeypatch.setattr(TypeAdapter, "__init__", built_late)
-    with TestClient(app, base_url="http://127.0.0.1:8000") as client:
-        assert client.get(path).is_success
+    with TestClient(app, base_url=BASE_URL) as client:
+        assert all(client.get(path).is_success for path in ("/v1/jobs", "/v1/datasets", "/", "/healthz"))
 
 
 def test_answers_are_sent_without_delay() -> None:

@@ -10,8 +10,6 @@ from typing import Any
 
 from PIL import Image
 
-from graspd.service.run.supervisor import Supervisor
-from graspd.service.settings import Settings
 from graspd.service.store.shards import read_shard
 from tests.shell import completed
 
@@ -52,13 +50,6 @@ def test_a_demo_leaves_its_files_and_nothing_that_runs(tmp_path: Path) -> None:
         with Image.open(path) as picture:
             assert min(picture.size) > 200
     assert processes_of(tmp_path) == []
-
-
-def test_a_demo_on_a_folder_in_use_is_refused(tmp_path: Path) -> None:
-    with Supervisor(Settings(data_dir=tmp_path / "service", port=0), workers=0, api=False):
-        done = demo("--out", str(tmp_path), *SMALL)
-    assert done.returncode == 1
-    assert "owns" in done.stderr or "in use" in done.stderr or "another graspd" in done.stderr
 
 
 def test_a_wrong_number_is_refused_before_anything_starts(tmp_path: Path) -> None:

@@ -48,7 +48,6 @@ def test_a_user_goes_from_a_submission_to_a_retry(real_page: Any, tmp_path: Path
     job = page.url
     page.wait_for_selector("#head .succeeded", timeout=WORK_MS)
     page.wait_for_selector("#best canvas[data-state=ready]")
-    page.wait_for_selector("#loss .uplot")
 
     page.click("text=All grasps of this job")
     page.fill("[name=max_penetration_depth_mm]", "1")

@@ -1,4 +1,4 @@
-// Line and bar charts by uPlot over the SVG that the page brings: the same numbers, with a reading under the pointer.
+// Bar charts by uPlot over the SVG that the page brings: the same numbers, with a reading under the pointer.
 (() => {
   "use strict";
   const made = new Map();
@@ -16,28 +16,25 @@
 
   const clock = (seconds) => new Date(1000 * seconds).toLocaleTimeString([], { hour: "2-digit", minute: "2-digit", hourCycle: "h23" });
 
-  // Of a logarithmic axis only 1, 2, 5 times a power of ten carry a number and a line.
-  const round = (_, splits) => splits.map((v) => ([1, 2, 5].includes(Number((v / 10 ** Math.floor(Math.log10(v) + 1e-9)).toPrecision(3))) ? v : null));
-
   function options(figure, data, width) {
-    const { kind, x, y, unit, log } = data;
-    const ink = resolved("ink"), line = resolved("line"), accent = resolved("accent"), soft = resolved(kind === "bars" ? "accent" : "soft");
+    const { x, y, unit } = data;
+    const ink = resolved("ink"), line = resolved("line"), accent = resolved("accent");
     const font = `12px ${colour("--sans")}`;
     const axis = { stroke: ink, font, grid: { stroke: line, width: 1 }, ticks: { show: false } };
     return {
       width, height: Number(figure.dataset.height ?? 180), padding: [8, 18, 0, 0],
-      cursor: { points: { size: 7 }, drag: { x: kind === "line", y: false } },
+      cursor: { points: { size: 7 }, drag: { x: false, y: false } },
       legend: { live: true },
-      scales: { x: { time: kind === "bars" }, y: log ? { distr: 3 } : { range: (_, low, high) => [0, Math.max(high, 1) * 1.08] } },
+      scales: { x: { time: true }, y: { range: (_, low, high) => [0, Math.max(high, 1) * 1.08] } },
       axes: [
-        { ...axis, size: 30, gap: 8, space: 90, grid: { show: false }, values: kind === "bars" ? (_, ticks) => ticks.map((t) => clock(t)) : undefined },
-        { ...axis, ...(log ? { filter: round, grid: { ...axis.grid, filter: round } } : {}), size: 44, gap: 8, space: 36 },
+        { ...axis, size: 30, gap: 8, space: 90, grid: { show: false }, values: (_, ticks) => ticks.map((t) => clock(t)) },
+        { ...axis, size: 44, gap: 8, space: 36 },
       ],
       series: [
-        { label: x, value: (_, v) => (v === null || v === undefined ? "–" : kind === "bars" ? clock(v) : String(v)) },
+        { label: x, value: (_, v) => (v === null || v === undefined ? "–" : clock(v)) },
         {
-          label: y, stroke: accent, fill: soft, width: kind === "bars" ? 0 : 2, points: { show: false },
-          paths: kind === "bars" ? uPlot.paths.bars({ size: [0.82, 40], radius: 0.15 }) : undefined,
+          label: y, stroke: accent, fill: accent, width: 0, points: { show: false },
+          paths: uPlot.paths.bars({ size: [0.82, 40], radius: 0.15 }),
           value: (_, v) => (v === null || v === undefined ? "–" : `${Number(v.toPrecision(4))} ${unit}`.trim()),
         },
       ],

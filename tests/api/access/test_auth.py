@@ -141,10 +141,10 @@ def test_a_damaged_key_file_opens_nothing(closed: Closed, keys: KeyFile) -> None
     assert (answer.status_code, answer.json()["type"]) == (503, "/problems/unavailable")
 
 
-@pytest.mark.parametrize("name", ["X-Forwarded-For", "Forwarded", "Via"])
-def test_an_open_service_answers_its_own_machine_only(app: FastAPI, http: TestClient, name: str) -> None:
-    answer = http.get("/v1/jobs", headers={name: "203.0.113.9"})
-    assert answer.status_code == 403 and "graspd keys add" in answer.json()["detail"]
+def test_an_open_service_answers_its_own_machine_only(app: FastAPI, http: TestClient) -> None:
+    for name in ("X-Forwarded-For", "Forwarded", "Via"):
+        answer = http.get("/v1/jobs", headers={name: "203.0.113.9"})
+        assert answer.status_code == 403 and "graspd keys add" in answer.json()["detail"]
     assert TestClient(app, base_url=BASE_URL, client=("203.0.113.9", 50000)).get("/v1/jobs").status_code == 403
 
 
@@ -165,30 +165,27 @@ def test_a_length_of_time_is_read_or_said_to_be_none(text: str) -> None:
         duration(text)
 
 
-@pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.0.2.7", "graspd.example"])
-def test_an_address_strangers_reach_needs_a_key(
-    settings: Settings, services: Services, keys: KeyFile, host: str
-) -> None:
-    exposed = settings.model_copy(update={"host": host})
-    with pytest.raises(InputError, match="graspd keys add"):
-        create_app(exposed, services)
+def test_an_address_strangers_reach_needs_a_key(settings: Settings, services: Services, keys: KeyFile) -> None:
+    for host in ("0.0.0.0", "::", "192.0.2.7", "graspd.example"):
+        exposed = settings.model_copy(update={"host": host})
+        with pytest.raises(InputError, match="graspd keys add"):
+            create_app(exposed, services)
     keys.add("me", Scope.ADMIN)
     assert create_app(exposed, services)
 
 
-@pytest.mark.parametrize(
-    "sent", ["Sec-Fetch-Site: cross-site", "Sec-Fetch-Site: same-site", "Origin: null", "Origin: http://x"]
-)
-def test_a_form_on_a_foreign_page_is_refused(http: TestClient, sent: str) -> None:
-    headers = dict([sent.split(": ")])
-    assert http.post("/submit", data=JOB, headers=headers).status_code == 403
-    assert http.post("/logout", headers=headers).status_code == 403
+def test_a_form_on_a_foreign_page_is_refused(http: TestClient) -> None:
+    for headers in (
+        *({"Sec-Fetch-Site": site} for site in ("cross-site", "same-site")),
+        *({"Origin": origin} for origin in ("null", "http://x", "http://[")),
+    ):
+        assert http.post("/submit", data=JOB, headers=headers).status_code == 403
+        assert http.post("/logout", headers=headers).status_code == 403
 
 
-@pytest.mark.parametrize("host", ["127.0.0.1:9", "localhost", "[::1]:8000"])
-def test_an_open_service_has_the_names_of_this_machine_alone(http: TestClient, host: str) -> None:
-    assert http.get("/healthz", headers={"Host": host}).status_code == 200
-    assert http.get("/v1/jobs", headers={"Host": "evil.example"}).status_code == 421
+def test_an_open_service_has_the_names_of_this_machine_alone(http: TestClient) -> None:
+    for host, status in (("127.0.0.1:9", 200), ("localhost", 200), ("[::1]:8000", 200), ("evil.example", 421)):
+        assert http.get("/healthz", headers={"Host": host}).status_code == status
 
 
 def test_without_keys_only_this_machine_is_served(tmp_path: Path) -> None:

@@ -259,30 +259,18 @@ def test_one_request_of_two_projects_is_two_jobs_of_one_shard(world: World) -> N
     assert world.ask("bob", "GET", f"/v1/shards/{world.said['shard_id']}").status_code == 404
 
 
-def test_the_same_file_of_two_projects_is_two_objects(world: World) -> None:
-    file = {"file": ("ball.stl", _BALL)}
-    own = world.ask("bob", "POST", "/v1/objects", data={"name": "red-secret-ball"}, files=file).json()
-    assert own["digest"] != world.said["objects_digest"] and own["project"] == "blue"
-    found = world.ask("bob", "GET", "/v1/objects/red-secret-ball").json()
-    assert found["digest"] == own["digest"]
-    assert world.ask("bob", "DELETE", "/v1/objects/red-secret-ball").status_code == 204
-    assert world.ask("ann", "GET", "/v1/objects/red-secret-ball").status_code == 200
-
-
-def test_the_same_network_of_two_projects_is_two_networks(world: World) -> None:
+def test_the_same_file_of_two_projects_is_two_assets(world: World) -> None:
     digest = world.ask("bob", "GET", "/v1/hands/allegro").json()["digest"]
-    file = {"file": ("net.npz", to_bytes(random_network(hand="allegro", digest=digest)))}
-    job = {"hand": "allegro", "object": "mug", "scene": "table", "method": "learned"}
-    job |= {"options": {"network": "red-secret-net"}}
-    assert world.ask("bob", "POST", "/v1/jobs", json=job).status_code == 404
-    own = world.ask("bob", "POST", "/v1/networks", data={"name": "red-secret-net"}, files=file).json()
-    assert own["digest"] != world.said["networks_digest"] and own["project"] == "blue"
-    made = world.ask("bob", "POST", "/v1/jobs", json=job).json()
-    assert made["request"]["options"]["network"] == own["digest"]
-    world.ask("bob", "POST", f"/v1/jobs/{made['id']}/cancel")
-    assert world.ask("bob", "DELETE", f"/v1/jobs/{made['id']}").status_code == 204
-    assert world.ask("bob", "DELETE", "/v1/networks/red-secret-net").status_code == 204
-    assert world.ask("ann", "GET", "/v1/networks/red-secret-net").status_code == 200
+    network = ("net.npz", to_bytes(random_network(hand="allegro", digest=digest)))
+    for kind, name, file in (
+        ("objects", "red-secret-ball", ("ball.stl", _BALL)),
+        ("networks", "red-secret-net", network),
+    ):
+        own = world.ask("bob", "POST", f"/v1/{kind}", data={"name": name}, files={"file": file}).json()
+        assert own["digest"] != world.said[f"{kind}_digest"] and own["project"] == "blue"
+        assert world.ask("bob", "GET", f"/v1/{kind}/{name}").json()["digest"] == own["digest"]
+        assert world.ask("bob", "DELETE", f"/v1/{kind}/{name}").status_code == 204
+        assert world.ask("ann", "GET", f"/v1/{kind}/{name}").status_code == 200
 
 
 def test_what_is_shared_is_used_by_all_and_deleted_by_its_own(world: World) -> None:

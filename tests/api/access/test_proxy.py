@@ -70,9 +70,8 @@ def test_people_of_a_project_find_their_jobs_and_no_others(behind: Settings, ser
     assert http.post("/v1/jobs", json=JOB, headers=headers("ray@lab.example", "")).status_code == 403
 
 
-@pytest.mark.parametrize(
-    ("address", "sent"),
-    [
+def test_forged_headers_open_nothing(behind: Settings, services: Services) -> None:
+    for address, sent in (
         (STRANGER, headers()),
         (("127.0.0.1", 4000), headers()),
         (("testclient", 1), headers()),
@@ -83,25 +82,21 @@ def test_people_of_a_project_find_their_jobs_and_no_others(behind: Settings, ser
         (PROXY, headers(user="")),
         (PROXY, headers(user="a\nb")),
         (STRANGER, headers() | {"X-Forwarded-For": "10.1.2.3", "Forwarded": "for=10.1.2.3"}),
-    ],
-)
-def test_forged_headers_open_nothing(
-    behind: Settings, services: Services, address: tuple[str, int], sent: dict[str, str]
-) -> None:
-    http = client(behind, services, address)
-    assert http.get("/v1/jobs", headers=sent).status_code == 401
-    assert http.get("/v1/jobs").status_code == 401
+    ):
+        http = client(behind, services, address)
+        assert http.get("/v1/jobs", headers=sent).status_code == 401, (address, sent)
+        assert http.get("/v1/jobs").status_code == 401
 
 
-@pytest.mark.parametrize("claim", ['["x", 9999999999]', "[]", "3", "{", '{"a": 1}', '["x", "y"]', "null"])
-def test_a_session_signed_with_the_empty_secret_opens_nothing(behind: Settings, services: Services, claim: str) -> None:
+def test_a_session_signed_with_the_empty_secret_opens_nothing(behind: Settings, services: Services) -> None:
     assert not behind.resolved_keys_file.exists()
-    packed = base64.urlsafe_b64encode(claim.encode()).decode()
-    forged = {"Cookie": f"{SESSION_COOKIE}={packed}.{hmac.new(b'', packed.encode(), 'sha256').hexdigest()}"}
     http = client(behind, services, PROXY)
-    for path in ("/", "/v1/jobs", "/login"):
-        answers = [http.get(path, headers=sent, follow_redirects=False) for sent in (forged, {})]
-        assert answers[0].status_code == answers[1].status_code < 500
+    for claim in ('["x", 9999999999]', "[]", "3", "{", '{"a": 1}', '["x", "y"]', "null"):
+        packed = base64.urlsafe_b64encode(claim.encode()).decode()
+        forged = {"Cookie": f"{SESSION_COOKIE}={packed}.{hmac.new(b'', packed.encode(), 'sha256').hexdigest()}"}
+        for path in ("/", "/v1/jobs", "/login"):
+            answers = [http.get(path, headers=sent, follow_redirects=False) for sent in (forged, {})]
+            assert answers[0].status_code == answers[1].status_code < 500
 
 
 def test_a_key_file_without_a_secret_opens_no_session(settings: Settings) -> None:

@@ -16,7 +16,7 @@ from starlette.testclient import TestClient
 from graspd.api.access.keys import Key, KeyFile, KeyLimits, Scope
 from graspd.api.access.quotas import Quotas
 from graspd.service.index.rebuild import differences
-from graspd.service.model.errors import ConflictError, QuotaError
+from graspd.service.model.errors import QuotaError
 from graspd.service.model.records import JobRecord, ObjectSet, object_set_of
 from graspd.service.model.webhooks import MOST_HOOKS
 from graspd.service.pipeline.backends import Services
@@ -260,16 +260,3 @@ def test_a_tag_given_twice_at_once_has_the_grasps_of_both(twins: list[TestClient
     assert codes(at_once(twins, give)) == [200, 200]
     assert [tag["grasps"] for tag in twins[0].get("/v1/tags").json()] == [2]
     assert strayed(services) == []
-
-
-def test_of_two_keys_of_one_name_at_once_one_is_made(settings: Settings) -> None:
-    start = Barrier(2)
-
-    def add(_: int) -> bool:
-        start.wait(60)
-        with suppress(ConflictError):
-            return bool(KeyFile(settings.resolved_keys_file).add("same", Scope.READ))
-        return False
-
-    with ThreadPoolExecutor(2) as pool:
-        assert sorted(pool.map(add, range(2))) == [False, True]

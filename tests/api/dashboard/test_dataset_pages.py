@@ -124,23 +124,8 @@ def test_unjudged_grasps_are_counted_and_not_called_valid(
     assert f">{word.capitalize()}</th>" in list_page and ">32</td>" in list_page
     assert f"<dt>{word.capitalize()}</dt><dd>32" in http.get("/datasets").text
     assert http.get("/v1/datasets/k").json()["valid_yield"] is None
-    assert "not validated" in http.get("/compare?one=k&other=k").text
     home = http.get("/").text
     assert f"32 of 32 {word}" in home and f'32<span class="sub">{word}' in home
-
-
-@pytest.mark.parametrize(("scene", "place"), [("free", ""), ("bin", " in a bin")])
-def test_the_share_of_a_cell_says_in_which_scene_it_is_valid(
-    http: TestClient, services: Services, scene: str, place: str
-) -> None:
-    create(services, scene=scene)
-    plan_all(services)
-    finish_all(services, add_job(services, scene=scene))
-    valid = services.index.datasets.get("k").valid
-    page = " ".join(http.get("/datasets/k").text.split())
-    assert f"32 grasps each{place} ·" in page
-    assert f">{valid} valid{place}<" in page
-    assert ("Valid grasps in scenes" in page) == bool(place)
 
 
 def test_a_dataset_and_a_job_have_the_same_options(http: TestClient, services: Services) -> None:

@@ -65,18 +65,6 @@ def test_models_are_served_as_gltf_and_kept_under_their_digest(http: TestClient,
     assert by_name.headers["cache-control"] == "no-cache"
 
 
-def test_grasps_of_a_scene_job_say_where_they_are_for(http: TestClient, services: Services) -> None:
-    free, table = add_job(services), add_job(services, scene="table", scenes=1)
-    for record in (free, table):
-        finish_all(services, record)
-    page = http.get("/grasps", params={"scene": "any", "valid": "true"}).text
-    assert '<span class="note">table</span>' in page and 'aria-current="true">valid in a scene' in page
-    assert '<span class="note">table</span>' not in http.get("/grasps", params={"scene": "free"}).text
-    assert "valid grasps on a table" in " ".join(http.get(f"/jobs/{table.id}").text.split())
-    assert "Valid in scenes" in http.get(f"/jobs/{table.id}").text
-    assert "Valid in scenes" not in http.get(f"/jobs/{free.id}").text
-
-
 def test_robust_grasps_are_found_by_share_and_first_failure(http: TestClient, services: Services) -> None:
     job = add_job(services, robust_models=8)
     manifest = finish_all(services, job)[0]

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-import pytest
 from starlette.testclient import TestClient
 
 from graspd.service.pipeline.backends import Services
 from tests.api.factories import add_job, finish_all
 
 JOB = {"hand": "allegro", "object": "mug", "grasps": 32}
-PLANE = {"kind": "half_space"}
-UPRIGHT = [0, 0, 0, 1, 0, 0, 0]
 
 
 def test_a_job_in_a_scene_tells_its_stages_and_its_scene(http: TestClient) -> None:
@@ -27,24 +22,6 @@ def test_a_job_in_a_scene_tells_its_stages_and_its_scene(http: TestClient) -> No
     named = http.post("/v1/jobs", json={**JOB, "scene": "free", "faces": "drawn"}).json()
     assert http.post("/v1/jobs", json=JOB).json()["id"] == named["id"]
     assert not {"scene", "faces"} & set(named["request"])
-
-
-@pytest.mark.parametrize(
-    ("wrong", "where", "words"),
-    [
-        ({"scene": "tabel"}, "scene", "did you mean table?"),  # codespell:ignore tabel
-        ({"scene": {"supports": [PLANE, {"kind": "box", "size": [0, 1, 1]}]}}, "scene", "must be more than 0.0001"),
-        ({"scene": "bin", "method": "graspit"}, "body", "plans around free objects only"),
-        ({"scene": "bin", "neighbours": ["../block"]}, "neighbours", "must begin with a letter"),
-        ({"scene": {"supports": [PLANE], "target": UPRIGHT, "neighbours": [{"object": "a"}]}}, "body", "give all"),
-    ],
-)
-def test_a_scene_that_is_none_is_a_problem(http: TestClient, wrong: dict[str, Any], where: str, words: str) -> None:
-    answer = http.post("/v1/jobs", json=JOB | wrong)
-    assert (answer.status_code, answer.headers["content-type"]) == (422, "application/problem+json")
-    detail = answer.json()["detail"]
-    assert detail.startswith(where) and words in detail and "\n" not in detail
-    assert http.get("/v1/jobs").json()["items"] == []
 
 
 def test_neighbours_are_named_and_come_back_with_their_digests(http: TestClient) -> None:
