@@ -1,4 +1,4 @@
-"""Datasets, and named sets of objects.
+"""Datasets, named sets of objects, and comparison of two datasets.
 
 Until it ends, a dataset counts against its key's quota as one job with all its grasps. Only its owner may change it.
 """
@@ -7,10 +7,14 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
-from typing import Final
+from dataclasses import dataclass
+from typing import Any, Final
 
 from graspd.api.access.auth import caller, caller_id, must_own, project_scope
 from graspd.api.access.quotas import DATASET_PREFIX, Quotas
+from graspd.api.catalog.grasps import MEAN_METRICS
+from graspd.service.index.queries.grasps import GraspFilter, Metric
+from graspd.service.index.queries.statistics import Distribution
 from graspd.service.index.views import CellView, DatasetView, MatrixCell, ObjectSetView, Page, SnapshotView
 from graspd.service.model.records import Snapshot
 from graspd.service.model.states import State
@@ -114,10 +118,77 @@ class Datasets:
     def object_set(self, name: str) -> ObjectSetView:
         return self._services.index.object_sets.get(name, scope=project_scope())
 
+    def compare(self, one: str, other: str) -> Comparison:
+        both = self.one(one), self.one(other)
+        filters = [
+            GraspFilter(dataset=each.name, valid=True if each.options.standing == "valid" else None) for each in both
+        ]
+        metrics = self._services.index.statistics.side_by_side(filters, MEAN_METRICS)
+        few = max(each.cells for each in both) <= MOST_CELLS
+        return Comparison(*both, list(_settings(*both)), self._pairs(one, other) if few else [], metrics)
+
+    def _pairs(self, one: str, other: str) -> list[Pair]:
+        cells = [{(cell.hand, cell.object): cell for cell in self.all_cells(name)} for name in (one, other)]
+        names = sorted({*cells[0], *cells[1]})
+        return [Pair(*name, cells[0].get(name), cells[1].get(name)) for name in names]
+
     def _owned(self, name: str) -> DatasetView:
         dataset = self.one(name)
         must_own(dataset.owner, f"dataset {name!r}", dataset.project)
         return dataset
 
 
+#: Most cells that are compared one by one; a longer table would be unreadable.
+MOST_CELLS: Final = 1000
 _AT_ONCE: Final = 200
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Hand and object with their cell in each dataset; None: the dataset has no such cell."""
+
+    hand: str
+    object: str
+    one: CellView | None
+    other: CellView | None
+
+    @property
+    def gain(self) -> float | None:
+        """Yield of the other dataset minus yield of this one, if both have candidates."""
+        if self.one is None or self.other is None or None in (self.one.valid_yield, self.other.valid_yield):
+            return None
+        return (self.other.valid_yield or 0.0) - (self.one.valid_yield or 0.0)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Content of the comparison page."""
+
+    one: DatasetView
+    other: DatasetView
+    settings: list[tuple[str, str, str]]
+    """Options that differ, with both values."""
+    pairs: list[Pair]
+    """Ordered by hand; empty if a dataset has more than `MOST_CELLS` cells."""
+    metrics: dict[Metric, list[Distribution | None]]
+    """Distributions over each dataset's counted grasps, in the same bins."""
+
+
+def _settings(one: DatasetView, other: DatasetView) -> Iterator[tuple[str, str, str]]:
+    """Yield options that differ; then hands and objects that only one dataset has."""
+    said = [each.options.model_dump(mode="json") for each in (one, other)]
+    for name in said[0]:
+        if said[0][name] != said[1][name]:
+            yield name.replace("_", " "), _text(said[0][name]), _text(said[1][name])
+    for name in ("hands", "objects"):
+        first, second = (set(getattr(each, name)) for each in (one, other))
+        if first != second:
+            yield f"{name} of its own", _text(sorted(first - second)), _text(sorted(second - first))
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, list | tuple):
+        return ", ".join(map(str, value)) or "–"
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {_text(one)}" for name, one in value.items()) or "–"
+    return "–" if value in (None, "") else str(value)

@@ -1,4 +1,4 @@
-"""Pages of datasets: hand x object matrix of all jobs and of each dataset, and actions."""
+"""Pages of datasets: hand x object matrix of all jobs and of each dataset, actions, and comparison."""
 
 from __future__ import annotations
 
@@ -16,8 +16,10 @@ from graspd.api.catalog.assets import Assets
 from graspd.api.catalog.datasets import Datasets
 from graspd.api.catalog.jobs import Jobs
 from graspd.api.dashboard import figures
+from graspd.api.dashboard.figures import twins
 from graspd.api.dashboard.form_uploads import asset_choices
 from graspd.api.dashboard.forms import fields_of, first_message, inputs_of, listed
+from graspd.api.dashboard.grasp_pages import COLUMNS
 from graspd.api.dashboard.rendering import render
 from graspd.api.routes.dependencies import READ, SUBMIT, AssetsOf, DatasetsOf, JobsOf
 from graspd.service.model.domain import JobRequest
@@ -203,4 +205,26 @@ def _overview(
         form=_MAKE | {"hands": [], "objects": []} | (form or {}),
         problem=problem,
         did=_did(request),
+    )
+
+
+_OFFERED: Final = 200
+
+comparison_router = APIRouter(include_in_schema=False)
+
+Named = Annotated[str, Query(max_length=64)]
+
+
+@comparison_router.get("/compare", dependencies=READ)
+def compare_page(request: Request, datasets: DatasetsOf, one: Named = "", other: Named = "") -> HTMLResponse:
+    found = datasets.compare(one, other) if one and other else None
+    shown = {key: (label, unit) for key, label, unit in COLUMNS}
+    return render(
+        request,
+        "compare.html",
+        page="/datasets",
+        names=[dataset.name for dataset in datasets.page(limit=_OFFERED).items],
+        chosen=(one, other),
+        found=found,
+        metrics=[(*shown[metric], both, twins(both)) for metric, both in found.metrics.items()] if found else [],
     )

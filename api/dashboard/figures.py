@@ -9,6 +9,7 @@ from typing import Final
 from urllib.parse import urlencode
 
 from graspd.api.models import Histogram
+from graspd.service.index.queries.statistics import Distribution
 from graspd.service.index.views import CellView, DatasetView, MatrixCell
 from graspd.service.model import studies
 from graspd.service.model.errors import DamagedError
@@ -68,6 +69,35 @@ def bars(histogram: Histogram, path: str, where: dict[str, str]) -> list[Bar]:
         query = where | {f"min_{histogram.metric}": f"{low:.6g}", f"max_{histogram.metric}": f"{high:.6g}"}
         made.append(Bar(10.0 * index + 1, 63 - tall, 8.0, tall, number, low, high, f"{path}?{urlencode(query)}"))
     return made
+
+
+@dataclass(frozen=True)
+class TwinBar:
+    """Shares of two sets of grasps in one bin."""
+
+    x: float
+    one: float
+    other: float
+    """Heights of both bars."""
+    low: float
+    high: float
+    shares: tuple[float, float]
+
+
+def twins(both: Sequence[Distribution | None]) -> list[TwinBar]:
+    """Return the bins of two distributions over the same range, each as shares of its own grasps."""
+    first = next(each for each in both if each is not None)
+    bins = len(first.counts)
+    shares = [[n / each.count for n in each.counts] if each is not None else [0.0] * bins for each in both]
+    most, width = max(map(max, shares)) or 1.0, (first.high - first.low) / bins
+    return [
+        TwinBar(10.0 * at, 60 * a / most, 60 * b / most, first.low + at * width, first.low + (at + 1) * width, (a, b))
+        for at, (a, b) in enumerate(zip(*shares, strict=True))
+    ]
+
+
+def _share(value: float, low: float, high: float) -> float:
+    return (value - low) / (high - low) if high > low else 0.5
 
 
 #: Steps of the colour scale; the style sheet has a class for each.

@@ -248,7 +248,15 @@ def _deleted(id: str) -> RedirectResponse:
 
 
 #: Routers of all pages, in matching order.
-routers: Final = (router, job_pages.router, grasp_pages.router, hand_pages.router, dataset_pages.router, forms.router)
+routers: Final = (
+    router,
+    job_pages.router,
+    grasp_pages.router,
+    hand_pages.router,
+    dataset_pages.router,
+    dataset_pages.comparison_router,
+    forms.router,
+)
 
 
 def install(app: FastAPI, services: Services) -> None:

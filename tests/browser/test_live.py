@@ -49,7 +49,7 @@ def places(services: Services) -> list[str]:
     gone = add_job(services, seed=11)
     fail(services, gone, "a reason")
     deletion.delete_job(services, gone.id)
-    datasets = "/ /datasets /datasets/kitchen /datasets/kitchen?state=queued"
+    datasets = "/ /datasets /datasets/kitchen /datasets/kitchen?state=queued /compare?one=kitchen&other=kitchen"
     grasps = "/grasps /grasps?view=table /grasps?min_epsilon=99 /grasps?tag=good+ones /hands /hands/shadow"
     others = "/docs /workers /chart /stability /submit /problems /login /deleted /usage"
     of_these = [f"/jobs/{record.id}", f"/jobs/{waiting.id}", f"/grasps/{shard}/0"]

@@ -124,6 +124,7 @@ def test_unjudged_grasps_are_counted_and_not_called_valid(
     assert f">{word.capitalize()}</th>" in list_page and ">32</td>" in list_page
     assert f"<dt>{word.capitalize()}</dt><dd>32" in http.get("/datasets").text
     assert http.get("/v1/datasets/k").json()["valid_yield"] is None
+    assert "not validated" in http.get("/compare?one=k&other=k").text
     home = http.get("/").text
     assert f"32 of 32 {word}" in home and f'32<span class="sub">{word}' in home
 
