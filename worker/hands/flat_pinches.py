@@ -13,14 +13,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.service.model import transforms
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, quat_rotate
-from graspd.worker.hands import closing, kinematics, primitives, surface
-from graspd.worker.hands import pinch_postures as oppositions
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel, SurfacePoints
-from graspd.worker.hands.pinch_postures import Oppositions, cached_postures, climbed, opposed_finger, random_postures
+from graspd.worker.hands.pinch_postures import Oppositions, climbed, opposed_finger, random_postures
 from graspd.worker.hands.surface import farthest_points, sample_surface
+from graspd.worker.objects.memory_cache import cached_by_content
 
 #: Object heights with their own postures [m]; higher objects reach the pads.
 HEIGHTS_M: Final = (0.005, 0.008, 0.012, 0.018)
@@ -47,16 +45,18 @@ SQUARE: Final = 0.7
 
 
 def pinches_of(hand: HandModel, height: float) -> Oppositions:
-    """Return postures for an object of this height [m], cached in memory and on this machine.
-    The result is empty if the object reaches the pads or the hand has one finger.
+    """Return postures for an object of this height [m]; none if it reaches the pads or the hand has one finger.
 
     The palm's approach without its part along `axis` points at the plane. `middle` is half the height above it.
     """
     known = [h for h in HEIGHTS_M if h >= height]
-    if not known or len(hand.fingertips) < 2:
-        return Oppositions.of_none(hand)
-    code = (sys.modules[__name__], closing, kinematics, oppositions, primitives, surface, transforms)
-    return cached_postures("pinches", (hand.content, str(known[0])), code, lambda: _pinches(hand, known[0]))
+    return _kept(hand, known[0]) if known and len(hand.fingertips) > 1 else Oppositions.of_none(hand)
+
+
+@cached_by_content(32)
+def _kept(hand: HandModel, height: float) -> Oppositions:
+    key, code = (hand.content, str(height)), sys.modules[__name__]
+    return Oppositions.kept_or_made("pinches", key, lambda: _pinches(hand, height), code)
 
 
 def _pinches(hand: HandModel, height: float) -> Oppositions:
@@ -74,8 +74,7 @@ def _pinches(hand: HandModel, height: float) -> Oppositions:
         & (seen.over > OVER_M)
         & (seen.width > WIDTHS_M[0])
     )
-    good = good[np.argsort(seen.width[good], kind="stable")] if len(good) >= FEW else good[:0]
-    return Oppositions(q[good], seen.axis[good], seen.middle[good], seen.width[good])
+    return Oppositions.of(q, seen, good if len(good) >= FEW else good[:0])
 
 
 @dataclass(frozen=True)

@@ -14,14 +14,12 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.service.model import transforms
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, quat_rotate
-from graspd.worker.hands import kinematics, primitives, surface
-from graspd.worker.hands import pinch_postures as oppositions
 from graspd.worker.hands.kinematics import body_poses, generalized_forces
 from graspd.worker.hands.model import HandModel, SurfacePoints
-from graspd.worker.hands.pinch_postures import Oppositions, cached_postures, oppositions_of
+from graspd.worker.hands.pinch_postures import Oppositions, oppositions_of
 from graspd.worker.hands.surface import sample_surface
+from graspd.worker.objects.memory_cache import cached_by_content
 
 Ints = NDArray[np.intp]
 Size = Literal["small", "wide"]
@@ -58,10 +56,10 @@ AT_ONCE: Final = 16
 _NEXT_TO: Final = 1e-9
 
 
+@cached_by_content(32)
 def spans_of(hand: HandModel, size: Size) -> Oppositions:
     """Return postures for small or wide objects, cached in memory and on this machine."""
-    code = (sys.modules[__name__], oppositions, kinematics, primitives, surface, transforms)
-    return cached_postures("spans", (hand.content, size), code, lambda: _spans(hand, size))
+    return Oppositions.kept_or_made("spans", (hand.content, size), lambda: _spans(hand, size), sys.modules[__name__])
 
 
 def widest_span(hand: HandModel) -> float:
@@ -85,9 +83,7 @@ def _spans(hand: HandModel, size: Size) -> Oppositions:
         better = new.cost < found.cost
         q[better] = tried[better]
         found.take(better, new)
-    good = np.flatnonzero(found.cost < GOOD_M)
-    good = good[np.argsort(found.width[good], kind="stable")]
-    return Oppositions(q[good], found.axis[good], found.middle[good], found.width[good])
+    return Oppositions.of(q, found, np.flatnonzero(found.cost < GOOD_M))
 
 
 @dataclass

@@ -6,13 +6,11 @@ pads, together. Everything follows from geometry, so a joint at 0 may be open or
 
 from __future__ import annotations
 
-import threading
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final
 
 import numpy as np
-from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, quat_conjugate, quat_rotate, spread_directions
@@ -20,6 +18,7 @@ from graspd.worker.hands.closing import posture
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel, JointType, SurfacePoints
 from graspd.worker.hands.surface import sample_surface
+from graspd.worker.objects.memory_cache import cached_by_content
 
 Ints = NDArray[np.intp]
 
@@ -116,22 +115,17 @@ def closing_by_geometry(hand: HandModel) -> Floats:
     return np.where(np.abs(balance) > 0.2 * np.maximum(total, 1e-12), -np.sign(balance), 0.0)
 
 
+@cached_by_content(32)
 def jaws_of(hand: HandModel) -> Jaws | None:
-    """Return the jaws of a complete hand, cached; None if it is no gripper."""
-    with _lock:
-        if hand.content not in _found:
-            _found[hand.content] = find_jaws(hand, hand.palm.approach)
-        return _found[hand.content]
-
-
-_found: LRUCache[str, Jaws | None] = LRUCache(32)
-_lock = threading.Lock()
+    """Return the jaws of a complete hand; None if it is no gripper."""
+    return find_jaws(hand, hand.palm.approach)
 
 
 def find_jaws(hand: HandModel, approach: Floats | None = None) -> Jaws | None:
-    """Find the jaws of a hand with known `closing`; None if it is no gripper.
-    A hand is no gripper if it has more than `MAX_DOFS` dofs, if no dof closes it, if no surfaces oppose, or
-    if more than two digits close from more than two sides."""
+    """Find the jaws of a hand with known `closing`; None if it has none.
+
+    A gripper has at most `MAX_DOFS` dofs, one of which closes it, and opposing surfaces on two sides.
+    """
     closing = np.flatnonzero(hand.closing)
     if not 1 <= len(closing) <= MAX_DOFS or hand.dofs > MAX_DOFS:
         return None
@@ -358,7 +352,8 @@ def fingertip_pad(hand: HandModel, tip: int) -> Pad:
     chosen = next((part for body in driven if (part := _moved_ahead(hand, tip, body, place, normal)).any()), None)
     if chosen is None:
         # No joint decides, and normals of a whole tip cancel to rounding noise: use the side that the palm faces.
-        ahead = quat_rotate(quat_conjugate(_pose(hand, tip)[3:]), hand.palm.approach)
+        pose = body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0, tip]
+        ahead = quat_rotate(quat_conjugate(pose[3:]), hand.palm.approach)
         chosen = normal @ ahead > _AHEAD
         if not chosen.any():
             return Pad(tip, place.mean(axis=0), ahead, place)
@@ -388,7 +383,3 @@ def _moved_ahead(hand: HandModel, tip: int, driven: int, place: Floats, normal: 
     ahead = np.einsum("ij,ij->i", move / np.maximum(speed, 1e-12)[:, None], normal) > _AHEAD
     far = speed >= speed.max() - PAD * np.ptp(speed)
     return np.asarray(ahead & far if (ahead & far).any() else ahead)
-
-
-def _pose(hand: HandModel, body: int) -> Floats:
-    return np.asarray(body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0, body])

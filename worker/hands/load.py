@@ -32,10 +32,10 @@ from graspd.worker.hands.options import (
     parse_options,
 )
 from graspd.worker.hands.primitives import volume
-from graspd.worker.hands.robot import Joint, Robot, chain_to
+from graspd.worker.hands.robot import Joint, Mimic, Robot, chain_to
 from graspd.worker.hands.shapes import Hulls, make_pieces
 from graspd.worker.hands.tendons import tendons_of
-from graspd.worker.hands.tree import Drive, Tree, build_tree
+from graspd.worker.hands.tree import Tree, build_tree
 from graspd.worker.hands.visuals import PlacedShape, Visuals
 from graspd.worker.hands.xacro import read_robot
 from graspd.worker.objects.disk_cache import recalling
@@ -140,7 +140,7 @@ def body_model(source: HandSource, tree: Tree) -> HandModel:
             {"root": None},
         )
     joints = [body.joint for body in tree.bodies]
-    drives = [tree.drives[joint.name] if joint else Drive("", 0.0, 0.0) for joint in joints]
+    drives = [tree.drives[joint.name] if joint else Mimic("", 0.0, 0.0) for joint in joints]
     number = {joint.name: body for body, joint in enumerate(joints) if joint}
     dofs = len(tree.dof_names)
     return HandModel(
@@ -152,7 +152,7 @@ def body_model(source: HandSource, tree: Tree) -> HandModel:
         joint_type=np.array([_joint_type(joint) for joint in joints], dtype=np.int32),
         origin=np.array([body.origin for body in tree.bodies]),
         axis=np.array([joint.axis if joint else (1.0, 0, 0) for joint in joints]),
-        dof=np.array([tree.dof_names.index(d.dof) if d.dof else -1 for d in drives], dtype=np.int32),
+        dof=np.array([tree.dof_names.index(d.joint) if d.joint else -1 for d in drives], dtype=np.int32),
         multiplier=np.array([d.multiplier for d in drives]),
         offset=np.array([d.offset for d in drives]),
         dof_names=tree.dof_names,

@@ -15,11 +15,12 @@ import mujoco
 import numpy as np
 
 from graspd.service.model.errors import HandError
-from graspd.service.model.transforms import IDENTITY_POSE, Floats, compose, invert, quat_from_axis_angle
-from graspd.worker.hands.mjcf_drives import Couplings, Servo, commanded, servos
+from graspd.service.model.transforms import IDENTITY_POSE, Floats, compose, invert
+from graspd.worker.hands.mjcf_drives import Couplings, chain_up, commanded, servos
 from graspd.worker.hands.mjcf_source import self_contained
 from graspd.worker.hands.primitives import hull
 from graspd.worker.hands.robot import UNLIMITED_M, Joint, Link, Robot, Shape, build_robot
+from graspd.worker.hands.tree import joint_motion
 
 _FREE, _HINGE, _SLIDE = (
     int(kind) for kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
@@ -76,7 +77,9 @@ class _Reader:
         """Return bodies on the world with moving parts below: the others are furniture or objects."""
         model = self.model
         moving = {
-            self._top(int(model.jnt_bodyid[j])) for j in range(model.njnt) if int(model.jnt_type[j]) in (_HINGE, _SLIDE)
+            chain_up(model, int(model.jnt_bodyid[j]))[-1]
+            for j in range(model.njnt)
+            if int(model.jnt_type[j]) in (_HINGE, _SLIDE)
         }
         found = sorted(moving)
         if not found:
@@ -87,11 +90,6 @@ class _Reader:
             for j in free
         ]
         return found
-
-    def _top(self, body: int) -> int:
-        while self.model.body_parentid[body]:
-            body = int(self.model.body_parentid[body])
-        return body
 
     def joints_of(self, body: int) -> list[int]:
         first, count = int(self.model.body_jntadr[body]), int(self.model.body_jntnum[body])
@@ -124,7 +122,7 @@ class _Reader:
                     self.links.append(Link(link, (), None))
                 at, frame = link, invert(there)
             if parent and at != name:
-                self.joints.append(_fixed(f"{name}:fixed", at, name, frame))
+                self.joints.append(Joint(f"{name}:fixed", "fixed", at, name, frame))
             self.links.append(self._link(body, name))
             children = [c for c in range(self.model.nbody - 1, body, -1) if self.model.body_parentid[c] == body]
             stack += [(c, name, _pose(self.model.body_pos[c], self.model.body_quat[c])) for c in children]
@@ -133,41 +131,38 @@ class _Reader:
         model, name = self.model, self.joint_name(joint)
         what = f"{self.main}: joint {name!r}"
         kind = int(model.jnt_type[joint])
-        still = _fixed(name, parent, child, origin)
+        still = Joint(name, "fixed", parent, child, origin)
         if kind not in (_HINGE, _SLIDE):
             fault = f"{what} is a ball joint; write it as three hinge joints"
             return replace(still, type="ball", fault=fault)
         slides = kind == _SLIDE
-        axis = np.asarray(model.jnt_axis[joint], float)
+        moving = replace(
+            still, type="prismatic" if slides else "revolute", axis=np.asarray(model.jnt_axis[joint], float)
+        )
         # A joint value counts from `ref`, the value in the pose of the file.
-        reference = -float(model.qpos0[model.jnt_qposadr[joint]])
-        origin = compose(origin, _motion(axis, reference, slides))
+        origin = compose(origin, joint_motion(moving, -float(model.qpos0[model.jnt_qposadr[joint]])))
         follows = self._mimics.get(joint)
         if isinstance(follows, float):
-            return _fixed(name, parent, child, compose(origin, _motion(axis, follows, slides)))
+            return replace(still, origin=compose(origin, joint_motion(moving, follows)))
         limited = bool(model.jnt_limited[joint])
         most = UNLIMITED_M if slides else math.pi
         lower, upper = map(float, model.jnt_range[joint]) if limited else (-most, most)
         fault = self._faults.get(joint, "")
         if not -4 * math.pi <= lower <= upper <= 4 * math.pi:
             fault = f"{what}: range {lower:g} .. {upper:g} is reversed or too large"
-        servo = self._servos.get(joint, Servo())
+        effort, stiffness = self._servos.get(joint, (0.0, 0.0))
         least, largest = self._commanded.get(joint, (lower, upper))
         if max(lower, least) < min(upper, largest):
             limited, lower, upper = True, max(lower, least), min(upper, largest)
-        kind_name = "prismatic" if slides else "revolute" if limited else "continuous"
-        return Joint(
-            name,
-            kind_name,
-            parent,
-            child,
-            origin,
-            axis,
-            lower,
-            upper,
-            servo.effort,
-            follows,
-            stiffness=servo.stiffness,
+        return replace(
+            moving,
+            type=moving.type if limited or slides else "continuous",
+            origin=origin,
+            lower=lower,
+            upper=upper,
+            effort=effort,
+            mimic=follows,
+            stiffness=stiffness,
             armature=float(model.dof_armature[model.jnt_dofadr[joint]]),
             dry_friction=float(model.dof_frictionloss[model.jnt_dofadr[joint]]),
             fault=fault,
@@ -220,19 +215,6 @@ class _Reader:
 
 def _pose(position: Any, quaternion: Any) -> Floats:
     return np.concatenate([np.asarray(position, float), np.asarray(quaternion, float)])
-
-
-def _motion(axis: Floats, value: float, slides: bool) -> Floats:
-    motion = IDENTITY_POSE.copy()
-    if slides:
-        motion[:3] = axis * value
-    else:
-        motion[3:] = quat_from_axis_angle(axis, np.asarray(value))
-    return motion
-
-
-def _fixed(name: str, parent: str, child: str, origin: Floats) -> Joint:
-    return Joint(name, "fixed", parent, child, origin, np.array([1.0, 0, 0]), 0.0, 0.0, 0.0, None)
 
 
 def _ellipsoid(half: Floats) -> tuple[Floats, Any]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
 from typing import Any, Final
 
 import mujoco
@@ -149,7 +148,7 @@ class Couplings:
 
     def _in_a_row(self, joints: list[int]) -> bool:
         """Check whether the joints form one chain."""
-        chains = sorted((set(_chain(self.model, int(self.model.jnt_bodyid[joint]))) for joint in joints), key=len)
+        chains = sorted((set(chain_up(self.model, int(self.model.jnt_bodyid[joint]))) for joint in joints), key=len)
         return all(a <= b for a, b in itertools.pairwise(chains))
 
     def _range(self, joint: int) -> tuple[float, float]:
@@ -262,7 +261,7 @@ def _ends(model: Any, loop: int) -> tuple[int, int]:
 
 def _on_loop(model: Any, loop: int) -> list[int]:
     """Return the joints between the ends and the body at which their chains branch."""
-    chains = [_chain(model, body) for body in _ends(model, loop)]
+    chains = [chain_up(model, body) for body in _ends(model, loop)]
     common = set(chains[0]) & set(chains[1])
     return [
         joint
@@ -273,7 +272,8 @@ def _on_loop(model: Any, loop: int) -> list[int]:
     ]
 
 
-def _chain(model: Any, body: int) -> list[int]:
+def chain_up(model: Any, body: int) -> list[int]:
+    """Return the bodies from this one up to the one on the world."""
     found = []
     while body:
         found.append(body)
@@ -321,25 +321,15 @@ def _anchors(model: Any, data: Any, loop: int) -> tuple[Floats, Floats]:
     return points[0], points[1]
 
 
-@dataclass(frozen=True)
-class Servo:
-    """Drive of a joint; 0: not stated."""
-
-    effort: float = 0.0
-    """[N m or N]"""
-    stiffness: float = 0.0
-    """[N m/rad or N/m]"""
-
-
-def servos(model: Any, mimics: Mapping[int, Mimic | float], shared: Collection[int]) -> dict[int, Servo]:
-    """Return the servo of each joint that an actuator drives.
+def servos(model: Any, mimics: Mapping[int, Mimic | float], shared: Collection[int]) -> dict[int, tuple[float, float]]:
+    """Return effort [N m or N] and stiffness [N m/rad or N/m] of each driven joint; 0: not stated.
 
     An actuator of gear g on a length l pulls with g F dl/dq at joint q. A position servo of gain k holds the joint with
     k (g dl/dq)^2. On a joint dl/dq is 1. On a fixed tendon it is the joint's coefficient plus those of its followers
     times their rates. If n joints share a tendon (`shared`), each is so stiff that n of them in series have the
     tendon's gain.
     """
-    found: dict[int, Servo] = {}
+    found: dict[int, tuple[float, float]] = {}
     joint_of = {str(model.joint(j).name): j for j in range(model.njnt)}
     for actuator in range(model.nu):
         gear = float(model.actuator_gear[actuator, 0])
@@ -350,14 +340,13 @@ def servos(model: Any, mimics: Mapping[int, Mimic | float], shared: Collection[i
                 rates[driver] = rates.get(driver, 0.0) + coefficient * rate
         for joint, rate in rates.items():
             arm = abs(gear * rate)
-            force, gain = _force(model, actuator), _gain(model, actuator)
-            gain *= len(rates) if joint in shared else 1
-            before = found.get(joint, Servo())
-            found[joint] = Servo(before.effort + arm * force, before.stiffness + arm**2 * gain)
-    for joint, servo in list(found.items()):
+            gain = _gain(model, actuator) * (len(rates) if joint in shared else 1)
+            effort, stiffness = found.get(joint, (0.0, 0.0))
+            found[joint] = effort + arm * _force(model, actuator), stiffness + arm**2 * gain
+    for joint, (effort, stiffness) in found.items():
         if model.jnt_actfrclimited[joint]:
             most = float(np.abs(model.jnt_actfrcrange[joint]).max())
-            found[joint] = Servo(min(servo.effort, most) or most, servo.stiffness)
+            found[joint] = min(effort, most) or most, stiffness
     return found
 
 

@@ -17,8 +17,8 @@ import numpy as np
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, compose, invert
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.options import HandOptions
-from graspd.worker.hands.robot import Joint, Robot, chain_to
-from graspd.worker.hands.tree import LEAST_RANGE, Body, Drive, Tree, joint_motion
+from graspd.worker.hands.robot import Joint, Mimic, Robot, chain_to
+from graspd.worker.hands.tree import LEAST_RANGE, Body, Tree, joint_motion
 
 #: Most joints of a wrist, largest range of one [rad], and its largest distance from the root along the joints [m]. The
 #: last joint of an arm usually has a larger range.
@@ -53,7 +53,7 @@ def mounting_tree(robot: Robot, root: str, options: HandOptions) -> Tree | None:
     wrist = [body.joint for body in bodies if body.joint is not None]
     moving = tuple(joint.name for joint in wrist)
     lower, upper, velocity = np.array([(j.lower, j.upper, j.velocity) for j in wrist]).reshape(-1, 3).T
-    drives = {name: Drive(name, 1.0, 0.0) for name in moving}
+    drives = {name: Mimic(name, 1.0, 0.0) for name in moving}
     return Tree(tuple(bodies), links, drives, moving, moving, lower, upper, velocity, (), frozenset())
 
 

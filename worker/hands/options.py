@@ -11,6 +11,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 
 from graspd.service.model.base import refusal
 from graspd.service.model.errors import HandError
+from graspd.worker.objects.options import stated_options
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Vector = tuple[Finite, Finite, Finite]
@@ -84,22 +85,12 @@ def parse_options(files: Mapping[str, bytes], extra: Mapping[str, Any] | None = 
     Raises:
         HandError: one of them is not JSON, or a key is unknown or wrong; the message names it.
     """
-    stated = {**_asset_json(files), **(extra or {})}
+    stated = {**stated_options(files, HandError), **(extra or {})}
     try:
         return HandOptions.model_validate({**_hand_json(files, stated.get("file")), **stated})
     except ValidationError as error:
         place = "asset.json" if error.errors()[0]["loc"][0] in stated else "hand.json"
         raise HandError(f"{place}: {refusal(error)}") from None
-
-
-def _asset_json(files: Mapping[str, bytes]) -> dict[str, Any]:
-    try:
-        stated = json.loads(files["asset.json"]) if "asset.json" in files else {}
-    except (ValueError, RecursionError):
-        raise HandError('asset.json is not JSON; write an object such as {"file": "hand.urdf"}') from None
-    if not isinstance(stated, dict):
-        raise HandError("asset.json must hold a JSON object")
-    return stated
 
 
 def _hand_json(files: Mapping[str, bytes], urdf: object) -> dict[str, Any]:

@@ -7,14 +7,12 @@ such postures for all feasible widths.
 from __future__ import annotations
 
 import sys
-import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any, Final
 
 import numpy as np
-from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from graspd.service.model import transforms
@@ -27,6 +25,7 @@ from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.surface import sample_surface
 from graspd.worker.objects.disk_cache import arrays_kept_or_made
+from graspd.worker.objects.memory_cache import cached_by_content
 
 #: Number of postures, candidates per posture, and random steps that improve them.
 POSTURES: Final = 160
@@ -80,24 +79,24 @@ class Oppositions:
     def of_none(cls, hand: HandModel) -> Oppositions:
         return cls(np.zeros((0, hand.dofs)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
 
+    @classmethod
+    def of(cls, q: Floats, seen: Any, good: NDArray[np.intp]) -> Oppositions:
+        """Select postures `good` of those seen, and sort them by width."""
+        good = good[np.argsort(seen.width[good], kind="stable")]
+        return cls(q[good], seen.axis[good], seen.middle[good], seen.width[good])
 
-_known: LRUCache[tuple[str, ...], Oppositions] = LRUCache(48)
-_lock = threading.RLock()
+    @classmethod
+    def kept_or_made(
+        cls, kind: str, key: tuple[str, ...], make: Callable[[], Oppositions], *more: ModuleType
+    ) -> Oppositions:
+        """Load postures from this machine's cache, or compute them with this code and `more`, and cache them."""
+        return cls(**arrays_kept_or_made(kind, key, (*_code(), *more), lambda: vars(make())))
 
 
-def cached_postures(
-    kind: str, key: tuple[str, ...], code: tuple[ModuleType, ...], make: Callable[[], Oppositions]
-) -> Oppositions:
-    """Return postures cached in memory and on this machine; `make` may request other kinds."""
-    with _lock:
-        if (kind, *key) not in _known:
-            _known[kind, *key] = Oppositions(**arrays_kept_or_made(kind, key, code, lambda: vars(make())))
-        return _known[kind, *key]
-
-
+@cached_by_content(32)
 def oppositions_of(hand: HandModel) -> Oppositions:
     """Return the opposed postures of a hand, cached in memory and on this machine; one finger has none."""
-    return cached_postures("oppositions", (hand.content,), _code(), lambda: _oppositions(hand))
+    return Oppositions.kept_or_made("oppositions", (hand.content,), lambda: _oppositions(hand))
 
 
 def _code() -> tuple[ModuleType, ...]:
@@ -120,8 +119,7 @@ def _oppositions(hand: HandModel) -> Oppositions:
     good = np.flatnonzero(
         (seen.facing > FACING) & (seen.square < SQUARE) & (seen.width > THINNEST_M) & (seen.ahead > AHEAD_M)
     )
-    good = good[np.argsort(seen.width[good], kind="stable")]
-    return Oppositions(q[good], seen.axis[good], seen.middle[good], seen.width[good])
+    return Oppositions.of(q, seen, good)
 
 
 def opposed_finger(hand: HandModel) -> int:
@@ -223,36 +221,26 @@ def require_opposing(hand: HandModel) -> None:
     Raises:
         HandError: no two of its surfaces face each other and close; the message states the fix.
     """
-    with _lock:
-        if hand.content not in _holding:
-            made = arrays_kept_or_made(
-                "opposing", (hand.content,), _code(), lambda: {"opposes": np.array(opposes(hand))}, fits=_is_one_answer
-            )
-            _holding[hand.content] = bool(made["opposes"])
-        if not _holding[hand.content]:
-            raise _why_not(hand)
-
-
-_holding: LRUCache[str, bool] = LRUCache(32)
-
-
-def _is_one_answer(kept: Mapping[str, NDArray[Any]]) -> bool:
-    return set(kept) == {"opposes"} and kept["opposes"].shape == () and kept["opposes"].dtype == bool
-
-
-def _why_not(hand: HandModel) -> HandError:
+    if _can_hold(hand):
+        return
     shaped = {piece.body for piece in hand.pieces}
     bare = [hand.body_names[tip] for tip in hand.fingertips if tip not in shaped]
     if bare:
-        return HandError(
+        raise HandError(
             f"{hand.name}: no two opposing digits: {', '.join(bare[:4])} have no collision shapes; give the hand with "
             "its fingers"
         )
-    return HandError.with_fixes(
+    raise HandError.with_fixes(
         f"{hand.name}: no two opposing digits: no two surfaces of it face each other and close, so it can hold nothing",
         "give the whole hand, or another --root",
         {"root": None},
     )
+
+
+@cached_by_content(32)
+def _can_hold(hand: HandModel) -> bool:
+    made = arrays_kept_or_made("opposing", (hand.content,), _code(), lambda: {"opposes": np.array(opposes(hand))})
+    return bool(made["opposes"])
 
 
 def opposes(hand: HandModel) -> bool:

@@ -16,7 +16,7 @@ from graspd.service.model.errors import HandError
 from graspd.service.model.transforms import Floats, quat_rotate
 from graspd.worker.hands.robot import Ints
 from graspd.worker.objects.disk_cache import recalled
-from graspd.worker.objects.topology import directed_edges, face_areas, face_vectors, outward_hull
+from graspd.worker.objects.topology import directed_edges, face_areas, face_vectors, on_faces, outward_hull
 
 if TYPE_CHECKING:
     from graspd.worker.hands.model import ConvexPiece
@@ -107,11 +107,7 @@ def sample(
     # Stratified over the faces: the number on each is its share, rounded up or down.
     ladder = (np.arange(count) + rng.random()) / max(count, 1) * areas.sum()
     face = np.minimum(np.searchsorted(np.cumsum(areas), ladder, side="right"), len(faces) - 1)
-    a, b, c = np.moveaxis(vertices[faces[face]], 1, 0)
-    u, v = rng.random((2, count, 1))
-    root = np.sqrt(u)
-    points = a * (1 - root) + b * (root * (1 - v)) + c * (root * v)
-    normals = np.cross(b - a, c - a)
+    points, normals = on_faces(vertices[faces[face]], *rng.random((2, count, 1))), face_vectors(vertices, faces[face])
     return points, normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
 
@@ -207,18 +203,20 @@ class HandFeatures:
         first, first_edge = [0], [0]
         ball = np.zeros(3)
         for piece in pieces:
-            found, thick = _edges(piece)
-            edges.append(found)
-            thickness += [thick] * len(found)
             middle, axis = piece.pose[:3], quat_rotate(piece.pose[3:], np.array([0.0, 0.0, 1.0]))
+            rim, radius = piece.kind == "cylinder", 0.0 if piece.kind in ("box", "hull") else piece.size[0]
             if piece.kind == "sphere":
-                rows.append((piece.body, middle, ball, piece.size[0]))
-            elif piece.kind in ("capsule", "cylinder"):
-                radius, length = piece.size
-                about = axis if piece.kind == "cylinder" else ball
-                rows += [(piece.body, middle + 0.5 * end * length * axis, about, radius) for end in (-1, 1)]
+                points, ends = middle[None], np.array([[middle, middle]])
+            elif radius:
+                half = 0.5 * piece.size[1] * axis
+                points = np.array([middle - half, middle + half])
+                ends = points[None]
             else:
-                rows += [(piece.body, corner, ball, 0.0) for corner in piece.vertices]
+                points = piece.vertices
+                ends = points[convex_edges(points, piece.faces)]
+            rows += [(piece.body, point, axis if rim else ball, radius) for point in points]
+            edges.append(ends)
+            thickness += [0.0 if rim else radius] * len(ends)
             first.append(len(rows))
             first_edge.append(len(thickness))
         return cls(
@@ -231,18 +229,6 @@ class HandFeatures:
             np.array(thickness),
             np.array(first_edge, np.int32),
         )
-
-
-def _edges(piece: ConvexPiece) -> tuple[Floats, float]:
-    """Return the ends (E, 2, 3) of a piece's edges and their radius; round pieces have their axis."""
-    middle, axis = piece.pose[:3], quat_rotate(piece.pose[3:], np.array([0.0, 0.0, 1.0]))
-    if piece.kind == "sphere":
-        return np.array([[middle, middle]]), piece.size[0]
-    if piece.kind in ("capsule", "cylinder"):
-        radius, length = piece.size
-        ends = np.array([[middle - 0.5 * length * axis, middle + 0.5 * length * axis]])
-        return ends, radius if piece.kind == "capsule" else 0.0
-    return piece.vertices[convex_edges(piece.vertices, piece.faces)], 0.0
 
 
 def convex_edges(vertices: Floats, faces: NDArray[np.integer[Any]]) -> NDArray[np.intp]:

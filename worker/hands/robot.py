@@ -70,12 +70,12 @@ class Joint:
     parent: str
     child: str
     origin: Floats
-    axis: Floats
-    lower: float
-    upper: float
-    effort: float
+    axis: Floats = field(default_factory=lambda: np.array([1.0, 0, 0]))
+    lower: float = 0.0
+    upper: float = 0.0
+    effort: float = 0.0
     """[N m or N]; 0: not stated."""
-    mimic: Mimic | None
+    mimic: Mimic | None = None
     """Mimic relation; a URDF follower's own limits are ignored, as in ROS: most published ones are wrong."""
     velocity: float = 0.0
     """Limit [rad/s or m/s]; 0: not stated."""

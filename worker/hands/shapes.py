@@ -21,11 +21,11 @@ from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, quat_t
 from graspd.worker.hands.model import ConvexPiece
 from graspd.worker.hands.primitives import hull, hull_planes, new_hull, signed_distance, tessellate, volume
 from graspd.worker.hands.robot import Ints, Shape
-from graspd.worker.hands.visuals import find_mesh
+from graspd.worker.hands.visuals import find_mesh, merged_and_thinned
 from graspd.worker.objects.convex import WorkLimitExceeded, coacd_parts, default_cache, keep_parts, load_parts
 from graspd.worker.objects.disk_cache import recalled
 from graspd.worker.objects.formats import read_mesh
-from graspd.worker.objects.topology import face_areas
+from graspd.worker.objects.topology import face_areas, on_faces
 
 #: A hull of V corners has at most 2 V - 4 triangles: 96 here. Every plane costs time in each distance query.
 MAX_HULL_VERTICES: Final = 50
@@ -152,7 +152,6 @@ _WAYS: Final = np.array([d for d in np.ndindex(3, 3, 3) if sum(k != 1 for k in d
 _DIRECTIONS: Final = (_WAYS / np.linalg.norm(_WAYS, axis=1, keepdims=True)) @ _TURN.T
 #: Offset of a ray's origin from its point [m].
 _START_M: Final = 1e-5
-_BLOCK: Final = 64
 #: Thickness below which pieces are splinters [m].
 _MIN_EXTENT_M: Final = 1e-3
 
@@ -180,7 +179,7 @@ def parts_of(vertices: Floats, faces: Ints) -> tuple[Floats, ...]:
 
 def _decomposed(vertices: Floats, faces: Ints) -> tuple[tuple[Floats, ...], bool]:
     """Return the pieces, and whether CoACD finished: a failed run may succeed later."""
-    light = _simplified(vertices, faces)
+    light = merged_and_thinned(vertices, faces, lambda count: 1 - _FACES / count)
     surface = _OpenSurface(*light)
     best: tuple[Floats, ...] = (vertices,)
     least, sure = surface.error(best), True
@@ -213,10 +212,7 @@ def _sample(vertices: Floats, faces: Ints) -> Floats:
     areas = face_areas(vertices, faces)
     ladder = (np.arange(_POINTS) + 0.5) / _POINTS * areas.sum()
     face = np.minimum(np.searchsorted(np.cumsum(areas), ladder), len(faces) - 1)
-    u, v = np.random.default_rng(0).random((2, _POINTS, 1))
-    a, b, c = np.moveaxis(vertices[faces[face]], 1, 0)
-    root = np.sqrt(u)
-    return a * (1 - root) + b * (root * (1 - v)) + c * (root * v)
+    return on_faces(vertices[faces[face]], *np.random.default_rng(0).random((2, _POINTS, 1)))
 
 
 class _OpenSurface:
@@ -248,19 +244,13 @@ def _hits(points: Floats, direction: Floats, corners: Floats) -> NDArray[np.bool
     a, first, second, across = a[usable], first[usable], second[usable], across[usable]
     inverse = 1 / determinant[usable]
     hit = np.zeros(len(points), dtype=bool)
-    # In projection along the ray a point must lie in a triangle's box, which excludes most pairs.
-    plane = np.linalg.svd(direction[None])[2][1:].T
-    seen, flat = points @ plane, corners[usable] @ plane
-    low, high = flat.min(axis=1) - _START_M, flat.max(axis=1) + _START_M
-    for block in range(0, len(points), _BLOCK):
-        inside = (seen[block : block + _BLOCK, None] >= low) & (seen[block : block + _BLOCK, None] <= high)
-        point, face = np.nonzero(inside.all(axis=2))
-        offset = points[block + point] - a[face]
-        u = np.einsum("kf,kf->k", offset, across[face]) * inverse[face]
-        beside = np.cross(offset, first[face])
-        v = beside @ direction * inverse[face]
-        t = np.einsum("kf,kf->k", beside, second[face]) * inverse[face]
-        hit[block + point[(u >= 0) & (v >= 0) & (u + v <= 1) & (t > _START_M)]] = True
+    for number, point in enumerate(points):
+        offset = point - a
+        u = np.einsum("kf,kf->k", offset, across) * inverse
+        beside = np.cross(offset, first)
+        v = beside @ direction * inverse
+        t = np.einsum("kf,kf->k", beside, second) * inverse
+        hit[number] = ((u >= 0) & (v >= 0) & (u + v <= 1) & (t > _START_M)).any()
     return hit
 
 
@@ -274,18 +264,3 @@ def _ways_out(part: Floats, points: Floats) -> Floats:
         onward = rate > 1e-9
         way[number] = (inside[:, onward] / rate[onward]).min(axis=1)
     return np.where((inside < -_START_M).any(axis=1), 0.0, np.maximum(way, 0.0))
-
-
-def _simplified(vertices: Floats, faces: Ints) -> tuple[Floats, Ints]:
-    import trimesh  # slow to load, seldom needed
-
-    merged = trimesh.Trimesh(vertices, faces, process=True)
-    points, triangles = np.asarray(merged.vertices, float), np.asarray(merged.faces, np.int32)
-    if len(triangles) > _FACES:
-        import fast_simplification  # slow to load, not needed for cached results
-
-        light, kept = fast_simplification.simplify(
-            points.astype(np.float32), triangles, target_reduction=1 - _FACES / len(triangles)
-        )
-        points, triangles = np.asarray(light, float), np.asarray(kept, np.int32)
-    return points, triangles

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import sys
-import threading
 from dataclasses import dataclass
+from functools import cached_property, partial
 from typing import Final
 
 import numpy as np
-from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from graspd.service.model import transforms
@@ -18,6 +17,7 @@ from graspd.worker.hands import kinematics, primitives
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import ConvexPiece, HandModel, SurfacePoints
 from graspd.worker.objects.disk_cache import arrays_kept_or_made, content_of
+from graspd.worker.objects.memory_cache import cached_by_content
 
 #: Candidates per point; thinning keeps the one in five that spreads most evenly.
 OVERSAMPLING: Final = 5
@@ -40,13 +40,7 @@ def sample_surface(hand: HandModel, count: int, *, seed: int = 0) -> SurfacePoin
         HandError: the hand has no outer surface.
     """
     # The shapes of a hand are available long before its closing.
-    key = (content_of(_Shapes(hand.pieces, _rest(hand))), count, seed)
-    with _lock:
-        if key not in _samples:
-            code = (sys.modules[__name__], primitives, kinematics, transforms)
-            made = arrays_kept_or_made("hand_samples", key, code, lambda: vars(_sample(hand, count, seed)))
-            _samples[key] = SurfacePoints(**made)
-        return _samples[key]
+    return _kept(_Shapes(hand.pieces, body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0]), count, seed)
 
 
 @dataclass(frozen=True)
@@ -55,30 +49,35 @@ class _Shapes:
     rest: Floats
     """(L, 7) poses of its bodies."""
 
-
-def _rest(hand: HandModel) -> Floats:
-    return body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0]
-
-
-_samples: LRUCache[tuple[str, int, int], SurfacePoints] = LRUCache(64)
-_lock = threading.Lock()
+    @cached_property
+    def content(self) -> str:
+        return content_of(self)
 
 
-def _sample(hand: HandModel, count: int, seed: int) -> SurfacePoints:
+@cached_by_content(64)
+def _kept(shapes: _Shapes, count: int, seed: int) -> SurfacePoints:
+    code = (sys.modules[__name__], primitives, kinematics, transforms)
+    make = partial(_sample, shapes, count, seed)
+    return SurfacePoints(
+        **arrays_kept_or_made("hand_samples", (shapes.content, count, seed), code, lambda: vars(make()))
+    )
+
+
+def _sample(shapes: _Shapes, count: int, seed: int) -> SurfacePoints:
     from scipy.spatial import cKDTree
 
-    candidates = _candidates(hand, max(OVERSAMPLING * count, MIN_CANDIDATES), seed)
+    bodies, candidates = len(shapes.rest), _candidates(shapes, max(OVERSAMPLING * count, MIN_CANDIDATES), seed)
     if len(candidates) < count:
         # Most of the surface is hidden inside other pieces: sample once more, in proportion.
         more = max(OVERSAMPLING * count, MIN_CANDIDATES) * count * OVERSAMPLING // max(len(candidates), 1)
-        candidates = _candidates(hand, min(more, 5_000_000), seed)
+        candidates = _candidates(shapes, min(more, 5_000_000), seed)
     if len(candidates) < count:
         raise HandError(
             f"the outer surface of the hand gives {len(candidates)} points where {count} are needed: its pieces lie "
             "inside one another; correct its collision shapes"
         )
-    area_of_body = np.bincount(candidates.body, candidates.area, minlength=hand.bodies).astype(float)
-    available = np.bincount(candidates.body, minlength=hand.bodies)
+    area_of_body = np.bincount(candidates.body, candidates.area, minlength=bodies).astype(float)
+    available = np.bincount(candidates.body, minlength=bodies)
     quota = apportion(area_of_body, count, available)
     chosen: list[NDArray[np.intp]] = []
     areas: list[Floats] = []
@@ -97,12 +96,11 @@ def _sample(hand: HandModel, count: int, seed: int) -> SurfacePoints:
     )
 
 
-def _candidates(hand: HandModel, count: int, seed: int) -> SurfacePoints:
+def _candidates(hand: _Shapes, count: int, seed: int) -> SurfacePoints:
     """Return about `count` area-uniform points on the pieces, without buried ones."""
     rng = np.random.default_rng([seed, 0x5EED])
     shares = np.array([primitives.area(p.kind, p.size, p.vertices, p.faces) for p in hand.pieces])
     numbers = np.maximum(np.ceil(count * shares / shares.sum()).astype(int), 8)
-    rest = _rest(hand)
     bodies, positions, normals, areas = [], [], [], []
     for i, (piece, number) in enumerate(zip(hand.pieces, numbers, strict=True)):
         local, direction = primitives.sample(
@@ -110,7 +108,7 @@ def _candidates(hand: HandModel, count: int, seed: int) -> SurfacePoints:
         )
         position = apply(piece.pose, local)
         normal = quat_rotate(piece.pose[3:], direction)
-        keep = ~_buried(hand, i, position, normal, rest)
+        keep = ~_buried(hand, i, position, normal)
         bodies.append(np.full(int(keep.sum()), piece.body, dtype=np.int32))
         positions.append(position[keep])
         normals.append(normal[keep])
@@ -128,22 +126,22 @@ def piece_distance(piece: ConvexPiece, points: Floats) -> Floats:
     return primitives.signed_distance(piece.kind, piece.size, _local_vertices(piece), piece.faces, local)
 
 
-def _buried(hand: HandModel, own: int, position: Floats, normal: Floats, rest: Floats) -> NDArray[np.bool_]:
+def _buried(hand: _Shapes, own: int, position: Floats, normal: Floats) -> NDArray[np.bool_]:
     """Check (N,) whether points of piece `own` lie inside another piece or on a face of an earlier piece."""
     mine = hand.pieces[own]
     above = position + COINCIDENT_M * normal
     below = position - COINCIDENT_M * normal
-    world = apply(rest[mine.body], position)
+    world = apply(hand.rest[mine.body], position)
     low, high = world.min(axis=0), world.max(axis=0)
     buried = np.zeros(len(position), dtype=bool)
     for other, piece in enumerate(hand.pieces):
         if other == own:
             continue
-        corners = apply(rest[piece.body], piece.vertices)
+        corners = apply(hand.rest[piece.body], piece.vertices)
         if (corners.min(axis=0) > high + BURIED_M).any() or (corners.max(axis=0) < low - BURIED_M).any():
             continue
         if piece.body != mine.body:
-            local = apply(invert(rest[piece.body]), world)
+            local = apply(invert(hand.rest[piece.body]), world)
             buried |= piece_distance(piece, local) < -BURIED_M
             continue
         buried |= piece_distance(piece, above) < 0

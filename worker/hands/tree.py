@@ -25,15 +25,6 @@ LEAST_RANGE: Final = 1e-5
 
 
 @dataclass(frozen=True)
-class Drive:
-    """Coupling of a moving joint to a degree of freedom: multiplier * value of joint `dof` + offset."""
-
-    dof: str
-    multiplier: float
-    offset: float
-
-
-@dataclass(frozen=True)
 class Body:
     """A body and the moving joint that carries it."""
 
@@ -51,8 +42,8 @@ class Tree:
     bodies: tuple[Body, ...]
     links: dict[str, tuple[int, Floats]]
     """Body of each retained link, and its pose in the body's frame."""
-    drives: dict[str, Drive]
-    """Drive of each moving joint."""
+    drives: dict[str, Mimic]
+    """Degree of freedom that each moving joint follows."""
     joint_names: tuple[str, ...]
     """Moving joints in the robot's order."""
     dof_names: tuple[str, ...]
@@ -95,11 +86,13 @@ def build_tree(robot: Robot, options: HandOptions) -> Tree:
     fixed = still | options.fix
     drives = {j.name: _resolve(j.name, mimics, fixed) for j in kept if j.type != "fixed"}
     frozen = {name: drive for name, drive in drives.items() if isinstance(drive, float)}
-    moving = {name: drive for name, drive in drives.items() if isinstance(drive, Drive)}
+    moving = {name: drive for name, drive in drives.items() if isinstance(drive, Mimic)}
     for name, drive in moving.items():
-        if drive.dof not in moving:
+        if drive.joint not in moving:
             raise HandError.with_fixes(
-                f"joint {name!r} follows {drive.dof!r}, which is dropped", f"fix it: --fix {name}=0", {"fix": {name: 0}}
+                f"joint {name!r} follows {drive.joint!r}, which is dropped",
+                f"fix it: --fix {name}=0",
+                {"fix": {name: 0}},
             )
     if not moving and still:
         shown = ", ".join(list(still)[:6]) + (", ..." if len(still) > 6 else "")
@@ -111,7 +104,7 @@ def build_tree(robot: Robot, options: HandOptions) -> Tree:
             f"no moving joint is left; nothing below {root!r} moves", "name another --root", {"root": None}
         )
     names = tuple(name for name in robot.joints if name in moving)
-    dofs = tuple(name for name in names if moving[name].dof == name)
+    dofs = tuple(name for name in names if moving[name].joint == name)
     lower, upper = np.array([_fold_limits(dof, moving, robot, options) for dof in dofs]).T
     velocity = np.array([_fold_velocity(dof, moving, robot) for dof in dofs])
     known = frozenset(robot.joints) | frozenset(robot.links)
@@ -151,7 +144,7 @@ def _kept_joints(robot: Robot, root: str, drop: set[str]) -> list[Joint]:
     return [joint for joint in robot.joints.values() if joint.name in kept]
 
 
-def _resolve(name: str, mimics: Mapping[str, Mimic | None], fixed: Mapping[str, float]) -> Drive | float:
+def _resolve(name: str, mimics: Mapping[str, Mimic | None], fixed: Mapping[str, float]) -> Mimic | float:
     """Return the drive of a joint through a chain of mimics, or its value if a fixed joint ends the chain."""
     multiplier, offset, at = 1.0, 0.0, name
     seen = {name}
@@ -167,15 +160,15 @@ def _resolve(name: str, mimics: Mapping[str, Mimic | None], fixed: Mapping[str, 
         if at in seen:
             raise HandError(f"joint {name!r} mimics itself through {at!r}; free one of them")
         seen.add(at)
-    return Drive(at, multiplier, offset) if abs(multiplier) > 1e-9 else offset
+    return Mimic(at, multiplier, offset) if abs(multiplier) > 1e-9 else offset
 
 
-def _fold_limits(dof: str, moving: dict[str, Drive], robot: Robot, options: HandOptions) -> tuple[float, float]:
+def _fold_limits(dof: str, moving: dict[str, Mimic], robot: Robot, options: HandOptions) -> tuple[float, float]:
     """Return the range of a dof in which all its followers stay within their own limits; see `_binds`."""
     lower, upper = -math.inf, math.inf
     narrowest = dof
     for name, drive in moving.items():
-        if drive.dof != dof:
+        if drive.joint != dof:
             continue
         joint = robot.joints[name]
         if not _binds(joint, drive, robot, options):
@@ -198,11 +191,11 @@ def _fold_limits(dof: str, moving: dict[str, Drive], robot: Robot, options: Hand
     return lower, upper
 
 
-def _check_travel(dof: str, lower: float, upper: float, moving: dict[str, Drive], robot: Robot) -> None:
+def _check_travel(dof: str, lower: float, upper: float, moving: dict[str, Mimic], robot: Robot) -> None:
     """Check that a follower without binding limits stays within a plausible range."""
     for name, drive in moving.items():
         way, most = abs(drive.multiplier) * (upper - lower), _MOST[robot.joints[name].type == "prismatic"]
-        if drive.dof == dof and name != dof and (way > most or abs(drive.offset) > most):
+        if drive.joint == dof and name != dof and (way > most or abs(drive.offset) > most):
             unit = "m" if robot.joints[name].type == "prismatic" else "rad"
             raise HandError(
                 f"joint {name!r} follows {dof!r} with {drive.multiplier:g} and offset {drive.offset:g}, which moves it "
@@ -210,9 +203,9 @@ def _check_travel(dof: str, lower: float, upper: float, moving: dict[str, Drive]
             )
 
 
-def _binds(joint: Joint, drive: Drive, robot: Robot, options: HandOptions) -> bool:
+def _binds(joint: Joint, drive: Mimic, robot: Robot, options: HandOptions) -> bool:
     """Check whether a joint's own limits bind it; a URDF follower's do not, as in ROS: most are wrong."""
-    return joint.name == drive.dof or robot.format != "URDF" or joint.name in options.couplings
+    return joint.name == drive.joint or robot.format != "URDF" or joint.name in options.couplings
 
 
 def passed_limits(robot: Robot, tree: Tree, options: HandOptions) -> list[str]:
@@ -221,7 +214,7 @@ def passed_limits(robot: Robot, tree: Tree, options: HandOptions) -> list[str]:
     for name in tree.joint_names:
         joint, drive = robot.joints[name], tree.drives[name]
         if not _binds(joint, drive, robot, options):
-            at = tree.dof_names.index(drive.dof)
+            at = tree.dof_names.index(drive.joint)
             ends = sorted(drive.multiplier * end + drive.offset for end in (tree.lower[at], tree.upper[at]))
             if ends[0] < joint.lower - LEAST_RANGE or ends[1] > joint.upper + LEAST_RANGE:
                 found.append(name)
@@ -238,12 +231,12 @@ def cut_drives(robot: Robot, tree: Tree) -> list[str]:
     return found
 
 
-def _fold_velocity(dof: str, moving: dict[str, Drive], robot: Robot) -> float:
+def _fold_velocity(dof: str, moving: dict[str, Mimic], robot: Robot) -> float:
     """Return the speed of a dof at which no follower exceeds its own limit; 0 if not stated."""
     stated = [
         robot.joints[name].velocity / abs(drive.multiplier)
         for name, drive in moving.items()
-        if drive.dof == dof and robot.joints[name].velocity > 0
+        if drive.joint == dof and robot.joints[name].velocity > 0
     ]
     return min(stated, default=0.0)
 
@@ -300,7 +293,7 @@ def pick_root(robot: Robot, options: HandOptions) -> str:
         root = children[0]
     tree = _Moving(robot, options)
     root = _below_arm(tree, root, options)
-    if options.palm or tree.reach(root) <= MAX_HAND_M:
+    if options.palm or tree.reach[root] <= MAX_HAND_M:
         return root
     hands = hand_links(tree, root)
     if len(hands) == 1:
@@ -310,14 +303,10 @@ def pick_root(robot: Robot, options: HandOptions) -> str:
         raise HandError.with_fixes(
             f"this is a robot with {len(hands)} hands", f"name its hand: {named}", *({"root": one} for one in hands[:6])
         )
-    if stiff := tree.stiff_digits():
-        raise HandError.with_fixes(
-            f"no part of this robot branches into fingers that move: {', '.join(stiff[:4])} are fixed joints",
-            "give a description in which its fingers move, or name another part: --root LINK",
-            {"root": None},
-        )
     raise HandError.with_fixes(
-        "no part of this robot branches into fingers", "if it has a hand, name it: --root LINK", {"root": None}
+        "no part of this robot branches into fingers that move",
+        "if it has a hand, name it: --root LINK",
+        {"root": None},
     )
 
 
@@ -328,7 +317,7 @@ def hand_links(tree: _Moving, root: str) -> list[str]:
     while queue:
         link = queue.popleft()
         fingers = tree.onward(link)
-        if len(fingers) > 1 and tree.reach(link) <= MAX_FINGER_M and tree.touches(link):
+        if len(fingers) > 1 and tree.reach[link] <= MAX_FINGER_M and tree.touches(link):
             found.append(link)
         else:
             queue.extend(joint.child for joint in fingers)
@@ -342,16 +331,17 @@ class _Moving:
         self.robot, self.options = robot, options
         self._children = _by_parent(joint for joint in robot.joints.values() if joint.child not in options.drop)
         self._moves: dict[str, bool] = {}
-        self._reach: dict[str, float] = {}
+        self.reach: dict[str, float] = {}
+        """Length of the joints below each link, along the longest chain that moves [m]."""
         for link in self._deepest_first(robot.root):
             children = self._children.get(link, [])
             self._moves[link] = any(self.free(joint) or self._moves[joint.child] for joint in children)
             ways = [
-                float(np.linalg.norm(joint.origin[:3])) + self._reach[joint.child]
+                float(np.linalg.norm(joint.origin[:3])) + self.reach[joint.child]
                 for joint in children
                 if self.free_below(joint)
             ]
-            self._reach[link] = max(ways, default=0.0)
+            self.reach[link] = max(ways, default=0.0)
 
     def _deepest_first(self, root: str) -> list[str]:
         order, stack = [], [root]
@@ -369,22 +359,8 @@ class _Moving:
     def onward(self, link: str) -> list[Joint]:
         return [joint for joint in self._children.get(link, []) if self.free_below(joint)]
 
-    def reach(self, link: str) -> float:
-        return self._reach[link]
-
     def touches(self, link: str) -> bool:
         return sum(self._has_shape(joint.child) for joint in self.onward(link)) > 1
-
-    def stiff_digits(self) -> list[str]:
-        """Return fixed joints of the first link at which shapes branch, between a moving joint and the ends."""
-        for joint in self.robot.joints.values():
-            ends = deque([joint.child] if self.free(joint) and not self._moves[joint.child] else [])
-            while ends:
-                digits = [other for other in self._children.get(ends.popleft(), []) if self._has_shape(other.child)]
-                if len(digits) > 1:
-                    return [digit.name for digit in digits]
-                ends.extend(digit.child for digit in digits)
-        return []
 
     def _has_shape(self, link: str) -> bool:
         if self.robot.links[link].shapes:

@@ -113,7 +113,7 @@ def _read_joint(element: ElementTree.Element, notes: list[str]) -> Joint:
     ends = [element.find(tag) for tag in ("parent", "child")]
     parent, child = ("" if end is None else end.get("link", "") for end in ends)
     origin = _origin(element, what)
-    still = Joint(name, kind, parent, child, origin, np.array([1.0, 0, 0]), 0.0, 0.0, 0.0, None)
+    still = Joint(name, kind, parent, child, origin)
     if kind == "fixed":
         return still
     try:

@@ -6,7 +6,7 @@ Only pictures need them, so a faulty one cannot make a hand unusable: unreadable
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Final
@@ -90,18 +90,21 @@ NO_VISUALS: Final = Visuals()
 
 
 def lighter(mesh: VisualMesh, times: float) -> VisualMesh:
-    # Slow to load, and few meshes come here.
+    vertices, faces = merged_and_thinned(mesh.vertices, mesh.faces, lambda _: 1 - 1 / times)
+    return replace(mesh, vertices=vertices, faces=faces) if len(faces) else mesh
+
+
+def merged_and_thinned(vertices: Floats, faces: Ints, share: Callable[[int], float]) -> tuple[Floats, Ints]:
+    """Merge equal vertices and drop the `share` of the faces that their number gives; none if it is not positive."""
+    # Both are slow to load and not needed for cached results.
+    import fast_simplification
     import trimesh
 
-    merged = trimesh.Trimesh(mesh.vertices, mesh.faces, process=True)
-    import fast_simplification  # slow to load, not needed for cached results
-
-    points, triangles = fast_simplification.simplify(
-        np.asarray(merged.vertices, np.float32), np.asarray(merged.faces, np.int32), target_reduction=1 - 1 / times
-    )
-    if not len(triangles):
-        return mesh
-    return replace(mesh, vertices=np.asarray(points, float), faces=np.asarray(triangles, np.int32))
+    merged = trimesh.Trimesh(vertices, faces, process=True)
+    points, triangles = np.asarray(merged.vertices, float), np.asarray(merged.faces, np.int32)
+    if (dropped := share(len(triangles))) > 0:
+        points, triangles = fast_simplification.simplify(points.astype(np.float32), triangles, target_reduction=dropped)
+    return np.asarray(points, float), np.asarray(triangles, np.int32)
 
 
 def _meshes(item: PlacedShape, files: Mapping[str, bytes], base: str, soups: dict[str, Soup]) -> list[VisualMesh]:

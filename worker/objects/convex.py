@@ -1,10 +1,12 @@
-"""Convex pieces of a mesh by CoACD (Wei et al. 2022), in a separate process."""
+"""Convex pieces of a mesh by CoACD (Wei et al. 2022), in a process of its own: this module with SECONDS."""
 
 from __future__ import annotations
 
 import io
 import json
 import logging
+import os
+import resource
 import signal
 import subprocess
 import sys
@@ -40,7 +42,7 @@ def coacd_parts(vertices: Floats, faces: NDArray[Any], options: Mapping[str, Any
     """
     given = io.BytesIO()
     np.savez(given, vertices=vertices, faces=faces, options=np.array(json.dumps(dict(options))))
-    command = [sys.executable, "-m", "graspd.worker.objects.coacd_child", str(cpu_s)]
+    command = [sys.executable, "-m", "graspd.worker.objects.convex", str(cpu_s)]
     try:
         done = subprocess.run(command, input=given.getvalue(), capture_output=True, check=True)
     except subprocess.CalledProcessError as error:
@@ -79,3 +81,24 @@ def keep_parts(file: Path, parts: tuple[Floats, ...]) -> None:
     np.savez(whole, **arrays)
     with suppress(OSError):
         user_cache.write_whole(file, [whole.getvalue()])
+
+
+def _decompose(cpu_s: int) -> None:
+    """Decompose the mesh on standard input onto standard output: npz in and out; a signal ends it after `cpu_s`."""
+    hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
+    resource.setrlimit(resource.RLIMIT_CPU, (cpu_s if hard == resource.RLIM_INFINITY else min(cpu_s, hard), hard))
+    # The library prints to standard output, which carries the result: redirect its output first.
+    result = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    import coacd
+
+    given = np.load(io.BytesIO(sys.stdin.buffer.read()))
+    coacd.set_log_level("off")
+    mesh = coacd.Mesh(given["vertices"], given["faces"])
+    parts = coacd.run_coacd(mesh, **json.loads(str(given["options"])))
+    with result:
+        np.savez(result, *[np.asarray(corners, float) for corners, _ in parts])
+
+
+if __name__ == "__main__":
+    _decompose(int(sys.argv[1]))

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspd.service.model.transforms import Floats
-from graspd.worker.objects.topology import Indices
+from graspd.worker.objects.topology import Indices, face_vectors, on_faces
 
 #: Least number of pieces of a mesh, so that a piece is small relative to the mesh.
 _PIECES = 10_000
@@ -103,16 +103,11 @@ def surface_points(vertices: Floats, faces: Indices, samples: int) -> Floats:
 
 def sample_faces(vertices: Floats, faces: Indices, count: int, seed: int = 0) -> tuple[Floats, NDArray[np.int64]]:
     """Sample area-uniform points (count, 3) and their faces (count,), stratified and reproducible."""
-    corners = vertices[faces]
-    a, b, c = np.moveaxis(corners, 1, 0)
-    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    areas = np.linalg.norm(face_vectors(vertices, faces), axis=1)
     rng = np.random.default_rng(seed)
     ladder = (np.arange(count) + rng.random(count)) / count * areas.sum()
     face = np.minimum(np.searchsorted(np.cumsum(areas), ladder, side="right"), len(faces) - 1)
-    u, v = rng.random((2, count, 1))
-    root = np.sqrt(u)
-    points = a[face] * (1 - root) + b[face] * (root * (1 - v)) + c[face] * (root * v)
-    return points, face.astype(np.int64)
+    return on_faces(vertices[faces[face]], *rng.random((2, count, 1))), face.astype(np.int64)
 
 
 def point_triangle_distance(points: Floats, triangles: Floats) -> Floats:

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from graspd.service.model.base import refusal
 from graspd.service.model.domain import JobOptions
-from graspd.service.model.errors import MeshError
+from graspd.service.model.errors import AssetError, MeshError
 from graspd.service.model.object_options import ObjectOptions
 from graspd.worker.objects.model import ObjectModel
 
@@ -27,12 +27,7 @@ def parse_options(files: Mapping[str, bytes], extra: Mapping[str, Any] | None = 
     Raises:
         MeshError: `asset.json` is not JSON, or a key is unknown or wrong; the message names it.
     """
-    try:
-        stated = json.loads(files["asset.json"]) if "asset.json" in files else {}
-    except (ValueError, RecursionError):
-        stated = None
-    if not isinstance(stated, dict):
-        raise MeshError('asset.json is no JSON object; write one such as {"file": "mug.stl", "units": "mm"}')
+    stated = stated_options(files, MeshError)
     given = {key: value for key, value in (extra or {}).items() if value is not None}
     if given.keys() & {"mass", "density"}:
         stated = {key: value for key, value in stated.items() if key not in ("mass", "density")}
@@ -40,6 +35,17 @@ def parse_options(files: Mapping[str, bytes], extra: Mapping[str, Any] | None = 
         return ObjectOptions.model_validate({**stated, **given})
     except ValidationError as error:
         raise MeshError(f"asset.json: {refusal(error)}") from None
+
+
+def stated_options(files: Mapping[str, bytes], error: type[AssetError]) -> dict[str, Any]:
+    """Return the keys of `asset.json` among the files; `error` if it is no JSON object."""
+    try:
+        stated = json.loads(files["asset.json"]) if "asset.json" in files else {}
+    except (ValueError, RecursionError):
+        stated = None
+    if not isinstance(stated, dict):
+        raise error('asset.json is no JSON object; write one such as {"file": "mug.stl"}')
+    return stated
 
 
 def as_asked(obj: ObjectModel, request: JobOptions) -> ObjectModel:

@@ -39,6 +39,13 @@ def face_vectors(vertices: Floats, faces: FaceIndices) -> Floats:
     return np.cross(b - a, c - a)
 
 
+def on_faces(corners: Floats, u: Floats, v: Floats) -> Floats:
+    """Return area-uniform points (N, 3) on triangles (N, 3, 3) for numbers (N, 1) of the unit interval."""
+    a, b, c = np.moveaxis(corners, 1, 0)
+    root = np.sqrt(u)
+    return np.asarray(a * (1 - root) + b * (root * (1 - v)) + c * (root * v))
+
+
 def face_areas(vertices: Floats, faces: FaceIndices) -> Floats:
     return np.linalg.norm(face_vectors(vertices, faces), axis=1) / 2
 
@@ -131,11 +138,15 @@ def open_edges(faces: Indices) -> int:
     return int((edge_faces(faces)[1] % 2 == 1).sum())
 
 
+def _by_edge(faces: Indices) -> tuple[Indices, Indices, Indices]:
+    """Return the directed edges (3F,) sorted by undirected edge, and first place and number (E,) of each edge's."""
+    index, counts = edge_faces(faces)
+    return np.argsort(index, kind="stable"), np.cumsum(counts) - counts, counts
+
+
 def pair_faces(faces: Indices) -> tuple[Indices, Indices, Mask]:
     """Return the two faces at each manifold edge, (M,) and (M,), and (M,) whether their windings agree."""
-    index, counts = edge_faces(faces)
-    order = np.argsort(index, kind="stable")
-    starts = np.cumsum(counts) - counts
+    order, starts, counts = _by_edge(faces)
     pairs = starts[counts == 2]
     one, two = order[pairs], order[pairs + 1]
     edges = directed_edges(faces)
@@ -189,11 +200,8 @@ def split_edges(vertices: Floats, faces: Indices) -> tuple[Floats, Indices]:
 
     Faces at a crowded edge are paired as neighbours around the edge that enclose material between them.
     """
-    index, counts = edge_faces(faces)
-    count = len(faces)
-    order = np.argsort(index, kind="stable")
-    starts = np.cumsum(counts) - counts
-    edges = directed_edges(faces)
+    order, starts, counts = _by_edge(faces)
+    count, edges = len(faces), directed_edges(faces)
     simple = starts[counts == 2]
     one, two = [order[simple]], [order[simple + 1]]
     for edge in np.flatnonzero(counts > 2):
@@ -216,15 +224,11 @@ def part_double_edges(vertices: Floats, faces: Indices) -> tuple[Floats, Indices
 
     Such edges are valid on a surface with a tunnel, but in a list of faces they look like one edge with four faces.
     """
-    index, counts = edge_faces(faces)
-    crowded = np.flatnonzero(counts > 2)
-    if not len(crowded):
-        return vertices, faces
-    count, edges, order = len(faces), directed_edges(faces), np.argsort(index, kind="stable")
-    starts = np.cumsum(counts) - counts
+    order, starts, counts = _by_edge(faces)
+    count, edges = len(faces), directed_edges(faces)
     points, extra, touched = [vertices], [], set[int]()
     changed = faces.copy()
-    for edge in crowded:
+    for edge in np.flatnonzero(counts > 2):
         half = order[starts[edge] : starts[edge] + counts[edge]]
         for pair in _pairs_around(vertices, faces, edges, half)[1:]:
             if touched & {int(h % count) for h in pair}:

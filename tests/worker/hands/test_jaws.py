@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
-from pathlib import Path
-
 import mujoco
 import numpy as np
 import pytest
@@ -19,6 +16,7 @@ from graspd.worker.simulation.device import joint_units
 from graspd.worker.validation.decomposition import decompose
 from graspd.worker.validation.model import MujocoOptions, build
 from tests.worker.hands.grippers import OPENING, gripper
+from tests.worker.hands.test_mjcf import package_file
 from tests.worker.hands.urdfs import joint, link, robot
 from tests.worker.models import object_from_mesh
 
@@ -95,16 +93,8 @@ def test_hands_of_several_fingers_are_no_grippers(name: str) -> None:
     assert jaws_of(ring_hand(2, coupling="one drive")) is not None
 
 
-def grippers() -> Path:
-    """The folder of `airo-models` with its grippers; nothing of the package is run."""
-    found = find_spec("airo_models")
-    if found is None or found.origin is None:
-        pytest.skip("airo-models is not installed: pip install '.[strangers]'")
-    return Path(found.origin).parent / "grippers"
-
-
 def test_a_robotiq_2f_85_opens_as_far_as_its_maker_says() -> None:
-    hand = hand_from_path(str(grippers() / "robotiq_2f_85"))
+    hand = hand_from_path(package_file("airo_models", "grippers/robotiq_2f_85"))
     jaws = jaws_of(hand)
     assert jaws is not None
     assert hand.dofs == 1

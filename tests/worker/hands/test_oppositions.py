@@ -15,11 +15,11 @@ from graspd.service.model.transforms import IDENTITY_POSE, apply, quat_rotate
 from graspd.worker.generation import validated_grasps
 from graspd.worker.hands import pinch_postures as oppositions
 from graspd.worker.hands.flat_pinches import HEIGHTS_M, OVER_M, pinches_of
-from graspd.worker.hands.grasp_widths import TURNED_M, Size, _Look, spans_of
+from graspd.worker.hands.grasp_widths import Size, spans_of
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path, load_hand
 from graspd.worker.hands.model import HandModel
-from graspd.worker.hands.pinch_postures import oppositions_of, require_opposing
+from graspd.worker.hands.pinch_postures import oppositions_of
 from graspd.worker.hands.surface import sample_surface
 from tests.worker.hands.grippers import gripper
 from tests.worker.hands.urdfs import BOX, joint, link, robot
@@ -116,24 +116,6 @@ def test_spans_begin_where_pads_end() -> None:
     assert spans_of(hand, "wide").width[-1] > pads[-1] + 0.005
 
 
-def test_pairs_taken_together_cost_what_each_of_them_costs() -> None:
-    look, rng = _Look(hand_from_path("barrett"), "small"), np.random.default_rng(0)
-    count = len(look.holding)
-    held, normal = rng.normal(0, 0.05, (2, count, 3)), rng.normal(size=(2, count, 3))
-    wanted = np.array([0.01, 0.03])
-    found = look._costs(held, normal, wanted)
-    for one, other, its in list(zip(look.one, look.other, found.T, strict=True))[::997]:
-        way = held[:, other] - held[:, one]
-        width = np.linalg.norm(way, axis=1)
-        facing = np.minimum((way * normal[:, one]).sum(axis=1), -(way * normal[:, other]).sum(axis=1)) / width
-        cost = TURNED_M * np.maximum(0, look.facing - facing) + np.abs(width - wanted) + look.round[one, other]
-        # Distances come from squares, so rounding of 1e-17 m² counts most where points nearly meet.
-        np.testing.assert_allclose(its, cost, atol=1e-10)
-    body = look.points.body[look.holding]
-    assert (body[look.one] != body[look.other]).all()
-    assert len(look.one) == (body[:, None] != body).sum() / 2
-
-
 def pointer() -> HandModel:
     """A stick of three links that bends a little: none of them ever faces another."""
     bends = '<limit lower="0" upper="0.3" effort="1" velocity="1"/>'
@@ -150,23 +132,8 @@ def test_without_opposing_digits_grasps_are_not_even_planned() -> None:
 
 
 def test_what_a_hand_can_hold_is_asked_once_on_a_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[str] = []
-    answer = oppositions.opposes
-
-    def opposes(hand: HandModel) -> bool:
-        asked.append(hand.name)
-        return answer(hand)
-
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(oppositions, "opposes", opposes)
-    for _ in range(2):
-        oppositions._holding.clear()  # as a process that begins
-        require_opposing(gripper())
-        with pytest.raises(HandError, match="no two opposing digits"):
-            require_opposing(pointer())
-    assert sorted(asked) == sorted([gripper().name, "pointer"])
-    for file in (tmp_path / "graspd" / "opposing").iterdir():
-        file.write_bytes(file.read_bytes()[:-1])
-    oppositions._holding.clear()
-    require_opposing(gripper())
-    assert len(asked) == 3, "an entry that was cut off is none"
+    # Without the cache in memory, as a process that begins.
+    assert [oppositions._can_hold.__wrapped__(hand) for hand in (gripper(), pointer())] == [True, False]
+    monkeypatch.setattr(oppositions, "opposes", lambda hand: pytest.fail("asked again"))
+    assert [oppositions._can_hold.__wrapped__(hand) for hand in (gripper(), pointer())] == [True, False]

@@ -11,24 +11,8 @@ import numpy as np
 from graspd.service.model.errors import MeshError
 from graspd.worker.objects.formats.soup import Soup, check_face_count, triangulate
 
-_TYPES = {
-    "char": "i1",
-    "int8": "i1",
-    "uchar": "u1",
-    "uint8": "u1",
-    "short": "i2",
-    "int16": "i2",
-    "ushort": "u2",
-    "uint16": "u2",
-    "int": "i4",
-    "int32": "i4",
-    "uint": "u4",
-    "uint32": "u4",
-    "float": "f4",
-    "float32": "f4",
-    "double": "f8",
-    "float64": "f8",
-}
+_NAMES = "char uchar short ushort int uint float double int8 uint8 int16 uint16 int32 uint32 float32 float64"
+_TYPES = dict(zip(_NAMES.split(), 2 * ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"), strict=True))
 _MAX_ELEMENTS = 16
 
 
@@ -263,12 +247,10 @@ def read_off(data: bytes) -> Soup:
     if min(vertex_count, face_count) < 0 or vertex_count + face_count > len(rows) - 1:
         raise MeshError(f"truncated: {vertex_count} vertices and {face_count} faces are promised, not all are there")
     vertices = np.array([row[:3] for row in rows[1 : 1 + vertex_count]], dtype="S40").astype(float).reshape(-1, 3)
-    counts: list[int] = []
-    corners: list[int] = []
-    for row in rows[1 + vertex_count : 1 + vertex_count + face_count]:
-        count = int(row[0])
-        if count < 0 or count > len(row) - 1:
-            raise MeshError(f"face {len(counts)} promises {count} corners and has {len(row) - 1}")
-        counts.append(count)
-        corners += map(int, row[1 : 1 + count])
-    return Soup(vertices, triangulate(vertices, np.array(counts, dtype=np.int64), np.array(corners, dtype=np.int64)))
+    faces = rows[1 + vertex_count : 1 + vertex_count + face_count]
+    counts = np.array([int(row[0]) for row in faces], dtype=np.int64)
+    for number, (count, row) in enumerate(zip(counts, faces, strict=True)):
+        if not 0 <= count < len(row):
+            raise MeshError(f"face {number} promises {count} corners and has {len(row) - 1}")
+    corners = [int(word) for row in faces for word in row[1 : 1 + int(row[0])]]
+    return Soup(vertices, triangulate(vertices, counts, np.array(corners, dtype=np.int64)))

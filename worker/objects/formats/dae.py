@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
-from typing import Final
+from dataclasses import replace
 
 import numpy as np
 from defusedxml import ElementTree as SafeTree
@@ -17,10 +17,8 @@ from defusedxml.common import DefusedXmlException
 
 from graspd.service.model.errors import MeshError
 from graspd.worker.objects.formats.obj import Nearby, colour_of, nothing_nearby
-from graspd.worker.objects.formats.soup import Soup, check_face_count, triangulate
+from graspd.worker.objects.formats.soup import Soup, soup_of, triangulate, walk
 
-_MAX_DEPTH: Final = 32
-_MAX_NODES: Final = 10_000
 Element = ElementTree.Element
 #: Vertices (V, 3), triangles (F, 3) and the symbol of the material of a primitive.
 _Primitive = tuple[np.ndarray, np.ndarray, str]
@@ -30,24 +28,12 @@ def read(data: bytes, nearby: Nearby = nothing_nearby) -> Soup:
     """Read vertices and triangles; every instance of a mesh in the node tree is its own copy."""
     root = _parse(data)
     library = _Library(root, nearby)
-    vertices: list[np.ndarray] = []
-    faces: list[np.ndarray] = []
-    colours: list[np.ndarray] = []
-    count = total = 0
-    for geometry, matrix, bound in _instances(root, library):
-        for points, triangles, symbol in library.primitives(geometry):
-            flipped = triangles[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else triangles
-            faces.append(flipped + count)
-            vertices.append(points @ matrix[:3, :3].T + matrix[:3, 3])
-            colour = library.colour(bound.get(symbol, symbol))
-            colours.append(np.tile(colour, (len(triangles), 1)))
-            count, total = count + len(points), total + len(triangles)
-            check_face_count(max(total, count // 3))
-    if not faces:
-        raise MeshError("the mesh has no faces; export a scene with a mesh")
-    known = np.concatenate(colours)
-    scaled = np.concatenate(vertices) * _unit(root)
-    return Soup(scaled, np.concatenate(faces), None if np.isnan(known).all() else known)
+    soup = soup_of(
+        (points, triangles, matrix, library.colour(bound.get(symbol, symbol)))
+        for geometry, matrix, bound in _instances(root, library)
+        for points, triangles, symbol in library.primitives(geometry)
+    )
+    return replace(soup, vertices=soup.vertices * _unit(root))
 
 
 def _parse(data: bytes) -> Element:
@@ -184,14 +170,11 @@ def _instances(root: Element, library: _Library) -> Iterator[tuple[str, np.ndarr
     """Return geometry, 4x4 matrix and material of each symbol for every mesh in the scene."""
     shown = root.find("scene/instance_visual_scene")
     scene = library.named(shown.get("url")) if shown is not None else root.find("library_visual_scenes/visual_scene")
-    stack = [(node, np.eye(4), 0) for node in (scene.findall("node") if scene is not None else [])]
-    visited = 0
-    while stack:
-        node, parent, depth = stack.pop()
-        visited += 1
-        if depth > _MAX_DEPTH or visited > _MAX_NODES:
-            raise MeshError("the node tree is too deep, too large or cyclic; flatten the scene")
-        matrix = parent @ _matrix(node)
+
+    def below(node: Element) -> list[Element]:
+        return node.findall("node") + [library.named(i.get("url")) for i in node.findall("instance_node")]
+
+    for node, matrix in walk(scene.findall("node") if scene is not None else [], _matrix, below):
         if node.find("instance_controller") is not None:
             raise MeshError("a skinned mesh is posed by its bones; apply the armature and export it without")
         for instance in node.findall("instance_geometry"):
@@ -200,8 +183,6 @@ def _instances(root: Element, library: _Library) -> Iterator[tuple[str, np.ndarr
                 for link in instance.findall("bind_material/technique_common/instance_material")
             }
             yield instance.get("url", ""), matrix, bound
-        stack += [(child, matrix, depth + 1) for child in node.findall("node")]
-        stack += [(library.named(i.get("url")), matrix, depth + 1) for i in node.findall("instance_node")]
 
 
 def _matrix(node: Element) -> np.ndarray:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Iterable, Iterator
 from typing import Any, Final
 
 import numpy as np
@@ -14,17 +15,16 @@ import numpy as np
 from graspd.service.model.errors import MeshError
 from graspd.service.model.transforms import Floats, quat_to_matrix
 from graspd.worker.objects.formats.obj import UNREADABLE, mean_colour
-from graspd.worker.objects.formats.soup import Soup, check_face_count
+from graspd.worker.objects.formats.soup import Part, Soup, soup_of, walk
 
 _INDEX_TYPES = {5121: "<u1", 5123: "<u2", 5125: "<u4"}
 #: Positions are floats, or with KHR_mesh_quantization integers that nodes or `normalized` scale.
 _POSITION_TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
-_TRIANGLES, _MAX_DEPTH = 4, 32
+_TRIANGLES = 4
 #: Extensions that contain or place vertices: refused by name wherever they occur.
 _GEOMETRY = ("KHR_draco_", "EXT_meshopt_", "KHR_meshopt_", "EXT_mesh_gpu_instancing")
 #: Extensions that move no vertex; any other one that a file requires is refused by name.
 _HARMLESS = ("KHR_mesh_quantization", "KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_", "KHR_xmp_")
-_MAX_INSTANCES = 10_000
 _UNKNOWN: Final = np.full(3, np.nan)
 
 
@@ -34,11 +34,11 @@ def read(data: bytes) -> Soup:
     for name in map(str, _list(document, "extensionsRequired")):
         if not name.startswith(_HARMLESS):
             raise _refusal(name)
-    vertices: list[np.ndarray] = []
-    faces: list[np.ndarray] = []
-    colours: list[np.ndarray] = []
+    return soup_of(_parts(document, binary))
+
+
+def _parts(document: dict[str, Any], binary: bytes) -> Iterator[Part]:
     looks: dict[tuple[int, int], np.ndarray] = {}
-    total = 0
     for mesh, matrix in _instances(document):
         shown = _item(document, "meshes", mesh)
         _refuse_morphs(shown)
@@ -47,20 +47,9 @@ def read(data: bytes) -> Soup:
             if 0 <= primitive.get("mode", _TRIANGLES) < _TRIANGLES:
                 continue
             points, triangles = _primitive(document, binary, primitive)
-            if np.linalg.det(matrix[:3, :3]) < 0:
-                triangles = triangles[:, ::-1]
-            faces.append(triangles + sum(map(len, vertices)))
-            vertices.append(points @ matrix[:3, :3].T + matrix[:3, 3])
             if (mesh, part) not in looks:
                 looks[mesh, part] = material_colour(document, binary, primitive)
-            colours.append(np.tile(looks[mesh, part], (len(triangles), 1)))
-            total += len(triangles)
-            check_face_count(total)
-            check_face_count(sum(map(len, vertices)) // 3)
-    if not faces:
-        raise MeshError("the mesh has no faces; export a scene with a mesh")
-    known = np.concatenate(colours)
-    return Soup(np.concatenate(vertices), np.concatenate(faces), None if np.isnan(known).all() else known)
+            yield points, triangles, matrix, looks[mesh, part]
 
 
 def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
@@ -81,7 +70,7 @@ def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
     return document, data[at + 8 : at + 8 + size]
 
 
-def _instances(document: dict[str, Any]) -> list[tuple[int, np.ndarray]]:
+def _instances(document: dict[str, Any]) -> Iterator[tuple[int, np.ndarray]]:
     nodes = _list(document, "nodes")
     scenes = _list(document, "scenes")
     if scenes:
@@ -89,24 +78,17 @@ def _instances(document: dict[str, Any]) -> list[tuple[int, np.ndarray]]:
     else:
         below = {int(child) for node in nodes for child in node.get("children", [])}
         roots = [root for root in range(len(nodes)) if root not in below]
-    stack = [(int(root), np.eye(4), 0) for root in roots]
-    found: list[tuple[int, np.ndarray]] = []
-    visited = 0
-    while stack:
-        index, parent, depth = stack.pop()
-        visited += 1
-        if depth > _MAX_DEPTH or visited > _MAX_INSTANCES or index < 0:
-            raise MeshError("the node tree is too deep, too large or cyclic; flatten the scene")
-        node = _item(document, "nodes", index)
-        matrix = parent @ _matrix(node)
+
+    def named(indices: Iterable[Any]) -> Iterator[dict[str, Any]]:
+        return (_item(document, "nodes", index) for index in indices)
+
+    for node, matrix in walk(named(roots), _matrix, lambda node: named(node.get("children", []))):
         _refuse_extensions(node)
         _refuse_morphs(node)
         if "skin" in node:
             raise MeshError("a skinned mesh is posed by its bones; apply the armature and export it without")
         if "mesh" in node:
-            found.append((int(node["mesh"]), matrix))
-        stack += [(int(child), matrix, depth + 1) for child in node.get("children", [])]
-    return found
+            yield int(node["mesh"]), matrix
 
 
 def _matrix(node: dict[str, Any]) -> np.ndarray:

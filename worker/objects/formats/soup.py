@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeVar
 
 import manifold3d
 import numpy as np
@@ -37,6 +38,48 @@ class Soup:
             (None if rgb[0] < 0 else (float(rgb[0]), float(rgb[1]), float(rgb[2])), np.flatnonzero(index == i))
             for i, rgb in enumerate(known)
         ]
+
+
+_MAX_DEPTH: Final = 32
+_MAX_NODES: Final = 10_000
+Node = TypeVar("Node")
+#: Vertices (V, 3), triangles (F, 3), 4x4 matrix of the part's place, and its sRGB colour (3,), NaN if not stated.
+Part = tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]
+
+
+def walk(
+    roots: Iterable[Node], matrix_of: Callable[[Node], Floats], below: Callable[[Node], Iterable[Node]]
+) -> Iterator[tuple[Node, Floats]]:
+    """Yield each node of a scene with its 4x4 matrix; a node that is named twice is there twice."""
+    stack = [(node, np.eye(4), 0) for node in roots]
+    visited = 0
+    while stack:
+        node, parent, depth = stack.pop()
+        visited += 1
+        if depth > _MAX_DEPTH or visited > _MAX_NODES:
+            raise MeshError("the node tree is too deep, too large or cyclic; flatten the scene")
+        matrix = parent @ matrix_of(node)
+        yield node, matrix
+        stack += [(child, matrix, depth + 1) for child in below(node)]
+
+
+def soup_of(parts: Iterable[Part]) -> Soup:
+    """Join the placed parts of a scene; mirrored ones are turned outward."""
+    vertices: list[NDArray[np.float64]] = []
+    faces: list[NDArray[np.int64]] = []
+    colours: list[NDArray[np.float64]] = []
+    count = total = 0
+    for points, triangles, matrix, colour in parts:
+        flipped = triangles[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else triangles
+        faces.append(flipped + count)
+        vertices.append(points @ matrix[:3, :3].T + matrix[:3, 3])
+        colours.append(np.tile(colour, (len(triangles), 1)))
+        count, total = count + len(points), total + len(triangles)
+        check_face_count(max(total, count // 3))
+    if not faces:
+        raise MeshError("the mesh has no faces; export a scene with a mesh")
+    known = np.concatenate(colours)
+    return Soup(np.concatenate(vertices), np.concatenate(faces), None if np.isnan(known).all() else known)
 
 
 def check_soup(soup: Soup) -> Soup:
