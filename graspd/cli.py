@@ -64,7 +64,6 @@ JOINED: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("admin", "kernels", "graspd.commands.admin", "Compile all kernels ahead of time."),
     ("admin", "index", "graspd.service.run.commands", "Rebuild the index from the store or export its tables."),
     ("admin", "store", "graspd.service.run.store_commands", "Verify and repair the store."),
-    ("admin", "gallery", "graspd.commands.admin", "Render hands and objects on tables as camera pictures."),
     ("hands", "check", "graspd.commands.hands", "Check whether a hand can be used, and report guesses."),
     ("objects", "check", "graspd.commands.objects", "Check whether a mesh can be used, and report repairs."),
     ("datasets", "balance", "graspd.commands.curate", "Write a subset in which no kind of grasps dominates."),

@@ -96,10 +96,6 @@ def twins(both: Sequence[Distribution | None]) -> list[TwinBar]:
     ]
 
 
-def _share(value: float, low: float, high: float) -> float:
-    return (value - low) / (high - low) if high > low else 0.5
-
-
 #: Steps of the colour scale; the style sheet has a class for each.
 STEPS: Final = 10
 #: Most objects on a page; objects with jobs come first.

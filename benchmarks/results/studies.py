@@ -655,9 +655,9 @@ STUDIES: Final = (
             *_on_its_way("allegro", "mug", "bin"),
             *_on_its_way("barrett", "mug", "shelf"),
             *_on_its_way("allegro", "block", "examples/scenes/beside_a_box.yaml"),
-            "graspd admin gallery --object mug --object bottle --object block "
+            "python -m benchmarks.scene_pictures --object mug --object bottle --object block "
             f"--object mustard={_mesh('006_mustard_bottle')} --object soup_can={_mesh('005_tomato_soup_can')} "
-            f"--object drill={_mesh('035_power_drill')} -o OUT/images/scenes",
+            f"--object drill={_mesh('035_power_drill')} --out OUT/images/scenes",
         ),
         (
             "graspd synth --hand barrett --object block --scene table --scenes 1 -n 1 -o WORK/way.h5",

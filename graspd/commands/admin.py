@@ -1,19 +1,14 @@
-"""Command line: `graspd admin kernels` and `gallery`."""
+"""Command line: `graspd admin kernels`."""
 
 from __future__ import annotations
 
 import os
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from graspd.service.cli import CommandGroup, JsonFlag, report
-from graspd.worker.engines.devices import Device
-
-if TYPE_CHECKING:
-    from graspd.worker.objects.model import ObjectModel
 
 app = CommandGroup(add_completion=False)
 
@@ -38,36 +33,3 @@ def kernels(
     made = {"folder": str(folder), "files": len(files), "bytes": size, "architectures": list(architectures), "cpu": cpu}
     line = f"{len(files)} kernel files, {size / 1e6:.1f} MB, in {folder}; GRASPD_KERNELS={folder.resolve()}"
     report(made, line, json=json)
-
-
-@app.command(epilog="graspd admin gallery --object mug --object banana.stl -o docs/images/scenes")
-def gallery(
-    object: Annotated[list[str] | None, typer.Option(help="Built-in object, mesh, or NAME=MESH; repeatable.")] = None,
-    hand: Annotated[list[str] | None, typer.Option(help="URDF or built-in hand; repeatable.")] = None,
-    device: Annotated[str, typer.Option(help="Warp device: cpu, cuda:0, or auto.")] = "auto",
-    seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same pictures.")] = 0,
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")] = Path("gallery"),
-    json: JsonFlag = False,
-) -> None:
-    """Write pages of camera pictures: hands in clear grasps on a table, and cluttered tables."""
-    from graspd.studies.gallery import paint
-    from graspd.worker.hands.load import hand_from_path
-
-    files = paint(
-        [hand_from_path(name) for name in hand or ["allegro", "barrett", "shadow"]],
-        [_object(name) for name in object or ["mug", "bottle", "block"]],
-        output,
-        device=Device(device).resolve(),
-        seed=seed,
-        say=lambda line: typer.echo(line, err=True),
-    )
-    names = [str(file) for file in files]
-    report({"files": names}, "\n".join(names), json=json)
-
-
-def _object(text: str) -> ObjectModel:
-    from graspd.worker.objects.prepare import object_from_path
-
-    name, _, path = text.rpartition("=")
-    obj = object_from_path(path, face_error_m=3e-4)
-    return replace(obj, name=name) if name else obj

@@ -90,7 +90,7 @@ def without_engine(*command: str, absent: str = "warp,newton,trimesh,mujoco,scip
     return completed([sys.executable, "-c", WITHOUT_ENGINE, absent, *command], cwd=REPOSITORY)
 
 
-@pytest.mark.parametrize("command", ["synth", "up", "admin gallery"])
+@pytest.mark.parametrize("command", ["synth", "up", "admin kernels"])
 def test_a_command_that_is_not_installed_says_what_to_install(command: str) -> None:
     done = without_engine(*command.split())
     assert done.returncode == 1
@@ -99,7 +99,7 @@ def test_a_command_that_is_not_installed_says_what_to_install(command: str) -> N
 
 
 def test_completion_does_not_mention_what_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = {"_GRASPD_COMPLETE": "complete_bash", "COMP_WORDS": "graspd admin gallery --h", "COMP_CWORD": "3"}
+    asked = {"_GRASPD_COMPLETE": "complete_bash", "COMP_WORDS": "graspd admin kernels --a", "COMP_CWORD": "3"}
     for name, value in asked.items():
         monkeypatch.setenv(name, value)
     assert without_engine().stderr == ""

@@ -101,7 +101,7 @@ _TYPED = """
     datasets balance FILE.h5 -o OUT; datasets card FILE.h5/ -o OUT
     datasets create x --spec FILE.toml; datasets estimate --spec FILE.json
     hands check FILE.urdf; hands check FILE.zip; objects check FILE.zip; objects check FILE.stl
-    bench --hand FILE.urdf; admin gallery --hand FILE.urdf -o OUT
+    bench --hand FILE.urdf
     chart --from FILE.json; chart --scene FILE.json --quick; stability --from FILE.json
     submit --hand allegro --object mug --scene FILE.json
 """

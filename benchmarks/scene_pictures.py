@@ -1,8 +1,14 @@
-"""Gallery pages: camera views of objects at rest, hands in clear grasps, and tables with several objects."""
+"""Pages of camera pictures: objects at rest, hands in clear grasps, and tables with several objects.
+
+usage: python -m benchmarks.scene_pictures --object mug --object mustard=MESH ... --out FOLDER [--hand allegro ...]
+           [--seed 0] [--device cpu]
+"""
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,8 +21,10 @@ from graspd.service.model.transforms import Floats, apply
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import Posture
 from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import PlanRequest, synthesize
 from graspd.worker.rendering.cameras import FIELD_OF_VIEW, GivenCameras, distance_to_fill, look_at
 from graspd.worker.rendering.hands import DrawnHand
@@ -24,7 +32,6 @@ from graspd.worker.rendering.sheets import label_page, scene_cells, with_palette
 from graspd.worker.rendering.views import Extras, render
 from graspd.worker.scenes import Neighbours, drop, drop_together, transfer
 
-Say = Callable[[str], None]
 #: Size of one picture [px].
 SIZE: Final = (300, 225)
 #: Rays per pixel, for pictures of high quality.
@@ -38,24 +45,17 @@ _LEVEL: Final = 0.94
 _CHANNELS: Final = ("left", "right", "depth", "normals", "segmentation", "boxes")
 
 
-def paint(
-    hands: Sequence[HandModel], objects: Sequence[ObjectModel], folder: Path, *, device: str, seed: int, say: Say
-) -> list[Path]:
-    """Write `views.png`, `hands.png` and, for three or more objects, `neighbours.png`; return the files."""
+def paint(hands: Sequence[HandModel], objects: Sequence[ObjectModel], folder: Path, *, device: str, seed: int) -> None:
+    """Write `views.png`, `hands.png` and, for three or more objects, `neighbours.png`."""
     folder.mkdir(parents=True, exist_ok=True)
     pages: dict[str, Callable[[], bytes]] = {
         "views": lambda: _views(objects, device, seed),
-        "hands": lambda: _hands(hands, objects, device, seed, say),
+        "hands": lambda: _hands(hands, objects, device, seed),
     }
     if len(objects) > 2:
         pages["neighbours"] = lambda: _neighbours(objects, device, seed)
-    written = []
     for name, page in pages.items():
-        say(f"{name} ...")
-        path = folder / f"{name}.png"
-        path.write_bytes(with_palette(page()))
-        written.append(path)
-    return written
+        (folder / f"{name}.png").write_bytes(with_palette(page()))
 
 
 def _seen(
@@ -76,13 +76,12 @@ def _views(objects: Sequence[ObjectModel], device: str, seed: int) -> bytes:
     return label_page(rows, _CHANNELS, names, title="What the cameras see", subtitle=subtitle)
 
 
-def _hands(hands: Sequence[HandModel], objects: Sequence[ObjectModel], device: str, seed: int, say: Say) -> bytes:
+def _hands(hands: Sequence[HandModel], objects: Sequence[ObjectModel], device: str, seed: int) -> bytes:
     rows, names = [], []
     for k, obj in enumerate(objects):
         cells, below = [], []
         for hand in hands:
             drawn, pose, kept, tried = _fitting(hand, obj, device, seed)
-            say(f"{hand.name} on {obj.name}: {kept} of {tried} grasps are clear of the table")
             extras = Extras(cameras=GivenCameras(extrinsics=_camera(drawn, obj, pose)[None]), drawn=drawn)
             seen = _seen(obj, pose[None], device, seed + k, extras, stereo=False)
             cells.append(Image.fromarray(np.asarray(seen["image/rgb_hand"][0], np.uint8)))
@@ -163,3 +162,26 @@ def _past(poses: Floats, obj: ObjectModel, beside: Neighbours) -> GivenCameras:
     return GivenCameras(
         extrinsics=look_at(centre + distance_to_fill(radius, FIELD_OF_VIEW, 1.0) * direction, centre)[None]
     )
+
+
+def _object(text: str) -> ObjectModel:
+    name, _, path = text.rpartition("=")
+    obj = object_from_path(path, face_error_m=3e-4)
+    return replace(obj, name=name) if name else obj
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--object", action="append", required=True, help="built-in object, mesh, or NAME=MESH")
+    parser.add_argument("--hand", action="append", help="URDF or built-in hand")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--out", type=Path, required=True)
+    args = parser.parse_args()
+    hands = [hand_from_path(name) for name in args.hand or ["allegro", "barrett", "shadow"]]
+    objects = [_object(name) for name in args.object]
+    paint(hands, objects, args.out, device=args.device, seed=args.seed)
+
+
+if __name__ == "__main__":
+    main()
