@@ -29,7 +29,6 @@ class JobKeywords(TypedDict, total=False):
     budget: float
     min_distance: float
     rechecks: int
-    robustness: int
     robust_models: int
     payload: bool
     min_payload: float

@@ -257,7 +257,8 @@ def table(result: dict[str, Any]) -> str:
             f"({shares}); {phase['queries_per_second'] / 1e6:.2f} M distances/s",
         ]
     start = result["start"]
-    lines += ["", f"First grasp after {start['first_grasp_s']:.2f} s, the next after {start['next_grasp_s']:.2f} s."]
+    first, following = start["first_grasp_s"], start["next_grasp_s"]
+    lines += ["", f"In a fresh process the first grasp takes {first:.2f} s, the next {following:.2f} s."]
     return "\n".join(lines)
 
 

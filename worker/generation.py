@@ -44,7 +44,7 @@ from graspd.worker.validation.lifting import lift_key, validate_lifts
 from graspd.worker.validation.payload import ENOUGH, Limit, limit_of, payloads, shake_margins
 from graspd.worker.validation.prefilter.prefilter import PrefilterVerdicts, first_terms
 from graspd.worker.validation.protocol import DIRECTIONS, Outcome
-from graspd.worker.validation.robust import reaches, robust, robustness
+from graspd.worker.validation.robust import reaches, robust
 from graspd.worker.validation.validator import prefiltered, validate
 
 #: Reasons to reject a grasp: its numbers are not finite; an obstacle of its scene blocks it; it was not held by the
@@ -481,7 +481,7 @@ class Batch:
         return NoStartFound(f"{error}: {why}") if why else error
 
     def finish(self) -> ValidatedBatch:
-        """Join the rounds to one batch of `count` grasps, with rechecks and robustness."""
+        """Join the rounds to one batch of `count` grasps, with rechecks."""
         scoring, rounds, count = self.scoring, self.rounds, self.count
         grasps = joined([part.grasps for part in rounds])
         columns = joined_columns([part.columns for part in rounds])
@@ -534,7 +534,7 @@ class Batch:
         }
 
     def _second_opinions(self, grasps: GraspSet, valid: NDArray[np.uint8]) -> Arrays:
-        """Return displacements of all grasps and, if wanted, robustness and rechecks.
+        """Return displacements of all grasps and, if wanted, rechecks.
         Rechecks validate the first valid grasps at level `dexgraspbench`."""
         scoring = self.scoring
         assert scoring.pieces is not None
@@ -548,11 +548,6 @@ class Batch:
                     known = self._rechecks.result() if self._rechecks else self._rechecked(grasps.take(rechecked))
                     recheck[rechecked] = known[: len(rechecked)]
                 columns["quality/recheck"] = recheck
-            if repeats := self.request.robustness:
-                seed, quiet = self.request.seed, run.quiet()
-                columns["quality/robustness"] = robustness(
-                    hand, obj, grasps, held=valid, repeats=repeats, seed=seed, pieces=pieces, run=quiet
-                )
         return columns
 
     def _begin_rechecks(self, first: Round) -> None:

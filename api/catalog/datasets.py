@@ -31,7 +31,7 @@ log = logging.getLogger(__name__)
 
 
 class Datasets:
-    """Datasets in the caller's scope; changes raise ForeignResource or QuotaError."""
+    """Datasets in the caller's scope. Changes of another owner's raise ForeignResource; above a quota, QuotaError."""
 
     def __init__(self, services: Services, quotas: Quotas) -> None:
         self._services = services

@@ -82,7 +82,7 @@ def _shard(shard: ShardView) -> Shard:
 
 
 class Jobs:
-    """Jobs in the caller's scope; changes raise ForeignResource or QuotaError."""
+    """Jobs in the caller's scope. Changes of another owner's raise ForeignResource; above a quota, QuotaError."""
 
     def __init__(
         self, services: Services, quotas: Quotas, idempotency: Idempotency, grasps: Grasps, shards: Shards

@@ -31,7 +31,7 @@ log = logging.getLogger(__name__)
 
 
 class Tags:
-    """Tags of the caller's project, each by its name or id; changes raise ForeignResource."""
+    """Tags of the caller's project, each by its name or id. Changes of another owner's raise ForeignResource."""
 
     def __init__(self, services: Services, grasps: Grasps) -> None:
         self._services = services

@@ -102,7 +102,7 @@ def get_usage(usage: UsageOf, since: Since = None, until: Until = None) -> list[
     ),
 )
 def get_usage_csv(usage: UsageOf, since: Since = None, until: Until = None) -> Response:
-    """Return the usage of `/v1/usage` as CSV."""
+    """Return the data of `/v1/usage` as CSV."""
     headers = {"Content-Disposition": 'attachment; filename="usage.csv"'}
     return Response(as_csv(usage.days(since, until)), media_type="text/csv", headers=headers)
 

@@ -29,7 +29,9 @@ from graspd.service.store.asset_summary import summary
 
 UrlOption = Annotated[
     str | None,
-    typer.Option("--url", help="URL of the API; default: GRASPD_API_URL, or the service of the data folder."),
+    typer.Option(
+        "--url", help="URL of the API; default: GRASPD_API_URL, else the local service that runs on the data folder."
+    ),
 ]
 
 

@@ -91,7 +91,7 @@ def _verdict_text(request: JobRequest, batches: range) -> dict[str, object]:
         found |= {} if request.min_distance == MIN_DISTANCE_M else {"min_distance": request.min_distance}
     if request.validation != "none":
         rechecks = sum(map(request.rechecks_of, batches))
-        found |= {"validation": request.validation, "rechecks": rechecks, "robustness": request.robustness}
+        found |= {"validation": request.validation, "rechecks": rechecks}
     if request.models:
         found |= {"robust": [request.models, request.robust]}
     if request.measures_payload:

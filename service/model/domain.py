@@ -202,9 +202,6 @@ class JobOptions(Model):
         description="number of valid grasps validated again at level dexgraspbench. The default checks one grasp in "
         f"64, at most {RECHECKS}, in a twentieth of the job's time; other numbers check the first valid grasps",
     )
-    robustness: Annotated[int, Option(places=JOB)] = Field(
-        0, ge=0, le=20, description="number of verdicts under noise for each valid grasp"
-    )
     robust: Annotated[
         float,
         Option("basic"),
@@ -306,11 +303,8 @@ class JobOptions(Model):
         return self
 
     def _check_scene(self) -> None:
-        if self.place.kind != "free":
-            if self.method in FREE_ONLY_METHODS:
-                raise ValueError(f"method {self.method} plans around free objects only: in a scene use fast_graspd")
-            if self.robustness:
-                raise ValueError("robustness repeats the six pushes of free grasps: choose scene free")
+        if self.place.kind != "free" and self.method in FREE_ONLY_METHODS:
+            raise ValueError(f"method {self.method} plans around free objects only: in a scene use fast_graspd")
         if not self.SUBMITTED:
             return
         if self.shake and not self.in_scene:
@@ -324,8 +318,6 @@ class JobOptions(Model):
             )
 
     def _check_without_validation(self) -> None:
-        if self.robustness:
-            raise ValueError("robustness counts verdicts: choose a validator")
         if self.models:
             raise ValueError("robust counts verdicts: choose a validator")
         if self.measures_payload:

@@ -149,7 +149,7 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
     GraspMetric(
         "robustness",
         "1",
-        "share of positive verdicts under noise of 1 mm and 1 degree on the object",
+        "share of positive verdicts under noise of 1 mm and 1 degree on the object; written by graspd 0.2",
         title="Share held under noise",
         short="Robustness",
         optional=True,

@@ -24,6 +24,8 @@ _LEVELS: Final = {"letter": "dexgraspbench", "certificate": "standard", "screen"
 VALUES: Final = {"validation": _LEVELS, "verdict_level": _LEVELS, "level": _LEVELS, "want": {"raw": "candidates"}}
 _OLD_KEYS: Final = {new: old for old, new in KEYS.items()}
 _OLD_VALUES: Final = {key: {new: old for old, new in names.items()} for key, names in VALUES.items()}
+#: Option of 0.2 without a successor. Digests of options contain its default.
+_REMOVED: Final = "robustness"
 #: Columns of base shards: present path, and path in schema graspd/base@1.
 COLUMNS: Final = {
     "quality/feasible": "quality/sound",
@@ -32,7 +34,7 @@ COLUMNS: Final = {
 }
 #: Revision of each stage in graspd 0.2.
 _REVISIONS: Final = {"synthesize": 23, "scene": 2, "render": 4}
-_OLD: Final = re.compile(rb'"(?:' + b"|".join([*map(str.encode, KEYS), *map(str.encode, _LEVELS), b"raw"]) + rb')"')
+_OLD: Final = re.compile(f'"(?:{"|".join([*KEYS, *_LEVELS, "raw", _REMOVED])})"'.encode())
 
 #: Measures of charts: success under the unmodified protocol (free or lifted), and speed over all candidates.
 _CHART: Final = re.compile(r"^(lift_)?(?:(letter)(?=_low$|_high$|_count$|$)|raw(?=_end_to_end_per_second$))")
@@ -50,6 +52,8 @@ def renamed(value: Any) -> Any:
         for key, names in VALUES.items():
             if isinstance(old := found.get(key), str):
                 found[key] = names.get(old, old)
+        if "rechecks" in found:  # options of a job
+            found.pop(_REMOVED, None)
         return found
     if isinstance(value, list):
         return [renamed(inner) for inner in value]
@@ -75,10 +79,11 @@ def _of_chart(name: str) -> str:
 
 def original(request: dict[str, Any]) -> dict[str, Any]:
     """Return a job's request with the names of graspd 0.2: ids of jobs and shards are digests of these names."""
-    return {
+    found = {
         _OLD_KEYS.get(key, key): _OLD_VALUES[key].get(value, value) if key in _OLD_VALUES else value
         for key, value in request.items()
     }
+    return found | {_REMOVED: 0} if "rechecks" in request else found
 
 
 def for_worker_of(revision: int, stage: str, message: dict[str, Any]) -> dict[str, Any]:

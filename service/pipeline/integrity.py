@@ -94,7 +94,7 @@ def scan(
                 yield entry.key, examine(store, entry.key, read=read, unsealed=unsealed)
 
 
-def is_on_its_way(store: Store, one: Damage) -> bool:
+def may_await_manifest(store: Store, one: Damage) -> bool:
     """Check whether a file may only wait for its manifest, which its worker puts next."""
     try:
         return one.what == NO_MANIFEST and (age_of(store.stamp(one.key)[1]) or 0.0) < _ON_ITS_WAY_S

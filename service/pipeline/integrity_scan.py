@@ -16,7 +16,7 @@ from graspd.service.index.notes import Damage, ScanNote
 from graspd.service.model.clock import age_of, timestamp
 from graspd.service.model.errors import GraspdError
 from graspd.service.pipeline.backends import Services
-from graspd.service.pipeline.integrity import FOLDERS, examine, is_checked, is_on_its_way
+from graspd.service.pipeline.integrity import FOLDERS, examine, is_checked, may_await_manifest
 
 log = logging.getLogger(__name__)
 #: Least interval of rounds over a small store [s].
@@ -132,7 +132,7 @@ class IntegrityScan:
     def _look(self, key: str) -> None:
         self._pace(_LEAST)
         wrong = examine(self._services.store, key, read=self._pace)
-        if wrong is not None and not is_on_its_way(self._services.store, wrong):
+        if wrong is not None and not may_await_manifest(self._services.store, wrong):
             log.warning("%s: %s", wrong.key, wrong.what)
             self._services.index.damage.mark([wrong])
 

@@ -16,7 +16,7 @@ from graspd.service.model.records import JobRecord
 from graspd.service.model.states import AssetKind, Priority, Stage
 from graspd.service.model.version import STAGE_REVISIONS
 from graspd.service.pipeline.backends import Services
-from graspd.service.pipeline.integrity import BAD_MANIFEST, FOREIGN, MISSING, NO_MANIFEST, STAGES, is_on_its_way
+from graspd.service.pipeline.integrity import BAD_MANIFEST, FOREIGN, MISSING, NO_MANIFEST, STAGES, may_await_manifest
 from graspd.service.store.library import builtin_assets, load_asset, publish_builtins
 from graspd.service.store.records import read_record, task_attempts
 
@@ -48,7 +48,7 @@ def _fix(services: Services, one: Damage, harmed: set[str]) -> str:
     if not one.shard:
         return "put a copy in its place"
     stage = STAGES[one.key.split("/")[1]]
-    if is_on_its_way(services.store, one):
+    if may_await_manifest(services.store, one):
         return "its manifest may follow soon; run the command again in a minute"
     planned = _planned(services, stage, one.shard)
     if isinstance(planned, str):

@@ -220,7 +220,7 @@ def sealed(key: str, data: bytes) -> bytes:
     if key.endswith(".json") and data[:1] == b"{":
         data, at = _JSON + _ZEROS + b'",' + data[1:], len(_JSON)
     elif key.endswith(".glb") and data[:4] == b"glTF" and data[_GLB_AT : _GLB_AT + 1] == b"{":
-        data, at = _with_extras(data), _GLB_AT + len(_GLB)
+        data, at = _with_blank_checksum(data), _GLB_AT + len(_GLB)
     elif key.endswith((".zip", ".npz")) and data[-_END.size : 4 - _END.size] == _END_MARK and data[-2:] == b"\0\0":
         comment = _ZIP + _ZEROS
         data = data[:-2] + struct.pack("<H", len(comment)) + comment
@@ -278,7 +278,7 @@ def _without_digits(chunk: bytes, at: int) -> bytes:
     return chunk if first >= last else chunk[:first] + b"0" * (last - first) + chunk[last:]
 
 
-def _with_extras(data: bytes) -> bytes:
+def _with_blank_checksum(data: bytes) -> bytes:
     length = int.from_bytes(data[12:16], "little")
     document = _GLB + _ZEROS + b'"},' + data[_GLB_AT + 1 : _GLB_AT + length]
     document += b" " * (-len(document) % 4)

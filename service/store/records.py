@@ -226,7 +226,7 @@ class Deletion(Record):
 
 
 class DeletedJob(Record):
-    """A deleted job; its shards are removed after the grace time without use."""
+    """A deleted job. After the grace time its shards are removed, unless another job needs them."""
 
     version: Literal[1] = 1
     at: str

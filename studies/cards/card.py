@@ -18,7 +18,7 @@ from graspd.service.readers import ShardFile, Shards
 from graspd.service.store.shards import open_shard
 from graspd.studies.cards.contents import Contents, ShardContents, pieces
 from graspd.studies.cards.numbers import numbers
-from graspd.studies.cards.page import page
+from graspd.studies.cards.page import render_card
 from graspd.studies.cards.plots import draw
 from graspd.studies.cards.tally import tally_of
 from graspd.worker.rendering import sheets
@@ -71,7 +71,7 @@ def write_card(
     card["plots"] = list(plots)
     (folder / "checksums.sha256").write_text("".join(checksums(contents)))
     (folder / "card.json").write_text(json.dumps(card, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
-    (folder / "README.md").write_text(page(card, plots))
+    (folder / "README.md").write_text(render_card(card, plots))
     return card
 
 

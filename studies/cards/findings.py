@@ -191,9 +191,6 @@ def _qualities(card: Row) -> Iterator[str]:
         if (models := found.get("robust_share")) and models["median"] < 1:
             share = _percent(models["median"])
             parts.append(f"half of them hold in at most {share} of the models around the nominal one")
-        if (robust := found.get("robustness")) and robust["median"] < 1:
-            share = _percent(1 - robust["median"])
-            parts.append(f"half of them fail in at least {share} of the repeats with 1 mm and 1° of noise")
         if parts:
             said.append(f"{hand}: {'; '.join(parts)}")
     if said:

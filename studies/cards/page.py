@@ -41,7 +41,7 @@ _MEDIANS: Final = (
 )
 
 
-def page(card: Row, plots: Mapping[str, str]) -> str:
+def render_card(card: Row, plots: Mapping[str, str]) -> str:
     """Return the whole page; `plots` are file names and captions."""
     unknown = {
         "approach directions of palms and use of joints (the hands' files are not available)": "directions.png",

@@ -149,7 +149,7 @@ def _kept(setting: Setting, way: str, hand: HandModel, place: ObjectScenes, mode
 
 
 def _tried(setting: Setting, way: str, hand: HandModel, place: ObjectScenes, models: int) -> Row:
-    """Return counts, shares and speed of one setting on one pair."""
+    """Return number, shares and rate of the grasps of one setting for a hand and an object."""
     obj = place.thing.load(setting.knobs.face_error_m)
     placed = place.scenes.placed(np.arange(setting.batch) % len(place.scenes.object_pose))
     row: Row = {"grasps": setting.batch, "seconds": 0.0, "end_seconds": 0.0, **_NOTHING}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import inspect
 import re
 import subprocess
 import sys
@@ -45,6 +47,15 @@ def test_the_files_to_open_for_a_change_are_there() -> None:
         assert len(named) == int(number), wish
         missing = [name for name in named if not (REPOSITORY / name).exists()]
         assert not missing, f"{wish}: {missing}"
+
+
+def test_the_interfaces_of_the_engine_have_these_parameters() -> None:
+    _, _, text = (REPOSITORY / "ARCHITECTURE.md").read_text().partition("## Interfaces of the engine")
+    named = re.findall(r"^    (graspd[\w.]+) +(\w+)\(([^)]*)\)", text, re.MULTILINE)
+    assert len(named) == 9
+    for module, function, parameters in named:
+        known = inspect.signature(getattr(importlib.import_module(module), function)).parameters
+        assert set(re.findall(r"\w+", parameters)) <= set(known), function
 
 
 #: The task engine of our own: what carries tasks from the controller to a worker's result and back. Rates of batches

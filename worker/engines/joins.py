@@ -44,7 +44,7 @@ def processes_at_once(device: str, wanted: int, *, threads: int = 0, workers: in
     """Return the number of processes that validate and measure: `wanted`, if not 0; 1: the worker's own, with threads.
 
     By default a worker on a GPU has one process fewer than its share of the cores. All `workers` together use at most a
-    quarter of the memory. On a CPU the planner uses the same cores, and threads (0: one per core) suffice.
+    quarter of the memory. On a CPU the planner needs all cores, so the default is 1.
     """
     if wanted or not device.startswith("cuda"):
         return wanted or 1

@@ -1,8 +1,8 @@
 """Postures in which any two parts of a hand face each other, for objects narrower than pads can grip, or wider.
 
 An object of 10 mm is held between the sides of two fingers, or between a finger and the palm. An object as wide as the
-hand's span is held between the sides of fingertips. In both cases two surface points have normals along the line
-between them and space for a cube of that width. Sampling and random steps find such pairs.
+hand's span is held between the sides of fingertips. In both cases there are two surface points with normals along
+the line between them, and room for a cube as wide as their distance. Sampling and random steps find such pairs.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Engine of a worker: the process that owns the device and runs tasks one by one.
 
-Its worker (`worker.process.main`) sends pairs of a word and its argument over a pipe, after the `Setup`. Orders are
+The worker (`worker.process.main`) first sends a `Setup` over a pipe, then orders of the form (name, argument):
 `service` (compares store and Redis), `check` (answer: `ready`), `task` (`done`, then `idle`) and `end`. An answer may
 be an error, `refused`. `stop` with a reason is accepted at any time. The engine also sends `facts` for the list of
 workers (including progress) and `event`. It does not access Redis.
@@ -111,13 +111,13 @@ class Engine:
         # Only the most expensive stage: others load with their first task, and are checked after failures.
         stages = self._setup.stages
         first = (Stage.SYNTHESIZE,) if Stage.SYNTHESIZE in stages else stages
-        fit = self._fitness.try_engine(first) or (self._setup.patient and self._sit_out(first))
+        fit = self._fitness.try_engine(first) or (self._setup.patient and self._wait_in_quarantine(first))
         if fit:
             self.update(state="idle")
         return fit
 
-    def _sit_out(self, stages: Collection[Stage]) -> bool:
-        return self._fitness.sit_out(stages, self.update, lambda: self._reason is not None)
+    def _wait_in_quarantine(self, stages: Collection[Stage]) -> bool:
+        return self._fitness.wait_in_quarantine(stages, self.update, lambda: self._reason is not None)
 
     def _do(self, raw: dict[str, Any]) -> None:
         context = self._surroundings.context(raw, self.update)
@@ -138,7 +138,7 @@ class Engine:
         if self._runner.device_lost:
             log.error("this worker ends: %s", self._runner.device_lost)
             return "unfit"
-        if self._fitness.reason and self._reason is None and not self._sit_out(self._setup.stages):
+        if self._fitness.reason and self._reason is None and not self._wait_in_quarantine(self._setup.stages):
             return "fit" if self._reason is StopReason.SHUTDOWN else "unfit"
         if why := self._surroundings.outgrown():
             log.info("this worker ends, so that a fresh one starts: %s", why)
@@ -186,7 +186,7 @@ class TaskResources:
 
     @cached_property
     def _join(self) -> int:
-        """Return the batches per launch on the device; waits until it is resolved."""
+        """Return the number of batches per kernel launch; block until the device is known."""
         join = self.settings.join
         return batches_at_once(self._device.resolve(), None if join == "auto" else int(join))
 

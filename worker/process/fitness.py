@@ -86,7 +86,9 @@ class Fitness:
                 self._failed = dict(list(self._failed.items())[-_REMEMBERED:])
         return self.reason
 
-    def sit_out(self, stages: Collection[Stage], update: Callable[..., None], told_to_stop: Callable[[], bool]) -> bool:
+    def wait_in_quarantine(
+        self, stages: Collection[Stage], update: Callable[..., None], told_to_stop: Callable[[], bool]
+    ) -> bool:
         """Wait in quarantine, reported by `update`; return True once the worker is fit, False if it must stop."""
         log.warning("this worker takes no tasks: %s", self.reason)
         for pause in PAUSES_S:

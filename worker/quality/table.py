@@ -226,7 +226,7 @@ def grasp_types(probe: Probe, found: Distances) -> NDArray[np.int32]:
     palm = touching[:, finger < 0].any(axis=1)
     touches = np.stack([touching[:, finger == digit].any(axis=1) for digit in digits], axis=1)
     wraps = np.stack([touching[:, inner[finger[inner] == digit]].any(axis=1) for digit in digits], axis=1)
-    sides = touches & _by_sides(probe, found, finger, digits)
+    sides = touches & _touching_with_sides(probe, found, finger, digits)
     count = touches.sum(axis=1)
     lateral = sides.any(axis=1) & (2 * sides.sum(axis=1) >= count)
     power = palm | ((wraps & ~sides).sum(axis=1) >= ENVELOPING)
@@ -235,7 +235,7 @@ def grasp_types(probe: Probe, found: Distances) -> NDArray[np.int32]:
     return np.where(count + palm < 2, GraspType.NONE, told).astype(np.int32)
 
 
-def _by_sides(
+def _touching_with_sides(
     probe: Probe, found: Distances, finger: NDArray[np.int32], digits: NDArray[np.int32]
 ) -> NDArray[np.bool_]:
     """Check (B, digits) whether more than half of a digit's near points are on its sides."""

@@ -124,7 +124,7 @@ def add_gradient(out: Launches, m: Model, d: Data) -> None:
     add_root_gradient(out, m, d)
     o = m.options
     inputs = [m.hand.lower, m.hand.upper, o.range_weight, o.limit_weight, d.hands]
-    out.add(penalties.joints, (d.capacity, m.dofs), inputs=inputs, outputs=[d.gradient])
+    out.add(penalties.joint_penalties, (d.capacity, m.dofs), inputs=inputs, outputs=[d.gradient])
 
 
 def add_step(

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspd.service.model.metrics import ROBUST_MODELS, Axis
-from graspd.service.model.transforms import Floats, compose, invert, quat_from_axis_angle
+from graspd.service.model.transforms import Floats
 from graspd.worker.execution_context import DEFAULT_CONTEXT, Count, ExecutionContext
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
@@ -27,8 +27,7 @@ from graspd.worker.simulation.environment import PlacedGrasps
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.lifting import LiftLevel, require_ways
 from graspd.worker.validation.model import MujocoOptions
-from graspd.worker.validation.validator import validate
-from graspd.worker.validation.variant import Models, Variant, about_centre, dealt, draw
+from graspd.worker.validation.variant import Models, Variant, dealt, draw
 
 NOT_VALIDATED: Final = -1
 #: Numerical tolerance of wanted shares: 0.9 of 10 models is exactly 9.
@@ -161,43 +160,3 @@ def _words(grasps: GraspSet, row: int) -> tuple[int, ...]:
         for array in (part.hand_pose, part.joint_positions):
             whole.update(np.ascontiguousarray(array[row], "<f8").tobytes())
     return tuple(np.frombuffer(whole.digest()[:16], "<u4").tolist())
-
-
-#: Size of the random shift [m] and of the turn [rad] of the object.
-NOISE_M: Final = 1e-3
-NOISE_RAD: Final = float(np.radians(1.0))
-
-
-def robustness(
-    hand: HandModel,
-    obj: ObjectModel,
-    grasps: GraspSet,
-    *,
-    held: NDArray[np.generic] | None = None,
-    repeats: int,
-    seed: int = 0,
-    pieces: ConvexPieces,
-    run: ExecutionContext = DEFAULT_CONTEXT,
-) -> Floats:
-    """Return the share (N,) of `repeats` in which a grasp holds with noise on the object's pose; nan: not tested.
-    The object is moved by `NOISE_M` in a random direction and turned by `NOISE_RAD` about a random axis through its
-    centre of mass; a grasp's noise follows from `seed`, the repeat and its place in the set. Only grasps with `held`
-    (N,) 1 are tested, by default all. Level fast is used, which suffices for a share."""
-    out = np.full(len(grasps), np.nan)
-    tried = np.arange(len(grasps)) if held is None else np.flatnonzero(np.asarray(held) == 1)
-    if not len(tried) or repeats < 1:
-        return out
-    moves = invert(np.array([_noise(obj, (seed, k, int(i))) for k in range(repeats) for i in tried]))
-    noisy = grasps.take(np.tile(tried, repeats))
-    for part in (noisy.grasp, noisy.pregrasp, noisy.squeeze):
-        part.hand_pose = compose(moves, part.hand_pose)
-    verdicts = validate(hand, obj, noisy, level="fast", pieces=pieces, run=run)
-    out[tried] = verdicts.success.reshape(repeats, len(tried)).mean(axis=0)
-    return out
-
-
-def _noise(obj: ObjectModel, seed: tuple[int, ...]) -> Floats:
-    rng = np.random.default_rng(seed)
-    shift, axis = rng.normal(size=(2, 3))
-    rotation = quat_from_axis_angle(axis / np.linalg.norm(axis), np.array(NOISE_RAD))
-    return about_centre(obj, NOISE_M * shift / np.linalg.norm(shift), rotation)

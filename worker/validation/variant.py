@@ -400,12 +400,7 @@ def motion_of(obj: ObjectModel, variant: Variant) -> Floats:
     turn = np.array(variant.object_turn)
     angle = float(np.linalg.norm(turn))
     turned = quat_from_axis_angle(turn / angle if angle else np.array([1.0, 0, 0]), np.array(angle))
-    return about_centre(obj, np.array(variant.object_shift_m), turned)
-
-
-def about_centre(obj: ObjectModel, shift: Floats, turn: Floats) -> Floats:
-    """Return the motion (7,) of an object: a rotation (4,) about its centre of mass and a shift (3,) [m]."""
-    about = np.concatenate([obj.centre_of_mass + shift, turn])
+    about = np.concatenate([obj.centre_of_mass + np.array(variant.object_shift_m), turned])
     return compose(about, np.concatenate([-obj.centre_of_mass, [1.0, 0, 0, 0]]))
 
 

@@ -35,7 +35,7 @@ class Assets(IndexPart):
         return Page(items=[AssetView(**row) for row in rows], next=following)
 
     def get(self, kind: AssetKind, name_or_digest: str, *, scope: ProjectScope = EVERYTHING) -> AssetView:
-        """Return a hand or object by digest, or the newest usable one of a name, the project's own first.
+        """Return the hand or object of a digest or name; of several, an accepted one, the project's own, the newest.
 
         NotFoundError: it does not exist; the message lists the existing names.
         """

@@ -1,4 +1,4 @@
-"""Queries of grasps: filters, and a search by metric, bounded in time at millions of rows.
+"""Queries of grasps: filters, and pages sorted by a metric, among millions of rows.
 
 The index is chosen here, not by the database: SQLite has no statistics of the values, and scans an order's index to the
 end for a filter that almost nothing passes. There are three plans:

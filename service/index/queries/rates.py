@@ -222,7 +222,6 @@ def recipe_of(options: JobOptions) -> Hashable:
         options.knobs.model_dump_json(exclude={"name"}),
         options.want,
         options.validation,
-        options.robustness,
         (options.models, options.robust),
         options.place.kind,
         len(options.beside),

@@ -89,7 +89,7 @@ def test_any_other_number_is_of_the_first_grasps() -> None:
 PLAIN: dict[str, Any] = (
     {"grasps": 32, "method": "fast_graspd", "fidelity": "standard", "seed": 0, "scenes": 0, "views": 0}
     | {"stereo": False, "width": 320, "height": 240, "channels": [], "friction": 1.0, "want": "valid", "budget": 4.0}
-    | {"validation": "standard", "rechecks": 8, "robustness": 0, "options": {}, "target": ""}
+    | {"validation": "standard", "rechecks": 8, "options": {}, "target": ""}
 )
 PLANE, NAN = {"kind": "half_space"}, float("nan")
 
@@ -175,7 +175,6 @@ def test_a_document_comes_back_and_fingertips_may_touch_unless_it_says_otherwise
         ({"scene": "table", "method": "learned"}, "needs the option network"),
         ({"scene": "shelf", "method": "learned", "options": {"network": "n"}}, "objects on a table"),
         ({"method": "learned", "options": {"network": "n"}}, "objects on a table"),
-        ({"scene": "table", "robustness": 2}, "six pushes"),
         ({"scene": "table", "scenes": 65}, "less than or equal to 64"),
         ({"robust": 0.5, "validation": "none"}, "choose a validator"),
         ({"robust": 1.5}, "less than or equal to 1"),

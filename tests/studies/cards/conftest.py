@@ -27,7 +27,7 @@ from graspd.service.store.store import open_store
 from graspd.studies.cards.card import write_card
 from graspd.studies.cards.contents import Contents, contents_of_store, pieces
 from graspd.studies.cards.numbers import numbers
-from graspd.studies.cards.page import page
+from graspd.studies.cards.page import render_card
 from graspd.studies.cards.tally import tally_of
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.stages.context import Output, shard_of
@@ -79,7 +79,7 @@ def case(folder: Path, *, drawn: bool = True, **options: Any) -> Case:
     else:
         card = undrawn(contents)
         (folder / "card").mkdir()
-        (folder / "card" / "README.md").write_text(page(card, {}))
+        (folder / "card" / "README.md").write_text(render_card(card, {}))
     return Case(made, contents, folder / "card", card)
 
 

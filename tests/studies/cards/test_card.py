@@ -28,7 +28,7 @@ from graspd.studies.cards.card import write_card
 from graspd.studies.cards.contents import AssetFacts, Contents, contents_of_folder, contents_of_store, with_provenance
 from graspd.studies.cards.findings import findings
 from graspd.studies.cards.numbers import numbers, share
-from graspd.studies.cards.page import head, page
+from graspd.studies.cards.page import head, render_card
 from graspd.studies.cards.plots import draw
 from graspd.studies.cards.tally import CellTally, JointUse, Tally, cell_counts, elevations
 from tests.shell import completed
@@ -182,7 +182,7 @@ def matrix(valid: int) -> tuple[Contents, Tally]:
 
 def test_the_card_of_many_objects_is_folded_and_bounded(tmp_path: Path) -> None:
     contents, tally = matrix(40)
-    text = page(numbers(contents, tally), {})
+    text = render_card(numbers(contents, tally), {})
     assert "<details><summary>Objects: 200</summary>" in text
     assert "Licence not recorded** for 200 objects" in text and "and 192 more" in text
     plots = draw(numbers(contents, tally), tally, tmp_path)

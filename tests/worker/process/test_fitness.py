@@ -49,7 +49,9 @@ class Bench:
 
     def sits_out(self, told_to_stop: bool = False) -> bool:
         """Whether it is fit again after its quarantine."""
-        return self.fitness.sit_out((Stage.SYNTHESIZE,), lambda **facts: self.told.append(facts), lambda: told_to_stop)
+        return self.fitness.wait_in_quarantine(
+            (Stage.SYNTHESIZE,), lambda **facts: self.told.append(facts), lambda: told_to_stop
+        )
 
     def fail(self, seed: int) -> Event:
         self.error = RuntimeError("no result")

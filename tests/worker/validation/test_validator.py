@@ -33,7 +33,6 @@ from graspd.worker.validation.displacement import GRAVITY, STEPS, TIMESTEP_S, si
 from graspd.worker.validation.key import LEVEL_MOVES, MOVES, Level, verdict_key
 from graspd.worker.validation.model import MujocoOptions, blend, build, scene_of
 from graspd.worker.validation.protocol import HOLD_S, MAX_DISPLACEMENT_M, MAX_ROTATION, Outcome, Rollout, Test
-from graspd.worker.validation.robust import robustness
 from graspd.worker.validation.validator import validate
 from tests.worker.models import object_from_mesh, on_one_dof, two_finger_hand
 from tests.worker.quality.helpers import BOX, CONTACT, PADS, WHOLE, grasp_of, many_grasps, pad_hand, plate_hand, posture
@@ -275,16 +274,6 @@ def test_actuators_never_exceed_the_effort() -> None:
     scene.command(data, CONTACT.hand_pose[0], CONTACT.joint_positions[0] + 0.08)
     mujoco.mj_step(scene.model, data, nstep=5)
     assert data.actuator_force == pytest.approx([2.0, 3.0])
-
-
-def test_only_grasps_that_held_are_tried_with_noise() -> None:
-    grasps = many_grasps()
-    all_of_them = robustness(PADS, BOX, grasps, repeats=2, pieces=WHOLE)
-    held = np.array([1, 0, 1, 0, -1, 0, 0, 0], np.int8)
-    share = robustness(PADS, BOX, grasps, held=held, repeats=2, pieces=WHOLE)
-    assert np.isfinite(share).tolist() == (held == 1).tolist()
-    assert np.array_equal(share[held == 1], all_of_them[held == 1]), "noise must not depend on what else is tried"
-    assert (all_of_them[0], all_of_them[-1]) == (1.0, 0.0), "a firm grasp survives noise, a grazing one gains nothing"
 
 
 def test_unknown_levels_are_refused_and_cancelled_validator_stops() -> None:

@@ -258,8 +258,8 @@ def gauss_seidel(
     """Take the paper's step: one sweep of position-based dynamics over the contacts (Deul 2016), in order.
 
     Contact i moves the object by -M^-1 j C / w along the normal, then against the slip of its point by at most mu times
-    that impulse. `states` (B, M, N) stores the object's motion before each contact for the reverse sweep. `passes` is
-    ignored: a second sweep would need states as well. Launch over (B, M).
+    that impulse. `states` (B, M, N) stores the object's motion before each contact for the reverse sweep.
+    `passes_in` is ignored, since `states` has room for one sweep. Launch over (B, M).
     """
     b, m = wp.tid()
     if hands_in.active[b] == 0:

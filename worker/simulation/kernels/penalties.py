@@ -43,7 +43,7 @@ def points_to_bodies(
 
 
 @wp.kernel
-def joints(
+def joint_penalties(
     lower_in: wp.array(dtype=wp.float32),
     upper_in: wp.array(dtype=wp.float32),
     range_weight_in: wp.float32,

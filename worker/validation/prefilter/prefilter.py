@@ -373,7 +373,7 @@ def mujoco_warp_version() -> str:
 
 @cache
 def mujoco_warp() -> Any:
-    """Return the module, with Warp initialised; raise InputError if it is not installed."""
+    """Initialise Warp and return the module `mujoco_warp`; raise InputError if mujoco-warp is not installed."""
     mujoco_warp_version()
     backend.start()
     import mujoco_warp as engine
