@@ -24,9 +24,9 @@ from graspd.service.store.store import open_store
 from tests.api.factories import add_builtins
 from tests.indexes import empty_index
 from tests.memory_queue import MemoryQueue
-from tests.service.conftest import redis_server, rq_queue
+from tests.service.conftest import redis_server, redis_settings, rq_queue
 
-__all__ = ["redis_server", "rq_queue"]
+__all__ = ["redis_server", "redis_settings", "rq_queue"]
 
 TODAY = "2026-11-20"
 BASE_URL = "http://127.0.0.1:8000"
