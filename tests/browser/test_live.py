@@ -80,6 +80,14 @@ def test_chosen_cells_stay_chosen_while_the_matrix_moves(page: Any, services: Se
     assert page.inner_text("[data-chosen]") == "1 cell selected"
 
 
+def test_a_column_stays_chosen_while_its_head_has_the_focus(page: Any, services: Services) -> None:
+    page.goto("/datasets")
+    page.click("thead button:has-text('allegro')")
+    finish_all(services, add_job(services, seed=21))
+    page.wait_for_selector("td.succeeded")
+    until(lambda: page.locator("input[name=cell]:checked").count() == 3, "the cells are chosen again")
+
+
 def test_a_press_on_a_head_takes_and_submits_the_column(page: Any) -> None:
     page.goto("/datasets")
     page.click("thead button:has-text('allegro')")

@@ -18,7 +18,7 @@
   function twin(region, element) {
     const name = (attribute) => (element.getAttribute(attribute) ? `[${attribute}="${CSS.escape(element.getAttribute(attribute))}"]` : "");
     const mark = name("id") || `${name("name")}${name("value")}${name("href")}`;
-    return mark && region.querySelector(element.localName + mark);
+    return mark ? region.querySelector(element.localName + mark) : null;
   }
 
   function swap(text) {
