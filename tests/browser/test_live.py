@@ -179,25 +179,30 @@ def test_no_page_scrolls_sideways(page: Any, places: list[str]) -> None:
             assert width > 390 or page.evaluate(BESIDE_CARDS) == [], path
 
 
+def _nodes(finding: dict[str, Any]) -> list[str]:
+    """HTML of a finding's nodes, without the buttons that Swagger UI nests."""
+    nested = finding["id"] == "nested-interactive"
+    html = [node["html"][:160] for node in finding["nodes"]]
+    return [one for one in html if not (nested and "opblock-summary-control" in one)]
+
+
 def test_no_page_has_a_serious_accessibility_finding(page: Any, places: list[str]) -> None:
     page.emulate_media(reduced_motion="reduce")
     found = []
     for path in places:
         page.goto(path)
-        # Swagger UI nests its buttons.
-        explorer = ", rules: { 'nested-interactive': { enabled: false } }" if path == "/docs" else ""
-        if explorer:
-            page.wait_for_selector(".opblock")
+        if path == "/docs":
+            page.wait_for_selector("#explorer .opblock")
         page.evaluate(AXE.read_text())
         # Colours are the same variables on all pages: some show them all.
-        dark = [("dark", f", runOnly: {COLOURS}")] if IN_DARK.match(path) else []
-        for scheme, rules in [("light", explorer), *dark]:
+        dark = [("dark", f"{{ runOnly: {COLOURS} }}")] if IN_DARK.match(path) else []
+        for scheme, rules in [("light", "{}"), *dark]:
             page.emulate_media(color_scheme=scheme)
-            result = page.evaluate(f"axe.run(document, {{ resultTypes: ['violations']{rules} }})")
+            result = page.evaluate(f"axe.run(document, {{ resultTypes: ['violations'], ...{rules} }})")
             found += [
-                f"{path}, {scheme}: {entry['id']}: {[node['html'][:160] for node in entry['nodes'][:3]]}"
+                f"{path}, {scheme}: {entry['id']}: {nodes[:3]}"
                 for entry in result["violations"]
-                if entry["impact"] in ("serious", "critical")
+                if entry["impact"] in ("serious", "critical") and (nodes := _nodes(entry))
             ]
     assert found == []
 

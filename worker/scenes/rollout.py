@@ -119,14 +119,13 @@ def lift_rollout(
 
     def lifted(grasps: GraspSet, placed: PlacedGrasps, score: Floats, beat: Floats) -> Floats:
         lift = partial(validate_lifts, hand, obj, level=level, pieces=pieces(), known=known, run=run)
-        out = np.maximum(score, SLIPS)
+        out, hard, found = np.maximum(score, SLIPS), np.zeros(len(score), bool), beat < SLIPS + 1.0
         some = np.flatnonzero(score < SLIPS)
-        hard = some[lift(grasps.take(some), placed.take(some), hard=True).success == 1]
+        hard[some] = lift(grasps.take(some), placed.take(some), hard=True).success == 1
         out[hard] = np.minimum(score[hard], BEST)
-        some = np.setdiff1d(np.arange(len(score)), hard)
-        lost = some[beat[some] < SLIPS + 1.0]
-        out[lost] = beat[lost]
-        some = some[beat[some] >= SLIPS + 1.0]
+        # The grasp has another candidate that lifts at full friction: only half friction would be better.
+        out[~hard & found] = beat[~hard & found]
+        some = np.flatnonzero(~hard & ~found if level == "lift" else hard | ~found)
         full = lift(grasps.take(some), placed.take(some))
         fell = full.success != 1
         out[some[fell]] = SLIPS + 1.0 + FALLS * np.minimum(score[some[fell]], 1.0)
@@ -160,8 +159,8 @@ def scene_verdicts(
     run: ExecutionContext,
 ) -> tuple[GraspSet, Arrays]:
     """Plan the trajectories of grasps in their scenes, and validate those that are clear.
-    At level lift, a grasp that lifts at half friction is not tested at full friction. Without `pieces`, only clearance
-    is checked.
+    At level lift, a grasp that lifts at half friction is not tested at full friction. At level dexgraspbench the
+    test at full friction decides, as published. Without `pieces`, only clearance is checked.
 
     Returns:
         The grasps with `approach`, `coming`, `lift` and `wrist`; and columns of the base shard, with the lift's
@@ -180,13 +179,15 @@ def scene_verdicts(
     common: dict[str, Any] = {"level": level, "pieces": pieces, "known": known, "run": run}
     outcome, margin = np.zeros(count, np.uint8), np.full(count, np.nan)
     hard = np.full(count, -1, np.int8)
-    hard[clear], left = 0, clear
-    for half in (True, False):
+    left, half_first = clear, level == "lift"
+    for half in (half_first, not half_first):
         lifts = validate_lifts(hand, obj, grasps.take(left), placed.take(left), hard=half, **common)
-        outcome[left], margin[left] = lifts.outcome, lifts.margin
         if half:
             hard[left] = lifts.success
-            left = left[lifts.success != 1] if level == "lift" else left
+        if half_first or not half:
+            outcome[left], margin[left] = lifts.outcome, lifts.margin
+        # What lifts at half friction needs no test at full friction; what fails at full friction needs none at half.
+        left = left[(lifts.success == 1) != half]
     success[clear] = outcome[clear] == LiftOutcome.LIFTED
     hard[outcome != LiftOutcome.LIFTED] = -1
     columns |= {"quality/lift_outcome": outcome, "quality/lift_hard": hard, "quality/verdict_margin": margin}

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet, joined
 from graspd.worker.scenes import rollout as rollouts
-from graspd.worker.scenes.rollout import BEST, FALLS, TOUCHES, hold_rollout, lift_rollout
+from graspd.worker.scenes.rollout import BEST, FALLS, TOUCHES, hold_rollout, lift_rollout, scene_verdicts
 from graspd.worker.simulation.environment import PlacedGrasps
 from graspd.worker.validation.lift import Lift
-from graspd.worker.validation.lifting import KnownLifts, validate_lifts
+from graspd.worker.validation.lifting import KnownLifts, LiftLevel, validate_lifts
 from graspd.worker.validation.prescreening import SLIPS, LiftRollouts
 from graspd.worker.validation.protocol import Test
 from graspd.worker.validation.validator import KnownRollouts, validate
@@ -67,7 +71,13 @@ def test_a_lift_of_anything_else_is_not_known(lifts: list[int], other: str) -> N
     assert len(lifts) == 6
 
 
-def rollout_of(monkeypatch: pytest.MonkeyPatch, scores: list[float], outcomes: dict[bool, list[int]], beat=None):
+def rollout_of(
+    monkeypatch: pytest.MonkeyPatch,
+    scores: list[float],
+    outcomes: dict[bool, list[int]],
+    beat=None,
+    level: LiftLevel = "lift",
+):
     """Scores of grasps that the short lift gives `scores`, and the lift test `outcomes` at half the friction (True) and
     at the whole of it."""
     count = len(scores)
@@ -89,7 +99,8 @@ def rollout_of(monkeypatch: pytest.MonkeyPatch, scores: list[float], outcomes: d
     monkeypatch.setattr(LiftRollouts, "scores", lambda *_: np.array(scores))
     monkeypatch.setattr(rollouts, "validate_lifts", validated)
     monkeypatch.setattr(rollouts, "plan_way", way)
-    return lift_rollout(HAND, BOX, lambda: WHOLE)(grasps, where, np.full(count, np.inf) if beat is None else beat)
+    rollout = lift_rollout(HAND, BOX, lambda: WHOLE, level=level)
+    return rollout(grasps, where, np.full(count, np.inf) if beat is None else beat)
 
 
 LIFTED, TOUCHED, FELL = 1, 3, 5
@@ -113,6 +124,47 @@ def test_lifting_at_half_the_friction_is_asked_to_be_better(monkeypatch: pytest.
     outcomes = {True: [LIFTED, FELL], False: [LIFTED, LIFTED]}
     found = rollout_of(monkeypatch, [0.2, 0.3], outcomes, np.array([1.5, 1.5]))
     assert found == pytest.approx([0.2, 1.5])
+
+
+def test_the_published_lift_is_at_full_friction(monkeypatch: pytest.MonkeyPatch) -> None:
+    outcomes = {True: [LIFTED, LIFTED, FELL], False: [LIFTED, FELL, LIFTED]}
+    found = rollout_of(monkeypatch, [0.2, 0.3, 0.4], outcomes, level="dexgraspbench")
+    assert found == pytest.approx([0.2, SLIPS + 1.0 + FALLS * 0.3, SLIPS])
+    assert rollout_of(monkeypatch, [0.3], {True: [LIFTED], False: [FELL]}) == pytest.approx([0.3]), "at level lift"
+
+
+@pytest.mark.parametrize(
+    ("level", "tested", "success", "hard"),
+    [
+        ("lift", [(True, [0, 1, 2, 3]), (False, [2, 3])], [1, 1, 1, 0], [1, 1, 0, -1]),
+        ("dexgraspbench", [(False, [0, 1, 2, 3]), (True, [0, 2])], [1, 0, 1, 0], [1, -1, 0, -1]),
+    ],
+)
+def test_no_grasp_is_lifted_that_another_lift_decides(
+    monkeypatch: pytest.MonkeyPatch, level: LiftLevel, tested: list[object], success: list[int], hard: list[int]
+) -> None:
+    lifting = {True: [1, 1, 0, 0], False: [1, 0, 1, 0]}
+    done: list[object] = []
+
+    def validated(hand, obj, some, placed, *, hard=False, **_):
+        rows = some.stability_loss.astype(int)
+        done.append((hard, rows.tolist()))
+        lifted = np.array(lifting[hard])[rows]
+        return SimpleNamespace(success=lifted, outcome=np.where(lifted, LIFTED, FELL), margin=np.zeros(len(rows)))
+
+    def way(hand, obj, some, placed):
+        clear = np.ones(len(some), bool)
+        return SimpleNamespace(
+            clear=clear, approach=None, open=None, lift=None, least=np.ones(4), wrist=np.zeros((4, 0))
+        )
+
+    monkeypatch.setattr(rollouts, "validate_lifts", validated)
+    monkeypatch.setattr(rollouts, "plan_way", way)
+    grasps = replace(MANY.take(np.zeros(4, int)), stability_loss=np.arange(4.0), scene=np.zeros(4, int))
+    scenes = SimpleNamespace(placed=lambda _: WHERE.take(np.zeros(4, int)))
+    _, columns = scene_verdicts(HAND, BOX, grasps, scenes, level=level, pieces=WHOLE, run=ExecutionContext())
+    assert done == tested
+    assert (columns["quality/success"].tolist(), columns["quality/lift_hard"].tolist()) == (success, hard)
 
 
 @pytest.mark.parametrize(("verdict", "score"), [(1, 0.2), (0, SLIPS + 1.0 + FALLS * 0.2)])
