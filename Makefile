@@ -72,7 +72,7 @@ dist: $(STAMP) ## wheel and sdist in dist/, the same bytes from the same sources
 	$(BIN)/python docker/dist.py dist
 
 pins: $(STAMP) ## versions and hashes that the images install: those of .venv (asks the package index)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,postgres,otel,gpu]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,postgres,gpu]'
 	$(BIN)/python docker/pin.py
 
 licences: $(STAMP) ## licences of what graspd runs with, into docs/reference/licences.md

@@ -244,7 +244,7 @@ def _told(services: Services, job_id: str) -> JobView:
 
 
 def _present_origin() -> Origin | None:
-    origin = Origin(request=bound("request"), key=bound("key"), traceparent=bound("traceparent"))
+    origin = Origin(request=bound("request"), key=bound("key"))
     return origin if origin != Origin() else None
 
 

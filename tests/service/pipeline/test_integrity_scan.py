@@ -27,7 +27,7 @@ from graspd.service.pipeline.datasets import actions
 from graspd.service.pipeline.datasets.spec import DatasetRequest
 from graspd.service.pipeline.identity import ServiceRecord
 from graspd.service.pipeline.integrity import FOLDERS, MISSING, NO_MANIFEST, examine, scan
-from graspd.service.pipeline.integrity_scan import IntegrityScan, Interrupted, ReadPermit
+from graspd.service.pipeline.integrity_scan import IntegrityScan, Interrupted
 from graspd.service.pipeline.repair import repair
 from graspd.service.run.store_commands import app
 from graspd.service.settings import Settings
@@ -205,7 +205,6 @@ def a_round(services: Services, stop: Pauses | None = None) -> None:
     scan = IntegrityScan(services, stop, clock=stop.clock)
     for _ in FOLDERS:
         scan.advance()
-    scan.turn.end()
     assert services.index.notes.scan_note().ended
 
 
@@ -278,21 +277,18 @@ def test_a_small_store_is_not_read_over_and_over(services: Services, shards: lis
 def test_it_makes_way_for_a_verify_and_goes_on_afterwards(services: Services, shards: list[ShardManifest]) -> None:
     stop = Pauses()
     scan = IntegrityScan(services, stop, clock=stop.clock)
-    verify = ReadPermit(services, is_controller=False)
-    assert scan.turn.is_mine() and not ReadPermit(services, is_controller=True).is_mine()
-    assert verify.is_mine()
+    assert services.index.notes.pause_scan(15.0, begin=True)
     stop.now += 10.0
     with pytest.raises(Interrupted):
         scan.advance()
-    assert not ReadPermit(services, is_controller=False).is_mine()
-    assert not ReadPermit(services, is_controller=True).is_mine()
-    verify.end()
+    assert not services.index.notes.pause_scan(15.0, begin=True)
+    assert services.index.notes.pause_scan(0.0)
     assert scan.advance()
 
 
 def test_a_second_verify_is_refused(tmp_path: Path) -> None:
     other = open_services(Settings(data_dir=tmp_path))
-    assert ReadPermit(other, is_controller=False).is_mine()
+    assert other.index.notes.pause_scan(15.0, begin=True)
     refused = CliRunner().invoke(app, ["store", "verify", "--data-dir", str(tmp_path)])
     other.close()
     assert refused.exit_code == 2
