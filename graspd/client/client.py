@@ -225,8 +225,8 @@ class Client(AbstractContextManager["Client"]):
     def _document(self, kind: type[View], method: str, path: str, **options: Any) -> View:
         return kind.model_validate_json(self.send(method, path, **options).content)
 
-    def _comes_back(self, timeout_s: float = 30.0) -> bool:
-        deadline = time.monotonic() + timeout_s
+    def _comes_back(self) -> bool:
+        deadline = time.monotonic() + 30.0
         while time.monotonic() < deadline:
             try:
                 self.send("GET", "/healthz")
@@ -247,7 +247,8 @@ class Client(AbstractContextManager["Client"]):
         for wait in (*_WAITS_S, None):
             with _translated(self.url):
                 answer = self._http.request(method, path, params=given or None, **options)
-            if wait is None or not _is_too_fast(answer):
+            # Only the rate of requests recovers within a retry, not the other quotas.
+            if wait is None or answer.status_code != 429 or RateError.slug not in answer.text:
                 break
             time.sleep(min(wait, float(answer.headers.get("retry-after", wait))))
         _raise_for(answer)
@@ -281,11 +282,6 @@ def _authorization(key: str) -> dict[str, str]:
     if not (key.isascii() and key.isprintable() and " " not in key):
         raise InputError("the API key (GRASPD_API_KEY) contains an invalid character; copy it again")
     return {"Authorization": f"Bearer {key}"}
-
-
-def _is_too_fast(answer: httpx.Response) -> bool:
-    """Check whether the rate of requests is exceeded; other quotas recover too slowly for a retry."""
-    return answer.status_code == 429 and RateError.slug in answer.text
 
 
 def events_of(answer: httpx.Response) -> Iterator[tuple[str, Any]]:

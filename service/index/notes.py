@@ -8,8 +8,7 @@ from typing import Any, Final
 
 from sqlalchemy import Connection, delete, func, select
 
-from graspd.service.index.bulk import upsert
-from graspd.service.index.database import IndexPart
+from graspd.service.index.database import IndexPart, upsert
 from graspd.service.index.tables import damage, notes
 from graspd.service.model.clock import timestamp
 

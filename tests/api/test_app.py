@@ -15,9 +15,9 @@ from pydantic import TypeAdapter
 from starlette.testclient import TestClient
 
 from graspd.api.metrics import Metrics, Snapshot
-from graspd.api.server import bind
 from graspd.service.model.series import SERIES
 from graspd.service.queue.port import QueueStatus
+from graspd.service.run.address import bind
 from tests.api.conftest import BASE_URL
 from tests.conftest import REPOSITORY
 from tests.fakes import beat_of

@@ -13,7 +13,7 @@ import pytest
 import uvicorn
 from fastapi import FastAPI
 
-from graspd.api.server import bind
+from graspd.service.run.address import bind
 from graspd.service.run.supervisor import Supervisor
 from graspd.service.settings import Settings
 from tests.api.conftest import app, furnished, services, settings

@@ -90,7 +90,8 @@ def _check_redis(settings: Settings, client: Redis, info: Mapping[str, Any]) -> 
     line = f"Redis {version} at {_shown(settings)}, {1000 * seconds:.1f} ms, {used >> 20} MiB"
     if tuple(int(part) for part in version.split(".")[:2]) < _OLDEST:
         return warning(f"{line}: older than 6.2, the oldest tested version", "install Redis 6.2 or newer, or Valkey")
-    if _is_open(settings):
+    parts = urlsplit(redis_url(settings))
+    if parts.scheme != "unix" and parts.hostname not in _LOCAL and not parts.password:
         fix = "requirepass in its configuration, or an ACL, and the password in GRASPD_REDIS_URL"
         return warning(f"{line}: it requires no password, so any client can start tasks", fix)
     if seconds > _SLOW_REDIS_S:
@@ -142,12 +143,6 @@ def _shown(settings: Settings) -> str:
     if parts.scheme == "unix":
         return unquote(parts.path)
     return f"{parts.scheme}://{parts.hostname}{f':{parts.port}' if parts.port else ''}{parts.path}"
-
-
-def _is_open(settings: Settings) -> bool:
-    """Check whether Redis accepts network connections without a password."""
-    parts = urlsplit(redis_url(settings))
-    return parts.scheme != "unix" and parts.hostname not in _LOCAL and not parts.password
 
 
 def _fix(error: Exception, settings: Settings) -> str:

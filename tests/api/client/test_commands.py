@@ -212,7 +212,6 @@ _PAIR = "submit --hand allegro --object mug"
         (f"{' '.join(CREATE)} --yes --views 2", "views need scenes"),
         (f"{' '.join(CREATE)} --yes --fidelity auto --target gsr>=0.5", "graspd chart --publish"),
         (f"{' '.join(CREATE)} --yes --option keep", "write it as name=value"),
-        ("datasets export none -o x --format zip", "there is no format 'zip'"),
     ],
 )
 def test_a_mistake_is_one_line_and_exit_2(graspd: Shell, arguments: str, words: str) -> None:

@@ -1,36 +1,15 @@
-"""Versions of libraries as Python's own look-up finds them, and imports without the garbage collector."""
+"""Imports without the garbage collector."""
 
 from __future__ import annotations
 
 import gc
 import subprocess
 import sys
-from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
 
 import pytest
 
 from graspd.service.model import libraries
-from graspd.service.model.libraries import _distributions, imports, own_process, version_of
-
-
-def test_a_version_is_that_of_the_distribution() -> None:
-    for library in ("numpy", "fast-simplification", "pydantic_settings"):
-        assert version_of.__wrapped__(library) == version(library)
-    with pytest.raises(PackageNotFoundError):
-        version_of("no-such-library-of-graspd")
-
-
-def test_the_first_place_counts_and_doubts_are_left_to_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for folder in ("one/My.Library-1.0.dist-info", "two/my_library-2.0.dist-info", "two/my_library-3.0.dist-info"):
-        (tmp_path / folder).mkdir(parents=True)
-        (tmp_path / folder / "METADATA").write_text(f"Name: my-library\nVersion: {folder[-13:-10]}\n")
-    _distributions.cache_clear()
-    monkeypatch.setattr("sys.path", [str(tmp_path / "none"), str(tmp_path / "one"), str(tmp_path / "two")])
-    assert version_of.__wrapped__("my-library") == "1.0"
-    monkeypatch.setattr("sys.path", [str(tmp_path / "two")])
-    assert version_of.__wrapped__("my-library") == version("my-library")
-    _distributions.cache_clear()
+from graspd.service.model.libraries import imports, own_process
 
 
 @pytest.fixture(autouse=True)

@@ -13,12 +13,11 @@ from pathlib import Path
 
 import pytest
 
-from graspd.api.server import bind
 from graspd.client.reports import open_client
 from graspd.service.model.errors import InputError, UnavailableError
-from graspd.service.run.address import forget_address, joining, record_address, recorded_address
+from graspd.service.run.address import bind, forget_address, joining, record_address, recorded_address
 from graspd.service.run.children import Child, end_leftovers, start_of
-from graspd.service.run.supervisor import Supervisor, _reserve
+from graspd.service.run.supervisor import Supervisor
 from graspd.service.settings import Settings
 from tests.servers import free_ports
 from tests.waiting import until
@@ -83,12 +82,13 @@ def test_a_service_on_any_free_port_is_found_until_it_stops(folder: Path) -> Non
 
 @pytest.mark.skipif(sys.platform != "linux", reason="a second socket of one address is refused there")
 def test_a_port_that_was_found_free_is_kept_for_the_api() -> None:
-    with _reserve("127.0.0.1", 0) as reserved, socket.socket() as stranger:
+    with bind("127.0.0.1", 0) as reserved, socket.socket() as stranger:
         address = reserved.getsockname()
         with pytest.raises(OSError, match="in use"):
             stranger.bind(address)
         for _ in range(2):  # an API that is started again takes it again
-            bind(*address).close()
+            with bind(*address) as listener:
+                listener.listen()
 
 
 @pytest.fixture
