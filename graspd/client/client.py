@@ -70,7 +70,6 @@ class Client(AbstractContextManager["Client"]):
         return self._document(JobDetail, "GET", path_of("jobs", job_id))
 
     def jobs(self, *, state: State | None = None, limit: int = 50) -> Page[Job]:
-        """Return jobs, newest first."""
         return self._document(Page[Job], "GET", "/v1/jobs", params={"state": state, "limit": limit})
 
     def cancel(self, job_id: str) -> JobDetail:
@@ -171,12 +170,10 @@ class Client(AbstractContextManager["Client"]):
         return self._document(DatasetView, "POST", "/v1/datasets", json=_matrix_body(request))
 
     def estimate(self, matrix: Matrix) -> Estimate:
-        """Estimate the cost of a matrix of datasets."""
         body = {name: value for name, value in _matrix_body(matrix).items() if name in Matrix.model_fields}
         return self._document(Estimate, "POST", "/v1/datasets/estimate", json=body)
 
     def datasets(self, *, limit: int = 50) -> Page[DatasetView]:
-        """Return datasets, newest first."""
         return self._document(Page[DatasetView], "GET", "/v1/datasets", params={"limit": limit})
 
     def dataset(self, name: str) -> DatasetView:
@@ -196,7 +193,6 @@ class Client(AbstractContextManager["Client"]):
         return self._document(SnapshotView, "POST", path_of("datasets", name, "snapshots"))
 
     def snapshot(self, name: str, digest: str) -> Snapshot:
-        """Return a snapshot with its list of shards."""
         return self._document(Snapshot, "GET", path_of("datasets", name, "snapshots", digest))
 
     def watch_dataset(self, name: str) -> Iterator[DatasetView]:

@@ -128,9 +128,9 @@ class Database:
             raise NotFoundError(f"there is no {what}")
         return found[0]
 
-    def column(self, query: Select[Any], within: Connection | None = None) -> list[Any]:
+    def column(self, query: Select[Any]) -> list[Any]:
         """Return the first column of the rows."""
-        with self.reading(within) as connection:
+        with self.reading() as connection:
             return list(connection.scalars(query))
 
     def among(self, query: Select[Any], column: ColumnElement[Any], wanted: Iterable[Any]) -> list[Any]:
