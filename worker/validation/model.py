@@ -395,7 +395,7 @@ def blend(a: Posture, b: Posture, row: int, share: float) -> tuple[Floats, Float
     return pose, (1 - share) * a.joint_positions[row] + share * b.joint_positions[row]
 
 
-def _add_tendon(spec: Any, hand: HandModel, tendon: Tendon, name: str, leading: NDArray[np.intp]) -> None:
+def _add_tendon(spec: Any, hand: HandModel, tendon: Tendon, name: str, leading: NDArray[np.int32]) -> None:
     """Add one actuator on the sum of joints; the joints are not coupled in any other way."""
     cord = spec.add_tendon(name=name)
     for d, pull in zip(tendon.dofs, tendon.coefficients, strict=True):
