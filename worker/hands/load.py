@@ -139,6 +139,11 @@ def body_model(source: HandSource, tree: Tree) -> HandModel:
     joints = [body.joint for body in tree.bodies]
     drives = [tree.drives[joint.name] if joint else Mimic("", 0.0, 0.0) for joint in joints]
     number = {joint.name: body for body, joint in enumerate(joints) if joint}
+    visuals = tuple(
+        PlacedShape(shape, body, compose(pose, shape.pose), link)
+        for link, (body, pose) in tree.links.items()
+        for shape in robot.links[link].visuals
+    )
     dofs = len(tree.dof_names)
     return HandModel(
         name=source.name,
@@ -168,7 +173,7 @@ def body_model(source: HandSource, tree: Tree) -> HandModel:
         masses=_masses(robot, tree, pieces),
         velocity=tree.velocity,
         arm=chain_to(robot, tree.bodies[0].name),
-        visuals=Visuals(_placed_visuals(robot, tree), source.files, base),
+        visuals=Visuals(visuals, source.files, base),
         frames=dict(tree.links),
         tendons=tendons_of(robot, source.options.tendons, tree.dof_names),
     )
@@ -193,14 +198,6 @@ def _pieces(source: HandSource, tree: Tree, base: str) -> tuple[ConvexPiece, ...
             placed = compose(pose, shape.pose)
             pieces += make_pieces(shape, body=body, pose=placed, link=name, files=source.files, base=base, hulls=hulls)
     return tuple(pieces)
-
-
-def _placed_visuals(robot: Robot, tree: Tree) -> tuple[PlacedShape, ...]:
-    return tuple(
-        PlacedShape(shape, body, compose(pose, shape.pose), link)
-        for link, (body, pose) in tree.links.items()
-        for shape in robot.links[link].visuals
-    )
 
 
 def _joint_type(joint: Joint | None) -> JointType:

@@ -10,12 +10,13 @@ import mujoco
 import numpy as np
 import pytest
 
+from benchmarks.foreign import with_our_shapes, with_their_shapes
 from graspd.studies.evaluation import combine, evaluate
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.model import Drag, HandModel
 from graspd.worker.hands.same_hand import same_hand
 from graspd.worker.validation.decomposition import decompose
-from graspd.worker.validation.foreign import driven_as, in_other_model, with_our_shapes, with_their_shapes
+from graspd.worker.validation.foreign import driven_as, in_other_model
 from graspd.worker.validation.key import verdict_key
 from graspd.worker.validation.model import MujocoOptions, Scene, build
 from graspd.worker.validation.prefilter.prefilter import first_terms
