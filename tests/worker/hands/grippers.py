@@ -33,6 +33,5 @@ def gripper_urdf(*, zero_is_open: bool = False, coupled: bool = True, effort: fl
 
 
 def gripper(options: Mapping[str, object] | None = None, **kwargs: object) -> HandModel:
-    """The hand of `gripper_urdf`."""
     files = {"gripper.urdf": gripper_urdf(**kwargs)}  # type: ignore[arg-type]
     return load_hand(files, name="gripper", digest="0" * 32, options=options)

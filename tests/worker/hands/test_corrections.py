@@ -49,9 +49,7 @@ def same(one: HandModel, other: HandModel, *, palm: bool) -> bool:
         ({"palm": {"link": "mount"}}, ["--palm", "mount"], True),
     ],
 )
-def test_corrections_and_options_make_the_same_hand(
-    said: dict[str, object], options: list[str], palm: bool, tmp_path: Path
-) -> None:
+def test_corrections_and_options_make_the_same_hand(said, options, palm: bool, tmp_path: Path) -> None:
     (tmp_path / "claw.urdf").write_bytes(CLAW)
     guessed = hand_from_path(tmp_path / "claw.urdf")
     facts = facts_of(hand_glb(guessed))

@@ -42,7 +42,6 @@ def load(urdf: bytes, **options: Any) -> HandModel:
 
 
 def report(urdf: bytes, **options: Any) -> dict[str, Any]:
-    """What the check tells of a hand."""
     return check_hand({"h.urdf": urdf}, "h", options)
 
 
