@@ -81,9 +81,7 @@ def test_a_device_that_works_is_not_blamed() -> None:
     assert (event.kind, runner.device_lost) == (EventKind.FAILED, "")
 
 
-def test_the_worker_ends_and_leaves_the_other_tasks(
-    rq_queue: RqQueue, work: Any, kinds: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_the_worker_ends_and_leaves_the_other_tasks(rq_queue: RqQueue, work, kinds, monkeypatch, caplog) -> None:
     monkeypatch.setattr(engine, "Runner", partial(Runner, check_device=broken))
     rq_queue.enqueue([message_for(), message_for(seed=1)], Priority.BULK)
     with caplog.at_level(logging.ERROR):

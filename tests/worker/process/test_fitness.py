@@ -48,7 +48,6 @@ class Bench:
         return runner.run(message.model_dump(mode="json", by_alias=True), TaskContext(self.store))
 
     def sits_out(self, told_to_stop: bool = False) -> bool:
-        """Whether it is fit again after its quarantine."""
         return self.fitness.wait_in_quarantine(
             (Stage.SYNTHESIZE,), lambda **facts: self.told.append(facts), lambda: told_to_stop
         )

@@ -182,9 +182,7 @@ def test_a_stage_that_ignores_the_stop_still_writes_nothing(bench: Bench) -> Non
         ({"revision": 99}, "revision 99 of synthesize"),
     ],
 )
-def test_what_another_version_must_do_is_handed_back_and_no_attempt_is_used_up(
-    bench: Bench, changed: dict[str, Any], why: str
-) -> None:
+def test_what_another_version_must_do_costs_no_attempt(bench: Bench, changed: dict[str, Any], why: str) -> None:
     message = message_for()
     outcome = bench.run(message, **changed)
     assert outcome.kind is EventKind.DEFERRED and why in outcome.message and bench.calls == 0
