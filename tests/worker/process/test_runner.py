@@ -16,6 +16,7 @@ from graspd.service.store.manifests import load_manifest
 from graspd.service.store.records import task_attempts
 from graspd.service.store.shards import read_shard
 from graspd.service.store.store import Store, open_store
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.process.runner import Runner
 from graspd.worker.stages import scene
 from graspd.worker.stages.context import StopReason, TaskContext
@@ -26,18 +27,22 @@ from tests.fakes import fake_synthesize, make_shard, message_for
 class Bench:
     """A runner on a store in memory."""
 
-    def __init__(self) -> None:
+    runner: Runner
+
+    def __init__(self, **options: Any) -> None:
         self.store: Store = open_store("memory://")
         self.told: list[Event] = []
         self.calls = 0
+        self.options = options
 
     def run(self, message: TaskMessage, stage: Any = fake_synthesize, **changes: Any) -> Event | None:
         def counted(task: TaskMessage, context: TaskContext) -> Any:
             self.calls += 1
             return stage(task, context)
 
-        runner = Runner({Stage.SYNTHESIZE: counted}, worker="w", publish=self.told.append)
-        return runner.run(message.model_dump(mode="json", by_alias=True) | changes, TaskContext(self.store))
+        self.runner = Runner({Stage.SYNTHESIZE: counted}, worker="w", publish=self.told.append, **self.options)
+        context = TaskContext(self.store, ExecutionContext("cuda:0" if "check_device" in self.options else "cpu"))
+        return self.runner.run(message.model_dump(mode="json", by_alias=True) | changes, context)
 
 
 @pytest.fixture
