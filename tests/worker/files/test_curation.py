@@ -1,7 +1,5 @@
 """Parts of datasets: chosen by an expression or by kind, balanced, and as files of clouds."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """JSON and TOML that is nested a hundred thousand deep, wherever a stranger's file or shard may hold some."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The results of an object do not depend on where the origin of its mesh lies."""
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A parallel gripper as a URDF: a housing and two box fingers that slide along x, 80 mm apart when open."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 from graspd.worker.hands.load import load_hand

@@ -1,7 +1,5 @@
 """Files that the commands of docs/how-to/hands.md name, as a reader would have them."""
 
-from __future__ import annotations
-
 import zipfile
 from pathlib import Path
 from typing import Final

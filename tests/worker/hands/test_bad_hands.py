@@ -1,7 +1,5 @@
 """Hands as others publish them: what does not matter is passed over, what is wrong is told for what it is."""
 
-from __future__ import annotations
-
 import re
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Which way joints close a hand, and where its palm faces, whatever limits and rounding say."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

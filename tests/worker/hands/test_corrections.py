@@ -1,7 +1,5 @@
 """What is corrected in the browser is what the command line says and writes: the same hand comes of it."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A hand's files however programs write, name and place them; xacro, which can neither read nor start anything."""
 
-from __future__ import annotations
-
 import json
 import resource
 import subprocess

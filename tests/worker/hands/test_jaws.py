@@ -1,7 +1,5 @@
 """Jaws of a gripper: which way is closed, how far they open, where the pads are; and hands that have none."""
 
-from __future__ import annotations
-
 from importlib.util import find_spec
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Hands from MJCF: where their bodies are is what MuJoCo says, and nothing outside their folder is read."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass, field, fields, make_dataclass
 from pathlib import Path

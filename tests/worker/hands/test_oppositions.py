@@ -1,7 +1,5 @@
 """Postures in which fingers oppose one another: at pads, on a plane, beside pads; who has none is refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

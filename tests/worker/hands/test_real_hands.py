@@ -1,7 +1,5 @@
 """The four reference hands: kinematics against yourdfpy, and each quirk that their notes name; the built-in hands."""
 
-from __future__ import annotations
-
 import functools
 import json
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Convex pieces, meshes that become several, and samples of their surface."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

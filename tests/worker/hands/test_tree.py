@@ -1,7 +1,5 @@
 """From URDF joints to bodies: merging, mimics, couplings; where a hand begins, behind its arm or in a whole robot."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

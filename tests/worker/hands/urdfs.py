@@ -1,7 +1,5 @@
 """Small hands for tests."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from graspd.worker.hands.check import check_hand

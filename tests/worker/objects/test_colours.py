@@ -1,7 +1,5 @@
 """Colours of mesh files and of what lies beside them, and COLLADA, which has both; bad ones are passed over."""
 
-from __future__ import annotations
-
 import io
 import json
 import struct

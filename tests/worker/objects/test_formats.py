@@ -1,7 +1,5 @@
 """Every format gives the same mesh however it is spelt, and what a header promises is never believed."""
 
-from __future__ import annotations
-
 import codecs
 import gzip
 import io

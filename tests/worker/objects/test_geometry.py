@@ -1,7 +1,5 @@
 """Mass, normals, distances and simplification against closed forms."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections.abc import Callable

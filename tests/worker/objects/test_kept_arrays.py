@@ -1,7 +1,5 @@
 """Arrays that are kept on the machine: read bit for bit, made anew when anything they follow from changes."""
 
-from __future__ import annotations
-
 import dataclasses
 import subprocess
 import sys

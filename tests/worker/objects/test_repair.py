@@ -1,7 +1,5 @@
 """From triangles to a solid: what is repaired, what is refused, and that both are said."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A GPU that breaks down under a task: the task goes back, and the process ends for a fresh one to start."""
 
-from __future__ import annotations
-
 import logging
 from functools import partial
 from pathlib import Path

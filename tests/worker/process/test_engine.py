@@ -1,7 +1,5 @@
 """A worker, its registration and the engine beside it: what each does when the other stops, hangs or ends."""
 
-from __future__ import annotations
-
 import os
 import signal
 import struct

@@ -1,7 +1,5 @@
 """Which failures are the worker's own, and its check of itself with the real engine."""
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from typing import Any
 

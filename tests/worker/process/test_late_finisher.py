@@ -1,7 +1,5 @@
 """How a worker closes its books on a task whose lease is gone, or when Redis takes no writes."""
 
-from __future__ import annotations
-
 import logging
 import threading
 from typing import Any

@@ -1,7 +1,5 @@
 """What becomes of a task, whatever its stage does."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

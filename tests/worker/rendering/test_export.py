@@ -1,7 +1,5 @@
 """Image files of views, read back by other readers, and clouds of them against the mesh."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Pictures for people, of grasps, of their ways and as films: what must be in them."""
 
-from __future__ import annotations
-
 import io
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The tracer against another one, Newton's camera sensor, and against itself where it takes a short cut."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Grasps moved onto a table beside other objects: poses, clearances, the way in."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh

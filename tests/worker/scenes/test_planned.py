@@ -1,7 +1,5 @@
 """Grasps planned in a scene, beside neighbours and with a forearm: never nearer than stated, by MuJoCo's distances."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

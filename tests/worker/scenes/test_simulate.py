@@ -1,7 +1,5 @@
 """Rest poses: drops, faces that carry, scenes of every kind, and neighbours laid in them."""
 
-from __future__ import annotations
-
 import dataclasses
 from functools import partial
 

@@ -1,7 +1,5 @@
 """The trial of candidates is the test of the validator itself, which is then not done again."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 

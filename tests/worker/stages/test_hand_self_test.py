@@ -1,7 +1,5 @@
 """The self-test of a hand: objects that suit it, and a line that says whether it is ready."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import count
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Uploads are hostile: each gets its verdict in bounded time, and nothing of them reaches the worker."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

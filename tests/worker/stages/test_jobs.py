@@ -1,7 +1,5 @@
 """Jobs through their stages, as a worker runs them: in scenes, in ranges of batches, from a network of the store."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Prepared objects and models in the store: made once, those of the engine; and what batches draw."""
 
-from __future__ import annotations
-
 import io
 from dataclasses import fields
 from pathlib import Path
