@@ -1,7 +1,5 @@
 """Arrays that are kept on the machine: read bit for bit, made anew when anything they follow from changes."""
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import fields
 from pathlib import Path
@@ -84,13 +82,8 @@ def load_balls(files: dict[str, bytes] = BALLS, error: float = 3e-4, **options: 
 def built(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """The bounds to which objects were prepared, not read."""
     bounds: list[float] = []
-
-    def build(mesh: Any, error: float) -> ObjectModel:
-        bounds.append(error)
-        return prepare_build(mesh, error)
-
-    prepare_build = prepare.build
-    monkeypatch.setattr(prepare, "build", build)
+    build = prepare.build
+    monkeypatch.setattr(prepare, "build", lambda mesh, error: bounds.append(error) or build(mesh, error))
     return bounds
 
 
@@ -169,10 +162,8 @@ def test_no_cache_gives_one_mesh_of_a_file_for_another() -> None:
     moved = dataclasses.replace(HAND, origin=origin)
     assert not np.array_equal(sample_surface(HAND, 200).position, sample_surface(moved, 200).position)
     # A tall plate and a cube of one volume and digest, and as many corners.
-    cube, plate = (
-        dataclasses.replace(object_from_mesh(trimesh.creation.box(size)), digest=BRICK.digest, volume=BRICK.volume)
-        for size in ((0.05, 0.05, 0.05), (0.1, 0.1, 0.0125))
-    )
+    boxes = (object_from_mesh(trimesh.creation.box(size)) for size in ((0.05, 0.05, 0.05), (0.1, 0.1, 0.0125)))
+    cube, plate = (dataclasses.replace(one, digest=BRICK.digest, volume=BRICK.volume) for one in boxes)
     assert rest_probability(cube, [0]) != rest_probability(plate, [0])
     again = probe_of(two_finger_hand(), dataclasses.replace(BRICK), hand_points=64, object_points=64)
     assert again is one, "an equal model that was loaded again"
