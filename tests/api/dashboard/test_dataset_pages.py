@@ -12,7 +12,7 @@ from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.datasets import actions
 from graspd.service.pipeline.datasets.spec import DatasetRequest
 from tests.api.factories import add_job, fail, finish_all
-from tests.planning import plan_all
+from tests.fakes import plan_all
 
 
 def cell(**fields: object) -> MatrixCell:
@@ -140,3 +140,44 @@ def test_a_dataset_and_a_job_have_the_same_options(http: TestClient, services: S
         assert (options.min_payload, options.shake, options.robust) == (0.5, True, 0.75)
     refused = http.post("/submit", data=pair | {"shake": "true"})
     assert refused.status_code == 422 and "lifted out of a scene" in refused.text
+
+
+@pytest.fixture
+def jobs(http: TestClient, services: Services) -> dict[str, str]:
+    """One job that was validated, and a larger one on the same pair that was not."""
+    validated, unvalidated = (
+        add_job(services, want="candidates"),
+        add_job(services, grasps=320, validation="none", want="candidates"),
+    )
+    for record in (validated, unvalidated):
+        finish_all(services, record)
+    return {"validated": validated.id, "unvalidated": unvalidated.id}
+
+
+def share(http: TestClient, job: str) -> float:
+    rows = http.get("/v1/grasps", params={"job": job, "limit": 200}).json()["items"]
+    return sum(row["valid"] for row in rows) / len(rows)
+
+
+def test_service_and_job_count_as_tries_only_what_was_validated(http: TestClient, jobs: dict[str, str]) -> None:
+    stats = http.get("/v1/stats").json()
+    assert (stats["candidates"], stats["validated"]) == (352, 32)
+    told = {name: http.get(f"/v1/jobs/{job}").json() for name, job in jobs.items()}
+    assert stats["valid_yield"] == told["validated"]["valid_yield"] == share(http, jobs["validated"])
+    assert (told["unvalidated"]["validated"], told["unvalidated"]["valid_yield"]) == (0, None)
+    words = f"{int(100 * share(http, jobs['validated']) + 1e-9)} %"
+    home = http.get("/").text
+    assert words in home and "320 candidates not validated" in home
+    assert words in http.get("/datasets").text
+
+
+def test_unjudged_grasps_are_not_among_the_rejected(http: TestClient, jobs: dict[str, str]) -> None:
+    def found(**query: str) -> set[str]:
+        rows = http.get("/v1/grasps", params={"limit": 200, **query}).json()["items"]
+        assert rows
+        return {str(row["success"]) for row in rows}
+
+    rejected = http.get("/v1/grasps", params={"limit": 200, "valid": "false"}).json()["items"]
+    assert rejected and all(row["success"] is False for row in rejected)
+    assert found(validated="false") == found(where="not validated") == {"None"}
+    assert "None" not in found(validated="true") | found(where="validated and not valid")

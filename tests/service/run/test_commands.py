@@ -19,7 +19,7 @@ from pydantic import SecretStr, ValidationError
 from typer.testing import CliRunner
 
 from graspd import cli as program
-from graspd.service.cli import load_settings, reporting_errors
+from graspd.service.cli import EngineSettings, engine_settings, load_settings, reporting_errors
 from graspd.service.model.errors import InputError, StoreUnavailable, UnavailableError
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
@@ -269,3 +269,27 @@ def test_a_setting_taken_back_does_not_come_from_the_environment(name: str, monk
     for variable, text in _stated(Settings(**{name: None})).items():
         monkeypatch.setenv(variable, text)
     assert getattr(Settings(), name) is None
+
+
+@pytest.fixture
+def nothing_set(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in [name for name in os.environ if name.upper().startswith("GRASPD_")]:
+        monkeypatch.delenv(name)
+
+
+def test_where_nothing_is_set_they_are_the_defaults_and_nothing_is_loaded(nothing_set: None) -> None:
+    whole = load_settings()
+    assert engine_settings() == EngineSettings(whole.prefilter, whole.processes)
+    code = "import sys; from graspd.service.cli import engine_settings; engine_settings(); print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "pydantic_settings" not in done.stdout.split()
+
+
+def test_a_set_value_counts_and_a_bad_one_is_refused_by_name(
+    nothing_set: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("graspd_processes", "3")
+    assert engine_settings() == EngineSettings("auto", 3)
+    monkeypatch.setenv("GRASPD_PREFILTER", "perhaps")
+    with pytest.raises(InputError, match="GRASPD_PREFILTER"):
+        engine_settings()
