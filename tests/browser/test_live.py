@@ -18,8 +18,7 @@ from graspd.service.store.records import publish
 from tests.api.dashboard.test_stability_page import a_record
 from tests.api.dashboard.test_tradeoff import RUNS
 from tests.api.factories import add_job, add_worker, fail, finish, finish_all
-from tests.fakes import record_of
-from tests.planning import plan_all
+from tests.fakes import plan_all, record_of
 from tests.waiting import until
 
 pytestmark = pytest.mark.browser

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import re
-import shlex
 import shutil
 import subprocess
 from collections.abc import Iterator
@@ -323,14 +322,3 @@ def test_the_kubernetes_job_is_valid_and_runs_as_the_workers_do() -> None:
         assert ours["containers"][0][same] == theirs["containers"][0][same]
     assert document["spec"]["template"]["metadata"]["labels"]["graspd/talks-to"] == "redis-store", "the network opens"
     assert ours["restartPolicy"] == "Never", "a pod failure policy needs it"
-
-
-def test_commands_of_the_page_are_shell() -> None:
-    blocks = re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL)
-    assert len(blocks) >= 4
-    for block in blocks:
-        subprocess.run(["bash", "-n", "-c", block], check=True)
-        for line in block.splitlines():
-            words = shlex.split(line.replace("\\", ""), comments=True)
-            if words[:1] == ["sbatch"]:
-                assert (REPOSITORY / words[-1]).is_file(), line

@@ -20,8 +20,8 @@ from graspd.service.pipeline.backends import Services
 from graspd.service.settings import Settings
 from graspd.service.store.network_file import to_bytes
 from tests.api.factories import bearer, people_of
+from tests.fakes import plan_all
 from tests.networks import random_network
-from tests.planning import plan_all
 
 JOB = {"hand": "allegro", "object": "mug", "grasps": 32}
 MATRIX = {"name": "d", "hands": ["allegro"], "objects": ["mug"], "grasps": 32}

@@ -31,10 +31,9 @@ from graspd.service.settings import Settings
 from graspd.service.store.network_file import to_bytes
 from graspd.service.store.store import open_store
 from tests.api.factories import add_worker, fail, finish_all, people_of
-from tests.fakes import record_of
+from tests.fakes import plan_all, record_of
 from tests.memory_queue import MemoryQueue
 from tests.networks import random_network
-from tests.planning import plan_all
 
 Headers = dict[str, str]
 JOB = {"hand": "allegro", "object": "mug", "grasps": 32, "scenes": 1, "views": 1, "seed": 77}

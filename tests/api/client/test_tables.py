@@ -24,7 +24,7 @@ from graspd.service.pipeline.datasets import actions
 from graspd.service.pipeline.datasets.cost import estimate
 from graspd.service.pipeline.datasets.spec import DatasetRequest
 from tests.api.factories import add_job, finish_all
-from tests.planning import plan_all
+from tests.fakes import plan_all
 
 NAME = "[red]mug[/] :mug: " + "a-very-long-name-of-an-object-that-somebody-gave-to-it"[:46]
 

@@ -11,7 +11,7 @@ from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.datasets import actions
 from graspd.service.pipeline.datasets.spec import DatasetRequest
 from tests.api.factories import add_job, finish_all
-from tests.planning import plan_all
+from tests.fakes import plan_all
 
 
 def _two(services: Services) -> None:

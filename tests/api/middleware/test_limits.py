@@ -18,8 +18,7 @@ from graspd.service.pipeline.backends import Services
 from graspd.service.queue.rq_queue import RqQueue
 from graspd.service.settings import Settings
 from tests.api.factories import bearer, finish_all
-from tests.fakes import record_of
-from tests.planning import plan_all
+from tests.fakes import plan_all, record_of
 from tests.waiting import PATIENCE_S
 
 JOB = {"hand": "allegro", "object": "mug", "grasps": 32}

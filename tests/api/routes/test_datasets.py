@@ -10,8 +10,7 @@ from starlette.testclient import TestClient
 from graspd.service.pipeline.backends import Services
 from graspd.service.store.records import publish
 from tests.api.factories import finish_all
-from tests.fakes import record_of
-from tests.planning import plan_all
+from tests.fakes import plan_all, record_of
 from tests.service.pipeline.test_fidelity_choice import CHART
 
 WANTED = {"name": "kitchen", "hands": ["allegro", "barrett"], "objects": ["mug", "block"], "grasps": 64}
@@ -90,20 +89,6 @@ def test_an_estimate_records_nothing(http: TestClient) -> None:
     assert found["asked"] == 4_000_000 and [plan["workers"] for plan in found["plans"]] == [1, 8, 64]
     assert all(rate["origin"].startswith("stored default") for rate in found["rates"])
     assert http.get("/v1/datasets").json()["items"] == []
-
-
-def test_cancel_and_retry_are_accepted_once(http: TestClient, services: Services, kitchen: dict[str, Any]) -> None:
-    answer = http.post("/v1/datasets", json=WANTED | {"grasps": 32})
-    assert answer.status_code == 409 and "another dataset named 'kitchen'" in answer.json()["detail"]
-    plan_all(services)
-    assert http.post("/v1/datasets/kitchen/retry").status_code == 409
-    assert http.post("/v1/datasets/kitchen/cancel").status_code == 202
-    assert http.post("/v1/datasets/kitchen/cancel").status_code == 409
-    plan_all(services)
-    assert http.get("/v1/datasets/kitchen").json()["state"] == "cancelled"
-    assert http.post("/v1/datasets/kitchen/retry").status_code == 202
-    plan_all(services)
-    assert http.get("/v1/datasets/kitchen").json()["state"] == "queued"
 
 
 def test_a_snapshot_is_made_once_and_names_checksums(

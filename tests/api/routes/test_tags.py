@@ -23,7 +23,7 @@ from graspd.service.readers.where import parse
 from graspd.service.store.manifests import ShardManifest
 from graspd.service.store.shards import Shard, read_shard
 from tests.api.factories import add_job, finish_all, people_of
-from tests.planning import plan_all
+from tests.fakes import plan_all
 
 Grasps = list[dict[str, Any]]
 

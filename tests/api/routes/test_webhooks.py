@@ -27,7 +27,7 @@ from graspd.service.pipeline.webhook_dispatcher import AT_ONCE, SLOW_AT_ONCE, We
 from graspd.service.settings import Settings
 from tests.api.conftest import BASE_URL
 from tests.api.factories import add_job, finish_all, people_of
-from tests.planning import plan_all
+from tests.fakes import plan_all
 from tests.waiting import PATIENCE_S, until
 
 ADDRESS = "https://ci.example.org/graspd"

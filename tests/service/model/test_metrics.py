@@ -10,8 +10,6 @@ import pytest
 
 from benchmarks.large_index import fill
 from graspd.service.index.index import Index
-from graspd.service.model.metrics import GRASP_METRICS
-from graspd.service.store.columns import SCHEMAS
 from graspd.service.store.store import open_store
 from tests.conftest import REPOSITORY
 from tests.one_more_metric import MEANING, NAME, TITLE
@@ -32,11 +30,6 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Found:
     done = completed(command, cwd=REPOSITORY)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout.splitlines()[-1])
-
-
-def test_the_metric_is_in_no_table_of_this_process() -> None:
-    assert NAME not in {metric.name for metric in GRASP_METRICS}
-    assert f"quality/{NAME}" not in SCHEMAS["base"]
 
 
 def test_shard_manifest_and_index_have_it_and_an_older_index_too(found: Found) -> None:

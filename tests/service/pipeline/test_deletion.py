@@ -21,8 +21,7 @@ from graspd.service.pipeline.deletion import delete_asset, delete_dataset, delet
 from graspd.service.pipeline.garbage_collector import GarbageCollector
 from graspd.service.store.library import publish_asset
 from graspd.service.store.records import deletions, pending
-from tests.fakes import OBJECT_FILES, make_shard, request, with_settings
-from tests.planning import plan_all
+from tests.fakes import OBJECT_FILES, make_shard, plan_all, request, with_settings
 from tests.service.pipeline.datasets.makers import fail
 
 

@@ -32,8 +32,7 @@ from graspd.service.queue.rq_queue import RqQueue
 from graspd.service.store.library import publish_asset
 from graspd.service.store.manifests import ShardManifest, publish_shard
 from graspd.worker.stages.context import TaskContext, shard_of
-from tests.fakes import OBJECT_FILES, beat_of, fake_stages, message_for, request, with_settings
-from tests.planning import plan_all
+from tests.fakes import OBJECT_FILES, beat_of, fake_stages, message_for, plan_all, request, with_settings
 from tests.service.pipeline.test_controller import Bench
 
 OWN = own_ability()

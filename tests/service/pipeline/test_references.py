@@ -28,9 +28,8 @@ from graspd.service.pipeline.garbage_collector import GarbageCollector
 from graspd.service.store.library import publish_asset
 from graspd.service.store.network_file import check_network
 from tests.api.factories import fail
-from tests.fakes import make_task, record_of, request
+from tests.fakes import make_task, plan_all, record_of, request
 from tests.networks import network_files, random_network
-from tests.planning import plan_all
 
 FLOOR = {"kind": "half_space"}
 UPRIGHT = [1.0, 0, 0, 0]
