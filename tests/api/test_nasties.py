@@ -127,9 +127,7 @@ def test_names_of_files_are_bounded(http: TestClient) -> None:
 
 
 @pytest.mark.parametrize("where", ["the body", "the archive", "the store"])
-def test_a_full_disk_is_said_and_the_upload_may_come_again(
-    http: TestClient, where: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_is_told_and_a_retry_works(http: TestClient, where: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: object, **__: object) -> Any:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 

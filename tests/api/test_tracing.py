@@ -31,9 +31,7 @@ def spans(monkeypatch: pytest.MonkeyPatch) -> InMemorySpanExporter:
     return exporter
 
 
-def test_a_task_is_in_the_trace_of_the_request_that_submitted_it(
-    spans: InMemorySpanExporter, http: TestClient, services: Services
-) -> None:
+def test_a_task_is_in_its_requests_trace(spans: InMemorySpanExporter, http: TestClient, services: Services) -> None:
     body = {"hand": "allegro", "object": "mug", "grasps": 32}
     made = http.post("/v1/jobs", json=body, headers={"traceparent": _PARENT}).json()
     record = record_of(services, made["id"])

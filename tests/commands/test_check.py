@@ -59,9 +59,7 @@ def test_a_folder_gets_a_verdict_each_and_code_2_if_refused(shared_data: Path, t
         ("two_components.stl", ("--keep-largest",), "repair"),
     ],
 )
-def test_a_file_gets_its_verdict_and_exit_code(
-    shared_data: Path, file: str, options: tuple[str, ...], verdict: str
-) -> None:
+def test_files_get_verdict_and_exit_code(shared_data: Path, file: str, options: tuple[str, ...], verdict: str) -> None:
     kind = "hands" if file.endswith(".urdf") else "objects"
     code, report = check(kind, "check", str(shared_data / "bad" / file), *options)
     assert report["verdict"] == verdict, report["message"]

@@ -111,9 +111,7 @@ def key_of(topology: Topology) -> str:
 
 @pytest.mark.s3
 @pytest.mark.postgres
-def test_the_services_of_the_compose_file_do_a_job_together(
-    topology: Topology, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_services_of_the_compose_file_do_a_job_together(topology: Topology, monkeypatch: pytest.MonkeyPatch) -> None:
     headers = bearer(key_of(topology))
     for number, port in enumerate(topology.ports):
         topology.start(f"api-{number}", "api", "graspd", "api", GRASPD_PORT=str(port))

@@ -64,9 +64,7 @@ def test_a_file_does_not_take_the_place_of_a_closed_output(tmp_path: Path) -> No
         (MemoryError(), "there is not enough memory; provide more, or request less at once"),
     ],
 )
-def test_a_refusal_of_the_system_names_the_thing_and_the_fix(
-    error: BaseException, line: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_system_error_names_the_fix(error: BaseException, line: str, capsys: pytest.CaptureFixture[str]) -> None:
     def command() -> None:
         raise error
 

@@ -96,9 +96,7 @@ def test_the_check_follows_the_age_of_the_file(tmp_path: Path) -> None:
     assert not is_healthy(file)
 
 
-def test_a_controller_lives_also_while_redis_is_away(
-    services: Services, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_controller_lives_without_redis(services: Services, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def away(*_: object) -> None:
         raise QueueUnavailable("Redis does not answer")
 

@@ -104,9 +104,7 @@ def test_a_refused_object_gets_in_with_the_named_fix(graspd: Shell) -> None:
     assert brick["facts"]["mass_kg"] == pytest.approx(60e-3 * 40e-3 * 30e-3 * 500, rel=1e-3)
 
 
-def test_a_folder_of_objects_becomes_a_dataset_and_its_files(
-    graspd: Shell, service: Supervisor, tmp_path: Path
-) -> None:
+def test_a_folder_of_objects_becomes_a_dataset_and_files(graspd: Shell, service: Supervisor, tmp_path: Path) -> None:
     graspd("hands", "add", "pincer.urdf", "--no-self-test")
     wanted = ("datasets", "create", "play", "--hands", "pincer", "--objects", "toys", "--grasps", "4")
     cheap = ("--fidelity", "draft", "--want", "candidates", "--validation", "none")

@@ -61,9 +61,7 @@ def test_a_stage_that_waits_says_why() -> None:
     ("queued", "succeeded", "reused", "seconds", "eta"),
     [(2, 2, 0, 20.0, pytest.approx(20.0)), (1, 3, 2, 10.0, pytest.approx(10.0)), (2, 2, 2, 0.0, None)],
 )
-def test_finished_batches_give_the_rate_unless_they_were_reused(
-    queued: int, succeeded: int, reused: int, seconds: float, eta: Any
-) -> None:
+def test_new_batches_give_the_rate(queued: int, succeeded: int, reused: int, seconds: float, eta: Any) -> None:
     counts = {"tasks": 4, "queued": queued, "succeeded": succeeded, "reused": reused, "done": float(succeeded)}
     assert status_of(StageProgress(stage=Stage.SYNTHESIZE, seconds=seconds, **counts)).eta_s == eta
 

@@ -132,9 +132,7 @@ def test_no_page_asks_for_anything_from_elsewhere_or_inline(http: TestClient) ->
     assert served and {http.get(address).status_code for address in served} == {200}
 
 
-def test_pages_are_read_on_while_redis_is_away(
-    http: TestClient, services: Services, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_pages_are_read_without_redis(http: TestClient, services: Services, monkeypatch: pytest.MonkeyPatch) -> None:
     record = add_job(services)
     finish_all(services, record)
 

@@ -114,9 +114,7 @@ def test_the_page_shows_the_chart_that_was_published_last(http: TestClient, serv
 
 
 @pytest.mark.parametrize("stored", [None, b"{}", b"no json"])
-def test_without_a_chart_the_page_says_which_command_makes_one(
-    http: TestClient, services: Services, stored: bytes | None
-) -> None:
+def test_without_a_chart_the_page_names_the_command(http: TestClient, services: Services, stored: bytes | None) -> None:
     if stored is not None:
         services.store.put("charts/20260101.json", stored)
     assert "graspd chart" in http.get("/chart").text

@@ -123,9 +123,7 @@ def test_grasps_in_flight_come_free_as_jobs_end(make_twins: Twins, keys: KeyFile
     assert client.post("/v1/jobs", json=JOB | {"seed": 1, "grasps": 33}, headers=headers).status_code == 202
 
 
-def test_a_dataset_counts_with_all_its_cells_until_it_ends(
-    make_twins: Twins, keys: KeyFile, services: Services
-) -> None:
+def test_a_dataset_counts_with_all_cells_until_it_ends(make_twins: Twins, keys: KeyFile, services: Services) -> None:
     headers = bearer(keys.add("me", Scope.SUBMIT, limits=KeyLimits(grasps_in_flight=64)))
     client, _ = make_twins()
     matrix = {"name": "d", "hands": ["allegro", "barrett"], "objects": ["mug"], "grasps": 32}

@@ -55,9 +55,7 @@ def test_with_auto_each_cell_says_which_fidelity_it_got(http: TestClient, servic
     assert "auto (gsr&gt;=0.6)" in http.get("/datasets/kitchen").text
 
 
-def test_cells_come_in_pages_with_a_link_to_the_next(
-    http: TestClient, services: Services, kitchen: dict[str, Any]
-) -> None:
+def test_cells_come_in_pages_with_a_next_link(http: TestClient, services: Services, kitchen: dict[str, Any]) -> None:
     finish_cells(services, http, 1)
     first = http.get("/v1/datasets/kitchen/cells", params={"limit": 3})
     address = first.headers["Link"].partition(">")[0].lstrip("<")
@@ -91,9 +89,7 @@ def test_an_estimate_records_nothing(http: TestClient) -> None:
     assert http.get("/v1/datasets").json()["items"] == []
 
 
-def test_a_snapshot_is_made_once_and_names_checksums(
-    http: TestClient, services: Services, kitchen: dict[str, Any]
-) -> None:
+def test_a_snapshot_is_made_once_with_checksums(http: TestClient, services: Services, kitchen: dict[str, Any]) -> None:
     assert http.post("/v1/datasets/kitchen/snapshots").status_code == 409
     finish_cells(services, http, 2)
     taken = http.post("/v1/datasets/kitchen/snapshots")

@@ -102,9 +102,7 @@ RECORDS = [of_job, of_manifest, of_attempt, of_event, of_asset, of_check, of_dat
 
 
 @pytest.mark.parametrize("record", RECORDS)
-def test_a_damaged_record_is_left_out_of_a_lost_index_and_named(
-    services: Services, record: Callable[[Services], str]
-) -> None:
+def test_a_rebuild_leaves_out_damage_and_names_it(services: Services, record: Callable[[Services], str]) -> None:
     key = record(services)
     overwrite(services.store, key, DAMAGED)
     fresh = lost(services)

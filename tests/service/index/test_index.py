@@ -305,9 +305,7 @@ WAYS: list[tuple[int, tuple[int, ...]]] = [(1000, (8, 16)), (0, (8, 16)), (0, (1
 
 
 @pytest.mark.parametrize("sort", [GraspSort(), GraspSort(by="penetration_depth_mm", descending=False)])
-def test_every_way_of_searching_finds_the_same(
-    services: Services, monkeypatch: pytest.MonkeyPatch, sort: GraspSort
-) -> None:
+def test_every_search_finds_the_same(services: Services, monkeypatch: pytest.MonkeyPatch, sort: GraspSort) -> None:
     job, _ = job_actions.submit(services, request(grasps=160))
     finish(services, job.id)
     everything = services.index.grasps.page(sort=sort, limit=200).items

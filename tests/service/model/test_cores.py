@@ -56,9 +56,7 @@ def test_without_control_groups_the_affinity_counts(tmp_path: Path, monkeypatch:
         (VERSION_1, v1("cpu", -1), MACHINE),
     ],
 )
-def test_the_least_readable_quota_on_the_way_up_counts(
-    tmp_path: Path, group: str, files: dict[str, str], expected: int
-) -> None:
+def test_the_least_quota_on_the_way_up_counts(tmp_path: Path, group: str, files: dict[str, str], expected: int) -> None:
     assert available_cores(system(tmp_path, group, files)) == expected
 
 
@@ -89,7 +87,5 @@ def test_the_files_are_read_once_in_a_moment(tmp_path: Path, monkeypatch: pytest
         ("9:cpu:/c", {}, MACHINE_MB),
     ],
 )
-def test_the_smallest_limit_around_the_process_counts(
-    tmp_path: Path, group: str, files: dict[str, str], limit: float
-) -> None:
+def test_the_smallest_memory_limit_counts(tmp_path: Path, group: str, files: dict[str, str], limit: float) -> None:
     assert available_memory(system(tmp_path, group, files)) / 2**20 == pytest.approx(limit)

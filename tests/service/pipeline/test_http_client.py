@@ -73,9 +73,7 @@ def test_no_way_of_writing_this_machine_reaches_it(ear: tuple[str, list[Any]], h
     assert answer.status is None and not ear[1]
 
 
-def test_a_name_is_looked_at_once_and_asked_where_it_was_then(
-    ear: tuple[str, list[Any]], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_name_is_looked_up_once(ear: tuple[str, list[Any]], monkeypatch: pytest.MonkeyPatch) -> None:
     port = int(ear[0].rpartition(":")[2])
     answers = iter(["93.184.216.34", "127.0.0.1"])
     dialled: list[Any] = []

@@ -300,9 +300,7 @@ def test_a_second_verify_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("rate", [100.0, 0.0])
-def test_the_controller_scans_beside_its_rounds_unless_it_is_off(
-    services: Services, shards: list[ShardManifest], rate: float
-) -> None:
+def test_the_controller_scans_unless_it_is_off(services: Services, shards: list[ShardManifest], rate: float) -> None:
     flip(services.store, shards[0].key)
     set_so = with_settings(services, integrity_scan_mb_per_s=rate, controller_interval_s=0.05)
     stop = threading.Event()

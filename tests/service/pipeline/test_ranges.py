@@ -61,9 +61,7 @@ NEXT = beat(revision=REVISION + 1)
         ([beat(schemas=(4, 9))], replace(NEED, schema=2, newest=5), Route()),
     ],
 )
-def test_a_task_goes_where_those_look_who_can_do_it(
-    present: list[WorkerBeat], need: Requirements, place: Route
-) -> None:
+def test_a_task_goes_where_able_workers_look(present: list[WorkerBeat], need: Requirements, place: Route) -> None:
     assert Routes(present).place(need) == place
 
 
@@ -80,9 +78,7 @@ def test_a_task_goes_where_those_look_who_can_do_it(
         ([beat(schemas=(5, 6))], replace(NEED, newest=4), "has at most schema 4"),
     ],
 )
-def test_what_nobody_can_do_is_held_back_with_the_reason(
-    present: list[WorkerBeat], need: Requirements, why: str
-) -> None:
+def test_what_nobody_can_do_is_held_with_the_reason(present: list[WorkerBeat], need: Requirements, why: str) -> None:
     assert why in Routes(present).place(need).held
 
 
@@ -263,9 +259,7 @@ def test_a_job_of_ranges_goes_through_its_stages(services: Services) -> None:
     assert differences(services.index, services.store) == []
 
 
-def test_shards_of_many_batches_enter_the_index_in_short_turns(
-    services: Services, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_large_shards_enter_the_index_in_short_turns(services: Services, monkeypatch: pytest.MonkeyPatch) -> None:
     bench = Bench(services)
     bench.controller.round()
     record = job_actions.prepare(services, request(grasps=32 * 64 * 5), priority=Priority.BULK)

@@ -169,9 +169,7 @@ NO_NEIGHBOURS = ({"object": "cup"}, {"object": "../x", "digest": "a" * 32}, {"ob
         *((NEIGHBOUR, {"neighbours": [one]}) for one in NO_NEIGHBOURS),
     ],
 )
-def test_a_forged_entry_names_nothing_without_its_digest(
-    services: Services, named: Reference, forged: dict[str, Any]
-) -> None:
+def test_a_forged_entry_needs_a_digest(services: Services, named: Reference, forged: dict[str, Any]) -> None:
     named.add(services)
     job = named.submit(services)
     said = message_of(job, next(plan(job)), attempt=1, max_attempt=3).model_dump(mode="json", by_alias=True)

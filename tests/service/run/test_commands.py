@@ -155,9 +155,7 @@ def test_a_worker_that_never_gets_ready_is_named_with_its_log(tmp_path: Path) ->
         supervisor.wait_ready()
 
 
-def test_what_is_waited_for_is_told_and_the_wait_can_be_stopped(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_wait_says_for_what_and_can_be_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("graspd.service.run.supervisor._TOLD_EVERY_S", 0.0)
     idle, stop, told = (sys.executable, "-c", "import signal; signal.pause()"), threading.Event(), []
 
@@ -171,9 +169,7 @@ def test_what_is_waited_for_is_told_and_the_wait_can_be_stopped(
     assert str(tmp_path / "logs") in told[-1]
 
 
-def test_a_check_fails_where_no_controller_or_worker_lives(
-    rq_queue: RqQueue, redis_server: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_check_fails_without_process(rq_queue: RqQueue, redis_server: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GRASPD_REDIS_URL", redis_server)
     for command in ("controller", "worker"):
         shown = runner.invoke(program.build(), [command, "--check"])

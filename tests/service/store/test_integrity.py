@@ -186,9 +186,7 @@ CHANGES = (external_link, soft_link, external_storage, virtual, made_up, deflate
 
 @pytest.mark.parametrize("change", CHANGES)
 @pytest.mark.parametrize("as_bytes", [False, True])
-def test_values_from_elsewhere_are_refused(
-    change: Callable[[h5py.File, Path], None], as_bytes: bool, tmp_path: Path
-) -> None:
+def test_foreign_values_are_refused(change: Callable[[h5py.File, Path], None], as_bytes: bool, tmp_path: Path) -> None:
     secret, shard = tmp_path / "secret.h5", tmp_path / "shard.h5"
     with h5py.File(secret, "w") as file:
         file["secret"] = np.full((4, 7), 42.0)

@@ -49,9 +49,7 @@ def test_what_was_in_a_pack_has_a_file_of_its_own(store: Store) -> None:
 
 
 @pytest.mark.parametrize("breaks_at", range(1, 8))
-def test_it_may_break_off_anywhere_and_the_next_one_goes_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, breaks_at: int
-) -> None:
+def test_it_may_break_off_and_is_continued(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, breaks_at: int) -> None:
     store, messages, calls = open_store((tmp_path / "store").as_uri()), batches(3), 0
     pack(store, messages[:2], dead=messages[1:2])
     pack(store, messages[2:])

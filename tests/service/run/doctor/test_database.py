@@ -75,7 +75,7 @@ def remove_row(services: Services) -> None:
         (change_row, "the store says"),
     ],
 )
-def test_a_manifest_or_row_that_is_gone_or_differs_is_bad(
+def test_missing_or_other_rows_are_bad(
     kept: Services, look: Look, harm: Callable[[Services], None], words: str
 ) -> None:
     shard = shard_of(kept).stem

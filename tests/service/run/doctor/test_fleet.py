@@ -181,9 +181,7 @@ def test_clocks_that_agree_are_good(settings: Settings, rq_queue: RqQueue) -> No
     ("ahead_s", "condition"),
     [(-60.0, Condition.WARNING), (60.0, Condition.WARNING), (3600.0, Condition.BAD), (-3.0, Condition.GOOD)],
 )
-def test_a_machine_whose_clock_is_off_is_named(
-    settings: Settings, rq_queue: RqQueue, ahead_s: float, condition: Condition
-) -> None:
+def test_a_wrong_clock_is_named(settings: Settings, rq_queue: RqQueue, ahead_s: float, condition: Condition) -> None:
     """Three seconds ago is as old as a beat may be."""
     present(rq_queue, seen=timestamp(-ahead_s))
     found = clocks(settings)

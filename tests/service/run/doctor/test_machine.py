@@ -120,9 +120,7 @@ def test_a_bucket_is_good_and_nothing_is_left_in_it(tmp_path: Path, s3_url: str)
 
 
 @pytest.mark.s3
-def test_a_wrong_secret_is_bad_and_the_mend_names_the_variables(
-    tmp_path: Path, s3_url: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_wrong_secret_names_its_variables(tmp_path: Path, s3_url: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "of-somebody-else")
     found = store(Settings(data_dir=tmp_path, store_url=s3_url))
     assert not found.ok and "AWS_SECRET_ACCESS_KEY" in found.fix
