@@ -9,6 +9,7 @@ import os
 import tempfile
 from itertools import cycle, product
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from redis.exceptions import ConnectionError as RedisAway
@@ -128,9 +129,7 @@ def test_names_of_files_are_bounded(http: TestClient) -> None:
 
 @pytest.mark.parametrize("where", ["the body", "the archive", "the store"])
 def test_a_full_disk_is_told_and_a_retry_works(http: TestClient, where: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object, **__: object) -> Any:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
+    full = Mock(side_effect=OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
     with monkeypatch.context() as patch:
         if where == "the body":
             patch.setattr(tempfile.SpooledTemporaryFile, "write", full)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from operator import attrgetter
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from fastapi import FastAPI
@@ -85,20 +86,14 @@ def test_a_body_over_the_limit_is_refused_by_length_or_arrival(http: TestClient)
 def test_a_part_that_is_away_is_503_and_worth_another_try(
     http: TestClient, services: Services, monkeypatch: pytest.MonkeyPatch, part: str, method: str, error: Any, slug: str
 ) -> None:
-    def away(*_: object, **__: object) -> None:
-        raise error
-
-    monkeypatch.setattr(type(attrgetter(part)(services)), method, away)
+    monkeypatch.setattr(type(attrgetter(part)(services)), method, Mock(side_effect=error))
     answer = http.post("/v1/jobs", json=JOB)
     assert problem(answer, 503, slug)["detail"] == str(error)
     assert int(answer.headers["retry-after"]) > 0
 
 
 def test_an_unforeseen_error_tells_no_detail(app: FastAPI, http: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
-    def burst() -> None:
-        raise RuntimeError("secret: /home/someone")
-
-    monkeypatch.setattr(app.state.overview, "stats", burst)
+    monkeypatch.setattr(app.state.overview, "stats", Mock(side_effect=RuntimeError("secret: /home/someone")))
     assert "secret" not in str(problem(http.get("/v1/stats"), 500, "internal"))
     page = http.get("/", headers={"Accept": "text/html"})
     assert (page.status_code, page.headers["content-type"]) == (500, "text/html; charset=utf-8")

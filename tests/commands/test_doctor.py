@@ -8,6 +8,7 @@ import subprocess
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -62,9 +63,7 @@ def test_a_driver_that_crashes_or_hangs_takes_only_the_child_with_it(tmp_path: P
     def crash(arguments: Sequence[str]) -> subprocess.CompletedProcess[str]:
         return subprocess.CompletedProcess([], -signal.SIGSEGV, "", "")
 
-    def hang(arguments: Sequence[str]) -> subprocess.CompletedProcess[str]:
-        raise subprocess.TimeoutExpired([], 120.0)
-
+    hang = Mock(side_effect=subprocess.TimeoutExpired([], 120.0))
     for look in (doctor.gpu, doctor.kernels):
         for child, told in ((crash, "signal 11"), (hang, "no answer within 120 s")):
             found = look(Settings(data_dir=tmp_path), child=child)
@@ -76,10 +75,7 @@ def test_the_child_tells_what_this_machine_has_and_what_is_wrong(monkeypatch: py
     done = doctor.run_child(["gpus"])
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout.splitlines()[-1])["toolkit"][0] >= 12
-
-    def broken(*_: object, **__: object) -> None:
-        raise EngineError("synthesize: OSError: no kernels")
-
+    broken = Mock(side_effect=EngineError("synthesize: OSError: no kernels"))
     monkeypatch.setattr("graspd.worker.process.selfcheck.check_engine", broken)
     told = doctor._tell_kernels("cpu")
     assert told["error"] == "synthesize: OSError: no kernels"

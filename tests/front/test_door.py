@@ -6,6 +6,7 @@ import errno
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from typer.testing import CliRunner
@@ -65,15 +66,12 @@ def test_a_file_does_not_take_the_place_of_a_closed_output(tmp_path: Path) -> No
     ],
 )
 def test_a_system_error_names_the_fix(error: BaseException, line: str, capsys: pytest.CaptureFixture[str]) -> None:
-    def command() -> None:
-        raise error
-
     with capsys.disabled(), pytest.MonkeyPatch.context() as patch:
         patch.setattr("graspd.service.cli._silence", lambda stream: None)
         patch.setattr("typer.echo", lambda text, err: told.append(text))
         told: list[str] = []
         with pytest.raises(SystemExit) as ended:
-            at_the_door(command)
+            at_the_door(Mock(side_effect=error))
     assert ended.value.code == 1
     assert told == [f"graspd: {line}"]
 

@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -97,12 +98,9 @@ def test_the_check_follows_the_age_of_the_file(tmp_path: Path) -> None:
 
 
 def test_a_controller_lives_without_redis(services: Services, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def away(*_: object) -> None:
-        raise QueueUnavailable("Redis does not answer")
-
     file = tmp_path / "alive"
     settings = services.settings.model_copy(update={"heartbeat_file": file, "integrity_scan_mb_per_s": 0.0})
-    monkeypatch.setattr(services.queue, "depths", away)
+    monkeypatch.setattr(services.queue, "depths", Mock(side_effect=QueueUnavailable("Redis does not answer")))
     stop = threading.Event()
     thread = threading.Thread(
         target=Controller(Services(settings, services.store, services.index, services.queue)).run, args=(stop,)

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from fastapi import FastAPI
@@ -149,10 +150,9 @@ def test_an_open_service_answers_its_own_machine_only(app: FastAPI, http: TestCl
 
 
 def test_only_who_may_read_is_told_what_is_wrong_with_a_part(closed: Closed, monkeypatch: pytest.MonkeyPatch) -> None:
-    def away(*_: object) -> float:
-        raise QueueUnavailable("Redis does not answer at redis://inside:6379")
-
-    monkeypatch.setattr(MemoryQueue, "ping", away)
+    monkeypatch.setattr(
+        MemoryQueue, "ping", Mock(side_effect=QueueUnavailable("Redis does not answer at redis://inside:6379"))
+    )
     client, tokens = closed
     assert "inside" not in client.get("/readyz").text
     assert "inside" in client.get("/readyz", headers=bearer(tokens[Scope.READ])).text

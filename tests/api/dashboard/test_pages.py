@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+from unittest.mock import Mock
 
 import pytest
 from PIL import Image
@@ -135,10 +136,7 @@ def test_no_page_asks_for_anything_from_elsewhere_or_inline(http: TestClient) ->
 def test_pages_are_read_without_redis(http: TestClient, services: Services, monkeypatch: pytest.MonkeyPatch) -> None:
     record = add_job(services)
     finish_all(services, record)
-
-    def away(*_: object) -> float:
-        raise QueueUnavailable("Redis does not answer at unix:///redis.sock")
-
+    away = Mock(side_effect=QueueUnavailable("Redis does not answer at unix:///redis.sock"))
     for method in ("ping", "depths"):
         monkeypatch.setattr(MemoryQueue, method, away)
     page = http.get("/")
@@ -150,9 +148,7 @@ def test_pages_are_read_without_redis(http: TestClient, services: Services, monk
 
 
 def test_a_page_without_its_index_says_so_as_a_page(http: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
-    def away(*_: object, **__: object) -> None:
-        raise IndexUnavailable("the index does not answer")
-
+    away = Mock(side_effect=IndexUnavailable("the index does not answer"))
     for part, method in ((Database, "ping"), (Overview, "stats"), (Jobs, "page")):
         monkeypatch.setattr(part, method, away)
     answer = http.get("/", headers={"Accept": "text/html"})

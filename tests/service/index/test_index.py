@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from datetime import datetime
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from pydantic import SecretStr
@@ -282,11 +283,7 @@ def test_every_kind_of_damage_to_the_index_is_seen_and_mended(services: Services
 def test_a_rebuild_that_breaks_off_leaves_the_old_rows(services: Services, monkeypatch: pytest.MonkeyPatch) -> None:
     build_a_history(services)
     jobs = len(services.index.jobs.page(limit=99).items)
-
-    def away(_store: Store, key: str) -> bytes:
-        raise StoreUnavailable("away")
-
-    monkeypatch.setattr(Store, "get", away)
+    monkeypatch.setattr(Store, "get", Mock(side_effect=StoreUnavailable("away")))
     with pytest.raises(StoreUnavailable):
         rebuild(services.index, services.store)
     assert len(services.index.jobs.page(limit=99).items) == jobs

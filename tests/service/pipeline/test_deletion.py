@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -276,8 +277,7 @@ def _jobs(services: Services) -> list[str]:
     return [job.id for job in services.index.jobs.page().items]
 
 
-def _break(*_: object, **__: object) -> None:
-    raise KeyboardInterrupt
+_break = Mock(side_effect=KeyboardInterrupt)
 
 
 def _after(count: int, real: Any) -> Any:

@@ -8,6 +8,7 @@ import socket
 import threading
 from collections.abc import Iterator
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -133,10 +134,7 @@ def test_a_name_with_a_private_address_is_refused_untold(monkeypatch: pytest.Mon
 
 
 def test_a_name_that_cannot_be_looked_up_tells_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    def unknown(*_: object, **__: object) -> None:
-        raise OSError("resolver 10.0.0.2: NXDOMAIN")
-
-    monkeypatch.setattr(http_client.socket, "getaddrinfo", unknown)
+    monkeypatch.setattr(http_client.socket, "getaddrinfo", Mock(side_effect=OSError("resolver 10.0.0.2: NXDOMAIN")))
     answer = post("http://nothing.internal/", b"{}", {})
     assert not answer.is_final and answer.detail == "the host of the address cannot be looked up"
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -46,10 +47,7 @@ def test_an_unknown_hand_or_object_leaves_nothing_behind(services: Services) -> 
 
 
 def test_without_redis_nothing_is_recorded_of_a_submit(services: Services, monkeypatch: pytest.MonkeyPatch) -> None:
-    def gone() -> float:
-        raise QueueUnavailable("Redis does not answer")
-
-    monkeypatch.setattr(services.queue, "ping", gone)
+    monkeypatch.setattr(services.queue, "ping", Mock(side_effect=QueueUnavailable("Redis does not answer")))
     with pytest.raises(QueueUnavailable):
         job_actions.submit(services, request())
     assert list(services.store.list(names.JOBS)) == []

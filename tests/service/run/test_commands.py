@@ -12,6 +12,7 @@ import sys
 import threading
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import typer
@@ -53,12 +54,8 @@ def _bad_model() -> ValidationError:
 def test_an_error_is_one_line_and_an_exit_code(
     error: BaseException, code: int, line: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    @reporting_errors
-    def command() -> None:
-        raise error
-
     with pytest.raises(typer.Exit) as ended:
-        command()
+        reporting_errors(Mock(side_effect=error))()
     assert ended.value.exit_code == code
     assert capsys.readouterr().err == line
 

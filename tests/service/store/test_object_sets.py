@@ -5,6 +5,7 @@ from __future__ import annotations
 import zipfile
 import zlib
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -57,10 +58,7 @@ def test_a_link_out_of_the_folder_is_left_alone_and_too_large_a_set_refused(tmp_
 
 
 def test_a_machine_without_memory_damages_no_archive(monkeypatch: pytest.MonkeyPatch) -> None:
-    def starved(*_: object) -> bytes:
-        raise zlib.error("Error -4 while decompressing data")
-
     data = pack({"asset.json": b"{}"})
-    monkeypatch.setattr(zipfile.ZipExtFile, "read", starved)
+    monkeypatch.setattr(zipfile.ZipExtFile, "read", Mock(side_effect=zlib.error("Error -4 while decompressing data")))
     with pytest.raises(MemoryError):
         unpack(data, limit_bytes=100)

@@ -7,6 +7,7 @@ import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from unittest.mock import Mock
 from urllib.parse import urlsplit
 
 import httpx
@@ -105,12 +106,11 @@ def test_a_url_that_names_no_store_is_refused(url: str) -> None:
 
 
 def test_a_full_disk_is_one_clear_line_and_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(descriptor: int) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
     store = open_store(tmp_path.as_uri())
     with monkeypatch.context() as patch:
-        patch.setattr("graspd.service.store.store.os.fsync", full)
+        patch.setattr(
+            "graspd.service.store.store.os.fsync", Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
+        )
         with pytest.raises(StoreUnavailable, match=r"No space left on device$"):
             store.put("shards/base/a.h5", b"data")
     assert list((tmp_path / "shards" / "base").iterdir()) == []

@@ -7,6 +7,7 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
+from unittest.mock import Mock
 
 import obstore
 import pytest
@@ -78,15 +79,10 @@ def test_findings_come_in_order_and_one_that_hangs_is_bad() -> None:
         hold.wait(30)
         return good("late")
 
-    def break_off() -> Finding:
-        raise ZeroDivisionError("by nothing")
-
-    def away() -> Finding:
-        raise StoreUnavailable("the store is away")
-
+    away = Mock(side_effect=StoreUnavailable("the store is away"))
     checks = [
         Check("hangs", hang, limit_s=0.05, mend_hang="restart it"),
-        Check("breaks", break_off),
+        Check("breaks", Mock(side_effect=ZeroDivisionError("by nothing"))),
         Check("away", away),
         Check("good", lambda: good("fine")),
     ]
