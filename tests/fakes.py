@@ -156,6 +156,12 @@ def plan_all(services: Services) -> None:
     assert not DatasetRounds(services).advance(math.inf)
 
 
+def tasks_of(job: JobRecord) -> list[TaskMessage]:
+    """The first attempts at a job's tasks of synthesis."""
+    tasks = [task for task in plan(job) if task.stage is Stage.SYNTHESIZE]
+    return [message_of(job, task, attempt=1, max_attempt=3) for task in tasks]
+
+
 def fail_task(services: Services, job: str, task: PlannedTask | TaskView, number: int = 1, **changes: Any) -> str:
     """A failed attempt at a task, the last one, in store and index; its key."""
     fields = {"kind": "ValueError", "reason": "it broke", "worker": "w", "ended": timestamp(), "last": True, **changes}

@@ -46,9 +46,8 @@ from graspd.service.store.records import (
     removed_folder,
 )
 from tests.damage import flip, flipped, overwrite, remove
-from tests.fakes import HAND_FILES, OBJECT_FILES, make_shard, message_for, request, with_settings
+from tests.fakes import HAND_FILES, OBJECT_FILES, make_shard, message_for, request, tasks_of, with_settings
 from tests.indexes import open_services
-from tests.packs import tasks_of
 from tests.waiting import PATIENCE_S, Pauses, until
 
 #: Flips of each object: with some thirty objects more than the 265 that were once tried by hand.
