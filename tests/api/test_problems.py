@@ -20,10 +20,8 @@ def problem(answer: Any, status: int, slug: str) -> dict[str, Any]:
     assert answer.status_code == status, answer.text
     assert answer.headers["content-type"] == "application/problem+json"
     document = answer.json()
-    assert document["type"] == f"/problems/{slug}"
-    assert document["status"] == status
-    assert document["request_id"] == answer.headers["x-request-id"]
-    assert "\n" not in document["detail"]
+    assert document["type"] == f"/problems/{slug}" and document["status"] == status
+    assert document["request_id"] == answer.headers["x-request-id"] and "\n" not in document["detail"]
     return document
 
 

@@ -100,8 +100,7 @@ def test_a_task_is_in_its_requests_trace(spans: InMemorySpanExporter, http: Test
     found = {span.name: span for span in spans.get_finished_spans()}
     request, work = found["HTTP POST"], found["task synthesize"]
     assert f"{request.context.trace_id:032x}" == "a" * 32
-    assert work.context.trace_id == request.context.trace_id
-    assert work.parent is not None
+    assert work.context.trace_id == request.context.trace_id and work.parent is not None
     assert work.parent.span_id == request.context.span_id
     assert dict(work.attributes or {})["graspd.outcome"] == "finished"
     assert dict(request.attributes or {})["http.route"] == "/v1/jobs"

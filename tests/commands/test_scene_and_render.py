@@ -91,8 +91,7 @@ def test_pictures_of_grasps_in_scenes_show_walls_and_whole_way(in_bin):
         output = in_bin.with_name("bin.png")
         graspd(f"pictures -n 1 {PICTURES} {more} -o", output, in_bin)
         with Image.open(output) as image:
-            assert image.width > columns * 48
-            assert (image.mode == "P") == ("--palette" in more)
+            assert image.width > columns * 48 and (image.mode == "P") == ("--palette" in more)
 
 
 def test_pictures_draw_the_best_first_and_each_posture_of_a_way(base):

@@ -188,12 +188,10 @@ def test_every_reference_to_a_secret_is_one_that_the_docs_make() -> None:
 @pytest.mark.parametrize("name", sorted({name for name, _ in pods()}))
 def test_a_pod_has_no_rights_to_lose(name: str) -> None:
     for pod in (pod for found, pod in pods() if found == name):
-        assert pod["automountServiceAccountToken"] is False
-        assert pod["securityContext"]["runAsNonRoot"] is True
+        assert pod["automountServiceAccountToken"] is False and pod["securityContext"]["runAsNonRoot"] is True
         for container in pod["containers"]:
             rights = container["securityContext"]
-            assert rights["readOnlyRootFilesystem"] is True
-            assert rights["allowPrivilegeEscalation"] is False
+            assert rights["readOnlyRootFilesystem"] is True and rights["allowPrivilegeEscalation"] is False
             assert rights["capabilities"] == {"drop": ["ALL"]}
             assert "memory" in container["resources"]["limits"]
 

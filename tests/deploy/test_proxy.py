@@ -121,5 +121,4 @@ def test_a_browser_signs_in_through_the_proxy(proxy: Proxy) -> None:
 def test_plain_http_is_sent_to_tls(proxy: Proxy) -> None:
     plain = f"http://127.0.0.1:{proxy.plain_port}/jobs"
     answer = httpx.get(plain, headers={"Host": NAME}, trust_env=False, timeout=60)
-    assert answer.status_code == 301
-    assert answer.headers["location"] == f"https://{NAME}/jobs"
+    assert answer.status_code == 301 and answer.headers["location"] == f"https://{NAME}/jobs"

@@ -50,8 +50,7 @@ def test_the_page_runs_as_it_is_printed(environment: dict[str, str], tmp_path: P
         r"```python\n(.*?)```", (REPOSITORY / "docs" / "reference" / "python.md").read_text(), re.DOTALL
     )
     said = run("\n".join(blocks), environment, tmp_path)
-    assert "<8 grasps of allegro on mug, 8 valid>" in said
-    assert "<8 grasps of barrett on mug, 8 valid>" in said
+    assert "<8 grasps of allegro on mug, 8 valid>" in said and "<8 grasps of barrett on mug, 8 valid>" in said
     assert "no_such_file.stl" in said
 
 

@@ -46,8 +46,7 @@ def test_the_rate_of_a_batch_is_what_it_did_since_first_seen() -> None:
     assert (once.rate_per_s, once.eta_s) == (None, None)
     clock.now += 10.0
     status = status_of(stage.model_copy(update={"done": 0.7}), task(70), paces=paces)
-    assert status.rate_per_s == pytest.approx(0.05)
-    assert status.eta_s == pytest.approx(6.0)
+    assert status.rate_per_s == pytest.approx(0.05) and status.eta_s == pytest.approx(6.0)
     assert status.message == "phase 1"
 
 

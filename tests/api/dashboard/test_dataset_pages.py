@@ -39,8 +39,7 @@ def create(services: Services, **changes: object) -> None:
 )
 def test_a_cell_tells_its_state_and_yield(counts: dict[str, int], state: str, shade: str) -> None:
     shown = of_service([cell(**counts)], ["h"], ["o"]).rows[0][1][0]
-    assert shown is not None
-    assert (shown.state, shown.shade) == (state, shade)
+    assert shown is not None and (shown.state, shown.shade) == (state, shade)
 
 
 def test_pairs_without_work_have_a_cell_to_choose() -> None:

@@ -37,8 +37,7 @@ def test_the_front_is_what_nothing_beats(points: list[tuple[int, int]]) -> None:
 def test_a_point_is_the_mean_over_hands_and_objects() -> None:
     runs = [run("draft", 1.0, 0.4), run("draft", 4.0, 0.8, object="block")]
     (point,) = draw(Measured.model_validate({"runs": runs}), axis="gsr").points
-    assert point.pairs == 2
-    assert point.speed == pytest.approx(math.sqrt(1.0 * 4.0))
+    assert point.pairs == 2 and point.speed == pytest.approx(math.sqrt(1.0 * 4.0))
     assert point.accuracy == pytest.approx(60.0)
 
 

@@ -109,8 +109,7 @@ def test_a_rebuild_leaves_out_damage_and_names_it(services: Services, record: Ca
     Controller(fresh).round()
     assert shown(fresh.index) == GOOD - (record is of_job)
     made = fresh.index.notes.completeness()
-    assert made is not None
-    assert (made.left_out, made.names) == (1, (key,))
+    assert made is not None and (made.left_out, made.names) == (1, (key,))
     fresh.index.close()
 
 

@@ -167,8 +167,7 @@ def test_the_service_in_numbers(services: Services) -> None:
     before = timestamp()
     finish(services, job.id, batches=1)
     stats = services.index.overview.stats()
-    assert (stats.grasps, stats.shards) == (32, 2)
-    assert stats.tasks[State.SUCCEEDED] == 2
+    assert (stats.grasps, stats.shards) == (32, 2) and stats.tasks[State.SUCCEEDED] == 2
     assert stats.jobs[State.RUNNING] == 1
     (cell,) = services.index.overview.matrix()
     assert (cell.hand, cell.object, cell.jobs, cell.grasps, cell.queued) == ("gripper", "ball", 1, 32, 2)

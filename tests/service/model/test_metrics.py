@@ -33,8 +33,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Found:
 
 
 def test_shard_manifest_and_index_have_it_and_an_older_index_too(found: Found) -> None:
-    assert found["schema"] == MEANING
-    assert found["manifest"][0] == 0 and found["manifest"][-1] == 20
+    assert found["schema"] == MEANING and found["manifest"][0] == 0 and found["manifest"][-1] == 20
     assert NAME in found["index columns"] and f"grasps_{NAME}" in found["index indexes"]
     assert found["older index"] == [None] * 50
 

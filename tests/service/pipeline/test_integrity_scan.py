@@ -220,8 +220,7 @@ def test_a_round_notes_what_is_damaged_and_nothing_else(services: Services, shar
     remove(services.store, shards[1].key)
     a_round(services)
     noted = found(services)
-    assert noted.keys() == {shards[0].shard_id, shards[1].shard_id}
-    assert "SHA-256" in noted[shards[0].shard_id]
+    assert noted.keys() == {shards[0].shard_id, shards[1].shard_id} and "SHA-256" in noted[shards[0].shard_id]
     assert noted[shards[1].shard_id] == MISSING
 
 
@@ -294,8 +293,7 @@ def test_a_second_verify_is_refused(tmp_path: Path) -> None:
     assert ReadPermit(other, is_controller=False).is_mine()
     refused = CliRunner().invoke(app, ["store", "verify", "--data-dir", str(tmp_path)])
     other.close()
-    assert refused.exit_code == 2
-    assert "another `graspd admin store verify`" in refused.output
+    assert refused.exit_code == 2 and "another `graspd admin store verify`" in refused.output
 
 
 @pytest.mark.parametrize("rate", [100.0, 0.0])

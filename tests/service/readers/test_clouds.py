@@ -80,8 +80,7 @@ def test_views_fused_agree_and_show_more_than_each(pictures: Pictures) -> None:
     clouds = pictures.clouds(4000, fuse=True, frame="object")
     assert len(clouds) == len(POSES)
     for scene, sample in enumerate(clouds):
-        assert sample["scene"] == scene
-        assert sample["camera/extrinsics"].shape == (VIEWS, 4, 4)
+        assert sample["scene"] == scene and sample["camera/extrinsics"].shape == (VIEWS, 4, 4)
         assert set(np.unique(sample["cloud/pixel"][:, 0])) == set(range(VIEWS))
         distance, normal = on_box(sample["cloud/points"].astype(float))
         assert distance.max() < 4 * DEPTH_M

@@ -137,8 +137,7 @@ def test_status_tells_each_cell(either: Services) -> None:
     assert (failed.tasks_failed, failed.attempts_failed, failed.reason) == (2, 2, "the mesh is torn")
     whole = either.index.datasets.get("grasps")
     assert (whole.state, whole.grasps, whole.tasks, whole.tasks_done, whole.tasks_failed) == ("running", 96, 8, 3, 2)
-    assert whole.progress == pytest.approx(3 / 8)
-    assert whole.seconds == pytest.approx(1.5) and whole.shards == 3
+    assert whole.progress == pytest.approx(3 / 8) and whole.seconds == pytest.approx(1.5) and whole.shards == 3
 
 
 def test_a_dataset_that_found_fewer_grasps_tells_the_outcomes(either: Services) -> None:
