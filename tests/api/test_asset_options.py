@@ -73,12 +73,6 @@ def test_the_options_of_a_hand_decide_its_check(http: TestClient, services: Serv
     assert "palm" not in facts["guessed"] and "closing" in facts["guessed"]
 
 
-def test_options_stand_over_the_asset_json_of_the_upload() -> None:
-    for options, said in (("{}", {}), (json.dumps({"units": "mm"}), {"units": "mm"})):
-        files = files_of_upload(AssetKind.OBJECT, "b.stl", b"solid", limit_bytes=99, options=options)
-        assert json.loads(files["asset.json"]) == {"file": "b.stl", **said}
-
-
 def test_what_was_refused_gets_in_under_its_name_with_the_mend(http: TestClient, services: Services) -> None:
     file = ("open_shell.stl", shell())
     first = http.post("/v1/objects", files={"file": file}).json()

@@ -96,9 +96,3 @@ def test_an_unforeseen_error_tells_no_detail(app: FastAPI, http: TestClient, mon
     page = http.get("/", headers={"Accept": "text/html"})
     assert (page.status_code, page.headers["content-type"]) == (500, "text/html; charset=utf-8")
     assert "secret" not in page.text and page.headers["x-request-id"] in page.text
-
-
-def test_a_page_that_does_not_exist_is_a_page_in_a_browser(http: TestClient) -> None:
-    answer = http.get("/jobs/none", headers={"Accept": "text/html"})
-    assert answer.status_code == 404 and answer.headers["content-type"].startswith("text/html")
-    assert "none" in answer.text

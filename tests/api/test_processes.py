@@ -108,7 +108,7 @@ def test_a_task_is_in_its_requests_trace(spans: InMemorySpanExporter, http: Test
 
 def test_without_an_endpoint_nothing_of_the_sdk_is_imported() -> None:
     code = (
-        "import sys; from service import telemetry; telemetry.set_up_tracing('api')\n"
+        "import sys; from graspd.service import telemetry; telemetry.set_up_tracing('api')\n"
         "with telemetry.span('x'): assert telemetry.traceparent() == ''\n"
         "assert not [name for name in sys.modules if name.startswith('opentelemetry')]"
     )

@@ -10,11 +10,8 @@ import pytest
 from PIL import Image
 from starlette.testclient import TestClient
 
-from graspd.service.index.database import Database
 from graspd.service.index.notes import Damage
-from graspd.service.index.queries.jobs import Jobs
-from graspd.service.index.queries.overview import Overview
-from graspd.service.model.errors import IndexUnavailable, QueueUnavailable
+from graspd.service.model.errors import QueueUnavailable
 from graspd.service.model.fidelity import OFFERED
 from graspd.service.model.planning import plan
 from graspd.service.model.states import State
@@ -145,15 +142,6 @@ def test_pages_are_read_without_redis(http: TestClient, services: Services, monk
     health = http.get("/readyz")
     assert (health.status_code, health.json()["parts"]["redis"]["ok"]) == (503, False)
     assert 'graspd_part_up{part="redis"} 0.0' in http.get("/metrics").text
-
-
-def test_a_page_without_its_index_says_so_as_a_page(http: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
-    away = Mock(side_effect=IndexUnavailable("the index does not answer"))
-    for part, method in ((Database, "ping"), (Overview, "stats"), (Jobs, "page")):
-        monkeypatch.setattr(part, method, away)
-    answer = http.get("/", headers={"Accept": "text/html"})
-    assert (answer.status_code, answer.headers["content-type"]) == (503, "text/html; charset=utf-8")
-    assert "the index does not answer" in answer.text
 
 
 @pytest.mark.parametrize("said", [{}, {"mass": "0.4", "min_payload": "0.5"}])
