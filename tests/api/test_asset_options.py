@@ -94,13 +94,13 @@ def folder_of(count: int, size: int) -> bytes:
 
 def test_a_zip_is_kept_without_ever_being_whole_in_memory(services: Services, tmp_path: Path) -> None:
     with (tmp_path / "upload.zip").open("w+b") as file:
-        file.write(folder_of(3, 8 * MIB))
+        file.write(folder_of(3, 4 * MIB))
         tracemalloc.start()
         files = files_of_upload(AssetKind.OBJECT, "thing.zip", file, limit_bytes=32 * MIB)
         asset = publish_asset(services.store, AssetKind.OBJECT, "thing", files)
         _, peak = tracemalloc.get_traced_memory()
         tracemalloc.stop()
-    # Two pieces of 1 MiB on their way into the store, of 24 MiB.
+    # Two pieces of 1 MiB on their way into the store, of 12 MiB.
     assert peak < 3 * MIB
     assert len(load_asset_files(services.store, AssetKind.OBJECT, asset.digest)) == 5
 

@@ -20,7 +20,6 @@ from tests.api.conftest import app, furnished, services, settings
 from tests.waiting import PATIENCE_S, until, until_a_worker_is_idle
 
 __all__ = ["app", "furnished", "services", "settings"]
-
 #: SwiftShader draws WebGL without a GPU; the rest keeps the browser from calling home.
 _ARGUMENTS = """
     --no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader --disable-quic --no-first-run

@@ -24,7 +24,6 @@ from graspd.worker.stages.models import SURFACE_POINTS
 from tests.waiting import until
 
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(900)]
-
 #: Eight draft grasps take about ten seconds on two cores; the rest is a busy machine.
 WORK_MS = 500_000
 

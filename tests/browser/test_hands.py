@@ -25,7 +25,6 @@ from tests.waiting import until
 from tests.worker.hands.urdfs import joint, link, robot
 
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(300)]
-
 BAR = '<collision><origin xyz="0 0 0.03"/><geometry><box size="0.016 0.02 0.06"/></geometry></collision>'
 SEEN = (
     '<visual><origin xyz="0 0 0.03"/><geometry><cylinder radius="0.009" length="0.06"/></geometry>'

@@ -22,7 +22,6 @@ from tests.fakes import plan_all, record_of
 from tests.waiting import until
 
 pytestmark = pytest.mark.browser
-
 AXE = Path(__file__).parent / "vendor" / "axe.min.js"
 #: Rules of axe that look at colours; what is serious of the others is so in every scheme.
 COLOURS = ["color-contrast", "link-in-text-block"]

@@ -17,7 +17,6 @@ from tests.api.factories import add_job, finish_all
 from tests.browser.conftest import serving
 
 pytestmark = pytest.mark.browser
-
 PREFIX = "/graspd"
 
 

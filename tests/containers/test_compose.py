@@ -21,7 +21,6 @@ from tests.servers import free_ports
 from tests.shell import completed
 
 pytestmark = [pytest.mark.slow, pytest.mark.containers, pytest.mark.timeout(5400)]
-
 BATCHES = 16
 #: Generous: on two cores that have other work the kernels' first use alone takes a minute.
 PATIENCE_S = 1800.0

@@ -19,7 +19,6 @@ FILLED = {"REDIS_PASSWORD": "secret"}
 SERVICES = composition.SERVICES
 OURS = sorted(name for name, service in SERVICES.items() if "build" in service)
 SETTINGS = {f"GRASPD_{name.upper()}" for name in Settings.model_fields}
-
 PREFIXES = ("AWS_", "REDIS_", "REDISCLI_", "POSTGRES_", "FORWARDED_", "OTEL_")
 
 

@@ -20,7 +20,6 @@ pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(find_spec("build") is None, reason="no `build`: pip install -e '.[release]'"),
 ]
-
 #: What a user does first, from files of the package alone: templates, built-in hands.
 FIRST_STEPS = """
 import pathlib, graspd, graspd.api.dashboard.rendering

@@ -50,8 +50,6 @@ OPTIONAL = {
     "worker": {"viser", "mujoco_warp"},
     "exchange": {"torch", "mink", "pxr"},
 }
-
-
 _owners = functools.cache(packages_distributions)
 
 

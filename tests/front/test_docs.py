@@ -159,14 +159,10 @@ def test_blocks_of_both_kinds_are_read_and_comments_are_not(tmp_path: Path) -> N
 
 _FOLDERS = (REPOSITORY.glob("*.md"), *((REPOSITORY / name).rglob("*.md") for name in ("docs", "examples")))
 LINKING = sorted(page for pages in _FOLDERS for page in pages if page.is_file())
-
 #: Sources whose comments, messages and help name pages.
 SOURCES = (*PACKAGES, "benchmarks", "docker", "examples")
-
 _LINKED = re.compile(r"(?<![\w/.])(?:docs|README|CONTRIBUTING|ARCHITECTURE|SECURITY)[\w/-]*\.md\b")
-
 _CODE = re.compile(r"^```.*?^```|`[^`\n]*`", re.DOTALL | re.MULTILINE)
-
 _LINK = re.compile(r"\]\(([^()\s]+)\)|(?:src|href)=\"([^\"]+)\"")
 
 
@@ -208,9 +204,7 @@ def test_pages_that_sources_name_exist(room: str) -> None:
 
 
 DOCS = REPOSITORY / "docs"
-
 QUESTIONS: list[dict[str, Any]] = yaml.safe_load((REPOSITORY / "tests" / "docs_questions.yaml").read_text())
-
 #: Results that a reader looks at before another search.
 LOOKED_AT = 5
 

@@ -83,7 +83,6 @@ def test_a_fault_of_graspd_keeps_its_trace() -> None:
 
 #: Words of the libraries that read files, and of pydantic and click.
 FOREIGN = ("Errno", "pydantic", "nable to open", "nput should", "Traceback", "Error:", "<unicode string>")
-
 #: FILE stands for what is not there, or is of no kind; the suffix is what a user would give.
 _TYPED = """
     synth --hand FILE.urdf --object mug -o OUT.h5
@@ -110,7 +109,6 @@ COMMANDS = (
         for name in IMPORTS
     ),
 )
-
 #: Sent to the service as they are: what they hold is its business.
 ABSENT = (
     "hands add FILE.urdf",

@@ -106,8 +106,6 @@ MODULES = sorted(
     # The readers' module for torch is for those who have it.
     if path.name not in ("__init__.py", "torch_data.py")
 )
-
-
 HEAVY = {"warp", "trimesh", "mujoco", "scipy", "newton", "torch", "graspd.worker", "graspd.api"}
 
 

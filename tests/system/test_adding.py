@@ -90,12 +90,6 @@ def graspd(service: Supervisor, files: Path) -> Shell:
     return Shell(kept | names | {"PYTHONPATH": path}, files)
 
 
-def test_a_hand_is_added_with_its_guesses(graspd: Shell) -> None:
-    code, hand, _ = graspd("hands", "add", "pincer.urdf", "--no-self-test")
-    assert (code, hand["name"], hand["verdict"]) == (0, "pincer", "accept")
-    assert hand["facts"]["palm_approach"] == [0.0, 0.0, 1.0]
-
-
 def test_a_refused_object_gets_in_with_the_named_fix(graspd: Shell) -> None:
     code, _, said = graspd("objects", "add", "brick.stl")
     assert code == 2 and "--units mm" in said
@@ -105,7 +99,9 @@ def test_a_refused_object_gets_in_with_the_named_fix(graspd: Shell) -> None:
 
 
 def test_a_folder_of_objects_becomes_a_dataset_and_files(graspd: Shell, service: Supervisor, tmp_path: Path) -> None:
-    graspd("hands", "add", "pincer.urdf", "--no-self-test")
+    code, hand, _ = graspd("hands", "add", "pincer.urdf", "--no-self-test")
+    assert (code, hand["name"], hand["verdict"]) == (0, "pincer", "accept")
+    assert hand["facts"]["palm_approach"] == [0.0, 0.0, 1.0]
     wanted = ("datasets", "create", "play", "--hands", "pincer", "--objects", "toys", "--grasps", "4")
     cheap = ("--fidelity", "draft", "--want", "candidates", "--validation", "none")
     code, seen, _ = graspd(*wanted, *cheap, "--dry-run")

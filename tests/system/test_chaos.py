@@ -37,7 +37,6 @@ from tests.waiting import PATIENCE_S, until
 
 pytestmark = pytest.mark.chaos
 Start = Callable[..., System]
-
 #: Promised time from the death of a worker to the next attempt of its task [s].
 RECOVERY_S = 10.0
 

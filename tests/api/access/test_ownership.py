@@ -26,8 +26,6 @@ from tests.networks import random_network
 JOB = {"hand": "allegro", "object": "mug", "grasps": 32}
 MATRIX = {"name": "d", "hands": ["allegro"], "objects": ["mug"], "grasps": 32}
 Ask = Callable[..., Response]
-
-
 #: Who may change what ann submitted.
 WHO = pytest.mark.parametrize(("who", "may"), [("ann", True), ("bob", False), ("eve", False), ("root", True)])
 

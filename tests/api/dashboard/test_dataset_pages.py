@@ -186,10 +186,8 @@ def test_unjudged_grasps_are_not_among_the_rejected(http: TestClient, jobs: dict
 
 def _two(services: Services) -> None:
     """`rough` is done, one cell of draft grasps; `fine` has another object besides and no grasp yet."""
-    rough = {"name": "rough", "hands": ["allegro"], "objects": ["mug"], "grasps": 32, "fidelity": "draft"}
-    fine = {"name": "fine", "hands": ["allegro"], "objects": ["mug", "block"], "grasps": 32}
-    for given in (rough, fine):
-        actions.create(services, DatasetRequest.model_validate(given))
+    create(services, name="rough", fidelity="draft")
+    create(services, name="fine", objects=["mug", "block"])
     plan_all(services)
     finish_all(services, add_job(services, fidelity="draft"))
 

@@ -36,7 +36,7 @@ def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
     else:
         made = f"sqlite:///{tmp_path / 'index.sqlite'}"
     index = Index(made)
-    fill(index, open_store("memory://"), grasps=600, jobs=20)
+    fill(index, open_store("memory://"), grasps=64, jobs=2)
     index.close()
     return made
 

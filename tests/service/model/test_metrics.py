@@ -23,7 +23,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Found:
     folder = tmp_path_factory.mktemp("metric")
     older = f"sqlite:///{folder / 'older.sqlite'}"
     index = Index(older)
-    fill(index, open_store("memory://"), grasps=600, jobs=20)
+    fill(index, open_store("memory://"), grasps=64, jobs=2)
     index.close()
     command = [sys.executable, "-m", "tests.one_more_metric", str(folder / "new"), older]
     (folder / "new").mkdir()

@@ -12,7 +12,6 @@ from graspd.service.model.pinhole import pixel_rays
 from graspd.service.store.shards import write_shard
 
 Floats = NDArray[np.float64]
-
 SIZE = np.array([0.09, 0.06, 0.05])
 JOINTS, GRASPS = 4, 6
 WIDTH, HEIGHT = 96, 72

@@ -26,8 +26,7 @@ from graspd.service.store.records import put_record
 from graspd.service.store.shards import read_shard
 from graspd.service.store.store import Store, open_store
 from tests.damage import flipped, flipped_values
-from tests.indexes import empty_index
-from tests.memory_queue import MemoryQueue
+from tests.indexes import open_services
 from tests.servers import S3Server
 from tests.service.readers.conftest import GRASPS, job_in
 
@@ -147,8 +146,7 @@ def _put_snapshot(services: Services, dataset: str, shards: Shards, *, created: 
 
 @pytest.mark.s3
 def test_what_was_read_once_from_s3_needs_the_server_no_more(s3_url: str, s3_server: S3Server, tmp_path: Path) -> None:
-    index = empty_index(f"sqlite:///{tmp_path / 'index.sqlite'}")
-    remote = Services(Settings(data_dir=tmp_path), open_store(s3_url), index, MemoryQueue())
+    remote = open_services(Settings(data_dir=tmp_path), open_store(s3_url))
     job = job_in(remote)
     shards = open_shards(s3_url, job=job, cache=tmp_path / "cache")
     assert [shards.path(file).read_bytes() for file in shards] == [remote.store.get(file.key) for file in shards]

@@ -313,8 +313,6 @@ def test_a_folder_that_cannot_be_made_is_the_callers_mistake(source: Fetch, snap
 
 ANNEALED = {"method": "graspit", "options": {"keep": 20, "steps": 40000}}
 AUTO = {"fidelity": "auto", "target": "gsr>=0.6"}
-
-
 _ON_BALL = (("draft", 40, 0.3), ("standard", 15, 0.8))
 
 
