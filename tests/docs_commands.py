@@ -6,8 +6,6 @@ Each page gets a folder with the files that a reader would have (`tests/docs_fil
 needs one; its lines run in their order, as they are printed. Ends with 1 if a line failed.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import re

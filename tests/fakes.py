@@ -1,7 +1,5 @@
 """Stand-ins for the engine: stages that make true shards of random numbers in no time, and a job to run them on."""
 
-from __future__ import annotations
-
 import argparse
 import ctypes
 import math

@@ -4,8 +4,6 @@ A process of its own: what follows from the table is made when the modules that 
 findings as JSON.
 """
 
-from __future__ import annotations
-
 import inspect
 import json
 import sys

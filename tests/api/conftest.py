@@ -1,13 +1,11 @@
 """The application over a file store, an SQLite index and the queue's twin; no network, no Redis."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from datetime import datetime, tzinfo
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import pytest
 from fastapi import FastAPI
@@ -40,7 +38,7 @@ def furnished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 class _Noon(datetime):
     @classmethod
-    def now(cls, tz: tzinfo | None = None) -> _Noon:
+    def now(cls, tz: tzinfo | None = None) -> Self:
         return cls.fromisoformat(f"{TODAY}T12:00:00+00:00")
 
 

@@ -1,7 +1,5 @@
 """The application as a whole: its socket, its imports, its OpenAPI document, its scrape."""
 
-from __future__ import annotations
-
 import asyncio
 import socket
 import subprocess

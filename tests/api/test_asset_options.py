@@ -1,7 +1,5 @@
 """Uploads: what a user says about one reaches its check, and files go past memory."""
 
-from __future__ import annotations
-
 import json
 import os
 import tracemalloc

@@ -3,8 +3,6 @@
 The long walk: `pytest -m slow tests/api/test_contract.py`.
 """
 
-from __future__ import annotations
-
 import base64
 import json
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Requests made to break something: each gets an answer that says what is wrong with it."""
 
-from __future__ import annotations
-
 import base64
 import errno
 import json

@@ -1,7 +1,5 @@
 """Every error is a problem document that names what is wrong."""
 
-from __future__ import annotations
-
 from operator import attrgetter
 from typing import Any
 from unittest.mock import Mock

@@ -1,7 +1,5 @@
 """One word finds a job in the logs of all processes, metrics tell what they did, and a request is one trace."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

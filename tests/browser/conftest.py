@@ -1,7 +1,5 @@
 """Headless Chromium on the dashboard: of an application in this process, or of a whole service with the real engine."""
 
-from __future__ import annotations
-
 import shutil
 import sys
 import threading

@@ -1,7 +1,5 @@
 """What users do, on a whole service with the real engine: from a file of their own to a grasp in 3D and its shard."""
 
-from __future__ import annotations
-
 import io
 import re
 from pathlib import Path

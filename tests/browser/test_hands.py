@@ -1,7 +1,5 @@
 """A hand in the browser: what was guessed of it is seen, corrected, kept as a hand of its own, and used."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

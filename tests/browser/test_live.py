@@ -1,7 +1,5 @@
 """The pages in a real browser: they move by themselves, fit every screen, read without scripts, are accessible."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """`graspd hands check` and `graspd objects check` through the entry point: the JSON contract and the exit codes."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """GPUs and kernels as the doctor sees them."""
 
-from __future__ import annotations
-
 import json
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """`graspd scene`, `graspd render` and `graspd pictures` on files, without queue or server."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

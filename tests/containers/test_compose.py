@@ -4,8 +4,6 @@ Takes minutes, and most of them go to the build. Where no engine is, or the base
 so.
 """
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """The compose file: valid, pinned, in step with the settings, and its services end in time."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The cost model and the simulated week: by hand on small numbers, and in step with docs/explanation/scaling.md."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

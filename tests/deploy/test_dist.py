@@ -1,7 +1,5 @@
 """Wheel and sdist: the same bytes twice, and a wheel that works outside the repository."""
 
-from __future__ import annotations
-
 import hashlib
 import subprocess
 import sys

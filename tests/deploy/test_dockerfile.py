@@ -1,7 +1,5 @@
 """The Dockerfile: sources, pinned images, no root; licences and GPU kernels of what it installs."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import re

@@ -1,7 +1,5 @@
 """The manifests and batch scripts: valid, in step with settings, images and queue; nothing ends a busy worker."""
 
-from __future__ import annotations
-
 import functools
 import re
 import shutil

@@ -1,7 +1,5 @@
 """The compose file's services as processes of this machine, and `docker/nginx.conf` before a real API."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -1,7 +1,5 @@
 """The example that trains a grasp predictor: its rows, what it compares networks with, and how proposals are lifted."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

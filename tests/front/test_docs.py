@@ -1,7 +1,5 @@
 """README and docs: what they print runs, commands and links exist, questions are answered, and the site is strict."""
 
-from __future__ import annotations
-
 import html
 import json
 import math

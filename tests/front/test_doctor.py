@@ -1,7 +1,5 @@
 """`graspd doctor`: exit codes, JSON, and what it says of a service that runs."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

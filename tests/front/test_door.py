@@ -1,7 +1,5 @@
 """What the system refuses, a wrong file among it, is one line on standard error, and never a trace."""
 
-from __future__ import annotations
-
 import errno
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """`graspd.Grasps`: what a file holds, chosen, sorted, saved, as a table, in a notebook and in the viewer."""
 
-from __future__ import annotations
-
 import base64
 import io
 import json

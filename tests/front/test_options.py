@@ -1,7 +1,5 @@
 """Options are declared once; messages name them as the caller spells them."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Files that a public project keeps beside its sources are valid; `import graspd` is light and complete."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

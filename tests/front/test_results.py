@@ -1,7 +1,5 @@
 """Figures and pictures of the docs: each is held by the manifest, each command of the list is one that there is."""
 
-from __future__ import annotations
-
 import json
 import shlex
 from importlib.util import find_spec

@@ -1,7 +1,5 @@
 """Help shows each word that a command declares; what cannot be understood is one line with the word that was meant."""
 
-from __future__ import annotations
-
 import inspect
 import os
 import re

@@ -1,7 +1,5 @@
 """ARCHITECTURE.md and docs say what the code does: tests, layers, files, light imports."""
 
-from __future__ import annotations
-
 import importlib
 import inspect
 import re

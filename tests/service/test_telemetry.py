@@ -1,7 +1,5 @@
 """Log lines as JSON objects, and the heartbeat file whose age tells health checks who lives."""
 
-from __future__ import annotations
-
 import json
 import logging
 import os

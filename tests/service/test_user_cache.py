@@ -1,7 +1,5 @@
 """The user's cache: entries whole, intact and the user's own, wherever it can be written."""
 
-from __future__ import annotations
-
 import logging
 import os
 import subprocess

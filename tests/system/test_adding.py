@@ -1,7 +1,5 @@
 """A user's own files through the whole service: command line, API, controller, worker with the real engine."""
 
-from __future__ import annotations
-
 import json
 import os
 import sys

@@ -1,7 +1,5 @@
 """Kills real processes and looks at what is left: every job ends, every result is there once, nothing stays behind."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

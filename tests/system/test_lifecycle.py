@@ -1,7 +1,5 @@
 """Workers that come, go and step aside, whose turn it is, and parts that go away in the middle of the work."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal

@@ -1,7 +1,5 @@
 """Keys, scopes, sessions, foreign web pages, keys as the doctor sees them, and people that a proxy has signed in."""
 
-from __future__ import annotations
-
 import base64
 import hmac
 import json

@@ -1,7 +1,5 @@
 """Who may cancel, retry and delete what: the key that submitted it, or an admin's."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import closing, nullcontext
 from typing import Any

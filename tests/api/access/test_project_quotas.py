@@ -1,7 +1,5 @@
 """What the keys of a project may use together: grasps in work, grasps of a day, and GPU seconds of a day."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,8 +1,6 @@
 """What a key of one project sees of another's: nothing, by any route. Each route of the application is walked, so one
 that is added later and forgets to ask fails here."""
 
-from __future__ import annotations
-
 import io
 import re
 import shutil
@@ -37,21 +35,6 @@ from tests.networks import random_network
 Headers = dict[str, str]
 JOB = {"hand": "allegro", "object": "mug", "grasps": 32, "scenes": 1, "views": 1, "seed": 77}
 _BALL = b"solid ball\nendsolid ball\n"
-
-
-@pytest.fixture(scope="module")
-def world(tmp_path_factory: pytest.TempPathFactory, furnished: Path) -> Iterator[World]:
-    """A service with a job that is done, one that failed, a dataset, a hand, objects and a set of project `red`."""
-    settings = Settings(data_dir=tmp_path_factory.mktemp("projects") / "data", webhook_secret=SecretStr("s" * 16))
-    shutil.copytree(furnished, settings.data_dir)
-    services = open_services(settings)
-    of_red = {"ann": (Scope.SUBMIT, "red"), "amy": (Scope.SUBMIT, "red")}
-    of_blue = {"bob": (Scope.SUBMIT, "blue"), "eve": (Scope.READ, "blue")}
-    people = people_of(settings, **of_red, **of_blue, old=(Scope.SUBMIT, ""), root=(Scope.ADMIN, ""))
-    app = create_app(settings, services)
-    with TestClient(app, base_url="https://graspd.example", follow_redirects=False) as client:
-        yield World(client, services, people)
-    services.close()
 
 
 @dataclass
@@ -104,6 +87,21 @@ class World:
         """What none but the project and an admin may read."""
         named = [f"red-secret-{what}" for what in ("hand", "ball", "gone", "net", "data", "set", "tag")]
         return [*named, "red-secret broke", *self.said.values()]
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory, furnished: Path) -> Iterator[World]:
+    """A service with a job that is done, one that failed, a dataset, a hand, objects and a set of project `red`."""
+    settings = Settings(data_dir=tmp_path_factory.mktemp("projects") / "data", webhook_secret=SecretStr("s" * 16))
+    shutil.copytree(furnished, settings.data_dir)
+    services = open_services(settings)
+    of_red = {"ann": (Scope.SUBMIT, "red"), "amy": (Scope.SUBMIT, "red")}
+    of_blue = {"bob": (Scope.SUBMIT, "blue"), "eve": (Scope.READ, "blue")}
+    people = people_of(settings, **of_red, **of_blue, old=(Scope.SUBMIT, ""), root=(Scope.ADMIN, ""))
+    app = create_app(settings, services)
+    with TestClient(app, base_url="https://graspd.example", follow_redirects=False) as client:
+        yield World(client, services, people)
+    services.close()
 
 
 _URDF = b"""<robot name="two"><link name="base"/><link name="tip"/><joint name="j" type="revolute"><parent link="base"/>

@@ -1,7 +1,5 @@
 """Requests that come at once, to one API process or to two: what one of them may have, two do not get."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress

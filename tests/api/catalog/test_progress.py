@@ -1,7 +1,5 @@
 """Rates and expected ends of stages."""
 
-from __future__ import annotations
-
 import io
 import math
 from typing import Any

@@ -1,7 +1,5 @@
 """Hands and folders of meshes on the command line: what is sent, and that one bad mesh stops nothing."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

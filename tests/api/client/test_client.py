@@ -1,7 +1,5 @@
 """The client turns problem documents back into the exceptions they came from, and outlives a restart of the API."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from pathlib import Path

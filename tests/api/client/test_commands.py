@@ -1,7 +1,5 @@
 """The commands against the real service: embedded Redis, file store, SQLite, controller, API. No worker: jobs wait."""
 
-from __future__ import annotations
-
 import json
 import os
 import socket
@@ -12,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Self
 
 import pytest
 from typer.testing import CliRunner
@@ -43,7 +41,7 @@ class Shell:
     in_process: bool = True
 
     @property
-    def apart(self) -> Shell:
+    def apart(self) -> Self:
         return replace(self, in_process=False)
 
     def __call__(self, *arguments: str, typed: str = "") -> subprocess.CompletedProcess[str]:

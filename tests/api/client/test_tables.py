@@ -1,7 +1,5 @@
 """Tables of jobs, datasets and their estimates on a terminal."""
 
-from __future__ import annotations
-
 import io
 import re
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """The matrix: cells with their yield, actions on chosen ones, datasets made and steered by forms."""
 
-from __future__ import annotations
-
 import pytest
 from starlette.testclient import TestClient
 

@@ -1,7 +1,5 @@
 """The form of a job runs the object that it shows: a refused file stays, and no known object takes its place."""
 
-from __future__ import annotations
-
 import json
 import re
 from html import unescape

@@ -1,7 +1,5 @@
 """The pages: complete without JavaScript, escaped, honest when empty."""
 
-from __future__ import annotations
-
 import io
 import re
 from unittest.mock import Mock

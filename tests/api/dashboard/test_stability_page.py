@@ -1,7 +1,5 @@
 """The maps of failure on their page: laid out as pictures are, told in words, and what stands there before any."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,8 +1,6 @@
 """The charts of speed against accuracy: points, front, free ones apart from those in scenes, and what stands there
 before anything is measured."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import math

@@ -1,7 +1,5 @@
 """Rates, requests at once and quotas, counted in a real Redis that two applications share."""
 
-from __future__ import annotations
-
 import asyncio
 import time
 from collections.abc import Callable

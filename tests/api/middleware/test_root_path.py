@@ -1,7 +1,5 @@
 """The service below a path of a proxy: every address that leaves has it, whether the proxy takes it off or not."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from typing import Any

@@ -1,7 +1,5 @@
 """Uploads of hands, objects and networks."""
 
-from __future__ import annotations
-
 import asyncio
 import io
 import json

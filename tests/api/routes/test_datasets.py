@@ -1,7 +1,5 @@
 """`/v1/datasets` and `/v1/object-sets`: answers, places, pages, refusals."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

@@ -1,7 +1,5 @@
 """Corrections of a hand: what was guessed is said instead, and is a hand of its own."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

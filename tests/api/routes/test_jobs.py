@@ -1,7 +1,5 @@
 """`/v1/jobs`: submit, list, watch, cancel, retry."""
 
-from __future__ import annotations
-
 from collections import Counter
 
 import numpy as np

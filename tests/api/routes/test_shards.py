@@ -1,7 +1,5 @@
 """Shards and grasps that are read; conditional requests and HEAD (RFC 9110), methods of an address, encoded bodies."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Callable
 from itertools import product

@@ -1,7 +1,5 @@
 """Tags: names for grasps, in the store and in the index; grasps chosen by an expression; what is taken home of them."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

@@ -1,7 +1,5 @@
 """The feed of ends, and webhooks: who is told what, signed how, and tried how often."""
 
-from __future__ import annotations
-
 import hashlib
 import hmac
 import json

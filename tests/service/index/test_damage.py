@@ -1,7 +1,5 @@
 """An index that is lost, removed under its readers, or damaged; and a store some of whose records are damaged."""
 
-from __future__ import annotations
-
 import json
 import os
 import sqlite3

@@ -1,7 +1,5 @@
 """Tables of the index as Parquet files, read by pyarrow itself."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

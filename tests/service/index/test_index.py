@@ -1,7 +1,5 @@
 """The index: what the API asks of it, that it holds the same rows as a rebuild, and several that write it at once."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import threading

@@ -1,7 +1,5 @@
 """Tables of another revision are refused, and `graspd admin index rebuild` makes them anew, on every database."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterator
 from pathlib import Path

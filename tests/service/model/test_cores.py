@@ -1,7 +1,5 @@
 """Cores and memory that the process is given, versions of its libraries, imports without the garbage collector."""
 
-from __future__ import annotations
-
 import gc
 import os
 import re

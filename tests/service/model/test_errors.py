@@ -1,7 +1,5 @@
 """What every error keeps: one line, no secret, words of this project; and names that do not fit."""
 
-from __future__ import annotations
-
 import logging
 from pathlib import Path
 from typing import Any

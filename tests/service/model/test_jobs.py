@@ -1,7 +1,5 @@
 """Options of a job and the shards that they move; from jobs to tasks, from facts to states."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """One row more in the table of metrics is found everywhere: stored, indexed, filtered, shown and documented."""
 
-from __future__ import annotations
-
 import json
 import sys
 from typing import Any

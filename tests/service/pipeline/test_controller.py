@@ -1,7 +1,5 @@
 """The controller on in-memory services: lost workers, lost events, lost queue, lost index, parts that are away."""
 
-from __future__ import annotations
-
 import json
 import threading
 from typing import Any

@@ -1,7 +1,5 @@
 """What a user deletes is gone at once, from the index and from one made anew; its objects go with the controller."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 from unittest.mock import Mock

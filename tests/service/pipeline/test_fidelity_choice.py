@@ -1,7 +1,5 @@
 """Charts in the store, and the cheapest fidelity that a chart promises: of grasps around free objects and in scenes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

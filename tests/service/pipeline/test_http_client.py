@@ -1,7 +1,5 @@
 """POST to addresses of strangers: which machines it reaches, and what an answer may do."""
 
-from __future__ import annotations
-
 import http.server
 import ipaddress
 import socket

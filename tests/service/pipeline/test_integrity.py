@@ -1,7 +1,5 @@
 """`graspd admin store verify`: five kinds of damage are five findings, on files and on S3; most is made again."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from pathlib import Path

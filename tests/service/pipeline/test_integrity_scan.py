@@ -1,7 +1,5 @@
 """A turned byte of anything in the store is found and named; the controller's integrity scan makes way for others."""
 
-from __future__ import annotations
-
 import io
 import random
 import re

@@ -1,7 +1,5 @@
 """Jobs of a user: submit, cancel and retry; those planned in scenes: what is refused, their stages, end and grasps."""
 
-from __future__ import annotations
-
 from typing import Any
 from unittest.mock import Mock
 

@@ -1,7 +1,5 @@
 """Store and index stay in step: an older copy of either is not believed, and what was answered 503 is in neither."""
 
-from __future__ import annotations
-
 import shutil
 import sqlite3
 import threading

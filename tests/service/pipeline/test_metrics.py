@@ -1,7 +1,5 @@
 """What is told to Prometheus: true numbers, at a cost that does not grow with queue or index."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import asdict

@@ -1,7 +1,5 @@
 """Packs of graspd 0.2 are taken apart, wherever it breaks off; a service goes on with them and with their workers."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import struct

@@ -1,7 +1,5 @@
 """How many batches a task has, by what was measured and who is there, and which workers it waits for."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import asdict, replace

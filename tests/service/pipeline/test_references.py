@@ -1,7 +1,5 @@
 """Neighbours and networks of jobs and datasets: which files they are, what is refused, and what may not be deleted."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import dataclass

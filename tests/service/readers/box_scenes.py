@@ -1,7 +1,5 @@
 """A box on a table as shards whose pictures are closed forms: what clouds of them are held against."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

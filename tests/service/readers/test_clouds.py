@@ -1,7 +1,5 @@
 """Clouds of closed-form pictures: points on the box, its face normals, frames that fit together, labels, graspness."""
 
-from __future__ import annotations
-
 import re
 from importlib.util import find_spec
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Reading shards back: from files, jobs, snapshots and S3; how pictures and grasps belong together."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import shutil

@@ -1,7 +1,5 @@
 """PyTorch's loaders on shards; skipped where torch is not installed."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

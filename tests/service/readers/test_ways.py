@@ -1,7 +1,5 @@
 """The way of a grasp: its postures in turn, and those between them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

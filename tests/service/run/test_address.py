@@ -1,7 +1,5 @@
 """The service of a data folder: found where it answers, joined by others; nothing of an earlier one is in its way."""
 
-from __future__ import annotations
-
 import json
 import os
 import socket

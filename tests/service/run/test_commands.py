@@ -1,7 +1,5 @@
 """The commands of the service: exit codes, one-line errors, JSON, private data, settings of the children."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """The Redis that comes along: how it is found, who may reach it, what it keeps."""
 
-from __future__ import annotations
-
 import signal
 import stat
 import subprocess

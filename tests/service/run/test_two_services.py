@@ -1,7 +1,5 @@
 """A second service is refused by every command that would work for it; a data folder may have any name."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Files of assets: networks come back as written, all else is refused; folders of meshes become sets of objects."""
 
-from __future__ import annotations
-
 import io
 import json
 import zipfile

@@ -1,7 +1,5 @@
 """Shards that are not what they were, or hold what is not theirs: refused by name, wherever they are read."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import resource

@@ -1,7 +1,5 @@
 """The object store: one contract on every adapter, and what only a local one or one behind a network must do."""
 
-from __future__ import annotations
-
 import errno
 import os
 import threading

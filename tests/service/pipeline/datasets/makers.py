@@ -1,7 +1,5 @@
 """Hands and objects without content, datasets on them, and their tasks done or failed on the spot."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What a dataset will cost: measured rates where there are any, stored ones with their origin where there are none."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

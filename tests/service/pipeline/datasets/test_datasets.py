@@ -1,7 +1,5 @@
 """A dataset from its creation to its end and its export; its options; and that the store tells it all."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import subprocess

@@ -1,7 +1,5 @@
 """The index as the doctor sees it: real files and a real PostgreSQL, which it never migrates, moves or fills."""
 
-from __future__ import annotations
-
 import sqlite3
 import time
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Redis, controller, workers, port and clocks as the doctor sees them, on real servers and real sockets."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import threading

@@ -1,7 +1,5 @@
 """Machine and store as the doctor sees them, and checks side by side."""
 
-from __future__ import annotations
-
 import os
 import threading
 from collections.abc import Iterator
