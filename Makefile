@@ -46,7 +46,7 @@ browser: $(STAMP) ## Chromium and Playwright for the dashboard's tests (Debian, 
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,browser]'
 
 screenshots: $(STAMP) ## the dashboard's pages of a real service, for docs/how-to/dashboard.md (needs make browser)
-	$(BIN)/python -m tests.browser.screenshots
+	$(BIN)/python -m benchmarks.screenshots
 
 docs: $(STAMP) ## rewrite the tables in the docs that follow from the code
 	$(BIN)/python -m graspd.service.docs

@@ -1,7 +1,5 @@
 """Connections to a real server on loopback: half-sent headers, bodies, forwarded addresses, streams of events."""
 
-from __future__ import annotations
-
 import asyncio
 import socket
 import tempfile

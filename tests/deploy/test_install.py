@@ -1,7 +1,5 @@
 """What an install with one extra brings, and that the code of that package needs nothing else."""
 
-from __future__ import annotations
-
 import ast
 import functools
 import json
@@ -49,8 +47,6 @@ OPTIONAL = {
     "worker": {"viser", "mujoco_warp"},
     "exchange": {"torch", "mink", "pxr"},
 }
-
-
 _owners = functools.cache(packages_distributions)
 
 

@@ -1,7 +1,5 @@
 """The index: what the API asks of it, that it holds the same rows as a rebuild, and several that write it at once."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import threading
@@ -9,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from pydantic import SecretStr
@@ -165,8 +164,7 @@ def test_the_service_in_numbers(services: Services) -> None:
     before = timestamp()
     finish(services, job.id, batches=1)
     stats = services.index.overview.stats()
-    assert (stats.grasps, stats.shards) == (32, 2)
-    assert stats.tasks[State.SUCCEEDED] == 2
+    assert (stats.grasps, stats.shards) == (32, 2) and stats.tasks[State.SUCCEEDED] == 2
     assert stats.jobs[State.RUNNING] == 1
     (cell,) = services.index.overview.matrix()
     assert (cell.hand, cell.object, cell.jobs, cell.grasps, cell.queued) == ("gripper", "ball", 1, 32, 2)
@@ -280,11 +278,7 @@ def test_every_kind_of_damage_to_the_index_is_seen_and_mended(services: Services
 def test_a_rebuild_that_breaks_off_leaves_the_old_rows(services: Services, monkeypatch: pytest.MonkeyPatch) -> None:
     build_a_history(services)
     jobs = len(services.index.jobs.page(limit=99).items)
-
-    def away(_store: Store, key: str) -> bytes:
-        raise StoreUnavailable("away")
-
-    monkeypatch.setattr(Store, "get", away)
+    monkeypatch.setattr(Store, "get", Mock(side_effect=StoreUnavailable("away")))
     with pytest.raises(StoreUnavailable):
         rebuild(services.index, services.store)
     assert len(services.index.jobs.page(limit=99).items) == jobs
@@ -303,9 +297,7 @@ WAYS: list[tuple[int, tuple[int, ...]]] = [(1000, (8, 16)), (0, (8, 16)), (0, (1
 
 
 @pytest.mark.parametrize("sort", [GraspSort(), GraspSort(by="penetration_depth_mm", descending=False)])
-def test_every_way_of_searching_finds_the_same(
-    services: Services, monkeypatch: pytest.MonkeyPatch, sort: GraspSort
-) -> None:
+def test_every_search_finds_the_same(services: Services, monkeypatch: pytest.MonkeyPatch, sort: GraspSort) -> None:
     job, _ = job_actions.submit(services, request(grasps=160))
     finish(services, job.id)
     everything = services.index.grasps.page(sort=sort, limit=200).items

@@ -1,15 +1,17 @@
-"""Cores and memory are those that the process is given: affinity and control groups."""
+"""Cores and memory that the process is given, and imports without the garbage collector."""
 
-from __future__ import annotations
-
+import gc
 import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
-from graspd.service.model import cores
+from graspd.service.model import cores, libraries
 from graspd.service.model.cores import available_cores, available_memory
+from graspd.service.model.libraries import imports, own_process
 from tests.conftest import PACKAGES, REPOSITORY
 
 MACHINE = 16
@@ -47,9 +49,7 @@ def test_without_control_groups_the_affinity_counts(tmp_path: Path, monkeypatch:
         ("0::/pods/mine", {"pods/cpu.max": "300000 100000", "pods/mine/cpu.max": "max 100000"}, 3),
     ],
 )
-def test_the_least_readable_quota_on_the_way_up_counts(
-    tmp_path: Path, group: str, files: dict[str, str], expected: int
-) -> None:
+def test_the_least_quota_on_the_way_up_counts(tmp_path: Path, group: str, files: dict[str, str], expected: int) -> None:
     assert available_cores(system(tmp_path, group, files)) == expected
 
 
@@ -79,7 +79,52 @@ def test_the_files_are_read_once_in_a_moment(tmp_path: Path, monkeypatch: pytest
         ("9:memory:/c", {}, MACHINE_MB),
     ],
 )
-def test_the_smallest_limit_around_the_process_counts(
-    tmp_path: Path, group: str, files: dict[str, str], limit: float
-) -> None:
+def test_the_smallest_memory_limit_counts(tmp_path: Path, group: str, files: dict[str, str], limit: float) -> None:
     assert available_memory(system(tmp_path, group, files)) / 2**20 == pytest.approx(limit)
+
+
+@pytest.fixture(autouse=True)
+def collects() -> object:
+    gc.enable()
+    yield
+    gc.enable()
+
+
+def test_nothing_is_collected_while_modules_come_even_if_one_fails() -> None:
+    with imports():
+        with imports():
+            pass
+        assert not gc.isenabled()
+    assert gc.isenabled()
+    with pytest.raises(ModuleNotFoundError), imports():
+        import no_such_module  # type: ignore[import-not-found]  # noqa: F401
+    assert gc.isenabled()
+
+
+def test_a_caller_who_collects_himself_goes_on_so() -> None:
+    gc.disable()
+    with imports():
+        pass
+    assert not gc.isenabled()
+
+
+def test_only_a_process_of_graspd_s_own_keeps_what_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    frozen: list[bool] = []
+    monkeypatch.setattr(gc, "freeze", lambda: frozen.append(True))
+    monkeypatch.setattr(libraries, "_ours", False)
+    with imports():
+        pass
+    assert not frozen
+    own_process()
+    with imports():
+        pass
+    assert frozen
+
+
+def test_the_command_line_is_such_a_process() -> None:
+    code = (
+        "import gc, sys; sys.argv = ['graspd', 'jobs', '--help']; import graspd.cli\n"
+        "try: graspd.cli.main()\nfinally: print(gc.get_freeze_count() > 0, gc.isenabled(), file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stderr.split() == ["True", "True"]

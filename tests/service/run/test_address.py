@@ -1,7 +1,5 @@
 """The service of a data folder: found where it answers, joined by others; nothing of an earlier one is in its way."""
 
-from __future__ import annotations
-
 import json
 import os
 import socket
@@ -182,9 +180,7 @@ def test_a_child_that_was_left_behind_is_ended(child: Child, tmp_path: Path) -> 
     assert not list((tmp_path / "run").iterdir())
 
 
-def test_a_process_that_got_the_number_of_a_child_lives_on(
-    child: Child, stranger: subprocess.Popen[bytes], tmp_path: Path
-) -> None:
+def test_a_stranger_with_that_pid_lives_on(child: Child, stranger: subprocess.Popen[bytes], tmp_path: Path) -> None:
     assert child.pid_file is not None
     _, started, token = json.loads(child.pid_file.read_text())
     for stale in (

@@ -32,10 +32,9 @@ from graspd.studies.cards.tally import tally_of
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.stages.context import Output, shard_of
 from tests.api import factories
-from tests.fakes import fail_task
+from tests.fakes import fail_task, plan_all
 from tests.indexes import empty_index
 from tests.memory_queue import MemoryQueue
-from tests.planning import plan_all
 
 HANDS = ("allegro", "barrett")
 OBJECTS = ("block", "mug")
