@@ -42,32 +42,23 @@ def grid_of_sphere(cells: int) -> Any:
 
 @wp.kernel(enable_backward=False)
 def _probe(
-    physics: kernels.ForceModel,
-    surface: Surface,
-    point_in: wp.array[wp.vec3],
-    velocity_in: wp.vec3,
-    distance_out: wp.array[wp.float32],
-    force_out: wp.array[wp.vec3],
-    slope_out: wp.array[wp.vec3],
+    physics: kernels.ForceModel, surface: Surface, points: wp.array[wp.vec3], speed: wp.vec3, out: wp.array2d[wp.vec3]
 ):
     i = wp.tid()
-    sample = field_distance(surface, point_in[i])
-    distance_out[i] = sample.distance
-    force_out[i] = kernels.contact_force(physics, -sample.distance, sample.normal, velocity_in)
-    slope_out[i] = kernels.force_slope(physics, -sample.distance, sample.normal, velocity_in)
+    sample = field_distance(surface, points[i])
+    out[0, i] = wp.vec3(sample.distance)
+    out[1, i] = kernels.contact_force(physics, -sample.distance, sample.normal, speed)
+    out[2, i] = kernels.force_slope(physics, -sample.distance, sample.normal, speed)
 
 
-def probed(
-    points: np.ndarray, velocity: tuple[float, float, float] = (0, 0, 0), grid: Any = None
-) -> tuple[np.ndarray, ...]:
+def probed(points: np.ndarray, velocity: tuple[float, ...] = (0, 0, 0), grid: Any = None) -> tuple[np.ndarray, ...]:
     """Distance, force and slope at points by a grid, by default of the sphere."""
-    grid = grid or grid_of_sphere(CELLS)
-    n = len(points)
-    found: list[Any] = [wp.zeros(n, dtype=kind, device="cpu") for kind in (wp.float32, wp.vec3, wp.vec3)]
+    found = wp.zeros((3, len(points)), dtype=wp.vec3, device="cpu")
     at = wp.array(points, dtype=wp.vec3, device="cpu")
-    given = [physics_of(SPHERE.gyration_radius), grid, at, wp.vec3(*velocity)]
-    wp.launch(_probe, n, inputs=given, outputs=found, device="cpu")
-    return tuple(f.numpy() for f in found)
+    given = [physics_of(SPHERE.gyration_radius), grid or grid_of_sphere(CELLS), at, wp.vec3(*velocity)]
+    wp.launch(_probe, len(points), inputs=given, outputs=[found], device="cpu")
+    distance, force, slope = found.numpy()
+    return distance[:, 0], force, slope
 
 
 @pytest.mark.parametrize("cells", [16, 32, 48])

@@ -66,9 +66,7 @@ def test_the_object_weighs_what_the_evaluator_wants(bench: Path, block: ObjectMo
     assert info["mass"] == pytest.approx(info["density"] * block.volume, rel=0.05)  # the pieces' against the mesh's
 
 
-def test_every_file_beside_the_pieces_is_a_piece_also_later(
-    bench: Path, hand: HandModel, block: ObjectModel, grasps: GraspSet
-) -> None:
+def test_every_file_beside_the_pieces_is_a_piece_also_later(bench, hand, block: ObjectModel, grasps: GraspSet) -> None:
     pieces = bench / np.load(files_of(bench, "graspd_barrett")[0], allow_pickle=True).item()["obj_path"] / "urdf/meshes"
     (pieces / "convex_piece_099.obj").write_text("of another decomposition")
     dexgraspbench.write(hand, block, grasps, [0], bench)
@@ -110,9 +108,7 @@ def test_evaluators_bodies_and_actuators_are_those_of_the_hand(bench: Path, hand
         assert any(name.startswith(prefix) for name in said["valid_body_name"])
 
 
-def test_a_hand_of_meshes_is_loaded_with_them(
-    shared_data: Path, block: ObjectModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_hand_of_meshes_is_loaded_with_them(shared_data: Path, block: ObjectModel, tmp_path, monkeypatch) -> None:
     hand = hand_from_path(shared_data / "hands" / "allegro" / "allegro_hand_right.urdf")
     (file,) = dexgraspbench.write(hand, block, random_postures(hand), [0], tmp_path)
     monkeypatch.chdir(tmp_path)  # nothing may depend on where the export was written
@@ -154,15 +150,7 @@ _SHADOW_THUMB = [
     ],
 )
 def test_hand_that_benchmark_has_is_mapped_onto_its_own_model(
-    shared_data: Path,
-    block: ObjectModel,
-    tmp_path: Path,
-    file: str,
-    config: str,
-    root: list[float],
-    chain: list[Any],
-    first: int,
-    tip: str,
+    shared_data, block, tmp_path, file, config, root, chain, first, tip
 ) -> None:
     hand = hand_from_path(shared_data / "hands" / file)
     grasps = random_postures(hand)
@@ -358,9 +346,7 @@ def test_an_import_is_validated_by_its_lift(tabletop: Path, candidates: Shard, t
     assert {"grasp/approach", "grasp/lift", "quality/lift_hard", "scene/object_pose"} <= set(found.arrays)
 
 
-def test_free_grasps_and_grasps_on_tables_do_not_mix(
-    tabletop: Path, hand: HandModel, block: ObjectModel, grasps: GraspSet
-) -> None:
+def test_free_grasps_and_grasps_on_tables_do_not_mix(tabletop, hand, block: ObjectModel, grasps: GraspSet) -> None:
     dexgraspbench.write(hand, block, grasps, [0], tabletop)
     assert len(files_of(tabletop, CONFIG)) == 1 and len(files_of(tabletop, CONFIG, EXPERIMENT)) == COUNT
     sets = dexgraspbench.read(tabletop, hand="barrett", obj="block")

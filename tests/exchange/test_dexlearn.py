@@ -97,9 +97,7 @@ def test_a_cloud_of_a_free_object_lies_on_it_where_it_is_itself(on_tables: Path,
         assert 1e-4 < np.abs(trimesh.proximity.closest_point(mesh, noisy)[1]).max() < 0.05
 
 
-def test_a_file_that_names_only_its_scene_is_read_with_it_and_none_that_lies_elsewhere(
-    checkout: Path, tmp_path: Path
-) -> None:
+def test_a_file_that_names_only_its_scene_is_read_with_it_and_none_that_lies_elsewhere(checkout, tmp_path) -> None:
     copy = tmp_path / "checkout"
     shutil.copytree(checkout, copy)
     (file, *_) = sorted((copy / "assets" / "grasp" / NAME / "succ_collect").rglob("*.npy"))

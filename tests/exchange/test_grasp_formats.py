@@ -46,9 +46,7 @@ def test_a_file_that_would_run_code_is_refused_and_does_not(tmp_path: Path, monk
             load_npy(Path("x.npy"))
 
 
-def test_a_grasp_of_dexgraspbench_moves_with_its_object(
-    hand: HandModel, block: ObjectModel, grasps: GraspSet, tmp_path: Path
-) -> None:
+def test_a_grasp_of_dexgraspbench_moves_with_its_object(hand, block: ObjectModel, grasps: GraspSet, tmp_path) -> None:
     (path, *_) = dexgraspbench.write(hand, block, grasps, [0], tmp_path)
     row = load_npy(path)
     moved = np.array([0.3, -0.2, 0.7, *Rotation.from_euler("xyz", [0.3, 1.1, -2.0]).as_quat(scalar_first=True)])
@@ -61,9 +59,7 @@ def test_a_grasp_of_dexgraspbench_moves_with_its_object(
     np.testing.assert_allclose(turn, quat_to_matrix(grasps.grasp.hand_pose[0, 3:]), atol=TINY)
 
 
-def test_dexgraspbench_scales_are_sets_and_another_hand_is_told(
-    hand: HandModel, block: ObjectModel, grasps: GraspSet, tmp_path: Path
-) -> None:
+def test_dexgraspbench_scales_are_sets_and_another_hand_is_told(hand, block, grasps: GraspSet, tmp_path) -> None:
     paths = dexgraspbench.write(hand, block, grasps, range(2), tmp_path)
     save_record(paths[0], load_npy(paths[0]) | {"obj_scale": 0.5})
     sets = dexgraspbench.read(tmp_path, hand="barrett", obj="block")
@@ -135,9 +131,7 @@ def test_ddgcs_quaternion_and_joints_are_put_in_our_order(hand: HandModel, tmp_p
     assert abs(joints["finger_2_distal"]) == pytest.approx(0.6)
 
 
-def test_imported_grasps_are_scored_and_say_where_they_come_from(
-    hand: HandModel, block: ObjectModel, grasps: GraspSet, tmp_path: Path
-) -> None:
+def test_imported_grasps_are_scored_and_say_where_they_come_from(hand, block, grasps: GraspSet, tmp_path) -> None:
     dexgraspbench.write(hand, block, grasps, range(len(grasps)), tmp_path / "bench")
     (found,) = dexgraspbench.read(tmp_path / "bench", hand="barrett", obj="block")
     path = write_scored(

@@ -67,9 +67,7 @@ def test_every_object_of_a_split_has_a_record_and_a_mesh(data: Path) -> None:
         assert (data / "objects" / paths[uuid]).is_file()
 
 
-def test_its_grasps_are_ours_with_their_verdicts(
-    data: Path, hand: HandModel, block: ObjectModel, stored: Shard
-) -> None:
+def test_its_grasps_are_ours_with_their_verdicts(data, hand: HandModel, block: ObjectModel, stored: Shard) -> None:
     record = record_of(data, "block")
     poses, mask = np.array(record["grasps"]["transforms"]), np.array(record["grasps"]["object_in_gripper"])
     assert poses.shape == (8, 4, 4) and mask.dtype == bool
@@ -139,9 +137,7 @@ def test_a_record_that_is_wrong_is_told(data: Path, tmp_path: Path, change: dict
         graspgen.read(path, hand="barrett", obj="block")
 
 
-def test_links_compressed_and_large_files_are_not_followed(
-    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_links_compressed_and_large_files_are_not_followed(data: Path, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(graspgen, "LARGEST", 1000)
     with pytest.raises(InputError, match="larger than"):
         graspgen.read(data / "grasps" / "barrett", hand="barrett", obj="block", object_name="block")

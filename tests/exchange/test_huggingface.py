@@ -78,9 +78,7 @@ def test_a_row_is_a_grasp_of_ours(folder: Path, stored: Shard, hand: HandModel) 
             assert row[f"{name}_joints"] == stored[f"{name}/joint_positions"][row["row"]].tolist()
 
 
-def test_picture_has_what_was_seen_and_fingertips_where_they_are(
-    folder: Path, on_tables: Path, hand: HandModel, stored: Shard
-) -> None:
+def test_picture_has_what_was_seen_and_fingertips_where_they_are(folder, on_tables, hand, stored: Shard) -> None:
     pictures = Pictures(open_shards(on_tables), valid=False)
     ours = {(one["object"], one["row"]): one for one in pictures}
     tip = hand.fingertips[0]

@@ -80,9 +80,7 @@ def test_a_study_plans_the_grasps_of_a_job() -> None:
     assert np.array_equal(found.squeeze.joint_positions, made.squeeze.joint_positions)
 
 
-def test_both_methods_are_told_side_by_side(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_both_methods_are_told_side_by_side(tmp_path: Path, monkeypatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(learned, "BUDGET", 2.0)
     hand = hand_from_path("barrett")
     save(random_network(hand.joint_names, hand=hand.name, digest=hand.digest), tmp_path / "net.npz")

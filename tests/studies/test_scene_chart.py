@@ -52,9 +52,7 @@ def test_rates_and_files_are_those_of_the_runs(made: tuple[dict[str, Any], Path]
     assert f"| {IN_SCENE} | fast_graspd | draft |" in (folder / "chart.md").read_text()
 
 
-def test_a_run_that_was_stopped_plans_only_what_is_missing(
-    made: tuple[dict[str, Any], Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_that_was_stopped_plans_only_what_is_missing(made: tuple[dict[str, Any], Path], monkeypatch) -> None:
     found, folder = made
     kept = sorted((folder / "work").glob("*.json"))
     assert len(kept) == 3

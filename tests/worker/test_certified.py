@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from types import SimpleNamespace
 from typing import Any
 
@@ -51,9 +52,7 @@ def valid(hand: HandModel, block: ObjectModel) -> ValidatedBatch:
 
 def test_a_batch_of_valid_grasps_holds_nothing_else(valid: ValidatedBatch) -> None:
     assert len(valid.grasps) == COUNT
-    assert (valid.columns["quality/valid"] == 1).all()
-    assert (valid.columns["quality/feasible"] == 1).all()
-    assert (valid.columns["quality/success"] == 1).all()
+    assert all((valid.columns[f"quality/{name}"] == 1).all() for name in ("valid", "feasible", "success"))
     assert all(len(array) == COUNT for path, array in valid.columns.items() if path != "quality/thresholds_m")
     assert valid.candidates == COUNT + sum(valid.rejected.values())
     assert valid.planned >= valid.candidates
@@ -75,35 +74,25 @@ def judge(monkeypatch: pytest.MonkeyPatch, *pushes: Outcome, feasible: bool) -> 
     monkeypatch.setattr(generation, "passes", gate)
 
 
-def test_tries_count_up_to_the_last_grasp_that_is_kept(
-    hand: HandModel, block: ObjectModel, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_tries_count_up_to_the_last_grasp_that_is_kept(hand: HandModel, block: ObjectModel, monkeypatch) -> None:
     judge(monkeypatch, Outcome.HELD, Outcome.DISPLACED, feasible=True)
     found = validated_grasps(hand, block, wish(rechecks=0), count=COUNT)
     # Six tries hold at 0, 2, 4; of the seven that promise to be enough the ones at 0, 2, 4 are.
     assert (found.candidates, found.planned, found.rejected["dropped"]) == (6 + 5, 6 + 7, 3 + 2)
 
 
-def test_what_the_validator_saw_of_each_try_is_counted(
-    hand: HandModel, block: ObjectModel, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_the_validator_saw_of_each_try_is_counted(hand: HandModel, block: ObjectModel, monkeypatch) -> None:
     seen = (Outcome.HELD, Outcome.DISPLACED, Outcome.ROTATED, Outcome.LOST_WHILE_CLOSING, Outcome.PENETRATION)
     judge(monkeypatch, *seen, feasible=False)
-    found = validated_grasps(
-        hand, block, wish(rechecks=0, grasps=5, budget=1), count=5, run=ExecutionContext(threads=1)
-    )
-    gates = {
-        name: found.outcomes.pop(name, 0) for name in ("gate_penetration", "gate_self_penetration", "gate_contacts")
-    }
-    assert sum(gates.values()) == 1
-    assert found.outcomes == {"slipped": 1, "turned": 1, "lost_while_closing": 1, "penetration": 1}
+    request, run = wish(rechecks=0, grasps=5, budget=1), ExecutionContext(threads=1)
+    found = validated_grasps(hand, block, request, count=5, run=run)
+    ends = Counter("gate" if name.startswith("gate_") else name for name in Counter(found.outcomes).elements())
+    assert ends == {"slipped": 1, "turned": 1, "lost_while_closing": 1, "penetration": 1, "gate": 1}
     assert (found.rejected["dropped"], found.rejected["gate"], found.candidates) == (4, 1, 5)
 
 
 @pytest.mark.parametrize("after", [0, 1])
-def test_a_batch_that_is_stopped_is_what_was_validated_before(
-    hand: HandModel, block: ObjectModel, monkeypatch: pytest.MonkeyPatch, after: int
-) -> None:
+def test_a_batch_that_is_stopped_is_what_was_validated_before(hand, block, monkeypatch, after: int) -> None:
     rounds, real = [], generation.Batch.made
 
     def counted(*given: Any) -> Any:
@@ -123,9 +112,7 @@ def test_a_batch_that_is_stopped_is_what_was_validated_before(
     assert len(found.grasps) == 1 and found.verdict_key is not None
 
 
-def test_a_grasp_like_one_that_is_kept_makes_room_for_another(
-    hand: HandModel, block: ObjectModel, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_grasp_like_one_that_is_kept_makes_room_for_another(hand: HandModel, block: ObjectModel, monkeypatch) -> None:
     real = generation.synthesize
 
     def twins(*given: Any, **named: Any) -> GraspSet:
@@ -144,11 +131,7 @@ def test_a_grasp_like_one_that_is_kept_makes_room_for_another(
 
 def test_candidate_grasps_are_all_kept_with_their_verdicts(hand: HandModel, block: ObjectModel) -> None:
     found = validated_grasps(hand, block, wish(want="candidates", rechecks=0), count=COUNT)
-    assert (len(found.grasps), found.candidates, found.rejected) == (
-        COUNT,
-        COUNT,
-        {"diverged": 0, "dropped": 0, "gate": 0, "alike": 0},
-    )
+    assert (len(found.grasps), found.candidates, set(found.rejected.values())) == (COUNT, COUNT, {0})
     assert set(np.unique(found.columns["quality/success"])) <= {0, 1}
     assert ((found.columns["quality/valid"] == 1) <= (found.columns["quality/success"] == 1)).all()
 
@@ -164,17 +147,14 @@ def test_without_a_validator_nobody_judges(hand: HandModel, block: ObjectModel) 
 
 def test_the_methods_own_options_reach_it(hand: HandModel, block: ObjectModel) -> None:
     wanted = {"method": "autograsp", "want": "candidates", "validation": "none"}
-    near, far = (
-        validated_grasps(hand, block, wish(**wanted, options={"standoff_m": gap}), count=2) for gap in (0.0, 0.05)
-    )
+    wishes = (wish(**wanted, options={"standoff_m": gap}) for gap in (0.0, 0.05))
+    near, far = (validated_grasps(hand, block, one, count=2) for one in wishes)
     assert not np.allclose(near.grasps.grasp.hand_pose, far.grasps.grasp.hand_pose)
     with pytest.raises(InputError, match="its options: standoff_m"):
         validated_grasps(hand, block, wish(**wanted, options={"speed": 3}), count=2)
 
 
-def test_a_budget_that_finds_nothing_ends_with_nothing(
-    hand: HandModel, block: ObjectModel, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_budget_that_finds_nothing_ends_with_nothing(hand: HandModel, block: ObjectModel, monkeypatch) -> None:
     planned: list[int] = []
 
     def plan(_hand: Any, _obj: Any, wanted: PlanRequest, *_: Any, **__: Any) -> GraspSet:
@@ -191,9 +171,7 @@ def test_a_budget_that_finds_nothing_ends_with_nothing(
     assert found.columns["quality/valid"].shape == (0,)
 
 
-def test_hands_that_are_no_numbers_are_dropped_and_counted(
-    hand: HandModel, block: ObjectModel, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_hands_that_are_no_numbers_are_dropped_and_counted(hand: HandModel, block: ObjectModel, monkeypatch) -> None:
     whole = generation.synthesize
 
     def plan(*arguments: Any, **options: Any) -> GraspSet:
@@ -231,9 +209,7 @@ def test_only_grasps_that_hold_in_enough_models_count(hand: HandModel, block: Ob
     assert "not_robust" in found.rejected
 
 
-def test_valid_grasps_that_hold_in_no_other_model_are_told_apart(
-    hand: HandModel, block: ObjectModel, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_valid_grasps_that_hold_in_no_other_model_are_told_apart(hand, block: ObjectModel, monkeypatch) -> None:
     def nowhere(*args: Any, held: np.ndarray, models: int, wanted: float, **kwargs: Any) -> Robustness:
         verdicts = np.where(held[:, None], 0, -1).astype(np.int8) * np.ones((1, models), np.int8)
         return Robustness(verdicts, np.full(verdicts.shape, Axis.POSE, np.uint8), wanted, 0.0)

@@ -54,9 +54,7 @@ def noted(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int, int]]:
 
 
 @pytest.mark.parametrize("in_scenes", [False, True])
-def test_grasps_of_several_lanes_are_those_of_one(
-    pair, scenes, monkeypatch: pytest.MonkeyPatch, in_scenes: bool
-) -> None:
+def test_grasps_of_several_lanes_are_those_of_one(pair, scenes, monkeypatch, in_scenes: bool) -> None:
     wish = REQUEST.model_copy(update={"budget": 1.5, "rechecks": 0}) if in_scenes else REQUEST
     calls, around = noted(monkeypatch), scenes if in_scenes else None
     two, one = (

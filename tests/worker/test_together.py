@@ -47,9 +47,7 @@ def assert_same(batches, others) -> None:
         assert_same_batch(one, other)
 
 
-def test_joined_batches_of_a_job_are_the_same_from_plan_to_verdict(
-    pair, alone, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_joined_batches_of_a_job_are_the_same_from_plan_to_verdict(pair, alone, monkeypatch) -> None:
     launches, whole = list[list[int]](), together.synthesize_batches
 
     def noted(hand: Any, obj: Any, asked: Sequence[BatchRequest], **named: Any) -> Any:
@@ -106,9 +104,7 @@ def test_waves_of_batches_in_scenes_are_the_same(pair, scenes: list[Scenes], apa
 
 
 @pytest.mark.parametrize("refused", [0, 1])
-def test_a_batch_of_a_wave_without_a_place_has_no_grasps_but_for_the_first(
-    pair, scenes: list[Scenes], monkeypatch: pytest.MonkeyPatch, refused: int
-) -> None:
+def test_a_batch_of_a_wave_without_a_place_has_no_grasps_but_for_the_first(pair, scenes, monkeypatch, refused) -> None:
     whole = together.synthesize_batches
 
     def narrow(hand: Any, obj: Any, asked: Sequence[BatchRequest], **named: Any) -> Any:

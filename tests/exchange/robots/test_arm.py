@@ -55,9 +55,7 @@ def test_the_share_of_grasps_that_the_arm_reaches_is_told(carried: tuple[dict[st
     assert sum(told["refused"].values()) == told["candidates"] - told["grasps"]
 
 
-def test_the_arm_holds_the_hand_where_the_grasp_has_it_all_along(
-    carried: tuple[dict[str, Any], Path], arm: Path
-) -> None:
+def test_the_arm_holds_the_hand_where_the_grasp_has_it_all_along(carried, arm: Path) -> None:
     """yourdfpy's forward kinematics is the oracle; poses are told in the frame of the arm's base."""
     robot = yourdfpy.URDF.load(str(arm), load_meshes=False, build_scene_graph=True)
     for row in rows(carried[1])[::5]:
@@ -117,16 +115,12 @@ def test_moveit_is_told_poses_in_the_arms_base_and_all_joints(table_shard: Path,
         (["--mount", "flange", "--base", "0 0 0"], "--base '0 0 0' is no pose"),
     ],
 )
-def test_an_arm_that_cannot_is_refused_in_a_line(
-    options: list[str], said: str, free_shard: Path, arm: Path, tmp_path: Path
-) -> None:
+def test_an_arm_that_cannot_is_refused_in_a_line(options, said: str, free_shard: Path, arm: Path, tmp_path) -> None:
     told = refused("export --format csv", free_shard, "--arm", arm, *options, "-o", tmp_path / "out")
     assert re.search(said, told) and not (tmp_path / "out").exists()
 
 
-def test_base_without_an_arm_and_an_arm_without_mink_are_refused(
-    free_shard: Path, arm: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_base_without_an_arm_and_an_arm_without_mink_are_refused(free_shard, arm: Path, tmp_path, monkeypatch) -> None:
     words = "export --format csv"
     assert "--arm ARM.urdf" in refused(words, free_shard, "--base", "0 0 0 1 0 0 0", "-o", tmp_path)
     monkeypatch.setitem(sys.modules, "mink", None)

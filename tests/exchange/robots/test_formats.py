@@ -84,9 +84,7 @@ def validated(shard: Path) -> list[bool]:
 
 
 @pytest.mark.parametrize("which", ["free_shard", "table_shard", "pressing_shard", "clutter_shard"])
-def test_a_mujoco_scene_replays_to_the_verdict_of_the_validator(
-    which: str, request: pytest.FixtureRequest, tmp_path: Path
-) -> None:
+def test_a_mujoco_scene_replays_to_the_verdict_of_the_validator(which: str, request, tmp_path) -> None:
     shard = limp(request.getfixturevalue(which), tmp_path / "limp.h5")
     told = export(shard, "mujoco", tmp_path)
     # A script that has only mujoco and numpy must do: -I keeps this checkout out of its reach.
@@ -226,9 +224,7 @@ def expected(shard: Path, row: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
 
 
 @pytest.mark.parametrize("which", ["free_shard", "table_shard"])
-def test_trimesh_reads_grasp_whose_parts_stand_where_they_should(
-    which: str, request: pytest.FixtureRequest, tmp_path: Path
-) -> None:
+def test_trimesh_reads_grasp_whose_parts_stand_where_they_should(which: str, request, tmp_path) -> None:
     shard = request.getfixturevalue(which)
     told = export(shard, "glb", tmp_path)
     files = sorted(tmp_path.glob("*.glb"))
@@ -278,9 +274,7 @@ def test_usd_opens_a_grasp_in_metres_that_moves_to_the_lift(table_shard: Path, t
     assert stage.GetPrimAtPath("/World/scene/support_0/mesh").IsValid()
 
 
-def test_without_usd_core_a_line_says_what_to_install(
-    free_shard: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_usd_core_a_line_says_what_to_install(free_shard: Path, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "pxr", None)
     assert "pip install 'graspd[usd]'" in refused("export --format usd", free_shard, "-o", tmp_path)
 

@@ -135,9 +135,7 @@ def test_the_card_of_a_dataset_says_where_its_grasps_are_valid(tmp_path: Path) -
     assert "planned around a free object" not in made.page and "clearance of the table (no scenes)" not in made.page
 
 
-def test_the_command_writes_the_card_of_a_dataset(
-    kitchen: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_command_writes_the_card_of_a_dataset(kitchen: Case, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setenv("GRASPD_DATA_DIR", str(kitchen.folder.parent))
     words = ["card", "kitchen", "-o", str(tmp_path / "out"), "--licence", "CC0-1.0", "--json"]
     done = CliRunner().invoke(app, words)
@@ -155,9 +153,7 @@ def test_the_command_writes_the_card_of_a_dataset(
         (("kitchen", "--snapshot", "0" * 32), "0" * 32),
     ],
 )
-def test_a_mistake_is_one_line_and_exit_2(
-    kitchen: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], words: str
-) -> None:
+def test_a_mistake_is_one_line_and_exit_2(kitchen, tmp_path, monkeypatch, arguments, words: str) -> None:
     monkeypatch.setenv("GRASPD_DATA_DIR", str(kitchen.folder.parent))
     done = CliRunner().invoke(app, ["card", *arguments, "-o", str(tmp_path / "out")])
     assert done.exit_code == 2 and len(done.stderr.strip().splitlines()) == 1

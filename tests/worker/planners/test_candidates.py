@@ -239,9 +239,7 @@ def test_a_grasp_nobody_holds_sets_out_as_often_as_it_may(free, attempts: list[i
     ("score", "off", "made"),
     [(0.1, False, 1), (0.7, False, 2), (1.5, False, 2), (0.1, True, 3), (1.5, True, 3), (2.5, True, 1 + len(FREE))],
 )
-def test_grasps_that_slip_or_stand_off_have_retries(
-    free, attempts: list[int], monkeypatch: pytest.MonkeyPatch, score: float, off: bool, made: int
-) -> None:
+def test_grasps_that_slip_or_stand_off_have_retries(free, attempts, monkeypatch, score, off: bool, made: int) -> None:
     hand, obj, wanted, _ = free
     if off:
         monkeypatch.setattr(planner, "standing_off", lambda hand, obj, grasp, **_: np.ones(len(grasp), bool))

@@ -21,18 +21,9 @@ DRAFT = FIDELITIES["draft"]
 QUICK = DRAFT.model_copy(update={"coarse_iterations": 20, "fine_iterations": 6, "polish_iterations": 2})
 
 
-def grasps(
-    count: int,
-    *,
-    hand: str = "allegro",
-    obj: str = "mug",
-    fidelity: Fidelity = QUICK,
-    threads: int = 1,
-    seed: int = 0,
-    batch: int = 0,
-) -> GraspSet:
-    wanted = PlanRequest(count, fidelity, seed, batch)
-    return synthesize(hand_from_path(hand), object_from_path(obj), wanted, ExecutionContext(threads=threads))
+def grasps(count: int, fidelity: Fidelity = QUICK, hand: str = "allegro", obj: str = "mug") -> GraspSet:
+    wanted = PlanRequest(count, fidelity)
+    return synthesize(hand_from_path(hand), object_from_path(obj), wanted, ExecutionContext(threads=2))
 
 
 @pytest.mark.parametrize(
@@ -40,7 +31,7 @@ def grasps(
 )
 def test_grasps_touch_with_several_links_and_hardly_penetrate(hand: str, obj: str) -> None:
     """Medians over 8 grasps at standard fidelity; limits a third looser than what users are told to expect."""
-    found = grasps(8, hand=hand, obj=obj, fidelity=FIDELITIES["standard"], threads=2)
+    found = grasps(8, FIDELITIES["standard"], hand, obj)
     quality = measure(hand_from_path(hand), object_from_path(obj), found, friction=1.0, run=ExecutionContext(threads=2))
     assert np.median(quality["quality/contact_links"]) >= 3
     assert np.median(quality["quality/penetration_depth_mm"]) < 1.0
@@ -62,43 +53,37 @@ def test_a_surface_is_tested_where_the_fidelity_says() -> None:
 
 
 def test_recipes_without_pull_or_fine_phase_and_descent_run() -> None:
-    assert schedule.loss_options(FIDELITIES["standard"]).pull == schedule.PULL > 0
-    assert schedule.loss_options(FIDELITIES["paper"]).pull == 0
-    assert schedule.loss_options(FIDELITIES["control"]).pull == 0
+    pulls = [schedule.loss_options(FIDELITIES[name]).pull for name in ("standard", "paper", "control")]
+    assert pulls == [schedule.PULL, 0, 0] and schedule.PULL > 0
     fidelity = QUICK.model_copy(
         update={"optimizer": "gd", "contact_solver": "gauss_seidel", "leak": "two_sided", "polish_iterations": 0}
     )
-    found = grasps(3, fidelity=fidelity)
+    found = grasps(3, fidelity)
     assert np.all(np.isfinite(found.grasp.hand_pose)) and np.all(np.isfinite(found.grasp.joint_positions))
-    found = grasps(3, fidelity=QUICK.model_copy(update={"fine_iterations": 0}))
+    found = grasps(3, QUICK.model_copy(update={"fine_iterations": 0}))
     assert np.all(found.stability_loss > 0)
 
 
 def test_the_optimiser_lowers_the_loss_it_started_from() -> None:
-    curve = grasps(8, fidelity=DRAFT).info["loss_curve"]
-    assert isinstance(curve, list)
+    curve = grasps(8, DRAFT).info["loss_curve"]
     assert curve[-1] < 0.5 * curve[0]
 
 
 @pytest.mark.parametrize("solver", ["jacobi", "gauss_seidel"])
 def test_the_other_contact_solvers_also_reach_the_object(solver: str) -> None:
-    fidelity = DRAFT.model_copy(update={"contact_solver": solver})
-    found = grasps(6, fidelity=fidelity)
+    found = grasps(6, DRAFT.model_copy(update={"contact_solver": solver}))
     quality = measure(hand_from_path("allegro"), object_from_path("mug"), found, friction=1.0)
     assert np.median(quality["quality/contact_links"]) >= 2
 
 
-FIDELITY = FIDELITIES["draft"].model_copy(update={"name": "custom", "finalists": 2, "coarse_iterations": 30})
+FIDELITY = DRAFT.model_copy(update={"name": "custom", "finalists": 2, "coarse_iterations": 30})
 
 
-def parts(count: int, threads: int = 1) -> planner.LaunchPart:
+def parts(count: int) -> planner.LaunchPart:
     """The grasps of a batch as one part."""
     hand, obj = hand_from_path("allegro"), object_from_path("block", face_error_m=1e-3)
-    found = planner.optimise_batch(
-        hand, obj, PlanRequest(count=count, fidelity=FIDELITY, seed=3), ExecutionContext(threads=threads)
-    )
-    assert len(found) == 1
-    return found[0]
+    (found,) = planner.optimise_batch(hand, obj, PlanRequest(count, FIDELITY, seed=3), ExecutionContext(threads=1))
+    return found
 
 
 def test_what_balances_poorly_sets_out_again_the_better_stays(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -123,9 +108,8 @@ def test_what_balances_poorly_sets_out_again_the_better_stays(monkeypatch: pytes
 @pytest.mark.slow
 def test_memory_is_flat_over_a_thousand_batches() -> None:
     hand, obj = hand_from_path("barrett"), object_from_path("block")
-    tiny = FIDELITIES["draft"].model_copy(
-        update={"starts": 1, "finalists": 1, "coarse_iterations": 3, "fine_iterations": 2, "polish_iterations": 1}
-    )
+    few = {"starts": 1, "finalists": 1, "coarse_iterations": 3, "fine_iterations": 2, "polish_iterations": 1}
+    tiny = DRAFT.model_copy(update=few)
 
     def run_batches(first: int, count: int) -> int:
         for batch in range(first, first + count):

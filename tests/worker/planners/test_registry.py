@@ -52,9 +52,7 @@ def test_a_wrong_option_is_refused_with_those_there_are(options: dict[str, objec
         ("fast_graspd", "graspd.baselines.autograsp.method:METHOD", None),
     ],
 )
-def test_entry_points_of_other_packages_are_methods_or_refused(
-    monkeypatch: pytest.MonkeyPatch, name: str, value: str, message: str | None
-) -> None:
+def test_entry_points_of_other_packages_are_methods_or_refused(monkeypatch, name, value, message: str | None) -> None:
     monkeypatch.setattr(metadata, "entry_points", lambda group: [EntryPoint(name, value, group)])
     assert name in method_names()
     if message is None:

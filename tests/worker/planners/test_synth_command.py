@@ -96,9 +96,7 @@ def test_evaluate_gives_a_verdict_of_each_grasp_that_agrees(validated: tuple[Pat
     assert "verdicts" not in told["files"][0]
 
 
-def test_readers_take_grasps_that_nobody_validated_only_when_told(
-    validated: tuple[Path, Any], unvalidated: tuple[Path, Any]
-) -> None:
+def test_readers_take_grasps_that_nobody_validated_only_when_told(validated, unvalidated: tuple[Path, Any]) -> None:
     both = open_shards([validated[0], unvalidated[0]])
     rows = [Grasps(both, columns=["quality/epsilon"], **wish) for wish in ({}, {"unvalidated": True}, {"valid": False})]
     assert [len(found) for found in rows] == [3, 3, 6]
@@ -106,9 +104,7 @@ def test_readers_take_grasps_that_nobody_validated_only_when_told(
 
 
 @pytest.mark.parametrize("command", ["export", "pictures"])
-def test_export_and_pictures_take_grasps_that_nobody_validated_only_when_told(
-    unvalidated: tuple[Path, Any], tmp_path: Path, command: str
-) -> None:
+def test_export_and_pictures_take_grasps_that_nobody_validated_only_when_told(unvalidated, tmp_path, command) -> None:
     if command == "export":
         words: list[str | Path] = ["export", unvalidated[0], "--format", "dexgraspbench", "-o", tmp_path / "out"]
     else:
@@ -143,9 +139,7 @@ def test_a_shard_finds_its_object_in_its_own_folder(of_own_mesh: Path, own_mesh:
     assert object_of_shard(shard, None).digest == shard.attributes["object_digest"]
 
 
-def test_a_file_of_the_right_name_and_another_content_is_not_taken(
-    of_own_mesh: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_of_the_right_name_and_another_content_is_not_taken(of_own_mesh: Path, tmp_path, monkeypatch) -> None:
     monkeypatch.setenv("GRASPD_DATA_DIR", str(tmp_path / "data"))
     shard = elsewhere(of_own_mesh, tmp_path)
     trimesh.creation.box((0.05, 0.06, 0.07)).export(tmp_path / "shard" / "clean.obj")
@@ -169,9 +163,7 @@ def test_every_command_finds_hand_and_object_of_a_file_by_itself(of_own_mesh: Pa
     graspd_command("render --views 1 --width 32 --height 24 --device cpu", tmp_path / "s.h5", "-o", tmp_path / "v.h5")
 
 
-def test_fewer_grasps_than_asked_are_told_with_the_reason_and_exit_code_3(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_fewer_grasps_than_asked_are_told_with_the_reason_and_exit_code_3(folder: Path, monkeypatch) -> None:
     out = folder / "few.h5"
     monkeypatch.setattr(generation, "passes", lambda columns: np.zeros(len(columns["quality/success"]), np.uint8))
     said = graspd_command(f"synth --hand barrett --object block -n 2 --budget 1 {DRAFT} -o", out, code=3)
@@ -186,9 +178,7 @@ def test_fewer_grasps_than_asked_are_told_with_the_reason_and_exit_code_3(
 
 
 @pytest.mark.parametrize("asked", [signal.SIGINT, signal.SIGTERM])
-def test_who_stops_it_keeps_what_was_validated(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, asked: signal.Signals
-) -> None:
+def test_who_stops_it_keeps_what_was_validated(folder: Path, monkeypatch, asked: signal.Signals) -> None:
     real, out = synthesis.synthesized, folder / f"stopped-{asked}.h5"
 
     def stopped(*given: Any, progress: Any, **named: Any) -> Any:

@@ -305,9 +305,7 @@ def same(one: tuple[np.ndarray, ...], other: tuple[np.ndarray, ...]) -> bool:
     return all(np.array_equal(a, b) and a.dtype == b.dtype for a, b in zip(one, other, strict=True))
 
 
-def test_later_process_measures_with_what_the_first_one_computed(
-    own_cache: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_later_process_measures_with_what_the_first_one_computed(own_cache: Path, monkeypatch) -> None:
     first = distances_of(Probe(FINGERS, BALL, hand_points=100, object_points=64))
     assert len(list(own_cache.iterdir())) == 1
 

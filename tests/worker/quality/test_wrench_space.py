@@ -6,7 +6,6 @@ import json
 import math
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -69,9 +68,7 @@ TRIPOD = np.array([[math.cos(a), math.sin(a), 0.0] for a in 2 * np.pi * np.arang
      (TETRAHEDRON, {}, 1.0, 0.689186, 5.588981), (TRIPOD, {}, 0.2, 0.103717, 0.001378),
      (TRIPOD, {}, 0.5, 0.275925, 0.078880), (TRIPOD, {}, 1.0, 0.554694, 2.211303)],
 )  # fmt: skip
-def test_contacts_on_the_unit_sphere(
-    points: np.ndarray, options: dict[str, Any], friction: float, epsilon: float, volume: float
-) -> None:
+def test_contacts_on_the_unit_sphere(points, options, friction: float, epsilon: float, volume: float) -> None:
     assert sphere_space(points, friction, **options) == pytest.approx((epsilon, volume), abs=PRINTED)
 
 

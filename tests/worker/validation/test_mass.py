@@ -143,9 +143,7 @@ def test_whoever_says_the_weight_is_told_what_the_grasps_lift(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize(("least", "kept", "outcomes"), [(0.3, 2, {}), (90.0, 0, {"weak": 2})])
-def test_a_job_counts_grasps_that_lift_the_wanted_payload(
-    tmp_path: Path, least: float, kept: int, outcomes: dict[str, int]
-) -> None:
+def test_a_job_counts_grasps_that_lift_the_wanted_payload(tmp_path, least, kept: int, outcomes: dict[str, int]) -> None:
     words = f"{BARRETT} -n 2 --budget 1 --mass 0.2 --min-payload {least} --shake -o"
     told = graspd(words, tmp_path / "g.h5", code=0 if kept else 3)
     shard = read_shard(tmp_path / "g.h5")

@@ -75,9 +75,7 @@ def test_only_what_holds_in_the_nominal_model_is_tried(monkeypatch: pytest.Monke
 
 @pytest.mark.parametrize("models", [1, 8])
 @pytest.mark.parametrize("wanted", [0.25, 0.75, 0.9])
-def test_judging_that_ends_early_says_of_the_share_what_all_say(
-    monkeypatch: pytest.MonkeyPatch, models: int, wanted: float
-) -> None:
+def test_judging_that_ends_early_says_of_the_share_what_all_say(monkeypatch, models: int, wanted: float) -> None:
     by_luck(monkeypatch)
     grasps = many_grasps(24)
     whole = robust(PADS, BOX, grasps, models=models, pieces=WHOLE)

@@ -87,9 +87,7 @@ def test_the_engine_has_the_numbers_of_hand_and_object() -> None:
 
 
 @pytest.mark.parametrize(("jaws", "contacts"), [(False, 2), (True, 8)], ids=["hand", "gripper"])
-def test_a_pair_of_pieces_has_one_contact_but_between_jaws(
-    jaws: bool, contacts: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_pair_of_pieces_has_one_contact_but_between_jaws(jaws: bool, contacts: int, monkeypatch) -> None:
     if not jaws:
         monkeypatch.setattr(model, "jaws_of", lambda hand: None)
     scene = build(plate_hand(), BOX, WHOLE, MujocoOptions())
@@ -317,9 +315,7 @@ class Exploding(Test):
 
 
 @pytest.mark.parametrize("level", ["dexgraspbench", "standard"])
-def test_a_blown_up_push_is_not_held_and_spoils_no_other_grasp(
-    level: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_blown_up_push_is_not_held_and_spoils_no_other_grasp(level: str, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     test = Exploding(build(PADS, BOX, WHOLE, MujocoOptions()))
     rollout = getattr(test, level)(grasp_of(), 0)

@@ -70,18 +70,14 @@ def test_outcomes_margins_and_depths_are_the_certificates(found: PrefilterOutcom
     assert found.ticks[0] * 10 == validate(PADS, BOX, grasp_of(), pieces=WHOLE).steps
 
 
-def test_verdicts_do_not_depend_on_which_world_takes_a_grasp(
-    found: PrefilterOutcomes, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_verdicts_do_not_depend_on_which_world_takes_a_grasp(found: PrefilterOutcomes, monkeypatch) -> None:
     rows = np.arange(len(found.outcome))[::-1]
     other = pool(monkeypatch, Stand(), 3).validate(every_kind().take(rows))
     np.testing.assert_array_equal(other.outcome[rows], found.outcome)
     np.testing.assert_array_equal(other.margin[rows], found.margin)
 
 
-def test_grasps_that_need_more_room_are_validated_again_with_it(
-    standard: Verdicts, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_grasps_that_need_more_room_are_validated_again_with_it(standard: Verdicts, monkeypatch) -> None:
     found = pool(monkeypatch, Stand(needs_rows=ROWS + 1), 4).validate(every_kind())
     assert not found.overflow.any()
     np.testing.assert_array_equal(found.outcome, standard.outcome)
@@ -187,9 +183,7 @@ def lies(found: PrefilterOutcomes) -> PrefilterOutcomes:
     return dataclasses.replace(found, outcome=np.ones_like(found.outcome), margin=np.zeros(len(found.margin)))
 
 
-def test_a_first_judge_that_the_cpu_contradicts_is_not_believed(
-    standard: Verdicts, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_first_judge_that_the_cpu_contradicts_is_not_believed(standard: Verdicts, monkeypatch, caplog) -> None:
     true = screening.WorldPool.validate
     monkeypatch.setattr(screening.WorldPool, "validate", lambda *some, **more: lies(true(*some, **more)))
     not_rechecked = verdicts(ON, "fast")
@@ -205,9 +199,7 @@ def test_a_first_judge_that_the_cpu_contradicts_is_not_believed(
     assert "the CPU validates all" in caplog.text
 
 
-def test_where_a_gpu_has_no_memory_for_it_the_cpu_judges(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_where_a_gpu_has_no_memory_for_it_the_cpu_judges(monkeypatch, caplog: pytest.LogCaptureFixture) -> None:
     def full(*_: Any) -> Any:
         raise RuntimeError("Failed to allocate 4096 bytes on device 'cuda:0'")
 
@@ -218,9 +210,7 @@ def test_where_a_gpu_has_no_memory_for_it_the_cpu_judges(
     assert "no memory for the prefilter" in caplog.text
 
 
-def test_grasps_that_overflow_the_first_judge_are_the_cpus(
-    stand_in: Stand, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_grasps_that_overflow_the_first_judge_are_the_cpus(stand_in: Stand, monkeypatch, caplog) -> None:
     verdicts(ON, grasps=grasp_of())
     assert "overflow" not in caplog.text
     monkeypatch.setattr(screening, "DOUBLINGS", 1)
