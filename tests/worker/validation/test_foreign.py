@@ -14,7 +14,6 @@ from graspd.studies.evaluation import combine, evaluate
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.model import Drag, HandModel
 from graspd.worker.hands.same_hand import same_hand
-from graspd.worker.validation.decomposition import decompose
 from graspd.worker.validation.foreign import driven_as, in_other_model, with_our_shapes, with_their_shapes
 from graspd.worker.validation.key import verdict_key
 from graspd.worker.validation.model import MujocoOptions, Scene, build
@@ -22,24 +21,24 @@ from graspd.worker.validation.prefilter.prefilter import first_terms
 from tests.studies.test_evaluation import BOX, HAND, plates_case
 from tests.worker.hands.mjcfs import CLAW
 from tests.worker.hands.test_mjcf import load
-
-FAR = np.array([0, 0, -0.5, 1.0, 0, 0, 0])
-
-
-def scene_of(hand: HandModel, tmp_path: Path) -> tuple[Scene, mujoco.MjData]:
-    scene = build(hand, BOX, decompose(BOX, cache=tmp_path), MujocoOptions())
-    return scene, mujoco.MjData(scene.model)
+from tests.worker.quality.helpers import FAR, WHOLE, placed_data
 
 
-def test_a_tendon_moves_the_sum_and_pulls_by_its_coefficients(tmp_path: Path) -> None:
+def driven(hand: HandModel, begin: np.ndarray, aim: np.ndarray) -> tuple[Scene, mujoco.MjData]:
+    """A hand far from everything whose dofs (D,) are driven to an aim."""
+    scene = build(hand, BOX, WHOLE, MujocoOptions())
+    data = placed_data(scene, hand.expand(begin))
+    scene.command(data, FAR, hand.expand(aim))
+    return scene, data
+
+
+def test_a_tendon_moves_the_sum_and_pulls_by_its_coefficients() -> None:
     hand = load(root="palm")
-    scene, data = scene_of(hand, tmp_path)
-    assert scene.model.nu == hand.dofs - 1
     bend, curl = (hand.dof_names.index(name) for name in ("left_bend", "left_curl"))
     aim = hand.preshape.copy()
     aim[[bend, curl]] = 0.5, 0.4
-    scene.place(data, FAR, hand.expand(hand.preshape))
-    scene.command(data, FAR, hand.expand(aim))
+    scene, data = driven(hand, hand.preshape, aim)
+    assert scene.model.nu == hand.dofs - 1
     mujoco.mj_step(scene.model, data, nstep=1)
     body = {name: hand.joint_body[hand.joint_names.index(name)] for name in ("left_bend", "left_curl")}
     force = [float(data.joint(f"joint{body[name]}").qfrc_actuator[0]) for name in body]
@@ -50,18 +49,16 @@ def test_a_tendon_moves_the_sum_and_pulls_by_its_coefficients(tmp_path: Path) ->
     assert q[bend] + 0.5 * q[curl] == pytest.approx(0.5 + 0.5 * 0.4, abs=1e-3)
 
 
-def test_one_joint_of_tendon_takes_what_limit_of_other_leaves(tmp_path: Path) -> None:
+def test_one_joint_of_tendon_takes_what_limit_of_other_leaves() -> None:
     hand = load(root="palm")
     bend, curl, spread = (hand.dof_names.index(f"left_{name}") for name in ("bend", "curl", "spread"))
     upper = hand.upper.copy()
     upper[curl] = 0.1
-    scene, data = scene_of(dataclasses.replace(hand, upper=upper), tmp_path)
     begin = hand.preshape.copy()
     begin[spread] = -0.2  # past the other finger
     aim = begin.copy()
     aim[[bend, curl]] = 0.5, 0.8
-    scene.place(data, FAR, hand.expand(begin))
-    scene.command(data, FAR, hand.expand(aim))
+    scene, data = driven(dataclasses.replace(hand, upper=upper), begin, aim)
     mujoco.mj_step(scene.model, data, nstep=1500)
     q = hand.reduce(data.qpos[scene.joint_qpos])
     # A limit gives way to torques by less than a milliradian.
@@ -69,14 +66,12 @@ def test_one_joint_of_tendon_takes_what_limit_of_other_leaves(tmp_path: Path) ->
     assert q[bend] == pytest.approx(0.5 + 0.5 * (0.8 - q[curl]), abs=1e-3)
 
 
-def test_the_first_judge_and_the_key_know_of_tendons(tmp_path: Path) -> None:
+def test_the_first_judge_and_the_key_know_of_tendons() -> None:
     hand = load(root="palm")
-    pieces = decompose(BOX, cache=tmp_path)
     separate = dataclasses.replace(hand, tendons=())
-    keys = {verdict_key(one, BOX, "standard", False, pieces=pieces) for one in (hand, separate)}
-    assert len(keys) == 2
     dragged = dataclasses.replace(separate, drag=Drag(np.zeros(hand.bodies), np.zeros(hand.bodies)))
-    assert verdict_key(dragged, BOX, "standard", False, pieces=pieces) not in keys
+    keys = {verdict_key(one, BOX, "standard", False, pieces=WHOLE) for one in (hand, separate, dragged)}
+    assert len(keys) == 3
     assert first_terms(load(root="palm"), "standard", ExecutionContext(prefilter="on")) == []
 
 
@@ -103,14 +98,12 @@ def test_the_same_model_gives_the_same_verdicts(tmp_path: Path) -> None:
 
 def test_a_model_with_other_pads_says_otherwise(tmp_path: Path) -> None:
     # The other model's pads do not reach the object: they are 40 mm nearer to their joints.
-    back = {body: np.array([0, 0, -0.04 if body else 0.0]) for body in range(HAND.bodies)}
-    shorter = tuple(
-        dataclasses.replace(
-            p, vertices=p.vertices + back[p.body], pose=np.concatenate([p.pose[:3] + back[p.body], p.pose[3:]])
-        )
-        for p in HAND.pieces
+    back, foot = np.array([0, 0, -0.04]), HAND.pieces[0]
+    moved = (
+        dataclasses.replace(pad, vertices=pad.vertices + back, pose=pad.pose + [*back, 0, 0, 0, 0])
+        for pad in HAND.pieces[1:]
     )
-    other = dataclasses.replace(HAND, name="shorter", pieces=shorter)
+    other = dataclasses.replace(HAND, name="shorter", pieces=(foot, *moved))
     same = same_hand(HAND, other)
     row = evaluate(plates_case(), validation_hand=same, cache=tmp_path)
     assert row["foreign_held"] == {"both": 0, "nominal": 2, "foreign": 0, "neither": 1}
