@@ -62,26 +62,19 @@ def test_every_view_that_may_be_drawn_can_be_read(root: Path, hand: HandModel) -
 
 def test_a_fingertip_stands_where_ours_does_in_the_camera(root, split, hand, stored: Shard, on_tables: Path) -> None:
     pictures = Pictures(open_shards(on_tables))
-    tip, met = hand.fingertips[0], 0
+    tip = hand.fingertips[0]
     for scene, view in some_views(root, split, 6, seed=4):
         found = sample(root, scene, view, "barrett", list(hand.joint_names))
         rows = np.load(root / "data" / "dex_grasps_new" / scene / "barrett" / "block.npz")["row"]
         in_root = body_poses(hand, np.tile(IDENTITY_POSE, (len(rows), 1)), found.qpos)[:, tip, :3]
         there = np.einsum("nij,nj->ni", found.rot, in_root) + found.trans
+        (number,) = set(stored["grasp/scene_index"][rows].tolist())
         # The picture of the same scene and view, two a scene; others are these again.
-        seen = [one for one in pictures if one["object"] == "block" and one["scene"] == scene_of(stored, rows)][
-            view % 2
-        ]
+        seen = [one for one in pictures if one["object"] == "block" and one["scene"] == number][view % 2]
         poses = compose(seen["object/pose"], stored["grasp/hand_pose"][rows])
         ours = body_poses(hand, poses, stored["grasp/joint_positions"][rows])[:, tip, :3]
         np.testing.assert_allclose(there, ours, atol=ROUNDING_M)
-        met += len(rows)
-    assert met
-
-
-def scene_of(stored: Shard, rows: np.ndarray) -> int:
-    (scene,) = set(stored["grasp/scene_index"][rows].tolist())
-    return int(scene)
+        assert len(rows)
 
 
 def test_the_object_of_the_cloud_is_where_grasps_mean_it(root, split, hand: HandModel, block: ObjectModel) -> None:

@@ -55,12 +55,10 @@ def picture(cell: dict[str, Any]) -> np.ndarray:
 
 def test_its_card_names_all_files_and_columns_of_pictures(folder: Path) -> None:
     found = configs(folder)
-    assert {table: sorted(splits) for table, splits in found.items()} == {
-        table: ["test", "train"] for table in ("grasps", "pictures")
-    }
-    assert sorted(file for splits in found.values() for files in splits.values() for file in files) == sorted(
-        folder.rglob("*.parquet")
-    )
+    splits = ["test", "train"]
+    assert {table: sorted(parts) for table, parts in found.items()} == {"grasps": splits, "pictures": splits}
+    files = [file for parts in found.values() for part in parts.values() for file in part]
+    assert sorted(files) == sorted(folder.rglob("*.parquet"))
     for file in (folder / "pictures").iterdir():
         told = json.loads(pq.read_schema(file).metadata[b"huggingface"])["info"]["features"]
         assert told == {name: {"_type": "Image"} for name in ("rgb", "depth", "segmentation")}

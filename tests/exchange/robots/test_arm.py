@@ -11,6 +11,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+import yaml
 import yourdfpy
 
 from graspd.exchange.robots.execution import ASSUMED_RAD_S
@@ -96,12 +97,10 @@ def test_arms_scene_opens_in_mujoco_and_nothing_of_arm_touches(table_shard: Path
 
 
 def test_moveit_is_told_poses_in_the_arms_base_and_all_joints(table_shard: Path, arm: Path, tmp_path: Path) -> None:
-    import yaml
-
     export(table_shard, arm, tmp_path, "moveit")
     grasps = yaml.safe_load((tmp_path / "grasps.yaml").read_text())
     assert {grasp["grasp_pose"]["header"]["frame_id"] for grasp in grasps} == {"base"}
-    file = sorted((tmp_path / "trajectories").iterdir())[0]
+    file = min((tmp_path / "trajectories").iterdir())
     assert yaml.safe_load(file.read_text())["joint_trajectory"]["joint_names"][:6] == NAMES
 
 
@@ -124,8 +123,8 @@ def test_base_without_an_arm_and_an_arm_without_mink_are_refused(free_shard, arm
     words = "export --format csv"
     assert "--arm ARM.urdf" in refused(words, free_shard, "--base", "0 0 0 1 0 0 0", "-o", tmp_path)
     monkeypatch.setitem(sys.modules, "mink", None)
-    arms = refused(words, free_shard, "--arm", arm, "--mount", "flange", "-o", tmp_path)
-    assert "pip install 'graspd[arm]'" in arms
+    said = refused(f"{words} --mount flange --arm", arm, free_shard, "-o", tmp_path)
+    assert "pip install 'graspd[arm]'" in said
 
 
 def test_speeds_that_the_arm_does_not_state_are_assumed_and_told(free_shard: Path, tmp_path: Path) -> None:

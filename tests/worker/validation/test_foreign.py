@@ -98,11 +98,8 @@ def test_the_same_model_gives_the_same_verdicts(tmp_path: Path) -> None:
 
 def test_a_model_with_other_pads_says_otherwise(tmp_path: Path) -> None:
     # The other model's pads do not reach the object: they are 40 mm nearer to their joints.
-    back, foot = np.array([0, 0, -0.04]), HAND.pieces[0]
-    moved = (
-        dataclasses.replace(pad, vertices=pad.vertices + back, pose=pad.pose + [*back, 0, 0, 0, 0])
-        for pad in HAND.pieces[1:]
-    )
+    back, (foot, *pads) = np.array([0, 0, -0.04, 0, 0, 0, 0]), HAND.pieces
+    moved = (dataclasses.replace(p, vertices=p.vertices + back[:3], pose=p.pose + back) for p in pads)
     other = dataclasses.replace(HAND, name="shorter", pieces=(foot, *moved))
     same = same_hand(HAND, other)
     row = evaluate(plates_case(), validation_hand=same, cache=tmp_path)
