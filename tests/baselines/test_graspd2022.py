@@ -11,18 +11,8 @@ import trimesh
 import warp as wp
 
 from graspd.baselines.common import ground_of
-from graspd.baselines.graspd2022 import kernels
-from graspd.baselines.graspd2022.method import (
-    FRICTION,
-    LEAK,
-    MISMATCH,
-    STIFFNESS,
-    VISCOUS,
-    Search,
-    _Batch,
-    distance_grid,
-    physics_of,
-)
+from graspd.baselines.graspd2022 import kernels, method
+from graspd.baselines.graspd2022.method import Search, _Batch, distance_grid, physics_of
 from graspd.worker.simulation.data import HandState
 from graspd.worker.simulation.kernels.surface import Surface, field_distance
 from tests.worker.models import object_from_mesh, two_finger_hand
@@ -85,11 +75,11 @@ def test_points_inside_push_the_object_away_and_rub_against_it() -> None:
     depth = -distance
     np.testing.assert_allclose(depth, 0.001, rtol=1e-3)
     # At the two points whose normal is across the motion: k c inwards, and the lesser of kf v and mu k c against it.
-    rub = np.minimum(VISCOUS * 0.01, FRICTION * STIFFNESS * depth)
+    rub = np.minimum(method.VISCOUS * 0.01, method.FRICTION * method.STIFFNESS * depth)
     np.testing.assert_allclose(force[:2, 2], -rub[:2], rtol=1e-3)
-    np.testing.assert_allclose([-force[0, 0], -force[1, 1]], STIFFNESS * depth[:2], rtol=1e-3)
+    np.testing.assert_allclose([-force[0, 0], -force[1, 1]], method.STIFFNESS * depth[:2], rtol=1e-3)
     # Where the motion is along the normal there is no friction.
-    np.testing.assert_allclose(force[2], [0, 0, STIFFNESS * depth[2]], atol=0.1)
+    np.testing.assert_allclose(force[2], [0, 0, method.STIFFNESS * depth[2]], atol=0.1)
 
 
 @pytest.mark.parametrize("velocity", [(0.0, 0.0, 0.01), (0.005, 0.01, -0.01)])
@@ -98,13 +88,13 @@ def test_the_slope_of_the_force_is_its_difference_quotient(velocity: tuple[float
     step = 2e-5
     slope = probed(ring(0.001), velocity)[2]
     quotient = (probed(ring(0.001 + step), velocity)[1] - probed(ring(0.001 - step), velocity)[1]) / (2 * step)
-    np.testing.assert_allclose(slope, quotient, atol=0.05 * STIFFNESS)
+    np.testing.assert_allclose(slope, quotient, atol=0.05 * method.STIFFNESS)
 
 
 def test_points_outside_leak_a_share_of_the_slope() -> None:
     assert np.all(probed(ring(-0.002), (0.0, 0.0, 0.01))[1] == 0), "points outside press with nothing"
     outside, inside = (probed(ring(depth))[2] for depth in (-0.001, 0.001))
-    np.testing.assert_allclose(outside, LEAK * inside, atol=0.02 * STIFFNESS)
+    np.testing.assert_allclose(outside, method.LEAK * inside, atol=0.02 * method.STIFFNESS)
 
 
 def touching_batch() -> _Batch:
@@ -141,4 +131,4 @@ def test_relaxation_departs_from_hard_contact_as_its_weight_says() -> None:
     for pull in (0.01, 0.04):
         relaxed, hard = settled(pull)
         apart = (relaxed - hard)[..., 0]
-        np.testing.assert_allclose(apart, -pull / (2 * MISMATCH), atol=0.02)
+        np.testing.assert_allclose(apart, -pull / (2 * method.MISMATCH), atol=0.02)

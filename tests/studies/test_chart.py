@@ -53,8 +53,7 @@ def test_runs_have_the_rates_that_their_counts_and_seconds_give(made: tuple[dict
         # Seconds are printed to the microsecond, the rate is not rounded so.
         rounded = 0.5e-6 * len(run["seconds"]) / used
         assert run["valid_per_second"] == pytest.approx(run["valid"] / used, rel=1e-5 + rounded)
-        assert run["gsr"] == pytest.approx(run["valid"] / run["grasps"])
-        assert run["kept"] <= run["valid"]
+        assert run["gsr"] == pytest.approx(run["valid"] / run["grasps"]) and run["kept"] <= run["valid"]
         assert all(whole > planned for whole, planned in zip(run["end_seconds"], run["seconds"], strict=True))
         assert run["end_to_end_per_second"] == pytest.approx(run["kept"] / sum(run["end_seconds"]), rel=1e-4)
         for key in ("gsr", "dexgraspbench", "hard", "end_to_end_per_second", *(["robust"] if run["valid"] else [])):
@@ -139,12 +138,10 @@ def test_sums_divide_all_valid_by_all_seconds() -> None:
     (row,) = summed([run_of("a", 8, 1.0, 0.1), run_of("a", 2, 4.0, 0.3)])
     assert row["valid_per_second"] == pytest.approx(10 / 5.0)
     assert row["end_to_end_per_second"] == pytest.approx(10 / 10.0)
-    assert row["gsr"] == row["dexgraspbench"] == pytest.approx(0.5)
-    assert row["pd_mm"] == pytest.approx(0.2)
+    assert row["gsr"] == row["dexgraspbench"] == pytest.approx(0.5) and row["pd_mm"] == pytest.approx(0.2)
     able, unable = summed([run_of("a", 5, 1.0, 0.5), run_of("b", 0, 0.1, 0.0)])
     assert able["front"] == ["dexgraspbench", "hard", "robust", "gsr", "epsilon", "pd_mm"]
-    assert unable["front"] == [] and unable["robust"] is None
-    assert unable["seconds_to_first_valid"] is None
+    assert unable["front"] == [] and unable["robust"] is None and unable["seconds_to_first_valid"] is None
     fast, gentle = summed([run_of("a", 5, 1.0, 0.5), run_of("b", 5, 2.0, 0.1)])
     assert "pd_mm" in fast["front"] and gentle["front"] == ["pd_mm"]
 
@@ -210,8 +207,7 @@ def test_no_word_lies_on_another_or_on_a_point_or_outside(crowd: str) -> None:
 def test_a_word_stands_close_to_its_point_and_on_no_other() -> None:
     axes, (word,) = drawn([(10.0, 0.5)])
     box, point = word.get_window_extent(), axes.transData.transform((10.0, 0.5))
-    assert word.arrow_patch is None
-    assert 0 < box.x0 - point[0] < 15 and 0 < box.y0 - point[1] < 15
+    assert word.arrow_patch is None and 0 < box.x0 - point[0] < 15 and 0 < box.y0 - point[1] < 15
     figure = Figure(figsize=(5.0, 4.0))
     axes = figure.subplots()
     # The second point lies where the first one's word would stand.
@@ -260,8 +256,7 @@ def test_a_run_that_was_stopped_plans_only_what_is_missing(in_scenes: tuple[dict
         return runs[setting.method, way]
 
     monkeypatch.setattr("graspd.studies.chart.scenes._tried", tried)
-    assert graspd(f"{ON_TABLE} --work", folder / "work")["runs"] == found["runs"]
-    assert len(planned) == 1
+    assert graspd(f"{ON_TABLE} --work", folder / "work")["runs"] == found["runs"] and len(planned) == 1
 
 
 def test_a_chart_of_earlier_is_published_apart_and_drawn(
@@ -271,8 +266,7 @@ def test_a_chart_of_earlier_is_published_apart_and_drawn(
     graspd("chart --publish --from", folder / "chart.json", "--data-dir", tmp_path, "--out", tmp_path)
     store = open_store((tmp_path / "store").as_uri())
     stored = latest(store, "scene_charts/table")
-    assert stored is not None and stored["runs"] == found["runs"]
-    assert latest(store, "charts") is None
+    assert stored is not None and stored["runs"] == found["runs"] and latest(store, "charts") is None
     assert (tmp_path / "chart.json").read_bytes() == (folder / "chart.json").read_bytes()
     assert (tmp_path / "chart.md").read_text() == (folder / "chart.md").read_text()
     # What it promises is what a job in such a scene is given.

@@ -38,14 +38,12 @@ def plates_case(**kwargs: object) -> Case:
 
 def test_row_has_the_contract_s_keys_and_counts_what_holds(tmp_path: Path) -> None:
     row = evaluate(plates_case(seconds=1.0), cache=tmp_path)
-    assert set(row) >= CONTRACT
-    assert (row["n"], row["gsr"], row["osr"]) == (3, pytest.approx(2 / 3), 1.0)
+    assert set(row) >= CONTRACT and (row["n"], row["gsr"], row["osr"]) == (3, pytest.approx(2 / 3), 1.0)
     assert row["sgs"] < row["sgs_without_validation"] == pytest.approx(2.0)
     assert row["reasons"] == {"held": 2, "displaced under +x": 1}
     json.dumps(row, allow_nan=False)
     first, _, last = row["verdicts"]
-    assert first["outcomes"] == ["held"] * 6 and first["margin"] < 1
-    assert last.pop("margin") > 1
+    assert first["outcomes"] == ["held"] * 6 and first["margin"] < 1 and last.pop("margin") > 1
     outcomes = ["displaced"] + ["not_tried"] * 5
     assert last == {"row": 2, "held": False, "outcomes": outcomes, "reason": "displaced under +x"}
 
@@ -112,8 +110,7 @@ def test_published_contacts_lie_on_fingertips_as_we_pose_them(shared_data: Path)
     assert len(found) == 8
     file = next(file for file in found if file.name == "056_tennis_ball.json")
     case, stored = load_case(file), json.loads(file.read_text())["grasps"]
-    assert case.published is not None
-    assert (case.published == 1).mean() == pytest.approx(0.91, abs=0.005)
+    assert case.published is not None and (case.published == 1).mean() == pytest.approx(0.91, abs=0.005)
     bodies = body_poses(case.hand, case.grasps.grasp.hand_pose, case.grasps.grasp.joint_positions)
     tips = [p for p in case.hand.pieces if p.body in case.hand.fingertips and "tip" in p.link]
     for row, grasp in zip(bodies, stored, strict=True):

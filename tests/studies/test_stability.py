@@ -141,8 +141,7 @@ def test_a_report_has_pictures_tables_and_says_what_still_breaks(tmp_path: Path)
     assert json.loads(data.read_text())["maps"][0]["cells"][1]["value"] is None
     assert picture.name == "stability-demo.png" and picture.read_bytes().startswith(b"\x89PNG")
     said = page.read_text()
-    assert "| a | 1 | 0 | 2 | 0 |" in said
-    assert "| A demo | 1 | 0 | 1 | 0 | a 2 (10) | it flies |" in said
+    assert "| a | 1 | 0 | 2 | 0 |" in said and "| A demo | 1 | 0 | 1 | 0 | a 2 (10) | it flies |" in said
     whole = [replace(cell, outcome="good") for cell in a_map().cells]
     assert "| A demo | 2 | 0 | 0 | 0 | nothing | – |" in markdown(a_record(a_map(cells=whole)))
 
@@ -253,8 +252,7 @@ def test_amounts_within_reach_are_those_that_robust_draws(name: str) -> None:
 def assert_valid_ones_are_clear(hand: HandModel, found: ValidatedBatch, spec: SceneSpec) -> None:
     """By MuJoCo's distances at the grasp, whatever the planner thinks of its clearance."""
     rows = np.flatnonzero(found.columns["quality/valid"] == 1)
-    assert (found.columns["quality/clearance_m"][rows] >= MARGIN_M).all()
-    assert spec.target is not None
+    assert (found.columns["quality/clearance_m"][rows] >= MARGIN_M).all() and spec.target is not None
     for support in supports_of(spec) if len(rows) else ():
         seen = support.seen_from(np.asarray(spec.target, float))
         assert mujoco_room(hand, found.grasps.grasp.take(rows), seen).min() >= MARGIN_M - 1e-6

@@ -54,8 +54,7 @@ def test_a_batch_of_valid_grasps_holds_nothing_else(valid: ValidatedBatch) -> No
     assert len(valid.grasps) == COUNT
     assert all((valid.columns[f"quality/{name}"] == 1).all() for name in ("valid", "feasible", "success"))
     assert all(len(array) == COUNT for path, array in valid.columns.items() if path != "quality/thresholds_m")
-    assert valid.candidates == COUNT + sum(valid.rejected.values())
-    assert valid.planned >= valid.candidates
+    assert valid.candidates == COUNT + sum(valid.rejected.values()) and valid.planned >= valid.candidates
     assert (valid.columns["quality/recheck"] >= 0).tolist() == [True] * 2 + [False] * (COUNT - 2)
     assert "quality/robust_share" not in valid.columns and "not_robust" not in valid.rejected
 
@@ -138,8 +137,7 @@ def test_candidate_grasps_are_all_kept_with_their_verdicts(hand: HandModel, bloc
 
 def test_without_a_validator_nobody_judges(hand: HandModel, block: ObjectModel) -> None:
     found = validated_grasps(hand, block, wish(validation="none"), count=COUNT)
-    assert found.verdict_key is None
-    assert "quality/success" not in found.columns
+    assert found.verdict_key is None and "quality/success" not in found.columns
     assert len(found.grasps) == COUNT
     assert (found.columns["quality/feasible"] == 1).all(), "the budget is for feasible grasps then"
     assert not found.columns["quality/valid"].any()
@@ -201,12 +199,10 @@ def test_rounds_end_with_enough_grasps_or_with_budget_used_up(wanted: int, facto
 def test_only_grasps_that_hold_in_enough_models_count(hand: HandModel, block: ObjectModel) -> None:
     found = validated_grasps(hand, block, wish(robust=0.75, robust_models=4, rechecks=0), count=3)
     share, weakest = found.columns["quality/robust_share"], found.columns["quality/robust_weakest"]
-    assert len(found.grasps) == 3
-    assert (share >= 0.75).all()
+    assert len(found.grasps) == 3 and (share >= 0.75).all()
     assert weakest.dtype == np.uint8 and ((weakest == 0) | (share < 1)).all()
     assert (found.columns["quality/valid"] == 1).all()
-    assert found.candidates == 3 + sum(found.rejected.values())
-    assert "not_robust" in found.rejected
+    assert found.candidates == 3 + sum(found.rejected.values()) and "not_robust" in found.rejected
 
 
 def test_valid_grasps_that_hold_in_no_other_model_are_told_apart(hand, block: ObjectModel, monkeypatch) -> None:
@@ -216,8 +212,7 @@ def test_valid_grasps_that_hold_in_no_other_model_are_told_apart(hand, block: Ob
 
     monkeypatch.setattr(generation, "robust", nowhere)
     none = validated_grasps(hand, block, wish(robust=0.5, budget=1, rechecks=0), count=4)
-    assert len(none.grasps) == 0
-    assert none.rejected["not_robust"] > 0
+    assert len(none.grasps) == 0 and none.rejected["not_robust"] > 0
     raw = validated_grasps(hand, block, wish(robust=0.5, want="candidates", rechecks=0), count=4)
     held = raw.columns["quality/success"] == 1
     assert (raw.columns["quality/robust_share"][held] == 0).all() and len(raw.grasps) == 4

@@ -132,8 +132,7 @@ def test_the_first_valid_grasps_are_audited_whoever_finds_them(pair, monkeypatch
 )
 def test_parts_are_as_many_as_cores_and_none_is_small(rows: range, cores: int, sizes: list[int]) -> None:
     parts = parts_of(rows, cores)
-    assert [len(part) for part in parts] == sizes
-    assert [row for part in parts for row in part] == list(rows)
+    assert [len(part) for part in parts] == sizes and [row for part in parts for row in part] == list(rows)
 
 
 def test_a_lane_that_ends_leaves_its_cores_to_the_others() -> None:
@@ -211,8 +210,7 @@ def test_joined_batches_of_a_job_are_the_same_from_plan_to_verdict(pair, alone, 
     joined = validated_batches(*pair, ASKED, sizes=[2, 2, 2], join=3, run=run)
     assert launches[0] == [0, 1, 2], "the first launch has all three"
     assert_same(joined, alone)
-    assert told[-1] == (6, 6)
-    assert all(done <= total for done, total in told)
+    assert told[-1] == (6, 6) and all(done <= total for done, total in told)
 
 
 def test_batches_that_other_processes_judge_and_measure_are_the_same(pair, alone) -> None:
@@ -291,7 +289,6 @@ def test_what_becomes_of_one_batch_ends_the_job(pair) -> None:
 
 
 def test_how_many_are_joined_where_nobody_says() -> None:
-    assert batches_at_once("cpu", None) == 1
-    assert batches_at_once("cpu", 4) == 4
+    assert batches_at_once("cpu", None) == 1 and batches_at_once("cpu", 4) == 4
     # Of an H100 and an H200 (132 multiprocessors), of a GPU with 20, and of one whose memory is nearly full.
     assert [fitting(132, 80 << 30), fitting(20, 8 << 30), fitting(132, 1 << 30), fitting(132, 0)] == [32, 4, 4, 1]

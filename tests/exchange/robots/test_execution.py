@@ -129,8 +129,7 @@ def test_trajectories_stay_within_limits_and_reach_every_posture(free: Execution
         # Secants of a motion are no steeper than its steepest tangent; 1e-9: rounding.
         assert (np.abs(np.diff(found.joints, axis=0)) / step[:, None] <= speed * velocity * (1 + 1e-9)).all()
         along = np.linalg.norm(np.diff(found.hand_pose[:, :3], axis=0), axis=1) / step
-        assert along.max() <= speed * execution.HAND_M_S * (1 + 1e-9)
-        assert not found.velocity[[0, -1]].any()
+        assert along.max() <= speed * execution.HAND_M_S * (1 + 1e-9) and not found.velocity[[0, -1]].any()
         ends = [0] + [k for k in range(len(step)) if found.phase[k] != found.phase[k + 1]] + [len(step)]
         ends = sorted(set(ends) - {0}) if len(ends) > len(POSTURES) else ends
         for posture_name, k in zip(POSTURES, ends, strict=True):

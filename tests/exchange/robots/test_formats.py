@@ -143,8 +143,7 @@ def test_moveit_grasps_have_the_fields_of_the_messages(table_shard: Path, tmp_pa
     grasps = yaml.safe_load((tmp_path / "grasps.yaml").read_text())
     assert len(grasps) == told["grasps"]
     for grasp in grasps:
-        assert set(grasp) == GRASP
-        assert grasp["grasp_pose"]["header"]["frame_id"] == "scene"
+        assert set(grasp) == GRASP and grasp["grasp_pose"]["header"]["frame_id"] == "scene"
         x, y, z, w = (grasp["grasp_pose"]["pose"]["orientation"][k] for k in "xyzw")
         assert x * x + y * y + z * z + w * w == pytest.approx(1.0, abs=1e-6)
         for name, points in (("pre_grasp_posture", 1), ("grasp_posture", 2)):

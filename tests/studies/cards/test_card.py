@@ -50,8 +50,7 @@ def test_the_page_its_links_and_figures_agree_with_the_card(kitchen: Case) -> No
     stored = json.loads((kitchen.folder / "card.json").read_text())
     assert [(cell["hand"], cell["object"]) for cell in stored["cells"]] == [(h, o) for h in HANDS for o in OBJECTS]
     assert f"{stored['composition']['valid']:,} valid grasps of 2 robot hands on 2 objects" in kitchen.page
-    assert stored["snapshot"]["digest"] == kitchen.snapshot.digest
-    assert kitchen.snapshot.digest in kitchen.page
+    assert stored["snapshot"]["digest"] == kitchen.snapshot.digest and kitchen.snapshot.digest in kitchen.page
 
 
 def test_the_checksums_are_those_of_an_export(kitchen: Case, export: Path, tmp_path: Path) -> None:
@@ -199,8 +198,7 @@ def test_counts_costs_and_clearance_are_those_of_the_dataset(kitchen: Case) -> N
     assert valid["candidates"] == sum(one.candidates for one in base)
     assert (valid["rechecked"], valid["recheck_dropped"]) == (32, 0)
     assert sum(made["bytes"].values()) == kitchen.snapshot.size_bytes
-    assert (made["scenes"], made["pictures"]) == (16, 16)
-    assert valid["rejected"]["gate"] == len(base)
+    assert (made["scenes"], made["pictures"]) == (16, 16) and valid["rejected"]["gate"] == len(base)
     making, batches = kitchen.card["making"], 8
     stages = {"base": Stage.SYNTHESIZE, "scene": Stage.SCENE, "views": Stage.RENDER}
     assert making["seconds"] == {kind: batches * SECONDS[stage] for kind, stage in stages.items()}
@@ -334,5 +332,4 @@ def test_the_use_of_a_joint_is_a_share_of_its_limits() -> None:
     (found,) = use.shares().values()
     # bins are 1/200 of the range
     assert found["used"] == pytest.approx(0.49, abs=0.01) and found["median"] == pytest.approx(0.5, abs=0.005)
-    assert list(use.shares()) == ["a"]
-    assert share(0, 0) is None
+    assert list(use.shares()) == ["a"] and share(0, 0) is None

@@ -74,8 +74,7 @@ def test_pregrasp_is_clear_and_within_limits() -> None:
     fingers = np.isin(Probe(hand, BOX).points.body, [1, 2])
     # Clearance is decided on 600 points; between them, a round finger's surface bulges by less than a millimetre.
     assert (found.distance[:, fingers].min(axis=1) > CLEARANCE_M - 1e-3).all()
-    assert (found.distance.min(axis=1) > 0).all()
-    assert (before.joint_positions >= hand.lower - 1e-12).all()
+    assert (found.distance.min(axis=1) > 0).all() and (before.joint_positions >= hand.lower - 1e-12).all()
     assert (before.joint_positions < held.joint_positions).all()
 
 
@@ -102,8 +101,7 @@ def test_fingers_leave_along_the_contact_normals() -> None:
 
 def test_forces_between_plates_balance_one_sided_ones_do_not() -> None:
     held = hold_forces(plate_hand(), BOX, CLOSED, total_normal_force=20.0)
-    assert held.residual[0] < 0.01
-    assert held.torque[0] == pytest.approx([10.0, 10.0], rel=0.02)
+    assert held.residual[0] < 0.01 and held.torque[0] == pytest.approx([10.0, 10.0], rel=0.02)
     held = hold_forces(plate_hand(), BOX, posture(((0, 0, 0), (0.065, 0.0))))
     assert held.residual[0] > 0.5
 
@@ -218,16 +216,14 @@ def test_forces_balance_and_idle_fingers_close_as_in_numpy(case: tuple[HandModel
     np.testing.assert_allclose(held.residual, residual, atol=1e-8)
     np.testing.assert_allclose(held.torque, torque, atol=1e-7)
     np.testing.assert_allclose(pressed, closing, atol=1e-7)
-    assert 0 < np.count_nonzero(held.residual < 1.0) < len(grasp)
-    assert np.abs(torque - closing).max() > 1e-3
+    assert 0 < np.count_nonzero(held.residual < 1.0) < len(grasp) and np.abs(torque - closing).max() > 1e-3
 
 
 def test_links_in_contact_are_counted_as_in_numpy(case: tuple[HandModel, Probe, Posture]) -> None:
     hand, probe, grasp = case
     near = probe.touch(grasp, reach=LINK_CONTACT_M).distance < LINK_CONTACT_M
     wanted = [len(np.unique(probe.points.body[one])) for one in near]
-    assert postures.touching_links(hand, OBJ, grasp).tolist() == wanted
-    assert len(set(wanted)) > 2
+    assert postures.touching_links(hand, OBJ, grasp).tolist() == wanted and len(set(wanted)) > 2
 
 
 BALL = object_from_mesh(trimesh.creation.icosphere(4, 0.02))
@@ -326,5 +322,4 @@ def test_weights_keep_to_their_columns_and_leave_out_the_worse() -> None:
     made = systems(3, 40, 1)
     made[:, 20:] = np.nan
     found = nonnegative_weights(made, np.full(3, 20))
-    assert np.isfinite(found).all()
-    assert not found[:, 20:].any()
+    assert np.isfinite(found).all() and not found[:, 20:].any()

@@ -97,8 +97,7 @@ def test_what_is_matter_with_one_batch_leaves_others_as_they_are(pair) -> None:
     stopping = ExecutionContext(threads=1, cancelled=lambda: True)
     buried, first, broken, stopped, last = made(pair, wanted, ONE, ONE, ONE, stopping)
     assert isinstance(buried, InputError) and "nothing can reach" in str(buried)
-    assert isinstance(broken, MeshError)
-    assert isinstance(stopped, TaskCancelled)
+    assert isinstance(broken, MeshError) and isinstance(stopped, TaskCancelled)
     for joined, alone in ((first, wanted[1]), (last, wanted[4])):
         assert_same(joined, synthesize(hand, obj, alone, ONE))
 
@@ -112,11 +111,9 @@ def test_a_batch_that_is_cancelled_leaves_the_others_alone(pair) -> None:
 
     stopping = ExecutionContext(threads=1, progress=tell, cancelled=lambda: any("coarse" in one for one in told))
     stopped, kept = made(pair, wanted, stopping)
-    assert isinstance(stopped, TaskCancelled)
-    assert told == ["starts", "coarse optimization"]
+    assert isinstance(stopped, TaskCancelled) and told == ["starts", "coarse optimization"]
     assert_same(kept, synthesize(*pair, wanted[1], ONE))
     # Where all are cancelled the launch ends.
     told.clear()
     run = ExecutionContext(threads=1, progress=tell, cancelled=lambda: bool(told))
-    assert all(isinstance(one, TaskCancelled) for one in made(pair, wanted, run, run))
-    assert told == ["starts"]
+    assert all(isinstance(one, TaskCancelled) for one in made(pair, wanted, run, run)) and told == ["starts"]

@@ -84,8 +84,7 @@ def test_the_documented_package_runs_as_a_method(tmp_path: Path) -> None:
     done = subprocess.run(command, env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True, timeout=240)
     assert done.returncode == 0, done.stderr
     with h5py.File(out) as file:
-        assert file.attrs["method"] == "mine"
-        assert len(file["grasp/hand_pose"]) == 2
+        assert file.attrs["method"] == "mine" and len(file["grasp/hand_pose"]) == 2
 
 
 @pytest.mark.parametrize("name", sorted(PLANNERS))

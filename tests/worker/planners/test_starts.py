@@ -148,8 +148,7 @@ def test_a_ring_of_six_has_a_place_only_when_it_opens(ring: HandModel, cube: Obj
     state, depth = clear_starts(model, generators)
     assert (depth > NO_PLACE).all()
     opened = starts.open_further(model, generators, state, depth, np.array([True, True, True, False]))
-    assert opened.tolist() == [1, 1, 1, 0]
-    assert (depth[:3] <= CLEAR).all() and depth[3] > NO_PLACE
+    assert opened.tolist() == [1, 1, 1, 0] and (depth[:3] <= CLEAR).all() and depth[3] > NO_PLACE
     closed = ring.closing > 0
     assert (state.q[:3, closed].mean(axis=1) < ring.preshape[closed].mean()).all()
 
@@ -214,8 +213,7 @@ def test_what_a_hand_cannot_span_or_reach_is_told(block, barrett) -> None:
     assert not Openings.of(known, block, deep).within_reach
     wide = replace(block, vertices=10 * block.vertices, centre_of_mass=10 * block.centre_of_mass)
     opening = Openings.of(known, wide, lying(wide))
-    assert not opening.within_reach
-    assert not len(opening.sums)
+    assert not opening.within_reach and not len(opening.sums)
 
 
 def test_hands_reach_across_what_lies_flat_from_above(barrett) -> None:
@@ -226,8 +224,7 @@ def test_hands_reach_across_what_lies_flat_from_above(barrett) -> None:
     assert len(Openings.in_scene(barrett, flat, standing).known) == len(oppositions_of(barrett))
     found = across(barrett, flat, opening, np.random.default_rng(1).random((60, 6)), free_ways(scene, flat))
     line = np.einsum("nij,nj->ni", found.turn, opening.known.axis[found.posture])
-    assert np.abs(line @ UP).max() < 1e-6
-    assert (found.away @ UP).min() > 0.6
+    assert np.abs(line @ UP).max() < 1e-6 and (found.away @ UP).min() > 0.6
 
 
 def test_hands_hold_the_middle_and_come_from_a_free_way(block, barrett) -> None:
@@ -406,5 +403,4 @@ def test_candidate_grasps_none_of_which_is_valid_come_with_the_reason(tmp_path) 
     made = synthesized("allegro", str(sheet), request, place=place, scenes=1)
     found = made.summary()
     assert (found["grasps"], found["valid"], found["reason"]) == (1, 0, None)
-    assert "is 4 mm high" in found["narrow"]
-    assert _said({"file": "g.h5", **found}).endswith(found["narrow"])
+    assert "is 4 mm high" in found["narrow"] and _said({"file": "g.h5", **found}).endswith(found["narrow"])

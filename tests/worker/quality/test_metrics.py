@@ -140,8 +140,7 @@ def test_no_more_contacts_than_the_limit_and_they_span_the_patch() -> None:
     place = np.stack(np.meshgrid(np.linspace(0, 1, 30), np.linspace(0, 1, 30), [0.0]), axis=-1).reshape(-1, 3)
     normal = np.tile([0, 0, 1.0], (1, 900, 1))
     chosen, count = spread_contacts(np.ones((1, 1, 900), bool), place[None], normal, scale=1.0, limit=12)
-    assert count == 12
-    assert np.ptp(place[chosen[0, 0]], axis=0)[:2] == pytest.approx([1.0, 1.0])
+    assert count == 12 and np.ptp(place[chosen[0, 0]], axis=0)[:2] == pytest.approx([1.0, 1.0])
 
 
 def test_consistency_is_the_spread_of_finger_distances() -> None:
@@ -227,8 +226,7 @@ def gate(**changes: float) -> bool:
     ],
 )
 def test_each_bound_is_inclusive_and_decides_alone(name: str, bound: float, worse: float) -> None:
-    assert gate(**{name: bound})
-    assert not gate(**{name: bound + worse}) and not gate(**{name: math.nan})
+    assert gate(**{name: bound}) and not gate(**{name: bound + worse}) and not gate(**{name: math.nan})
 
 
 def test_bars_of_shares_and_means_cover_the_truth() -> None:
@@ -261,8 +259,7 @@ def test_no_piece_that_shares_volume_is_left_out_many_others_are() -> None:
     postures = Posture(np.hstack([rng.uniform(-0.05, 0.05, (200, 3)), turn]), rng.uniform(0.0, 0.1, (200, 2)))
     ball = object_from_mesh(trimesh.creation.icosphere(subdivisions=3, radius=0.04))
     kept, shared = kept_and_shared(ball, postures)
-    assert not (shared[~kept] > 0).any()
-    assert (shared > 0).sum() > 100 and (~kept).sum() > 100
+    assert not (shared[~kept] > 0).any() and (shared > 0).sum() > 100 and (~kept).sum() > 100
     assert (shared[kept] > 0).mean() > 0.9, "only edges beside edges are kept for nothing"
 
 
@@ -355,8 +352,7 @@ def test_of_grasps_that_are_near_the_first_is_kept() -> None:
 
 def test_distinct_grasps_keep_the_given_nearest_sees_all_pairs() -> None:
     points = np.zeros((3, 4, 3))
-    assert distinct(points, 0.0).all()
-    assert distinct(points, 0.005).tolist() == [True, False, False]
+    assert distinct(points, 0.0).all() and distinct(points, 0.005).tolist() == [True, False, False]
     assert distinct(points, 0.005, given=2).tolist() == [True, True, False]
     rng = np.random.default_rng(17)
     # Turned about their middles too, so that near middles are no near grasps.

@@ -248,8 +248,7 @@ def test_loss_and_gradient_are_finite_wherever_the_hand_is(solver: str, slivers:
     data.set_schedule(still(dilation=0.01, weight=1e4))
     data.set_state(HandState(places, np.tile([1.0, 0.0, 0.0, 0.0], (3, 1)), np.tile(hand.preshape, (3, 1))))
     record_evaluation(model, data).run()
-    assert np.all(np.isfinite(data.loss.numpy()))
-    assert np.all(np.isfinite(data.gradient.numpy()))
+    assert np.all(np.isfinite(data.loss.numpy())) and np.all(np.isfinite(data.gradient.numpy()))
 
 
 def test_small_descent_steps_never_raise_the_loss() -> None:

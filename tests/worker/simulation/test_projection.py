@@ -149,8 +149,7 @@ def test_wrenches_add_up_with_the_same_bits_in_any_order() -> None:
     forces = rng.normal(size=(500, 3)) * 10.0 ** rng.uniform(-3, 4, (500, 1))
     shuffled = forces[rng.permutation(500)]
     plain, other = (np.add.accumulate(some.astype(np.float32))[-1] for some in (forces, shuffled))
-    assert (plain != other).any()
-    assert (summed(forces) == summed(shuffled)).all()
+    assert (plain != other).any() and (summed(forces) == summed(shuffled)).all()
     forces = np.random.default_rng(6).normal(size=(300, 3)).astype(np.float32)
     force, torque = np.split(summed(forces) * wrenches.UNIT, 2)
     # Each addend loses less than one count, and the tenth is rounded to float32.
@@ -173,8 +172,7 @@ def test_marked_points_get_the_slots_of_a_counter(count: int) -> None:
     wp.launch(packing.pack, (4, count), inputs=[active, marked, *counts], outputs=[packed], device="cpu")
     for b in (0, 1, 3):
         kept, close = np.flatnonzero(mark[b]), np.flatnonzero(mark[b] == packing.NEAR)
-        assert packed.count.numpy()[b] == len(kept)
-        assert packed.near_count.numpy()[b] == len(close)
+        assert packed.count.numpy()[b] == len(kept) and packed.near_count.numpy()[b] == len(close)
         assert (packed.body.numpy()[b, : len(kept)] == kept).all()
         assert (kept[packed.near.numpy()[b, : len(close)]] == close).all()
     assert packed.count.numpy()[2] == -1

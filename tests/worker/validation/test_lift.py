@@ -61,8 +61,7 @@ def lift_test() -> Lift:
 def test_a_firm_squeeze_lifts_the_box_and_none_leaves_it(level: str) -> None:
     test = lift_test()
     firm, none = (getattr(test, level)(grasp(squeeze), 0) for squeeze in (0.05, -0.005))
-    assert (firm.outcome, none.outcome) == (LiftOutcome.LIFTED, LiftOutcome.NOT_LIFTED)
-    assert firm.margin < 0.5
+    assert (firm.outcome, none.outcome) == (LiftOutcome.LIFTED, LiftOutcome.NOT_LIFTED) and firm.margin < 0.5
 
 
 def test_a_lift_ends_where_its_object_is_lost() -> None:
@@ -189,8 +188,7 @@ def test_the_box_falls_by_what_friction_does_not_carry() -> None:
 def test_half_friction_needs_twice_the_squeeze_unless_beaten() -> None:
     grasps = joined([grasp(share * LEAST_AT_HALF) for share in (0.9, 1.1, 0.9)])
     found = LiftRollouts(HAND, BOX, lambda: WHOLE).scores(grasps, placed(3), np.array([1.5, 1.5, np.inf]))
-    assert found[0] == 1.5 and found[1] < 0.05
-    assert SLIPS <= found[2] < SLIPS + 0.05
+    assert found[0] == 1.5 and found[1] < 0.05 and SLIPS <= found[2] < SLIPS + 0.05
 
 
 def test_pads_that_start_in_the_box_are_no_candidates() -> None:

@@ -127,8 +127,7 @@ def test_whoever_says_the_weight_is_told_what_the_grasps_lift(tmp_path: Path) ->
     words = f"{BARRETT} -n 1 --mass 0.37 -o"
     for more, told in (((), keys), (("--no-payload",), keys - {"payload_kg"})):
         said = graspd(words, tmp_path / "g.h5", *more)
-        assert keys & said.keys() == told
-        assert said["mass_kg"] == 0.37 and said.get("payload_kg", 1.0) >= 0.37
+        assert keys & said.keys() == told and said["mass_kg"] == 0.37 and said.get("payload_kg", 1.0) >= 0.37
 
 
 @pytest.mark.parametrize(("least", "kept", "outcomes"), [(0.3, 2, {}), (90.0, 0, {"weak": 2})])
@@ -165,8 +164,7 @@ def test_what_is_wanted_is_told_with_what_the_best_grasp_lifts() -> None:
 
     lifts = bears(FRICTION)
     found = limit(3 * lifts)
-    assert found.hopeless
-    assert 0.95 * lifts < found.lifts_kg < lifts < found.bound_kg < 1.1 * lifts
+    assert found.hopeless and 0.95 * lifts < found.lifts_kg < lifts < found.bound_kg < 1.1 * lifts
     assert found.line == (
         "two_finger lifts 0.34 kg at friction 0.6 in the best of 8 grasps, and at most 0.38 kg by actuator effort; "
         "1.06 kg are wanted"

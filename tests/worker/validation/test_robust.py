@@ -49,8 +49,7 @@ def test_in_models_that_are_all_same_grasp_holds_in_all_or_none(monkeypatch: pyt
     grasps = many_grasps()
     found = robust(PADS, BOX, grasps, models=3, pieces=WHOLE)
     verdicts = validate(PADS, BOX, grasps, pieces=WHOLE)
-    assert found.share.tolist() == verdicts.success.tolist()
-    assert {0.0, 1.0} == set(found.share)
+    assert found.share.tolist() == verdicts.success.tolist() and {0.0, 1.0} == set(found.share)
     assert ((found.weakest == Axis.NONE) == (verdicts.success == 1)).all()
 
 
@@ -58,8 +57,7 @@ def test_only_what_holds_in_the_nominal_model_is_tried(monkeypatch: pytest.Monke
     by_luck(monkeypatch)
     held = np.array([1, 0, 1, -1, 0, 1, 1, 1])
     found = robust(PADS, BOX, many_grasps(), held=held, models=4, pieces=WHOLE)
-    assert (np.isfinite(found.share) == (held == 1)).all()
-    assert (found.weakest[held != 1] == Axis.NONE).all()
+    assert (np.isfinite(found.share) == (held == 1)).all() and (found.weakest[held != 1] == Axis.NONE).all()
 
 
 @pytest.mark.parametrize("models", [1, 8])
@@ -85,8 +83,7 @@ def test_no_model_is_validated_after_the_share_is_sure(monkeypatch: pytest.Monke
     assert ((found.held >= 0).sum(axis=1) == 1).all()
     by_luck(monkeypatch, odds=1.0)
     found = robust(PADS, BOX, many_grasps(), models=8, wanted=0.5, pieces=WHOLE)
-    assert ((found.held >= 0).sum(axis=1) == 4).all()
-    assert (found.share == 0.5).all()
+    assert ((found.held >= 0).sum(axis=1) == 4).all() and (found.share == 0.5).all()
 
 
 def test_the_weakest_axis_is_that_of_the_first_model_that_fails() -> None:
@@ -202,8 +199,7 @@ def test_fits_that_change_nothing_are_not_offered() -> None:
     ball = dataclasses.replace(hand, pieces=tuple(p for p in hand.pieces if p.kind == "sphere"))
     assert fits_of(ball) == frozenset()
     assert "hull" in fits_of(hand), "a finger has a shaft and a tip"
-    assert len(refitted(hand, "hull").pieces) == 3
-    assert refitted(ball, "capsule") is ball
+    assert len(refitted(hand, "hull").pieces) == 3 and refitted(ball, "capsule") is ball
 
 
 def test_nominal_variant_has_verdicts_of_the_judge_bit_for_bit() -> None:
@@ -356,8 +352,7 @@ def test_each_reading_moves_as_it_says() -> None:
 
 def test_a_ratio_keeps_what_both_can_do() -> None:
     hand = recoupled(tied(), "ratio")
-    assert (hand.dofs, hand.tendons) == (1, ())
-    assert (hand.lower[0], hand.upper[0]) == (-0.2, 1.1)
+    assert (hand.dofs, hand.tendons) == (1, ()) and (hand.lower[0], hand.upper[0]) == (-0.2, 1.1)
     assert hand.expand(np.array([0.4])) == pytest.approx([0.4, 0.4])
     assert variants.nearest(hand, np.array([[0.1, 0.5]]))[0] == pytest.approx([0.3, 0.3])
     turned = recoupled(tied(-1.0), "ratio")

@@ -35,19 +35,8 @@ from graspd.worker.validation.model import MujocoOptions, blend, build, scene_of
 from graspd.worker.validation.protocol import HOLD_S, MAX_DISPLACEMENT_M, MAX_ROTATION, Outcome, Rollout, Test
 from graspd.worker.validation.validator import validate
 from tests.worker.models import object_from_mesh, on_one_dof, two_finger_hand
-from tests.worker.quality.helpers import (
-    BOX,
-    CONTACT,
-    FAR,
-    PADS,
-    WHOLE,
-    grasp_of,
-    many_grasps,
-    pad_hand,
-    placed_data,
-    plate_hand,
-    posture,
-)
+from tests.worker.quality import helpers
+from tests.worker.quality.helpers import BOX, CONTACT, FAR, PADS, WHOLE, grasp_of, many_grasps, placed_data, posture
 
 
 def test_a_pressed_box_is_held_and_a_free_one_falls() -> None:
@@ -85,8 +74,7 @@ def test_penetration_counts_at_pregrasp_where_simulation_starts(level: str) -> N
 def test_the_engine_has_the_numbers_of_hand_and_object() -> None:
     model = build(PADS, BOX, WHOLE, MujocoOptions()).model
     fingers = [int(model.joint(f"joint{b}").dofadr[0]) for b in PADS.joint_body]
-    assert model.dof_damping[fingers] == pytest.approx(0.02 * PADS.stiffness)
-    assert not model.dof_armature.any()
+    assert model.dof_damping[fingers] == pytest.approx(0.02 * PADS.stiffness) and not model.dof_armature.any()
     assert not model.dof_frictionloss.any()
     assert [model.body(f"body{b}").mass[0] for b in range(3)] == pytest.approx(PADS.masses)
     body = model.body("object")
@@ -101,7 +89,7 @@ def test_the_engine_has_the_numbers_of_hand_and_object() -> None:
 def test_a_pair_of_pieces_has_one_contact_but_between_jaws(jaws: bool, contacts: int, monkeypatch) -> None:
     if not jaws:
         monkeypatch.setattr(model, "jaws_of", lambda hand: None)
-    scene = build(plate_hand(), BOX, WHOLE, MujocoOptions())
+    scene = build(helpers.plate_hand(), BOX, WHOLE, MujocoOptions())
     data = placed_data(scene, CONTACT.joint_positions[0] + 1e-3, CONTACT.hand_pose[0])
     # A plate's face lies flat on the box: with multi-contact each of the two has four points.
     assert len(data.contact.dist) == contacts
@@ -160,11 +148,9 @@ def test_cheaper_levels_say_what_the_letter_says(level: str) -> None:
 def test_hard_holds_no_more_and_threads_change_nothing() -> None:
     grasps = many_grasps()
     normal, hard = (validate(PADS, BOX, grasps, hard=h, pieces=WHOLE) for h in (False, True))
-    assert (hard.success <= normal.success).all()
-    assert normal.key != hard.key
+    assert (hard.success <= normal.success).all() and normal.key != hard.key
     one, two = (validate(PADS, BOX, many_grasps(), pieces=WHOLE, run=ExecutionContext(threads=n)) for n in (1, 2))
-    assert np.array_equal(one.margin, two.margin)
-    assert one.key == two.key
+    assert np.array_equal(one.margin, two.margin) and one.key == two.key
 
 
 def test_progress_is_told_by_one_thread_and_counts_every_grasp() -> None:
@@ -180,15 +166,13 @@ def test_progress_is_told_by_one_thread_and_counts_every_grasp() -> None:
         alone.release()
 
     validate(PADS, BOX, many_grasps(), level="fast", pieces=WHOLE, run=ExecutionContext(threads=4, progress=progress))
-    assert overlaps == 0
-    assert told == list(range(1, len(many_grasps()) + 1))
+    assert overlaps == 0 and told == list(range(1, len(many_grasps()) + 1))
 
 
 def test_terms_depend_not_on_grasps_but_on_everything_else(monkeypatch: pytest.MonkeyPatch) -> None:
     terms = verdict_key(PADS, BOX, "dexgraspbench", False, pieces=WHOLE)
     found = [validate(PADS, BOX, grasp_of(force=force), level="dexgraspbench", pieces=WHOLE) for force in (10.0, 20.0)]
-    assert [verdicts.terms for verdicts in found] == [terms, terms]
-    assert found[0].key != found[1].key
+    assert [verdicts.terms for verdicts in found] == [terms, terms] and found[0].key != found[1].key
     heavier = dataclasses.replace(PADS, masses=PADS.masses * 2)
     others = {
         terms,
@@ -275,14 +259,12 @@ def test_unknown_levels_are_refused_and_cancelled_validator_stops() -> None:
 
 def test_a_convex_object_is_one_piece_and_an_l_is_cut_and_kept(tmp_path: Path) -> None:
     pieces = decompose(BOX, cache=tmp_path)
-    assert len(pieces) == 1
-    assert pieces.volume_ratio == pytest.approx(1.0, abs=1e-6)
+    assert len(pieces) == 1 and pieces.volume_ratio == pytest.approx(1.0, abs=1e-6)
     parts = [trimesh.creation.box((0.1, 0.02, 0.02)), trimesh.creation.box((0.02, 0.1, 0.02))]
     parts[1].apply_translation([0.04, 0.04, 0])
     shape = object_from_mesh(trimesh.boolean.union(parts, engine="manifold"))
     pieces = decompose(shape, cache=tmp_path)
-    assert 2 <= len(pieces) <= 4
-    assert pieces.volume_ratio == pytest.approx(1.0, abs=0.05)
+    assert 2 <= len(pieces) <= 4 and pieces.volume_ratio == pytest.approx(1.0, abs=0.05)
     assert len(list(tmp_path.glob("*.npz"))) == 2
     cube = np.asarray(trimesh.creation.box((0.02, 0.02, 0.02)).vertices)
     assert union_volume((cube, cube + np.array([0.01, 0, 0]))) == pytest.approx(12e-6, rel=1e-5)
@@ -396,7 +378,7 @@ def test_a_push_ends_once_it_is_decided(moved: Motion, turned: Motion, outcome: 
     assert seconds is None or push.elapsed == pytest.approx(seconds)
 
 
-SHORT_PADS, PLATES = pad_hand(), plate_hand()
+SHORT_PADS, PLATES = helpers.pad_hand(), helpers.plate_hand()
 TABLE = Obstacle.half_space((0, 0, 1), -0.3)
 
 

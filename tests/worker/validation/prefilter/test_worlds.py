@@ -86,11 +86,9 @@ def test_grasps_that_need_more_room_are_validated_again_with_it(standard: Verdic
 def test_what_finds_no_room_or_blows_up_is_said_and_never_clear(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(screening, "DOUBLINGS", 1)
     found = pool(monkeypatch, Stand(needs_rows=1 << 30), 4).validate(grasp_of())
-    assert found.held.all() and found.overflow.all()
-    assert not (found.clearly_held | found.clearly_failed).any()
+    assert found.held.all() and found.overflow.all() and not (found.clearly_held | found.clearly_failed).any()
     found = pool(monkeypatch, Stand(diverges=True), 1).validate(grasp_of())
-    assert Outcome.DIVERGED in found.outcome[0]
-    assert not (found.clearly_held | found.clearly_failed).any()
+    assert Outcome.DIVERGED in found.outcome[0] and not (found.clearly_held | found.clearly_failed).any()
 
 
 def test_the_band_is_clear_of_neither_side() -> None:
@@ -181,8 +179,7 @@ def test_a_first_judge_that_the_cpu_contradicts_is_not_believed(standard: Verdic
     monkeypatch.setattr(screening, "RECHECK_ONE_IN", 2)
     with caplog.at_level(logging.WARNING):
         found = verdicts(ON, "fast")
-    assert found.rechecked >= found.contradicted > 1
-    assert (found.validated_by == ValidatedBy.MUJOCO).all()
+    assert found.rechecked >= found.contradicted > 1 and (found.validated_by == ValidatedBy.MUJOCO).all()
     np.testing.assert_array_equal(found.success, standard.success)
     assert "the CPU validates all" in caplog.text
 
@@ -194,8 +191,7 @@ def test_where_a_gpu_has_no_memory_for_it_the_cpu_judges(monkeypatch, caplog: py
     monkeypatch.setattr(screening, "WorldPool", full)
     with caplog.at_level(logging.WARNING):
         found = verdicts(ON)
-    assert (found.validated_by == ValidatedBy.MUJOCO).all()
-    assert "no memory for the prefilter" in caplog.text
+    assert (found.validated_by == ValidatedBy.MUJOCO).all() and "no memory for the prefilter" in caplog.text
 
 
 def test_grasps_that_overflow_the_first_judge_are_the_cpus(stand_in: Stand, monkeypatch, caplog) -> None:
@@ -222,8 +218,7 @@ def test_a_shard_tells_of_each_grasp_who_validated_it(mode: Any) -> None:
     found = scored(PADS, BOX, every_kind(), request, pieces=lambda obj: WHOLE, run=run)
     columns = found.columns
     assert ("quality/validated_by" in columns) == (mode == "on")
-    assert found.verdict_key == verdicts(run, "fast").terms
-    assert columns.keys() <= SCHEMAS["base"].keys()
+    assert found.verdict_key == verdicts(run, "fast").terms and columns.keys() <= SCHEMAS["base"].keys()
     assert mode == "off" or (columns["quality/validated_by"] == ValidatedBy.MUJOCO_WARP).any()
 
 
