@@ -29,7 +29,7 @@ from graspd.worker.rounds import SMALLEST_PART, parts_of
 from graspd.worker.scenes.kinds import rest_poses, supports_of
 from graspd.worker.simulation.environment import Scenes
 from graspd.worker.together import validated_batches
-from tests.worker.batches import assert_same_batch
+from tests.worker.models import assert_same_batch
 
 REQUEST = JobOptions(fidelity=resolve_fidelity("draft"), rechecks=2, seed=3)
 ASKED = REQUEST.model_copy(update={"rechecks": 0, "grasps": 6, "seed": 0})

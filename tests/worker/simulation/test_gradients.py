@@ -16,7 +16,7 @@ from graspd.service.model.transforms import apply, compose, invert, quat_from_ax
 from graspd.worker.grasps import Posture
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
-from graspd.worker.hands.model import HandModel
+from graspd.worker.hands.model import ConvexPiece, HandModel
 from graspd.worker.hands.surface import piece_distance, sample_surface
 from graspd.worker.scenes.placement import outer_solid
 from graspd.worker.simulation.data import HandState, Schedule
@@ -28,7 +28,59 @@ from graspd.worker.simulation.projection import Projection, ProjectionOptions
 from graspd.worker.simulation.record import OPTIMIZERS, record_evaluation, record_iteration, record_placement
 from graspd.worker.simulation.sampling import object_samples
 from tests.worker.simulation.rigs import ball, rig, still
-from tests.worker.simulation.solids import nearest_edges
+
+_GOLDEN = (np.sqrt(5) - 1) / 2
+
+
+def least_along(f: Callable[[np.ndarray], np.ndarray], edges: np.ndarray) -> np.ndarray:
+    """(E,) least value of a convex function of points (E, 3) on edges (E, 2, 3)."""
+    low, high = np.zeros((len(edges), 1)), np.ones((len(edges), 1))
+    for _ in range(45):
+        a, b = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
+        one, other = (f(edges[:, 0] + at * (edges[:, 1] - edges[:, 0])) for at in (a, b))
+        left = (one < other)[:, None]
+        low, high = np.where(left, low, a), np.where(left, b, high)
+    middle = edges[:, 0] + (low + high) / 2 * (edges[:, 1] - edges[:, 0])
+    return np.minimum(f(middle), np.minimum(f(edges[:, 0]), f(edges[:, 1])))
+
+
+def link_distance(piece: ConvexPiece, points: np.ndarray) -> np.ndarray:
+    """(N,) signed distance of points (N, 3) in the body frame: as `piece_distance`, and outside of boxes and cylinders
+    the true one."""
+    local = apply(invert(piece.pose), points)
+    if piece.kind == "box":
+        beyond = np.abs(local) - np.array(piece.size) / 2
+    elif piece.kind == "cylinder":
+        beyond = np.stack([np.hypot(local[:, 0], local[:, 1]), np.abs(local[:, 2])], -1)
+        beyond -= [piece.size[0], piece.size[1] / 2]
+    else:
+        return piece_distance(piece, points)
+    return np.linalg.norm(np.maximum(beyond, 0.0), axis=1) + np.minimum(beyond.max(axis=1), 0.0)
+
+
+def nearest_edges(hand: HandModel, bodies: np.ndarray, obstacle: Obstacle, far: float) -> np.ndarray:
+    """(P,) distance of the nearest of the obstacle's edges from each piece, or how deep an edge of the piece is in the
+    obstacle; `far` where that is more. `bodies` (L, 7)."""
+    out = np.full(len(hand.pieces), far)
+    features = hand.features
+    for number, piece in enumerate(hand.pieces):
+        pose = bodies[piece.body]
+        middle = piece.vertices.mean(axis=0)
+        reach = np.linalg.norm(piece.vertices - middle, axis=1).max()
+        if obstacle.distance(apply(pose, middle)) > reach + far:
+            continue
+        edges = apply(invert(pose), obstacle.corners)[obstacle.edges]
+        half = np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1) / 2
+        edges = edges[link_distance(piece, edges.mean(axis=1)) - half < far]  # no distance falls faster than one to one
+        if len(edges):
+            out[number] = min(far, least_along(lambda x, p=piece: link_distance(p, x), edges).min())
+        mine = slice(features.first_edge[number], features.first_edge[number + 1])
+        edges = apply(pose, features.edges[mine])
+        pierce = (least_along(obstacle.distance, edges) - features.thickness[mine]).min()
+        if pierce < min(out[number], 0.0):
+            out[number] = pierce
+    return out
+
 
 HANDS = ("allegro", "barrett", "shadow")
 EACH_HAND = pytest.mark.parametrize("name", HANDS)
