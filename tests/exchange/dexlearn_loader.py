@@ -41,9 +41,8 @@ class Data:
     def __init__(self, root: Path, name: str) -> None:
         said = yaml.safe_load((root / "dexlearn" / "config" / "data" / f"{name}.yaml").read_text())
         self.root, self.config = root, said
-        self.grasps, self.objects = (
-            root / said[key].replace("${data_folder}", "assets") for key in ("grasp_path", "object_path")
-        )
+        self.grasps = root / said["grasp_path"].replace("${data_folder}", "assets")
+        self.objects = root / said["object_path"].replace("${data_folder}", "assets")
         self.types = said["grasp_type_lst"]
 
     def split(self, name: str) -> list[str]:

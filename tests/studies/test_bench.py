@@ -155,9 +155,8 @@ def test_convex_objects_fall_as_their_hull_forearms_end_below() -> None:
 def test_pages_recipe_finds_point_of_the_mesh_behind_each_pixel(tmp_path: Path) -> None:
     obj = object_from_path("block")
     poses = drop(obj, count=1, seed=2)["scene/object_pose"]
-    arrays = render(
-        obj, poses, views=1, stereo=False, width=40, height=30, seed=3, samples=2, run=ExecutionContext(threads=1)
-    )
+    small = {"views": 1, "stereo": False, "width": 40, "height": 30, "samples": 2}
+    arrays = render(obj, poses, **small, seed=3, run=ExecutionContext(threads=1))
     (tmp_path / "views.h5").write_bytes(write_shard("views", arrays, {}))
     with h5py.File(tmp_path / "scenes.h5", "w") as file:
         file["scene/object_pose"] = poses

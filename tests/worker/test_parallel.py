@@ -64,9 +64,8 @@ def noted(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int, int]]:
 def test_grasps_of_several_lanes_are_those_of_one(pair, scenes, monkeypatch, in_scenes: bool) -> None:
     wish = REQUEST.model_copy(update={"budget": 1.5, "rechecks": 0}) if in_scenes else REQUEST
     calls, around = noted(monkeypatch), scenes if in_scenes else None
-    two, one = (
-        validated_grasps(*pair, wish, count=COUNT, scenes=around, run=ExecutionContext(threads=n)) for n in (2, 1)
-    )
+    runs = (ExecutionContext(threads=2), ExecutionContext(threads=1))
+    two, one = (validated_grasps(*pair, wish, count=COUNT, scenes=around, run=run) for run in runs)
     assert {(0, 0, SMALLEST_PART), (0, SMALLEST_PART, SMALLEST_PART)} <= set(calls)
     assert_same_batch(two, one)
 
@@ -243,10 +242,8 @@ def own_scenes(pair) -> list[Scenes]:
 def test_waves_of_batches_in_scenes_are_the_same(pair, own_scenes: list[Scenes], apart: bool) -> None:
     wish = ASKED.model_copy(update={"budget": 3.0, "rechecks": 1})
     where, sizes = own_scenes if apart else own_scenes[0], [2, 2, 3]
-    one_by_one, waves = (
-        validated_batches(*pair, wish, sizes=sizes, scenes=where, join=join, run=ExecutionContext(threads=2))
-        for join in (1, 2)
-    )
+    given = {"sizes": sizes, "scenes": where, "run": ExecutionContext(threads=2)}
+    one_by_one, waves = (validated_batches(*pair, wish, **given, join=join) for join in (1, 2))
     assert_same(waves, one_by_one)
     assert [one.shares for one in waves] == [one.shares for one in one_by_one]
     assert set(np.concatenate([one.grasps.scene for one in waves])) <= {0, 1}, "numbered as the batch has them"

@@ -37,9 +37,8 @@ from graspd.worker.simulation.environment import Obstacle, PlacedGrasps
 from graspd.worker.simulation.obstacles import DeviceObstacles
 from tests.networks import random_network
 
-QUICK = resolve_fidelity("draft").model_copy(
-    update={"coarse_iterations": 20, "fine_iterations": 6, "polish_iterations": 2}
-)
+FEW = {"coarse_iterations": 20, "fine_iterations": 6, "polish_iterations": 2}
+QUICK = resolve_fidelity("draft").model_copy(update=FEW)
 TABLE = SceneSpec(kind="table")
 
 
@@ -72,10 +71,8 @@ def keep(network: ProposalNetwork) -> str:
 
 def made(hand: HandModel, obj: ObjectModel, network: ProposalNetwork, count: int, **given: Any) -> GraspSet:
     wanted = PlanRequest(count, QUICK, given.pop("seed", 1), placed=given.pop("placed", on_table(obj, count)))
-    options = {"network": keep(network), "starts": 2}
-    return synthesize(
-        hand, obj, wanted, ExecutionContext(threads=given.pop("threads", 1)), method="learned", options=options
-    )
+    run, options = ExecutionContext(threads=given.pop("threads", 1)), {"network": keep(network), "starts": 2}
+    return synthesize(hand, obj, wanted, run, method="learned", options=options)
 
 
 def assert_same(one: GraspSet, other: GraspSet) -> None:
@@ -98,9 +95,8 @@ def test_joined_batches_are_those_of_separate_launches(hand, block, network) -> 
     wanted = [PlanRequest(2, QUICK, 1, batch, placed=on_table(block, 2)) for batch in (0, 1)]
     joins = method("learned").joined
     assert joins is not None
-    found = joins(method("learned").options(**options))(
-        hand, block, [BatchRequest(one, ExecutionContext(threads=1)) for one in wanted]
-    )
+    asked = [BatchRequest(one, ExecutionContext(threads=1)) for one in wanted]
+    found = joins(method("learned").options(**options))(hand, block, asked)
     for one, alone in zip(found, wanted, strict=True):
         assert isinstance(one, GraspSet)
         assert_same(one, synthesize(hand, block, alone, ExecutionContext(threads=1), method="learned", options=options))
@@ -109,9 +105,8 @@ def test_joined_batches_are_those_of_separate_launches(hand, block, network) -> 
 def proposing(network: ProposalNetwork, found: Proposals, anchor: np.ndarray) -> ProposalNetwork:
     """A network that proposes one grasp, whatever it sees; its noise is a tenth of a millimetre or milliradian."""
     rows = encode(found, anchor)[0].astype(np.float32)
-    weights = {
-        name: np.zeros_like(array) if name.startswith("flow.out") else array for name, array in network.weights.items()
-    }
+    zero = {name: np.zeros_like(w) for name, w in network.weights.items() if name.startswith("flow.out")}
+    weights = network.weights | zero
     return replace(network, weights=weights, mean=rows, std=np.full_like(rows, 1e-4))
 
 
@@ -182,9 +177,8 @@ def test_what_it_cannot_do_is_said_in_a_line(hand, block, network, tmp_path: Pat
     board = Obstacle.box([0, 0, -0.01, 1, 0, 0, 0], [1, 1, 0.02])
     refused("has none, choose fast_graspd", placed=replace(on_table(block, 1), supports=(board,)))
     with pytest.raises(InputError, match="not known here"):
-        planner("learned", {"network": "e" * 32}, in_scenes=True)(
-            hand, block, PlanRequest(1, QUICK), ExecutionContext()
-        )
+        plan = planner("learned", {"network": "e" * 32}, in_scenes=True)
+        plan(hand, block, PlanRequest(1, QUICK), ExecutionContext())
     # A worker that is told a path reads no file.
     save(network, tmp_path / "net.npz")
     with pytest.raises(InputError, match="option of learned: network"):

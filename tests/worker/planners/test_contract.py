@@ -64,9 +64,7 @@ def test_grasps_respect_joint_limits_and_unit_quaternions(name: str) -> None:
 @EACH
 def test_cancelling_stops_at_the_first_look(name: str) -> None:
     calls: list[float] = []
-    run = ExecutionContext(
-        threads=1, progress=lambda done, total, message: calls.append(done), cancelled=lambda: bool(calls)
-    )
+    run = ExecutionContext("cpu", 1, progress=lambda *what: calls.append(what[0]), cancelled=lambda: bool(calls))
     with pytest.raises(TaskCancelled):
         grasps(name, 2, run=run)
     assert len(calls) == 1

@@ -61,10 +61,8 @@ def test_a_surface_is_tested_where_the_fidelity_says() -> None:
 def test_recipes_without_pull_or_fine_phase_and_descent_run() -> None:
     pulls = [schedule.loss_options(FIDELITIES[name]).pull for name in ("standard", "paper", "control")]
     assert pulls == [schedule.PULL, 0, 0] and schedule.PULL > 0
-    fidelity = QUICK.model_copy(
-        update={"optimizer": "gd", "contact_solver": "gauss_seidel", "leak": "two_sided", "polish_iterations": 0}
-    )
-    found = grasps(3, fidelity)
+    plain = {"optimizer": "gd", "contact_solver": "gauss_seidel", "leak": "two_sided", "polish_iterations": 0}
+    found = grasps(3, QUICK.model_copy(update=plain))
     assert np.all(np.isfinite(found.grasp.hand_pose)) and np.all(np.isfinite(found.grasp.joint_positions))
     found = grasps(3, QUICK.model_copy(update={"fine_iterations": 0}))
     assert np.all(found.stability_loss > 0)

@@ -24,11 +24,7 @@ from graspd.worker import generation
 from graspd.worker.files import synthesis
 from graspd.worker.files.provenance import object_of_shard
 from tests.worker.commands_run import graspd as graspd_command
-
-
-def run(*words: str | Path) -> Any:
-    return CliRunner().invoke(build(), [str(word) for word in words])
-
+from tests.worker.commands_run import refused
 
 DRAFT = "--fidelity draft --device cpu"
 
@@ -90,9 +86,8 @@ def test_grasps_that_nobody_validated_are_sound_and_never_valid(unvalidated: tup
 
 def test_evaluate_gives_a_verdict_of_each_grasp_that_agrees(validated: tuple[Path, Any]) -> None:
     told = graspd_command("evaluate", validated[0])
-    assert [(one["file"], one["row"], one["held"]) for one in told["verdicts"]] == [
-        (str(validated[0]), row, True) for row in range(3)
-    ]
+    expected = [(str(validated[0]), row, True) for row in range(3)]
+    assert [(one["file"], one["row"], one["held"]) for one in told["verdicts"]] == expected
     assert "verdicts" not in told["files"][0]
 
 
@@ -103,21 +98,17 @@ def test_readers_take_grasps_that_nobody_validated_only_when_told(validated, unv
     assert {both.by_id(sample["shard_id"]).path for sample in rows[1]} == {unvalidated[0]}
 
 
-@pytest.mark.parametrize("command", ["export", "pictures"])
+@pytest.mark.parametrize("command", ["export --format dexgraspbench", "pictures -n 1 --size 32 --device cpu"])
 def test_export_and_pictures_take_grasps_that_nobody_validated_only_when_told(unvalidated, tmp_path, command) -> None:
-    if command == "export":
-        words: list[str | Path] = ["export", unvalidated[0], "--format", "dexgraspbench", "-o", tmp_path / "out"]
-    else:
-        words = ["pictures", unvalidated[0], "-n", "1", "--size", "32", "--device", "cpu", "-o", tmp_path / "out.png"]
-    refused = run(*words)
-    assert refused.exit_code == 2 and "select them with --unvalidated" in refused.output
-    assert not list(tmp_path.iterdir()) and run(*words, "--unvalidated").exit_code == 0
+    assert "select them with --unvalidated" in refused(command, unvalidated[0], "-o", tmp_path / "out.png")
+    assert not list(tmp_path.iterdir())
+    graspd_command(f"{command} --unvalidated", unvalidated[0], "-o", tmp_path / "out.png")
 
 
-@pytest.mark.parametrize("words", [("--want", "good"), ("--validation", "validate")])
-def test_a_word_that_is_none_is_refused_before_the_files_are_read(words: tuple[str, str], tmp_path: Path) -> None:
-    done = run("synth", "--hand", "absent.urdf", "--object", "block", "-o", tmp_path / "g.h5", *words)
-    assert done.exit_code == 2 and f"{words[0]}: must be one of" in done.output
+@pytest.mark.parametrize("words", ["--want good", "--validation validate"])
+def test_a_word_that_is_none_is_refused_before_the_files_are_read(words: str, tmp_path: Path) -> None:
+    said = refused(f"synth --hand absent.urdf --object block {words} -o", tmp_path / "g.h5")
+    assert f"{words.split()[0]}: must be one of" in said
 
 
 def elsewhere(file: Path, folder: Path) -> Shard:
@@ -189,7 +180,7 @@ def test_who_stops_it_keeps_what_was_validated(folder: Path, monkeypatch, asked:
     before = signal.getsignal(asked)
     monkeypatch.setattr(synthesis, "synthesized", stopped)
     words = f"synth --hand barrett --object block -n 64 --budget 1 --validation none --json {DRAFT} -o"
-    done = run(*words.split(), out)
+    done = CliRunner().invoke(build(), [*words.split(), str(out)])
     shard = read_shard(out, kind="base")
     kept = len(shard["quality/valid"])
     assert done.exit_code == 128 + asked and 0 < kept <= 32
