@@ -48,7 +48,7 @@ def _parameter(row: Row) -> inspect.Parameter:
 
 
 def parsed_options(model: type[ModelT], values: dict[str, Any]) -> ModelT:
-    """Validate the given options; InputError names the first invalid option as typed."""
+    """Validate the given options; InputError names the first invalid option as on the command line."""
     options = {row.name: row.flags[0].partition("/")[0] for place in EVERYWHERE for row in rows(model, place)}
     names = {name: f"--{name.replace('_', '-')}" for name in model.model_fields}
     # The name of a dataset is an argument.
@@ -56,7 +56,7 @@ def parsed_options(model: type[ModelT], values: dict[str, Any]) -> ModelT:
 
 
 def pairs(texts: Iterable[str]) -> dict[str, str | int | float]:
-    """Parse `name=value` of each `--option`, numbers as numbers, as in HTTP. InputError for another form."""
+    """Parse `name=value` of each `--option`; values that are numbers become numbers, as in HTTP."""
     split = [text.partition("=") for text in texts]
     for name, equals, value in split:
         if not equals:

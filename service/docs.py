@@ -1,6 +1,6 @@
-"""Generated files: tables of the documentation, type stubs of keywords.
+"""Generated tables of the documentation, and type stubs of keywords.
 
-Pages contain tables between `<!-- NAME -->` and `<!-- /NAME -->`; `python -m graspd.service.docs` rewrites all.
+`python -m graspd.service.docs` rewrites all tables between `<!-- NAME -->` and `<!-- /NAME -->`.
 """
 
 from __future__ import annotations

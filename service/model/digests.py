@@ -13,7 +13,7 @@ from graspd.service.model.renamed import original
 from graspd.service.model.states import AssetKind, Stage
 from graspd.service.model.version import STAGE_REVISIONS
 
-#: Increment when payloads change but grasps do not.
+#: Increase when payloads change but grasps do not.
 _PAYLOAD_REVISION: Final = 2
 
 
@@ -29,7 +29,7 @@ def digest_json(value: object) -> str:
 
 
 def digest_files(kind: AssetKind, files: Mapping[str, bytes]) -> str:
-    if hasattr(files, "digest"):  # an archive on disk (`service.store.assets.ZipFiles`)
+    if hasattr(files, "digest"):  # Archive on disk (`service.store.assets.ZipFiles`).
         digests = {name: files.digest(name) for name in files}
     else:
         digests = {name: digest_bytes(data) for name, data in files.items()}
@@ -37,7 +37,7 @@ def digest_files(kind: AssetKind, files: Mapping[str, bytes]) -> str:
 
 
 def digest_variant(digest: str, options: Mapping[str, object] | None) -> str:
-    """Return the digest of a hand or object that is read with further options; without options, `digest`."""
+    """Return the digest of a hand or object with these read options; without options, `digest`."""
     return digest_json({"files": digest, "options": dict(options)}) if options else digest
 
 
@@ -58,7 +58,7 @@ def shard_id(
         "revision": revision,
         "hand": hand_digest,
         "object": object_digest,
-        "names": [request.hand, request.object],  # written into the shard
+        "names": [request.hand, request.object],
         "batch": batch,
         "count": count,
         "seed": request.seed,

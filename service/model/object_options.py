@@ -18,8 +18,6 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
 class MeshOptions(Model):
-    """Options for reading a mesh file."""
-
     units: Annotated[Literal["m", "mm", "cm", "in"], _SIZE] = Field("m", description="unit of the mesh")
     scale_to: Annotated[Positive | None, _SIZE] = Field(None, description="longest extent after scaling [m]")
     keep_largest: Annotated[bool, _READ] = Field(False, description="keep only the largest of several components")

@@ -1,4 +1,4 @@
-"""Webhooks: notifications to a user's URL when a job or dataset ends, and their signatures."""
+"""Webhooks: signed notifications to a URL when a job or dataset ends."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from graspd.service.model.records import Record
 
 End = Literal["succeeded", "failed", "cancelled"]
 MAX_URL: Final = 500
-#: Most webhooks of one project, and most waiting deliveries of one webhook.
 MOST_HOOKS: Final = 20
 MOST_WAITING: Final = 1000
 SIGNATURE: Final = "X-Graspd-Signature"

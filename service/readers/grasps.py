@@ -38,8 +38,7 @@ _KEPT: Final = 256
 class Grasps(Sequence[dict[str, Any]]):
     """Grasps of base shards. `grasps[i]` is a dictionary of column rows and `hand`, `object`, `shard_id`, `row`.
 
-    Names, units and frames of columns are those of docs/reference/dataset.md. Swept metrics have one value per contact
-    threshold of the shard.
+    Columns are described in docs/reference/dataset.md; swept metrics have one value per contact threshold of the shard.
     """
 
     def __init__(
@@ -60,8 +59,7 @@ class Grasps(Sequence[dict[str, Any]]):
             unvalidated: select instead only feasible grasps without validation.
             where: further selection: a function of the columns that returns a mask.
 
-        Raises:
-            InputError: unknown column, or a mask of wrong length.
+        Raises InputError for an unknown column, or a mask of wrong length.
         """
         check_known("base", columns)
         self.shards, self.columns = shards, tuple(columns)

@@ -1,7 +1,7 @@
 """Files of proposal networks: `.npz` of schema `graspd/proposals@1`, arrays and a JSON text, no code.
 
-The architecture is fixed, so every array is checked against the shape implied by the joints.
-`baselines.learned.network` evaluates the network.
+The architecture is fixed, so the joints imply the shape of every array. `baselines.learned.network` evaluates the
+network.
 """
 
 from __future__ import annotations
@@ -34,14 +34,12 @@ ENCODER: Final = (7, 64, 128, 256)
 FEATURE: Final = 256
 #: Size of the condition: feature of the cloud, its height above the table, and the label.
 CONDITION: Final = FEATURE + 2
-#: Number of sines and cosines of the time.
 TIME_FEATURES: Final = 8
 HIDDEN: Final = 512
 BLOCKS: Final = 2
 #: Numbers of a grasp besides its joints: position, two columns of the rotation, approach direction.
 POSE: Final = 12
 _META: Final = "meta"
-#: Fields of a network in its JSON text.
 _SHARED: Final = ("hand", "hand_digest", "joint_names", "points", "steps", "about")
 #: Exceptions for bytes that are no archive of arrays.
 _BROKEN: Final = (OSError, ValueError, EOFError, KeyError, MemoryError, RuntimeError, zipfile.BadZipFile, zlib.error)

@@ -11,7 +11,7 @@ from graspd.service.model.states import Stage
 
 
 class WorkersPlan(View):
-    """The same dataset on a number of workers."""
+    """Time and network traffic of the dataset with a number of workers."""
 
     workers: int
     seconds: float = Field(description="expected time until the dataset is done [s]")
@@ -34,8 +34,6 @@ class RateUsed(View):
 
 
 class Estimate(View):
-    """Estimated cost of a dataset. Seconds are of one worker."""
-
     cells: int
     asked: int = Field(description="grasps requested in all cells")
     candidates: int = Field(description="candidates to plan for these")

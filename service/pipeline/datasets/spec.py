@@ -16,11 +16,11 @@ from graspd.service.model.records import Choice, DatasetRecord, Member, request_
 from graspd.service.model.renamed import original
 from graspd.service.model.version import STAGE_REVISIONS
 
-#: Larger matrices must be split by the user: a record of this many cells has 4 MB.
+#: Most cells of a dataset: a record of this many cells has 4 MB.
 MAX_CELLS: Final = 100_000
 
 
-#: Names without repetitions: these are the same cell.
+#: Repeated names would be one cell.
 Names = Annotated[tuple[Name, ...], AfterValidator(lambda given: tuple(dict.fromkeys(given)))]
 
 
@@ -45,8 +45,6 @@ class Matrix(JobOptions):
 
 
 class DatasetRequest(Matrix):
-    """A matrix with a name."""
-
     name: Name = Field(description="name of the dataset; `estimate` is taken by an address of the API")
 
     @field_validator("name")
@@ -71,7 +69,6 @@ def describe(
     `choose` replaces `auto` by a fidelity, or raises InputError if none meets the target on one of the cells.
     """
     cells = [(hand, obj, *choose(request_of(options, hand.name, obj.name))) for hand in hands for obj in objects]
-    # A chosen fidelity has a name.
     fidelities = tuple(str(request.fidelity) for _, _, request, _ in cells) if options.fidelity == AUTO else ()
     found = [choice for *_, choice in cells if choice is not None]
     places = {choice: place for place, choice in enumerate(dict.fromkeys(found))}

@@ -37,7 +37,6 @@ from graspd.service.run.embedded import find_server
 from graspd.service.settings import Settings
 from graspd.service.store.store import Store, open_store
 
-#: Oldest tested version.
 _OLDEST: Final = (6, 2)
 
 _SLOW_REDIS_S: Final = 0.02
@@ -103,7 +102,7 @@ def _check_redis(settings: Settings, client: Redis, info: Mapping[str, Any]) -> 
 
 
 def _write(client: Redis) -> float:
-    """Return the duration of a write and a read [s]. Raises RedisError if writes are refused."""
+    """Return the duration of a write and a read [s]; RedisError if writes are refused."""
     key, value = f"graspd:doctor:{secrets.token_hex(8)}", secrets.token_bytes(8)
     start = time.perf_counter()
     client.set(key, value, ex=60)
@@ -170,7 +169,6 @@ _SETTLES_S: Final = 3.0
 
 
 def index(settings: Settings) -> Finding:
-    """Check connection, integrity and schema of the index; changes nothing."""
     try:
         found = look(settings.resolved_index_url)
     except IndexDamaged as error:
@@ -228,7 +226,6 @@ def _openable(settings: Settings) -> str:
 
 
 def index_identity(settings: Settings) -> Finding:
-    """Check whether store, index and Redis belong to one service; changes nothing."""
     folder = local_store(settings)
     if folder is not None and not folder.exists():
         return skipped("there is no store yet")
@@ -253,7 +250,7 @@ def index_identity(settings: Settings) -> Finding:
 
 
 def index_is_store(settings: Settings, *, full: bool = False, settles_s: float = _SETTLES_S) -> Finding:
-    """Compare the rows with the store. Differences in only one of two comparisons are still being indexed."""
+    """Compare the rows with the store. A difference in only one of two comparisons is an event in progress."""
     if why := _openable(settings):
         return skipped(why)
     store = open_store(settings.resolved_store_url)
@@ -310,7 +307,6 @@ def store_damage(settings: Settings) -> Finding:
 
 _FOLDER: Final = "health"
 
-#: Limit for a dozen requests.
 _SLOW_STORE_S: Final = 5.0
 #: Number of concurrent writers of one name; only one may succeed.
 _RIVALS: Final = 4
@@ -334,7 +330,7 @@ def store(settings: Settings) -> Finding:
 
 
 def check_store(opened: Store) -> Finding:
-    """Return the finding on an open store. Raises GraspdError if an operation fails."""
+    """Return the finding on an open store; GraspdError if an operation fails."""
     key = f"{_FOLDER}/doctor-{secrets.token_hex(8)}"
     start = time.perf_counter()
     try:

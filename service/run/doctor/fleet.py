@@ -1,7 +1,7 @@
 """Checks of the fleet: controller, capable workers, the API, and clocks.
 
-Leases use each process's own monotonic clock, so work continues with wrong clocks. They affect displayed and sorted
-times, expiry of keys, the grace time of shards, and S3, which refuses requests off by fifteen minutes.
+Leases use each process's own monotonic clock, so work continues with wrong clocks. Wrong clocks affect times shown and
+sorted, expiry of keys, the grace time of shards, and S3, which refuses requests off by fifteen minutes.
 """
 
 from __future__ import annotations
@@ -47,7 +47,6 @@ def _asked(settings: Settings, look: Callable[[RqQueue], Finding]) -> Finding:
 
 
 def controller(settings: Settings) -> Finding:
-    """Check for a recent heartbeat of a controller."""
     dead = bad(
         "no heartbeat from a controller: finished tasks are not indexed, and nothing is queued", "graspd controller"
     )
@@ -89,7 +88,6 @@ def _check_workers(beats: list[WorkerBeat], waiting: Counter[Stage]) -> Finding:
 
 
 def port(settings: Settings) -> Finding:
-    """Check whether this service's API answers and is ready."""
     url = recorded_address(settings.data_dir)
     if url is None and "api_url" in settings.model_fields_set:
         url = settings.api_url
@@ -138,7 +136,6 @@ _FIX: Final = "timedatectl set-ntp true, or chronyd, on the machine whose clock 
 
 
 def clocks(settings: Settings) -> Finding:
-    """Compare the clocks of the other machines with this one."""
     offsets = dict(_offsets(settings))
     if not offsets:
         return skipped("only this machine's clock can be read")
