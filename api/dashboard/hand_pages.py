@@ -21,7 +21,6 @@ from graspd.service.store.asset_summary import hand_line, limit_line, self_test_
 from graspd.service.store.descriptions import MAX_ENTRIES, HandFacts
 
 PAGE_SIZE: Final = 50
-#: Polling interval [s]; a check takes seconds.
 _CHECK_S: Final = 2
 _MAX_FIELDS: Final = 16 + 3 * MAX_ENTRIES
 

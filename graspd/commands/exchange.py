@@ -25,7 +25,6 @@ app = CommandGroup(no_args_is_help=True)
 
 #: Formats of robots and their simulators; the first has two names.
 ROBOTS: Final = ("moveit", "urdf+yaml", "mujoco", "usd", "glb", "isaac", "csv")
-#: Training formats: they take a folder of shards.
 TRAINING: Final = ("dexlearn", "dexgraspnet2", "graspgen", "huggingface", "lerobot")
 EXPORTS: Final = ("images", "replicator", "webdataset", "dexgraspbench", *TRAINING, *ROBOTS)
 IMPORTS: Final = (

@@ -56,17 +56,14 @@ class GraspSheet:
     kind: Kind
     run: ExecutionContext
     edge: int | None = None
-    """Edge of one picture [px]; None: as in `LOOKS`."""
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height of one picture [px]."""
         edge = self.edge or LOOKS[self.kind][0]
         return edge, edge
 
     @property
     def scene(self) -> str:
-        """Kind of scene that the grasps were planned in; empty: none."""
         spec = _scene_of(self.shard)
         return "" if spec is None else spec.kind
 
@@ -107,7 +104,7 @@ class GraspSheet:
 
 
 def around_of(shard: Shard, rows: NDArray[np.intp]) -> PictureScenes:
-    """Return the surroundings of grasps of a base shard: the scenes they were planned in, or none."""
+    """Return the surroundings of grasps of a base shard: the scenes in which they were planned, or none."""
     if (spec := _scene_of(shard)) is None:
         return PictureScenes()
     poses = np.asarray(shard["scene/object_pose"], float)
@@ -147,7 +144,6 @@ class GraspAnimation:
     rows: NDArray[np.intp]
     run: ExecutionContext
     width: int | None = None
-    """Width [px]; None: `WIDTH`."""
 
     def file(self, suffix: str) -> bytes:
         """Return the film as GIF, WebP or animated PNG."""
