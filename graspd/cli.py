@@ -92,7 +92,7 @@ class LazyGroup(TyperGroup):
                 typer.echo(f"graspd: {said}", err=True)
         except typer.Abort:
             code = 1
-            typer.echo("graspd: stopped at a question", err=True)
+            typer.echo("graspd: stopped at a prompt", err=True)
         sys.exit(code)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:

@@ -88,9 +88,7 @@ def print_results(console: Console, job: JobDetail, paths: dict[str, list[str] |
 
 
 def write_pages(out: Path, job: JobDetail, shards: list[Path]) -> dict[str, list[str] | str]:
-    """Write the best grasps, views of the first batch, and an index.html; return the paths of shards, pictures and
-    page.
-    """
+    """Write a sheet of the best grasps, views of the first batch, and an index.html; return all paths."""
     from graspd.worker.rendering.sheets import views_page
 
     pages: dict[str, bytes] = {}

@@ -1,7 +1,4 @@
-"""Generated tables of the documentation, and type stubs of keywords.
-
-`python -m graspd.service.docs` rewrites all tables between `<!-- NAME -->` and `<!-- /NAME -->`.
-"""
+"""`python -m graspd.service.docs` rewrites the tables of the documentation and the type stubs of keywords."""
 
 from __future__ import annotations
 

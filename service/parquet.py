@@ -69,4 +69,4 @@ def read(file: Path, wanted: Iterable[str]) -> dict[str, list[Any]]:
                 )
             return dict(found.read(columns=names).to_pydict())
     except (OSError, pa.ArrowException, MemoryError) as error:
-        raise InputError(f"{file} is no Parquet file that can be read: {error}") from None
+        raise InputError(f"{file} is not a readable Parquet file: {error}") from None

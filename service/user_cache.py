@@ -90,7 +90,7 @@ def _root(xdg: str, home: str, temporary: str) -> Path:
     except (OSError, RuntimeError) as error:
         trouble = str(error)
     root = _private(Path(temporary))
-    log.warning("no cache in the home folder (%s); what can be computed again is kept in %s", trouble, root)
+    log.warning("no cache in the home folder (%s); reproducible files are in %s", trouble, root)
     return root
 
 

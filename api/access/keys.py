@@ -31,10 +31,7 @@ SESSION_S: Final = 12 * 3600
 
 
 class Scope(StrEnum):
-    """Permission of a key; each scope includes the one before it.
-
-    `submit` covers resources submitted with the same key, `admin` those of all keys.
-    """
+    """Permission of a key, each including the one before: `submit` covers own resources, `admin` those of all keys."""
 
     READ = "read"
     SUBMIT = "submit"
@@ -131,7 +128,7 @@ class KeyFile:
             if any(key.name == name and key.is_live for key in document.keys):
                 raise ConflictError(f"there is a key named {name!r}; revoke or rotate it, or take another name")
             if "@" in name:
-                raise InputError(f"{name!r} is no key name: names with an @ belong to people whom a proxy signs in")
+                raise InputError(f"{name!r} is no key name: names with an @ are reserved for users of a proxy")
             token = PREFIX + secrets.token_urlsafe(32)
             try:
                 key = Key(

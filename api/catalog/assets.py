@@ -98,10 +98,7 @@ class Assets:
         return facts_of(self.model(asset))
 
     def correct(self, name: str, corrections: HandCorrections, new_name: str = "") -> AssetView:
-        """Create a hand from the same files with corrected facts in `asset.json`, and queue its check.
-
-        Without a new name the hand gets its old name with the next free number.
-        """
+        """Create a hand from the same files with corrected facts, and queue its check; default name: with a number."""
         hand = self.one(AssetKind.HAND, name)
         facts = self.hand_facts(hand)
         archive = self._services.store.get(names.asset_files(AssetKind.HAND, hand.digest))

@@ -111,10 +111,7 @@ class Grasps:
             raise NotFoundError(f"{key} holds no grasps that can be shown: {error}") from None
 
     def statistics(self, job: JobView | models.JobDetail) -> tuple[list[models.Histogram], models.Diversity | None]:
-        """Return distributions and diversity of a job's valid grasps, or of all stored ones if not validated.
-
-        The result is cached while the number of grasps is unchanged.
-        """
+        """Return distributions and diversity of a job's valid grasps, or without validation of all stored ones."""
         validated = job.request.validation != "none"
         count = job.valid if validated else job.grasps
         return self._statistics(job.id, validated, count) if count else ([], None)

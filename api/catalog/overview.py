@@ -50,10 +50,7 @@ FINGERPRINT_S: Final = 1.0
 
 
 class Overview:
-    """Read-only data of the home page, probes and Prometheus.
-
-    Workers, queue and health are visible to all; data of jobs is limited to the caller's scope.
-    """
+    """Data of the home page, probes and Prometheus; data of jobs is limited to the caller's scope."""
 
     def __init__(self, services: Services, jobs: Jobs) -> None:
         self._services = services

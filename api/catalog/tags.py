@@ -111,10 +111,7 @@ class GraspExports:
         self._tags = tags
 
     def made(self, places: Sequence[Grasp], format: Format, said: Mapping[str, Any]) -> tuple[int, Iterator[bytes]]:
-        """Write a file of these grasps, which must be visible to the caller; return its size and its bytes.
-
-        `said` describes the selection.
-        """
+        """Write a file of these grasps, all visible to the caller, described by `said`; return size and bytes."""
         file = TemporaryFile()  # noqa: SIM115 (it is closed once it is sent)
         try:
             {"csv": self._csv, "json": self._json, "zip": self._zip}[format](file, places, said)

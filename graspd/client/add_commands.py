@@ -131,10 +131,7 @@ def _add(
 
 @contextmanager
 def upload_of(path: Path) -> Iterator[tuple[Path, str]]:
-    """Yield the file to send, and the name of the hand's description in it (empty: chosen by the service).
-
-    The file is the path itself, or a temporary ZIP of the files it needs.
-    """
+    """Yield the file to send (the path, or a temporary ZIP), and the hand's description in it (empty: not chosen)."""
     alone = not path.is_dir() and (path.suffix.lower() not in SUFFIXES or not path.is_file())
     files, main = ({}, "") if alone else files_of_hand(path)
     if len(files) <= 1 and not path.is_dir():

@@ -202,7 +202,8 @@ def _table(rows: list[dict[str, Any]], whole: dict[str, Any]) -> Table:
     friction = " ".join(sorted({f"{row['mu']:g}" for row in rows}))
     table = Table(
         title=f"{stated}; ε at μ = {friction}, contact at 5 mm; medians",
-        caption="GSR share held; SGS held per s; PD, SPD mm; CA cm²; IV cm³; SD cm; D share of the first component",
+        caption="GSR: held share; SGS: held grasps per s; PD, SPD: penetration, self-penetration [mm]; CA: contact "
+        "area [cm²]; IV: intersection volume [cm³]; SD: displacement [cm]; D: variance share of the first component",
         title_justify="left",
         caption_justify="left",
         box=SIMPLE_HEAD,

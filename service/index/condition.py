@@ -43,10 +43,7 @@ class IndexCondition:
 
 
 def look(url: str | URL) -> IndexCondition | None:
-    """Return the condition of an index; None if the file of an SQLite index does not exist yet.
-
-    Raises InputError and IndexUnavailable as `Database`, and IndexDamaged for a file with invalid content.
-    """
+    """Return the condition of an index; None without a file. Errors as in `Database`, and IndexDamaged."""
     try:
         parsed = make_url(url)
         if parsed.get_backend_name() == "sqlite":

@@ -207,9 +207,7 @@ def rows_among(
 
 
 def _file_of(url: str | URL) -> SqliteFile | None:
-    """Return the file of an SQLite index; None for other databases and for one in memory; InputError for an invalid
-    URL.
-    """
+    """Return the file of an SQLite index; None for another database or one in memory; InputError for an invalid URL."""
     try:
         parsed = make_url(url)
         is_file = parsed.get_backend_name() == "sqlite" and parsed.database and parsed.database != ":memory:"
@@ -367,10 +365,7 @@ class SqliteFile:
         self.path = path
 
     def identity(self) -> Identity:
-        """Return device and inode of the file that has the name now; None if there is none.
-
-        A process with a removed file open would use data that no other process sees.
-        """
+        """Return device and inode of the named file, None if absent: another process may replace an open file."""
         try:
             facts = self.path.stat()
         except FileNotFoundError:
@@ -411,10 +406,7 @@ Row = Mapping[str, Any]
 
 
 def upsert(connection: Connection, table: Table, rows: Sequence[Row], *, keep: Sequence[str] = ()) -> None:
-    """Insert rows with equal columns; for existing primary keys update all columns except `keep`.
-
-    Of two rows with one key the last counts.
-    """
+    """Insert rows with equal columns; of two rows with one key the last counts. `keep` are columns without update."""
     if not rows:
         return
     keys = [column.name for column in table.primary_key]

@@ -77,7 +77,7 @@ class JobView(Validated):
     recheck_held: int = Field(0, description="rechecked grasps that held")
     outcomes: dict[str, int] = Field({}, description="rejected candidates by outcome")
 
-    @computed_field(description="note on the numbers; null: none")  # type: ignore[prop-decorator]
+    @computed_field(description="why fewer grasps than requested were found; null: not applicable")  # type: ignore[prop-decorator]
     @property
     def note(self) -> str | None:
         request = self.request

@@ -59,7 +59,7 @@ _REFEREES_IN_WORDS: Final = {
 _FACES_IN_WORDS: Final = {"drawn": "as dropped", "all": "every stable face"}
 _WANTS_IN_WORDS: Final = {"valid": "valid grasps", "candidates": "all candidates"}
 _SCENES_IN_WORDS: Final = {"free": "free object", "table": "table", "bin": "bin", "shelf": "shelf"}
-SHAKE_NEEDS_A_SCENE: Final = "shake moves an object lifted out of a scene: choose a scene, such as table"
+SHAKE_NEEDS_A_SCENE: Final = "shake needs a lift out of a scene: choose a scene, such as table"
 
 
 def _sparse(default: Any, **facts: Any) -> Any:
@@ -289,7 +289,7 @@ class JobOptions(Model):
         if self.target and self.fidelity != AUTO:
             raise ValueError("a target requires fidelity auto")
         if self.mass is not None and self.density is not None:
-            raise ValueError("mass and density both: give one of them")
+            raise ValueError("mass and density exclude each other: give one")
         if self.validation == "dexgraspbench" and self.matter:
             raise ValueError(
                 f"validation dexgraspbench gives all objects {MASS_KG:g} kg and friction "

@@ -44,5 +44,5 @@ class ObjectOptions(MeshOptions):
     @model_validator(mode="after")
     def _one_of_mass_and_density(self) -> Self:
         if self.mass is not None and self.density is not None:
-            raise ValueError("mass and density both: give one of them")
+            raise ValueError("mass and density exclude each other: give one")
         return self

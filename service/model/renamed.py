@@ -1,7 +1,4 @@
-"""Names of graspd 0.2 in stores, shards and queues, with their present names.
-
-Readers accept old names everywhere; only tasks for workers of 0.2 are written with them.
-"""
+"""Names of graspd 0.2, which readers accept everywhere; only tasks for workers of 0.2 are written with them."""
 
 from __future__ import annotations
 

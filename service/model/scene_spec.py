@@ -123,7 +123,7 @@ class SceneSpec(Model):
         if self.kind == "free":
             raise ValueError("neighbours need a scene: choose table, bin, shelf or a scene file, not free")
         if len(placed) > 1:
-            raise ValueError("give all neighbours a pose, or none: those without are dropped together")
+            raise ValueError("give all neighbours a pose, or none: neighbours without a pose are dropped together")
         if placed == {True} and self.kind != "file":
             raise ValueError("neighbours with poses need a scene file")
         if placed == {False} and self.target is not None:

@@ -45,7 +45,7 @@ def check_url(url: str) -> str:
     if parts.scheme not in ("http", "https") or not host or parts.username is not None or len(url) > MAX_URL:
         raise InputError("the address of a webhook is https://host/path, without a user, of at most 500 characters")
     if not url.isascii() or any(ord(letter) <= 32 or ord(letter) == 127 for letter in url):
-        raise InputError("the address of a webhook holds characters that no address has; write them as %xx")
+        raise InputError("the address of a webhook has invalid characters; write them as %xx")
     return url
 
 

@@ -148,9 +148,8 @@ class Controller:
                 self._mark()
 
     def round(self, *, wait_s: float = 0.0) -> None:
-        """Index new events, then check queue, leases and workers.
-
-        Raises UnavailableError for an unavailable backend, and BusyError if another service has taken over the store.
+        """Index new events, then check queue, leases and workers; BusyError if another service has taken over the
+        store.
         """
         self._identify()
         self._see_to_the_index()

@@ -61,10 +61,7 @@ def delete_asset(
 
 
 def delete_job(services: Services, job_id: str, *, owner: str = "") -> None:
-    """Delete a job; its shards follow after a grace time unless another job needs them.
-
-    ConflictError: the job is unfinished, or a dataset contains it.
-    """
+    """Delete a job; shards that no other job needs follow later. ConflictError: unfinished, or in a dataset."""
     job = services.index.jobs.get(job_id)
     try:
         record = read_record(JobRecord, services.store, names.job_record(job_id))
@@ -81,10 +78,7 @@ def delete_job(services: Services, job_id: str, *, owner: str = "") -> None:
 
 
 def delete_dataset(services: Services, name: str, *, owner: str = "", with_snapshots: bool = False) -> None:
-    """Delete a dataset, and the jobs that were planned for it alone.
-
-    ConflictError: the dataset is unfinished, or has snapshots and `with_snapshots` is False.
-    """
+    """Delete a dataset, and the jobs planned for it alone. ConflictError: unfinished, or with unconfirmed snapshots."""
     dataset = services.index.datasets.get(name)
     if not dataset.state.is_final:
         raise ConflictError(f"dataset {name!r} is {dataset.state}; cancel it first: graspd datasets cancel {name}")

@@ -70,10 +70,7 @@ class Resolver:
         return self.choose(request)[0]
 
     def choose(self, request: JobRequest) -> tuple[JobRequest, Choice | None]:
-        """Return the request with `auto` replaced by a fidelity, and the reason; None without `auto`.
-
-        InputError: no chart exists for its scene, or no fidelity meets the target.
-        """
+        """Return the request with `auto` replaced, and the reason (None without `auto`); InputError without a match."""
         if request.fidelity != AUTO:
             return request, None
         chart = self._chart(request)
@@ -118,7 +115,7 @@ def parse_target(text: str, *, in_scene: bool = False) -> tuple[str, float]:
     metric, sign, bound = found.groups()
     if metric not in known:
         where = "in scenes" if in_scene else "of free objects"
-        raise InputError(f"{text!r}: charts {where} hold {', '.join(known)}; write {examples}")
+        raise InputError(f"{text!r}: charts {where} contain {', '.join(known)}; write {examples}")
     if (sign == ">=") != known[metric]:
         raise InputError(f"{text!r}: write {metric}{'>=' if known[metric] else '<='}{bound}")
     return metric, float(bound)

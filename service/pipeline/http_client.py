@@ -87,9 +87,7 @@ def reachable(host: str, port: int, allowed: Networks) -> list[str]:
     for one in found:
         address = ipaddress.ip_address(one.partition("%")[0])
         if not is_public(address) and not any(address in network for network in allowed):
-            raise RefusedAddress(
-                "the address is not one of the public internet; the operator may allow it: GRASPD_WEBHOOK_NETWORKS"
-            )
+            raise RefusedAddress("the address is not public; the operator can allow it: GRASPD_WEBHOOK_NETWORKS")
     return found
 
 

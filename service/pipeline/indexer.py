@@ -47,9 +47,8 @@ class Indexer:
         self._readers = ThreadPoolExecutor(_READERS, thread_name_prefix="manifests")
 
     def apply(self, events: Sequence[Event]) -> list[int]:
-        """Update the index. A repeated event changes nothing.
-
-        Return the positions of events that need the unavailable store; apply these again later.
+        """Update the index idempotently; return the positions of events that need the unavailable store, to repeat
+        later.
         """
         started: dict[str, str] = {}
         finished: list[int] = []

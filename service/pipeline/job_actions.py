@@ -158,7 +158,7 @@ class Routes:
         here = self._here.get(need.stage) or [own_ability()]
         lacking = {one.lacks(need) for one in here} - {""}
         if all(one.lacks(need) for one in here):
-            return Route(held=f"held back, because no present worker can do it: {'; '.join(sorted(lacking))}")
+            return Route(held=f"held back, because no present worker is capable: {'; '.join(sorted(lacking))}")
         return Route(apart=bool(lacking))
 
 

@@ -158,7 +158,7 @@ class LeaseReaper:
 
     def _lose_check(self, message: IngestMessage) -> None:
         if message.attempt >= message.max_attempt:
-            ended = f"the check of this {message.kind.value} ended its worker {message.attempt} times"
+            ended = f"the check of this {message.kind.value} crashed its worker {message.attempt} times"
             reason = f"{ended}; delete it to try again"
             found = {"verdict": "refuse", "message": reason, "repairs": [], "facts": {}}
             put_document(self._services.store, names.asset_check(message.kind, message.digest), found)

@@ -82,10 +82,10 @@ class Clouds(Sequence[dict[str, Any]]):
         chosen = frame or ("table" if fuse else "camera")
         if chosen not in FRAMES or (fuse and chosen == "camera"):
             raise InputError(
-                f"clouds {'of several views ' * fuse}cannot be in the frame {chosen!r}; take table or object"
+                f"clouds {'of several views ' * fuse}cannot be in the frame {chosen!r}; choose table or object"
             )
         if unknown := set(postures) - set(POSTURES):
-            raise InputError(f"there is no posture {sorted(unknown)[0]!r}; choose of {', '.join(POSTURES)}")
+            raise InputError(f"there is no posture {sorted(unknown)[0]!r}; choose from {', '.join(POSTURES)}")
         if points < 1 or voxel_m < 0 or touch_m <= 0 or seed < 0:
             raise InputError(
                 "clouds need at least one point, a voxel of 0 or more, a touch above 0 and a seed of 0 or more"

@@ -178,7 +178,7 @@ def _paths(entry: Path) -> list[Path]:
         if next(entry.rglob("*.pack"), None) is not None:
             raise InputError(f"{entry} has shards in {PACKED}")
         if not found:
-            raise NotFoundError(f"{entry} holds no .h5 file")
+            raise NotFoundError(f"{entry} contains no .h5 file")
         return found
     if not entry.is_file():
         raise NotFoundError(f"{entry} does not exist")
@@ -196,7 +196,7 @@ def _local(path: Path) -> ShardFile:
 
 def _of_store(store: Store, job: str | None, dataset: str | None, snapshot: str | None) -> Iterator[ShardFile]:
     if (job is None) == (dataset is None):
-        raise InputError(f"name what to read of {store.url}: a job or a dataset")
+        raise InputError(f"name the data to read from {store.url}: a job or a dataset")
     if has_packs(store):
         raise InputError(f"{store.url} has shards in {PACKED}")
     if job is not None:

@@ -92,7 +92,7 @@ class Grasps(Sequence[dict[str, Any]]):
             if file.hand == hand:
                 with open_shard(self.shards.path(file)) as opened:
                     return [str(name) for name in opened.attrs["joint_names"]]
-        raise InputError(f"none of the shards is of the hand {hand!r}")
+        raise InputError(f"no shard is of the hand {hand!r}")
 
     def arrays(self, *columns: str) -> dict[str, Array]:
         """Return columns of all grasps, by default those of samples; InputError if they do not fit into one array."""

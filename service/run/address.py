@@ -54,7 +54,7 @@ def bind(host: str, port: int) -> socket.socket:
         bound.close()
         if error.errno == errno.EADDRINUSE:
             raise BusyError(
-                f"port {port} on {host} is taken; stop what uses it, or choose another with --port or GRASPD_PORT"
+                f"port {port} on {host} is in use; stop its process, or choose another with --port or GRASPD_PORT"
             ) from None
         raise InputError(f"the address {host}:{port} cannot be used: {error.strerror or error}") from None
     return bound

@@ -136,7 +136,7 @@ def _open_zip(file: IO[bytes]) -> zipfile.ZipFile:
 def _entries(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
     entries = [entry for entry in archive.infolist() if not entry.is_dir()]
     if len(entries) > MAX_FILES:
-        raise LimitError(f"the archive holds {len(entries)} files; at most {MAX_FILES} are taken")
+        raise LimitError(f"the archive holds {len(entries)} files; at most {MAX_FILES} are allowed")
     found = {}
     for entry in entries:
         name = check_path(entry.filename)

@@ -215,7 +215,7 @@ def main_of(files: Mapping[str, bytes], wanted: str = "", *, where: str = "the h
                 f"{where} holds {len(found)} hand files ({names}); name one: --urdf {_short(found)}, or in a ZIP an "
                 f'asset.json with {{"file": "{_short(found)}"}}'
             )
-    raise InputError(f"{where} holds no hand file; a URDF, xacro or MJCF is needed, or the folder or ZIP it lies in")
+    raise InputError(f"{where} contains no hand file; give a URDF, xacro or MJCF, or its folder or ZIP")
 
 
 def _named(wanted: str, known: list[str], where: str) -> str:

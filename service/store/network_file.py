@@ -155,7 +155,7 @@ def from_bytes(data: bytes, what: str) -> ProposalNetwork:
             expected = _expected(joints)
             found = sorted(info.filename for info in archive.infolist())
             if found != sorted(f"{name}.npy" for name in [_META, *expected]):
-                raise InputError(f"{what}: its arrays are not those of {SCHEMA}: {_difference(found, expected)}")
+                raise InputError(f"{what}: its arrays differ from {SCHEMA}: {_difference(found, expected)}")
             arrays = {name: _read(archive, name, shape, what) for name, shape in expected.items()}
     except _BROKEN as error:
         raise InputError(f"{what} is no .npz file of {SCHEMA}: {error}") from None
@@ -169,7 +169,7 @@ def from_bytes(data: bytes, what: str) -> ProposalNetwork:
 
 def check_size(size: int, what: str) -> None:
     if size > MAX_BYTES:
-        raise LimitError(f"{what} has more than {MAX_BYTES >> 20} MiB; no proposal network needs as much")
+        raise LimitError(f"{what} has more than {MAX_BYTES >> 20} MiB; a proposal network is smaller")
 
 
 def _expected(joints: int) -> dict[str, tuple[int, ...]]:

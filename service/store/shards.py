@@ -158,10 +158,10 @@ def _check_contents(file: h5py.File, name: str) -> None:
             if len(seen) > _MOST_ITEMS:
                 raise InputError(f"{name} holds more than {_MOST_ITEMS} datasets and groups, too many for a shard")
             if not isinstance(group.get(key, getlink=True), h5py.HardLink):
-                raise InputError(f"{name}: {path} is a link; a shard holds its own values")
+                raise InputError(f"{name}: {path} is a link; a shard contains no links")
             item = group[key]
             if (address := h5py.h5o.get_info(item.id).addr) in seen:
-                raise InputError(f"{name}: {path} is a link; a shard holds its own values")
+                raise InputError(f"{name}: {path} is a link; a shard contains no links")
             seen.add(address)
             if isinstance(item, h5py.Group):
                 waiting.append((item, f"{path}/"))

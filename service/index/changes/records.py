@@ -89,9 +89,7 @@ class Changes(IndexPart):
     def add_manifests(
         self, manifests: Iterable[ShardManifest], *, within: Connection | None = None
     ) -> dict[str, State]:
-        """Add shards with their grasps, and mark the tasks of all jobs that make them as succeeded. Return the jobs'
-        states.
-        """
+        """Add shards with their grasps; the tasks that make them have succeeded. Return the states of their jobs."""
         new = {manifest.shard_id: manifest for manifest in manifests}
         touched: defaultdict[str, set[int]] = defaultdict(set)
         with self.database.writing(within) as connection:
@@ -109,9 +107,7 @@ class Changes(IndexPart):
     def add_attempt(
         self, attempt: AttemptRecord, *, not_before: float = 0.0, within: Connection | None = None
     ) -> State | None:
-        """Add a failed attempt; the next one is due at `not_before` [s]. Return the job's state; None for an unknown
-        task.
-        """
+        """Add a failed attempt; the next one is due at `not_before` [s]. Return the job's state; None: unknown task."""
         with self.database.writing(within) as connection:
             if connection.scalar(select(tasks.c.id).where(tasks.c.id == attempt.task_id)) is None:
                 return None  # The job is deleted, or the attempt is forged.

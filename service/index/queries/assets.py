@@ -35,10 +35,7 @@ class Assets(IndexPart):
         return Page(items=[AssetView(**row) for row in rows], next=following)
 
     def get(self, kind: AssetKind, name_or_digest: str, *, scope: ProjectScope = EVERYTHING) -> AssetView:
-        """Return the hand or object of a digest or name; NotFoundError lists the existing names.
-
-        Of equal names, accepted assets come first, then own ones, then newer ones.
-        """
+        """Return an asset by digest or name: accepted ones first, then own, then newer ones; or NotFoundError."""
         named = and_(assets.c.kind == kind.value, assets.c.name == name_or_digest)
         by_digest = and_(assets.c.kind == kind.value, assets.c.digest == name_or_digest)
         refused_last = case((assets.c.verdict == "refuse", 1), else_=0)

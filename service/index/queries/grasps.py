@@ -345,10 +345,7 @@ def _plain(column: ColumnElement[Any]) -> ColumnElement[Any]:
 
 
 def truth(node: Node, grasps: Columns) -> ColumnElement[bool]:
-    """Return an expression in SQL: true or false for each row, never unknown, so `not` is a complement.
-
-    Raises InputError for values missing in the index.
-    """
+    """Return an expression in SQL that is never unknown, so `not` is a complement; InputError for missing values."""
     if isinstance(node, Connective):
         return (or_ if node.word == "or" else and_)(*(truth(part, grasps) for part in node.parts))
     if isinstance(node, Negation):

@@ -178,10 +178,7 @@ def _stored_of(options: JobOptions) -> tuple[float, float, str]:
 
 
 def machine_of(batches: Iterable[BatchCost]) -> Machine:
-    """Compare the machine of these batches of `synthesize` with the stored numbers.
-
-    Only batches with their own stored number count: of offered fidelities, without options.
-    """
+    """Compare the machine of these batches of `synthesize` with the stored numbers of the same recipes."""
     comparable = [batch for batch in batches if batch.candidates and _is_stored(batch.request)]
     ratios = [
         batch.seconds / batch.candidates / _stored_of(batch.request)[0]

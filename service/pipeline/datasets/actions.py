@@ -101,10 +101,7 @@ def retry(services: Services, name: str) -> DatasetView:
 
 
 def snapshot(services: Services, name: str) -> tuple[Snapshot, bool]:
-    """Record the present shards of a dataset; equal shards give the same snapshot. Return it, and whether it is new.
-
-    Raises NotFoundError without the dataset, ConflictError without a shard.
-    """
+    """Record the present shards; return the snapshot, and whether it is new. ConflictError without a shard."""
     dataset = services.index.datasets.get(name)
     held = tuple(services.index.datasets.shards(name))
     if not held:
@@ -148,7 +145,7 @@ def add_object_set(
     assets = [services.index.assets.get(AssetKind.OBJECT, one, scope=scope) for one in objects]
     wanted = tuple(asset.name for asset in assets)
     if not wanted:
-        raise InputError(f"the set {name!r} holds no object; name some")
+        raise InputError(f"the set {name!r} holds no object; name at least one")
     # Of two concurrent requests for one name, the later one must see the set of the earlier one.
     with recording(services) as (connection, put):
         after, project = "", scope.project

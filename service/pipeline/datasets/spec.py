@@ -36,7 +36,7 @@ class Matrix(JobOptions):
     @model_validator(mode="after")
     def _has_objects(self) -> Self:
         if not self.objects and not self.sets:
-            raise ValueError("a dataset needs objects: name some, or a set of them")
+            raise ValueError("a dataset needs objects: name objects, or a set of objects")
         return self
 
     @property
@@ -45,13 +45,13 @@ class Matrix(JobOptions):
 
 
 class DatasetRequest(Matrix):
-    name: Name = Field(description="name of the dataset; `estimate` is taken by an address of the API")
+    name: Name = Field(description="name of the dataset; `estimate` is reserved")
 
     @field_validator("name")
     @classmethod
     def _is_free(cls, value: str) -> str:
         if value == "estimate":
-            raise ValueError("the API answers estimates at this name; take another one")
+            raise ValueError("this name is reserved for estimates; choose another one")
         return value
 
 

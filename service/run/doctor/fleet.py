@@ -50,7 +50,7 @@ def controller(settings: Settings) -> Finding:
     dead = bad(
         "no heartbeat from a controller: finished tasks are not indexed, and nothing is queued", "graspd controller"
     )
-    return _asked(settings, lambda queue: good("a controller lives") if queue.announced(PART) else dead)
+    return _asked(settings, lambda queue: good("a controller is alive") if queue.announced(PART) else dead)
 
 
 def workers(settings: Settings) -> Finding:
@@ -78,7 +78,7 @@ def _check_workers(beats: list[WorkerBeat], waiting: Counter[Stage]) -> Finding:
     if alone := sorted(stage.value for stage in waiting if stage not in served):
         tasks = sum(number for stage, number in waiting.items() if stage not in served)
         return bad(
-            f"{tasks} tasks wait, and no worker takes {', '.join(alone)}", f"graspd worker --stages {','.join(alone)}"
+            f"{tasks} tasks wait, and no worker serves {', '.join(alone)}", f"graspd worker --stages {','.join(alone)}"
         )
     if not beats:
         return warning("there is no worker, and no task waits", "graspd worker, or graspd up --workers 1")

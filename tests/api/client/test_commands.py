@@ -272,7 +272,7 @@ def test_a_job_with_a_target_says_how_its_fidelity_was_chosen(graspd: Shell, ser
     assert told in done.stdout
     assert graspd.json(*asked, "lift>=0.9")["choice"]["reached"] == 0.95
     done = graspd(*asked, "gsr>=0.8")
-    assert done.returncode == 2 and "charts in scenes hold lift, lift_dexgraspbench, lift_hard, robust" in said(done)
+    assert done.returncode == 2 and "charts in scenes contain lift, lift_dexgraspbench, lift_hard, robust" in said(done)
 
 
 def until(service: Supervisor, name: str, state: State) -> None:
