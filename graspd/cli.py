@@ -88,7 +88,7 @@ class LazyGroup(TyperGroup):
             code = super().main(*args, **extra | {"standalone_mode": False})
         except UsageError as error:
             code = error.exit_code
-            if said := usage_line(error):  # Otherwise it is help, already printed.
+            if said := usage_line(error):  # Without a line, help is already printed.
                 typer.echo(f"graspd: {said}", err=True)
         except typer.Abort:
             code = 1
@@ -201,8 +201,9 @@ def _entry() -> None:
 
 def main() -> None:
     own_process()
-    # No command draws with MuJoCo; its import would otherwise start a process to search for GLFW.
+    # Commands do not draw with MuJoCo, whose import would start a process to search for GLFW without this setting.
     os.environ.setdefault("MUJOCO_GL", "disable")
-    # Otherwise pydantic searches all installed packages for plugins. To enable plugins, set the variable to "".
+    # Without this setting pydantic searches all installed packages for plugins. To enable plugins, set the variable to
+    # "".
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     at_the_door(build())

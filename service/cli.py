@@ -47,7 +47,7 @@ def reporting_errors(command: Callable[P, R]) -> Callable[P, R]:
         except ValidationError as error:
             fail(refusal(error), InputError.exit_code)
         except BrokenPipeError:
-            _silence(sys.stdout)  # the reader (head, less) has closed the pipe
+            _silence(sys.stdout)  # The reader (head, less) has closed the pipe.
             raise typer.Exit(0) from None
         except KeyboardInterrupt:
             fail("interrupted", 130)
@@ -214,7 +214,7 @@ def log_to_stderr(settings: Settings, process: str = "graspd") -> None:
 
 
 def keep_private(settings: Settings) -> None:
-    """Restrict new files of this process and its children to their user; also a data folder that others can read."""
+    """Make new files of this process and its children, and a readable data folder, private to the user."""
     os.umask(0o077)
     with contextlib.suppress(OSError):
         status = settings.data_dir.stat()

@@ -27,7 +27,7 @@ def with_options(model: type[BaseModel], place: Place) -> Callable[[Callable[...
         at = [parameter.name for parameter in own].index("options")
         parameters = [*own[:at], *map(_parameter, added), *own[at + 1 :]]
         parameters = [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in parameters]
-        del wrapper.__wrapped__  # its signature differs
+        del wrapper.__wrapped__  # The wrapped command has another signature.
         wrapper.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         wrapper.__annotations__ = {one.name: one.annotation for one in parameters}
         return wrapper
@@ -51,7 +51,7 @@ def parsed_options(model: type[ModelT], values: dict[str, Any]) -> ModelT:
     """Validate the given options; InputError names the first invalid option as on the command line."""
     options = {row.name: row.flags[0].partition("/")[0] for place in EVERYWHERE for row in rows(model, place)}
     names = {name: f"--{name.replace('_', '-')}" for name in model.model_fields}
-    # The name of a dataset is an argument.
+    # The dataset's name is an argument, not an option.
     return accepted(model, values, names={**names, "name": "NAME", **options})
 
 

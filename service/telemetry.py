@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 SUBJECTS: Final = ("request", "key", "job", "task", "attempt", "worker")
 _bound: ContextVar[Mapping[str, Any]] = ContextVar("bound", default=MappingProxyType({}))
 _ORDINARY: Final = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "about", "taskName"}
-#: RQ logs every idle poll, httpx every request.
+#: Loggers with too many lines: RQ logs every idle poll, httpx every request.
 _TALKATIVE: Final = ("rq.worker", "rq.job", "rq.queue", "httpx")
 
 
@@ -103,7 +103,7 @@ def _time(record: logging.LogRecord) -> str:
 
 
 log = logging.getLogger(__name__)
-#: Well below the minute after which a health check declares the process dead.
+#: Interval of updates [s], well below the minute after which a health check declares the process dead.
 _EVERY_S: Final = 5.0
 
 

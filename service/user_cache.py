@@ -72,7 +72,7 @@ def make_room(folder: Path, suffix: str, limit_bytes: int, *, keep: Path) -> Non
     for _, size, file in sorted(found, reverse=True):
         used += size
         if used > limit_bytes and file != keep:
-            # A process that has it open can still read it.
+            # A process with the open file can still read it.
             file.unlink(missing_ok=True)
 
 

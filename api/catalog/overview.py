@@ -195,7 +195,7 @@ class Probes:
             except BusyError as error:
                 return part.model_copy(update={"ok": False, "detail": str(error)})
             except StoreUnavailable:
-                return part  # The probe of the store reports this.
+                return part  # The probe of the store reports this error.
             self._service = service
         return part
 

@@ -33,7 +33,7 @@ def hands_page(
 ) -> HTMLResponse:
     """Refused hands are included; their pages state the reason."""
     page = assets.page(AssetKind.HAND, limit=PAGE_SIZE, cursor=cursor, refused=True)
-    # Facts contain data from the upload as well as findings of the check, so they may be of any type.
+    # Facts contain data from the upload besides findings of the check, so they may be of any type.
     numbers = {
         hand.digest: [
             len(told) if isinstance(told, list) else 0 for told in map(hand.facts.get, ("dofs", "fingertips"))

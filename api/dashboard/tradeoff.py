@@ -239,7 +239,7 @@ def _labelled(points: list[Point]) -> list[Point]:
         offers = [(move, is_left) for move in _MOVES for is_left in (False, True)]
         boxes = [point.label_box(move, is_left=is_left) for move, is_left in offers]
         costs = [sum(_covered(box, other) for other in taken) + _outside(box) for box in boxes]
-        # Among equal places use the first one, which is the nearest.
+        # Of equal places the first one, nearest to the point, is used.
         best = costs.index(min(costs))
         move, is_left = offers[best]
         taken.append(boxes[best])

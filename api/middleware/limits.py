@@ -68,7 +68,7 @@ class RateLimit(HttpMiddleware):
         request = Request(scope)
         name = f"key:{key.name}" if key else f"address:{request.client.host if request.client else ''}"
         allowance = _allowance_of(key, self.settings)
-        # Not the request's id: a caller could choose equal ids, so that many requests count as one.
+        # The request's id is unsuitable: a caller could choose equal ids, so that many requests count as one.
         number = uuid.uuid4().hex
         admission = await self.rates.enter(name, allowance, number)
         if admission is None:

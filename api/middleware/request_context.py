@@ -185,7 +185,7 @@ class RootPath(HttpMiddleware):
     def _below(self, where: str, host: str) -> str:
         parts = urlsplit(where)
         if parts.netloc not in ("", host) or not parts.path.startswith("/"):
-            return where  # For example a signed address of the store.
+            return where  # Such as a signed address of the store.
         return parts._replace(path=f"{self.prefix}{parts.path}").geturl()
 
 

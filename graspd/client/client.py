@@ -27,7 +27,7 @@ from graspd.service.pipeline.datasets.spec import DatasetRequest, Matrix
 _PATIENCE_S: Final = 30.0
 _CONNECT_S: Final = 5.0
 _TIMEOUT: Final = httpx.Timeout(_PATIENCE_S, connect=_CONNECT_S)
-#: The server sends a keep-alive every 15 s.
+#: Longest wait for data of a stream [s]: the server sends a keep-alive every 15 s.
 _STREAM_TIMEOUT: Final = httpx.Timeout(40.0, connect=5.0)
 _POLL_S: Final = 0.3
 _DATASET_POLL_S: Final = 1.0
@@ -255,7 +255,7 @@ def path_of(*parts: str) -> str:
 
 
 def _matrix_body(matrix: Matrix) -> dict[str, Any]:
-    """Build the body of a matrix; empty fields are omitted, because an older service may not know them."""
+    """Build the body of a matrix without empty fields, which an older service may reject."""
     return {name: value for name, value in matrix.model_dump(mode="json").items() if value not in ({}, "")}
 
 

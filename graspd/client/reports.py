@@ -277,7 +277,7 @@ def _size_of(stage: StageStatus, job: Job) -> tuple[int, str]:
     return (job.requested, "grasps") if stage.stage is Stage.SYNTHESIZE else (stage.tasks, "tasks")
 
 
-#: A table with more hands does not fit a terminal: each cell then has a line.
+#: Most hands in a table that fits a terminal; with more hands each cell has a line.
 _MOST_COLUMNS: Final = 6
 _SHOWN_RATES: Final = 8
 _STYLES: Final = {

@@ -41,7 +41,8 @@ from graspd.worker.rendering.trajectory_pictures import (
 )
 
 Kind = Literal["one side", "three sides", "way"]
-#: Edge of a grasp's picture [px] and rays per pixel. Path tracing time grows with both: three sides cost half of one.
+#: Edge of a grasp's picture [px], and rays per pixel. Path tracing time grows with both: three small pictures take half
+#: as long as one large picture.
 LOOKS: Final[dict[Kind, tuple[int, int]]] = {"one side": (300, SAMPLES), "three sides": (160, 8), "way": (300, SAMPLES)}
 
 

@@ -90,7 +90,7 @@ def _bar(*, quiet: bool) -> Iterator[Report]:
     if quiet or not sys.stderr.isatty():
         yield lambda done, total, message: None
         return
-    # Without a bar, its library need not be loaded.
+    # The library is imported only if the bar is shown.
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
     began = time.perf_counter()

@@ -233,7 +233,7 @@ def unusable(error: Exception) -> InputError:
 
 
 def connect_postgres(url: str | URL) -> Engine:
-    """Return an engine that refuses encodings other than UTF-8; it makes no tables."""
+    """Return an engine without making tables; InputError for an encoding other than UTF-8."""
     engine = create_engine(url, pool_pre_ping=True, pool_size=5, max_overflow=10)
 
     # Runs before SQLAlchemy inspects the connection: the inspection fails on SQL_ASCII databases, which return bytes.

@@ -27,7 +27,7 @@ def export(database: Database, folder: Path) -> dict[str, int]:
     Integers are int64, other numbers float64, JSON is text. Rows are ordered by primary key. Raises InputError without
     pyarrow.
     """
-    # Before the query, so that a missing package is reported at once.
+    # The import precedes the query, so that a missing package is reported at once.
     schemas = {name: schema_of({c.name: _word(c) for c in table.columns}) for name, table in TABLES.items()}
     with database.reading() as connection:
         return {

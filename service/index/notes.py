@@ -18,7 +18,7 @@ _CHANGES: Final = "changes"
 _MARK: Final = "mark"
 _SCAN_PAUSE: Final = "integrity scan pause"
 _SERVICE: Final = "service"
-#: Stored names of damaged records; the count includes all.
+#: Most stored names of damaged records; their count has no limit.
 _NAMED: Final = 50
 
 

@@ -232,7 +232,7 @@ def _compare(table: Table, live: Connection, derived: Connection) -> Iterator[st
         else:
             for column in ours[key]:
                 if ours[key][column] != theirs[key][column]:
-                    yield f"{name}: {column} is {ours[key][column]!r}, the store says {theirs[key][column]!r}"
+                    yield f"{name}: {column} is {ours[key][column]!r}, in the store {theirs[key][column]!r}"
 
 
 def _rows(table: Table, connection: Connection) -> dict[tuple[Any, ...], dict[str, Any]]:
@@ -250,7 +250,7 @@ def _lasting(row: dict[str, Any]) -> dict[str, Any]:
         row["state"] = State.QUEUED.value
     if row.get("state") in (State.QUEUED.value, State.CANCELLED.value) and "worker" in row:
         row["worker"] = None
-    if "verdict" in row:  # Attempts of a check are not in the store.
+    if "verdict" in row:  # The store does not contain attempts of a check.
         row["last_attempt"] = 0
         if row["verdict"] is None:
             row["message"] = None

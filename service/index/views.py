@@ -310,7 +310,7 @@ class DatasetView(Validated):
     tasks_failed: int
     progress: float = Field(ge=0, le=1)
     seconds: float = Field(description="total worker time [s]")
-    eta_s: float | None = Field(description="expected time until it ends, at the current number of running tasks [s]")
+    eta_s: float | None = Field(description="expected time until the end, at the current number of running tasks [s]")
     shards: int
     size_bytes: int
     created: str
@@ -320,7 +320,7 @@ class DatasetView(Validated):
     cancelled: bool = Field(description="whether its user cancelled it; `retry` resumes it")
     outcomes: dict[str, int] = Field({}, description="rejected candidates by outcome")
 
-    @computed_field(description="why it ended with fewer grasps than requested; null: it did not")  # type: ignore[prop-decorator]
+    @computed_field(description="why the dataset has fewer grasps than requested; null: it has all")  # type: ignore[prop-decorator]
     @property
     def reason(self) -> str | None:
         if not self.state.is_final or self.options.want != "valid":

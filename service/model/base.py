@@ -21,7 +21,7 @@ class Model(BaseModel):
 #: Name given by a user. Letters, digits, dot, dash and underscore only, because file names and URLs contain it.
 NAME: Final = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
 Name = Annotated[str, Field(pattern=NAME)]
-#: Name of a tag: words of such characters, separated by single spaces.
+#: Name of a tag: words of the characters of `Name`, separated by single spaces.
 TagName = Annotated[
     str,
     StringConstraints(strip_whitespace=True, max_length=64, pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*( [A-Za-z0-9._-]+)*$"),
@@ -45,7 +45,7 @@ _WORDS: Final = {
 }
 #: Pydantic's error types for bounds, with the name of each bound.
 _BOUNDS: Final = {"greater_than_equal": "ge", "greater_than": "gt", "less_than_equal": "le", "less_than": "lt"}
-_NAMES: Final = "must begin with a letter or digit and hold at most 64 letters, digits, dots, dashes and underscores"
+_NAMES: Final = "must begin with a letter or digit and have at most 64 letters, digits, dots, dashes and underscores"
 #: Prefix of pydantic's messages, which the field's name replaces.
 _SUBJECT: Final = re.compile(r"^(Value error, )|^\w+ should ")
 _CLASS: Final = re.compile(r"_[A-Z]\w*$|constrained-\w+$")

@@ -69,7 +69,7 @@ FIDELITIES: Final[dict[str, Fidelity]] = {
         fine_iterations=60,
         polish_iterations=15,
     ),
-    # As in the paper: plain descent with one rate, one contact sweep, no penetration penalty, no selection.
+    # Settings of the paper: plain descent with one rate, one contact sweep, no penetration penalty, no selection.
     "paper": Fidelity(
         name="paper",
         starts=1,
@@ -88,7 +88,7 @@ FIDELITIES: Final[dict[str, Fidelity]] = {
 }
 
 
-#: Requests the cheapest fidelity that meets the target; the stored job has that fidelity.
+#: Value for the cheapest fidelity that meets the target; the stored job has that fidelity.
 AUTO: Final = "auto"
 
 

@@ -39,7 +39,7 @@ class Choice(Record):
     target: str = Field(description="required accuracy")
     chart: str = Field(description="key of the chart in the store")
     measured_on: Literal["hand and object", "hand", "all"] = Field(
-        description="runs of the chart that count: those of the same hand and object, of the same hand, or all"
+        description="runs of the chart that count: of the same hand and object, of the same hand, or all"
     )
     reached: float = Field(description="accuracy of the chosen fidelity in these runs")
 

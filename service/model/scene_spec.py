@@ -89,7 +89,7 @@ class SceneSpec(Model):
     kind: SceneKind = "free"
     supports: Supports = Field((), max_length=MOST_SUPPORTS)
     target: Pose | None = None
-    """Pose of the object in the scene; None: it is dropped onto the support below."""
+    """Pose of the object in the scene; None: drop onto the support below."""
     faces: Literal["drawn", "all"] = "drawn"
     """drawn: resting faces with their frequency after drops; all: one scene for each stable face."""
 

@@ -109,7 +109,7 @@ def counts(cells: Iterable[MapCell]) -> dict[Outcome, int]:
 
 
 def graded(value: float, weak: float, broken: float) -> Outcome:
-    if not value < broken:  # Also for nan.
+    if not value < broken:  # True for nan too.
         return "broken"
     return "good" if value < weak else "weak"
 

@@ -60,7 +60,7 @@ def slerp(a: Floats, b: Floats, share: float) -> Floats:
     cosine = float(a @ b)
     b, cosine = (-b, -cosine) if cosine < 0 else (b, cosine)
     angle = float(np.arccos(min(cosine, 1.0)))
-    # Nearly parallel: the chord equals the arc.
+    # Nearly parallel quaternions: the chord equals the arc.
     weights = (1 - share, share) if angle < 1e-6 else np.sin([(1 - share) * angle, share * angle]) / np.sin(angle)
     turned = weights[0] * a + weights[1] * b
     return np.asarray(turned / np.linalg.norm(turned))

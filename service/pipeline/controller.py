@@ -94,7 +94,7 @@ class Controller:
             PeriodicDuty(clock, self._mark, _WORKERS_EVERY_S),
             PeriodicDuty(clock, self._indexer.flush, _WORKERS_EVERY_S),
             PeriodicDuty(clock, self._look_after_workers, _WORKERS_EVERY_S, share=0.1),
-            # Each lease is checked three times before it can count as lost.
+            # A lease is checked three times before it counts as lost.
             PeriodicDuty(clock, self._look_after_queue, interval_s, longest_s=services.settings.lease_s / 3),
             PeriodicDuty(clock, self._feed_new, 0.0),
             PeriodicDuty(clock, self._pass_on_progress, min(_PROGRESS_EVERY_S, interval_s), share=0.1),
@@ -128,7 +128,7 @@ class Controller:
     def _run(self, stop: threading.Event) -> None:
         pause = 0.0
         while not stop.is_set():
-            # Also while a backend is unavailable: a restarted controller would wait just as long.
+            # Touched even while a backend is unavailable: a restarted controller would wait just as long.
             self._alive.touch()
             try:
                 self.round(wait_s=self._services.settings.controller_interval_s)
@@ -307,7 +307,7 @@ class Controller:
         """
         depths = self._services.queue.depths()
         now = time.time()
-        # A worker finds a waiting task whenever it ends one.
+        # Two tasks per worker, so that a worker that ends a task finds another one waiting.
         window = max(self._services.settings.queue_window, 2 * self._workers)
         held: set[str] = set()
         for priority in Priority:

@@ -66,7 +66,7 @@ def delete_job(services: Services, job_id: str, *, owner: str = "") -> None:
     try:
         record = read_record(JobRecord, services.store, names.job_record(job_id))
     except (NotFoundError, DamagedError):
-        record = None  # The shards are then unknown, and stay.
+        record = None  # Shards of an unreadable record are unknown, and stay.
     with recording(services) as (connection, put):
         if user := services.index.removals.user_of_job(job_id, within=connection):
             raise ConflictError(f"job {job_id} {user}")
@@ -153,7 +153,7 @@ def _restore(services: Services, deletion: Deletion, connection: Connection) -> 
         _enter(services, deletion, connection)
     except ConflictError:
         if not store.exists(waiting):
-            put_record(store, waiting, deletion)  # The controller removes it again.
+            put_record(store, waiting, deletion)  # The controller will remove it again.
         raise
     store.delete(waiting)
     store.delete(f"{folder}/deletion.json")

@@ -75,7 +75,7 @@ class Resolver:
             return request, None
         chart = self._chart(request)
         pair = (request.hand, request.object)
-        # All hands that the chart lacks share one result.
+        # All hands without runs in the chart share one result.
         hand = request.hand if request.hand in chart.hands else ""
         key = (request.method, request.target, *(pair if pair in chart.pairs else (hand, "")))
         if key not in chart.found:

@@ -56,10 +56,10 @@ class GarbageCollector:
                 self._services.store.delete(key)
         known = self._services.index.notes.completeness()
         if known is not None and known.left_out:
-            return False  # A job with an unreadable record may need one of them.
+            return False  # A job with an unreadable record may need one of these shards.
         for key, released in self._records(DeletedJob, names.RELEASED):
             if released.at > before:
-                break  # The following ones are younger.
+                break  # All further records are younger.
             for stage, shard in self._unneeded(released):
                 if self._clock() > deadline:
                     return True
@@ -79,7 +79,7 @@ class GarbageCollector:
         """Remove rows that a killed process left, then objects; return whether all is done."""
         with self._services.index.database.writing() as connection:
             if not self._services.store.exists(names.deletion(deletion.what, deletion.id)):
-                return True  # Restored since the listing.
+                return True  # The resource was restored after the listing.
             removals = self._services.index.removals
             if deletion.what == "job":
                 removals.remove_job(deletion.id, within=connection)

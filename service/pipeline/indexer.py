@@ -219,7 +219,7 @@ def _left_out(what: str) -> Iterator[None]:
         log.exception("%s is ignored", what)
 
 
-#: Most error names with a series of their own: more than an engine raises, and a bound against forged names.
+#: Most error names with a series of their own, as a bound against forged names; an engine raises fewer.
 MOST_KINDS: Final = 60
 OTHER_KIND: Final = "other"
 

@@ -122,7 +122,7 @@ def examine(
         orphan = not store.exists(manifest) and store.exists(key) and not store.exists(manifest)
         return Damage(key, NO_MANIFEST, shard) if orphan else None
     except NotFoundError:
-        return None  # Removed since the listing.
+        return None  # The object was removed after the listing.
 
 
 def _sealed(store: Store, key: str, read: Read, unsealed: Unsealed) -> Damage | None:

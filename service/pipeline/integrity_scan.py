@@ -59,7 +59,7 @@ class IntegrityScan:
             except GraspdError as error:
                 log.warning("%s; the integrity scan continues later", error)
             except Exception:
-                log.exception("the integrity scan failed; it continues later")
+                log.exception("the integrity scan failed and will continue later")
             self._stop.wait(_PAUSE_S)
 
     def _may_read(self) -> bool:

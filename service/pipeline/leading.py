@@ -70,7 +70,7 @@ class Leadership:
                     self._queue.resign(self.holder)
 
     def _renew(self, stop: threading.Event, over: threading.Event, done: threading.Event) -> None:
-        due = -math.inf  # Also while the work stops.
+        due = -math.inf  # Renewal continues while the work stops.
         while not done.wait(_LOOK_S) and not stop.is_set():
             if time.monotonic() < due:
                 continue

@@ -133,7 +133,7 @@ class LeaseReaper:
             raise
         except Exception:  # Any client of Redis can forge a lease, which must not block others.
             log.exception("the lease of task %s is ignored", lease.task_id)
-        # Removed only now: if the store was unavailable, the next round finds the lease again.
+        # The lease is removed last: if the store was unavailable, the next round finds the lease again.
         self._services.queue.release(lease)
 
     def _lose_task(self, worker: str, message: TaskMessage) -> None:
@@ -153,7 +153,7 @@ class LeaseReaper:
             except DamagedError as error:
                 self._fail(message.task_id, message.stage, error)
                 return
-        # The machine causes a first loss more often than the task does, so there is no wait.
+        # Without wait, because the machine causes a first loss more often than the task does.
         self._indexer.failed(attempt, at_once=attempt.number == 1)
 
     def _lose_check(self, message: IngestMessage) -> None:

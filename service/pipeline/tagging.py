@@ -81,7 +81,7 @@ def _change(
             put_version(put, after)
             services.index.tags.put(after, within=connection)
     if is_changed:
-        # Only after the rows are committed, and while no other process reads the last version.
+        # Older versions are dropped only after the commit, and while no other process reads the last version.
         with services.index.database.writing():
             drop_older(services.store, after)
     return before, after

@@ -36,12 +36,12 @@ def allowed_job(job: Job, queue: Queue) -> Job:
     except (DeserializationError, LookupError, TypeError):
         name, message = "what cannot be read", None
     if name != TASK_FUNCTION or job.instance is not None or not isinstance(message, dict):
-        raise TaskRefused(f"the queue asks for {name[:80]!r}, which is no task of graspd")
+        raise TaskRefused(f"the queue contains {name[:80]!r}, which is no task of graspd")
     return new_job(message, id=job.id, origin=queue.name, connection=job.connection, description=job.description)
 
 
 def is_of_an_entry(error: Exception) -> bool:
     """Check whether RQ failed to read an entry rather than to take it: unreadable entries are discarded."""
-    if not hasattr(error, "job_id"):  # RQ sets it on errors of reading an entry's job.
+    if not hasattr(error, "job_id"):  # RQ sets job_id on errors of reading an entry's job.
         return isinstance(error, UnicodeDecodeError)
     return not isinstance(error, RedisError) or is_wrong_type(error)

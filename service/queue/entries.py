@@ -23,7 +23,7 @@ _ADAPTERS: Final[dict[type, TypeAdapter[Any]]] = {kind: TypeAdapter(kind) for ki
 _ATTEMPT: Final = re.compile(r"(.+)-([0-9]{1,9})")
 #: Limit of the unpacked message; a real one has a few kilobytes.
 _MESSAGE_BYTES: Final = 1 << 20
-#: A stream rejects entries older than its newest: an entry this far in the future would block it permanently.
+#: Future time of an entry that would block a stream: a stream rejects entries older than its newest.
 _FUTURE_MS: Final = 24 * 3600 * 1000
 
 

@@ -121,7 +121,7 @@ class Pictures(Sequence[dict[str, Any]]):
     def _add(self, file: ShardFile, *, with_grasps_only: bool) -> None:
         with open_shard(self.shards.path(file)) as opened:
             scenes = np.asarray(opened["camera/scene_index"])
-            # For grasps planned in scenes these are in the base shard.
+            # The base shard contains the scenes of grasps planned in scenes.
             scene_shard = str(opened.attrs.get("base_shard") or opened.attrs.get("scene_shard") or "")
             if not scene_shard:
                 raise InputError(
@@ -147,7 +147,7 @@ class Pictures(Sequence[dict[str, Any]]):
 
     def scenes_of(self, shard: str) -> Scenes:
         found = self._scenes.get(shard)
-        if found is None:  # Concurrent threads may both build it, with equal results.
+        if found is None:  # Concurrent threads may both build the table, with equal results.
             found = self._scenes[shard] = Scenes(self.shards, shard, self._quality, **self._which)
             if len(self._scenes) > _KEPT:
                 self._scenes.popitem(last=False)

@@ -216,6 +216,6 @@ def path(data_dir: DataDir = None) -> None:
 def stop_on_signals() -> threading.Event:
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
-        # A thread sets it: the handler may interrupt the very `wait` whose lock `set` needs.
+        # A thread sets the event: the handler may interrupt a `wait` that holds the lock which `set` needs.
         signal.signal(number, lambda *_: threading.Thread(target=stop.set, daemon=True).start())
     return stop

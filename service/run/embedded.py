@@ -21,7 +21,7 @@ from graspd.service.settings import Settings
 from graspd.service.user_cache import write_whole
 
 log = logging.getLogger(__name__)
-#: Files of an append-only Redis, from version 7 on and before.
+#: Files of an append-only Redis: from version 7 on, and before.
 _LOGS: Final = ("appendonlydir", "appendonly.aof")
 _TAIL_BYTES: Final = 1 << 16
 _READY: Final = "Ready to accept connections"

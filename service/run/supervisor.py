@@ -34,7 +34,7 @@ _PROBE_S: Final = 0.1
 #: Timeout for readiness: kernels compile at first use, perhaps on a busy machine [s].
 READY_S: Final = 1800.0
 _TOLD_EVERY_S: Final = 15.0
-#: After this many restarts a process will not become ready.
+#: Restarts after which a process counts as failed.
 _ENDS: Final = 5
 _REDIS_S: Final = 60.0
 _PROGRAM: Final = (sys.executable, "-m", "graspd")
@@ -126,7 +126,7 @@ class Supervisor:
             while missing := self._missing(queue):
                 if stop is not None and stop.is_set():
                     return False
-                if "redis" in missing:  # The others may have ended because of it.
+                if "redis" in missing:  # Other processes may have ended because Redis is missing.
                     starts = {**self._starts(), "redis": starts.get("redis", 0)}
                 now = time.monotonic()
                 patience = min(timeout, _REDIS_S) if "redis" in missing and self._wanted.redis_url else timeout
@@ -180,7 +180,7 @@ class Supervisor:
             update["port"] = reserved.getsockname()[1]
             if sys.platform == "linux":
                 self._locks.append(reserved)
-            else:  # There a second socket of one address is refused.
+            else:  # Other systems refuse a second socket of one address.
                 reserved.close()
         self.settings = self._wanted.model_copy(update=update)
 

@@ -177,13 +177,13 @@ def format_of(name: str, data: bytes) -> Format | None:
     found = _FORMATS_OF.get(_root_element(text[:_HEAD_BYTES]))
     if found == "urdf" and any(sign in _COMMENT.sub("", text) for sign in _MACROS):
         return "xacro"
-    # Otherwise decide by the suffix, so that the reader reports the error in the file.
+    # Without a known root element the suffix decides, so that the reader reports the error in the file.
     return found or {".urdf": "urdf", ".xacro": "xacro", ".mjcf": "mjcf"}.get(suffix)  # type: ignore[return-value]
 
 
 def text_of(data: bytes) -> str:
     """Decode XML or YAML by byte order mark or declaration, and strip both; invalid UTF-8 is Latin 1."""
-    coding: str = json.detect_encoding(data)  # By the byte order mark, or the zeros in the first characters.
+    coding: str = json.detect_encoding(data)  # The byte order mark, or zeros among the first characters, decides.
     if (declared := _DECLARED.match(data)) and _NAMED.match(said := declared[1].decode()):
         coding = said
     try:

@@ -15,7 +15,7 @@ from graspd.service.model.errors import InputError
 from graspd.service.store.assets import check_path
 
 _SCHEME: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):(/*)")
-#: Schemes with a path; its first part, a package or foreign folders, is optional.
+#: Schemes of names with a path, whose first part (a package or foreign folders) is optional.
 _OURS: Final = frozenset({"package", "model", "file"})
 
 

@@ -258,7 +258,7 @@ def network_report(files: Mapping[str, bytes], name: str) -> dict[str, Any]:
         "points": network.points,
         "steps": network.steps,
         "about": "".join(letter for letter in " ".join(network.about.split()) if letter.isprintable()),
-        # Shards of `graspd synth` have this digest of the file.
+        # Digest of the file in shards of `graspd synth`.
         "file_digest": digest_bytes(data),
     }
     message = f"{name}: proposes grasps of {network.hand} ({network.hand_digest[:12]}), {joints} joints"

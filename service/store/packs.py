@@ -71,7 +71,7 @@ def _take_apart(store: Store, key: str, dead: list[str]) -> Iterator[ShardManife
         gone = {shard for record in dead for shard in json.loads(store.get(record))["shards"]}
         body, shards = _directory(key, data)
     except NotFoundError:
-        return  # Another process has converted it.
+        return  # Another process has converted the pack.
     except (DamagedError, ValueError, LookupError, TypeError) as error:
         log.error("the pack %s is damaged, and moved aside: %s", key, error)
         store.set_aside(key)

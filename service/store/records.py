@@ -256,7 +256,7 @@ def removed_before(key: str, at: str) -> bool:
 def deletions(store: Store, what: str = "") -> list[Deletion]:
     """Return the deletions that can be undone, newest first; `what` selects one kind of resource."""
     found: dict[str, Deletion] = {}
-    # An object that the controller moves is in the second folder before it leaves the first.
+    # The controller moves an object to the second folder before it leaves the first.
     for folder, before_kind in ((names.DELETIONS, "/"), (names.REMOVED, "-")):
         for key in _keys(store, folder):
             if key.count("/") == 2 and (not what or key.split(before_kind)[1] == what):

@@ -51,7 +51,7 @@ from graspd.service.model.records import (
 from graspd.service.model.states import State
 from graspd.service.store.manifests import ShardManifest
 
-#: Ranges entered in one transaction; it takes some tenths of a second, during which other writers wait.
+#: Ranges entered in one transaction of some tenths of a second, during which other writers wait.
 RANGES_AT_ONCE: Final = 500
 
 

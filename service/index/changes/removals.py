@@ -43,7 +43,7 @@ class Removals(IndexPart):
                 return user
             newest = select(object_sets).order_by(object_sets.c.name, object_sets.c.created, object_sets.c.digest)
             rows = {row["name"]: row for row in within.execute(newest).mappings()}
-            # In another project's set the name means another object, unless the object is shared.
+            # The name may mean another object in the set's project, unless this object is shared.
             near = [row for row in rows.values() if asset.shared or row["project"] == asset.project]
             if found := next((row["name"] for row in near if asset.name in row["objects"]), None):
                 return f"the set of objects {found!r}"

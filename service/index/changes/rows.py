@@ -144,9 +144,9 @@ def _short(facts: dict[str, Any]) -> dict[str, Any]:
 _JOBS_AT_ONCE: Final = 200
 _FACTS: Final = ("stage", "done", "last_attempt", "exhausted", "retried_upto")
 
-#: Option of a connection that suppresses reports of ends.
+#: Option of a connection that suppresses reports of ended jobs and datasets.
 QUIET: Final = "graspd_quiet"
-#: Prefix of the note about a job whose tasks are not all entered; the job's id follows.
+#: Prefix of the note about a job with tasks still to enter; the job's id follows.
 ENTERING: Final = "entering "
 _WHOSE: Final = (jobs.c.project, jobs.c.owner)
 
@@ -246,7 +246,7 @@ def _settle_jobs(connection: Connection, ids: Sequence[str]) -> dict[str, State]
             if state.is_final and state != row["now"]:
                 about = {"kind": "job", "subject": job, "state": state.value}
                 ended.append(about | {"project": row["project"], "owner": row["owner"]})
-    # A rebuild reports no earlier ends.
+    # A rebuild reports no past ends of jobs and datasets.
     if not connection.get_execution_options().get(QUIET):
         note_ends(connection, ended)
     return states

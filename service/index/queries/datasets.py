@@ -147,7 +147,7 @@ def _dataset_view(connection: Connection, row: Any) -> DatasetView:
 def _state(row: Any, states: dict[State, int]) -> State:
     state = job_state(state for state, count in states.items() if count)
     if row["cancelled"]:
-        # A cancelled dataset has no pending work: its jobs stop later, or continue for another dataset.
+        # A cancelled dataset has no pending work: its jobs stop, or continue for another dataset.
         return state if state.is_final else State.CANCELLED
     # The jobs have not received the dataset's last event, a retry.
     return State.QUEUED if state.is_final and row["applied"] < row["events"] else state

@@ -95,7 +95,7 @@ class Grasps(IndexPart):
                 yield GraspView(**row)
 
 
-#: Most rows that are fetched by an index and sorted: faster than a scan of a million rows.
+#: Most rows to fetch by an index and sort: faster than a scan of a million rows.
 SORTED_AT_ONCE: Final = 40_000
 #: Rows read in the wanted order: few at first, since most filters fill a page from them.
 LOOKED_AT: Final = (1000, 20_000)

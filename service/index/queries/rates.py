@@ -69,7 +69,7 @@ class StageRate:
     """Interval of the seconds, as factors."""
 
 
-#: Least interval of a measured rate: the difference between runs of the same batches.
+#: Narrowest interval of a measured rate: the observed difference between two runs of the same batches.
 MEASURED_SPREAD: Final = (0.8, 1.25)
 #: Interval of a stored rate on a machine with a known factor: fidelities and methods scale differently.
 SCALED_SPREAD: Final = (0.5, 2.0)

@@ -66,7 +66,7 @@ class Statistics(IndexPart):
         with self.database.reading() as connection:
             place: ColumnElement[Any] = (value - low) / width if width > 0 else value * 0
             if connection.dialect.name == "postgresql":
-                # PostgreSQL's cast rounds, SQLite's truncates, and not every SQLite has floor().
+                # A cast to integer rounds in PostgreSQL and truncates in SQLite; some versions of SQLite lack floor().
                 place = func.floor(place)
             place = cast(place, Integer)
             query = select(place, func.count()).where(value.between(low, high), *sql_conditions(where)).group_by(place)
@@ -77,10 +77,11 @@ class Statistics(IndexPart):
     def side_by_side(
         self, filters: Sequence[GraspFilter], metrics: Sequence[Metric], *, bins: int = 20, at_most: int = 20_000
     ) -> dict[Metric, list[Distribution | None]]:
-        """Return one distribution per metric and filter in common bins, from about `at_most` grasps each; None without
-        any.
+        """Return one distribution per metric and filter in common bins; None without grasps.
 
-        Ids of shards are digests: those below a bound are a fair sample, and they are adjacent in the index.
+        The grasps are a sample of about `at_most` per filter: ids of shards are digests, so the ids below a bound are a
+        fair
+        sample, and they are adjacent in the index.
         """
         samples = [self._values(where, metrics, at_most) for where in filters]
         found: dict[Metric, list[Distribution | None]] = {}

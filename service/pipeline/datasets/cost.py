@@ -31,9 +31,9 @@ from graspd.service.pipeline.datasets.estimate import Estimate, RateUsed, Worker
 from graspd.service.pipeline.datasets.spec import MAX_CELLS, Matrix
 
 WORKERS: Final = (1, 8, 64)
-#: A task in the queue and its events, in both directions (docs/explanation/scaling.md) [bytes].
+#: Traffic of a task in the queue and its events, in both directions (docs/explanation/scaling.md) [bytes].
 _MESSAGE_BYTES: Final = 19_500
-#: An object of unknown size: a scan of 5000 faces as STL [bytes].
+#: Size of an unknown object: a scan of 5000 faces as STL [bytes].
 _ASSET_BYTES: Final = 250_000
 _SHOWN_RATES: Final = 20
 Batches = Callable[[Stage], list[BatchCost]]

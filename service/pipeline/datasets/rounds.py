@@ -21,7 +21,7 @@ from graspd.service.pipeline.ranges import TaskRanges
 from graspd.service.store.records import job_events
 
 log = logging.getLogger(__name__)
-#: Time for datasets in one round of the controller [s]; queue and lost workers must not wait long.
+#: Most time for datasets in one round of the controller [s], because queue and lost workers must not wait long.
 BUDGET_S: Final = 0.5
 _CELLS_AT_ONCE: Final = 20
 
@@ -87,4 +87,4 @@ class DatasetRounds:
             act(self._services, job, cause=cause)
         except ConflictError as error:
             # The job ended or was restarted since the query of the index.
-            log.info("job %s of dataset %s is left as it is: %s", job, work.name, error)
+            log.info("job %s of dataset %s is unchanged: %s", job, work.name, error)

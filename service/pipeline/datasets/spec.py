@@ -20,7 +20,7 @@ from graspd.service.model.version import STAGE_REVISIONS
 MAX_CELLS: Final = 100_000
 
 
-#: Repeated names would be one cell.
+#: Unique names, because repeated names would be one cell.
 Names = Annotated[tuple[Name, ...], AfterValidator(lambda given: tuple(dict.fromkeys(given)))]
 
 

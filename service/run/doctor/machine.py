@@ -19,7 +19,7 @@ from graspd.service.settings import Settings
 from graspd.service.store.store import local_folder
 
 _GIB: Final = 2**30
-#: Below this, a worker's scratch files, a shard and the log of Redis may not fit together.
+#: Least free space: a worker's scratch files, a shard and the log of Redis must fit together.
 _DISK_BAD: Final = 1 * _GIB
 _DISK_LOW: Final = 5 * _GIB
 _FEW_INODES: Final = 10_000
