@@ -232,7 +232,7 @@ def test_an_api_that_cannot_start_says_why_in_one_line(graspd: Shell, tmp_path: 
     no_store = Shell(graspd.environment | {"GRASPD_STORE_URL": (tmp_path / "file" / "store").as_uri()})
     with socket.create_server(("127.0.0.1", 0)) as taken:
         for shell, arguments, code, words in (
-            (graspd, ("--port", str(taken.getsockname()[1])), 1, "taken"),
+            (graspd, ("--port", str(taken.getsockname()[1])), 1, "in use"),
             (graspd, ("--host", "0.0.0.0", "--port", "0"), 2, "graspd keys add"),
             (no_store, ("--port", "0"), 1, str(tmp_path / "file")),
         ):
