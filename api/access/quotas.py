@@ -237,7 +237,7 @@ class Quotas:
         return met.decode(), int(amount)
 
     def _forget_ended(self, holder: _Holder) -> None:
-        """Drop ended jobs, except pending ones, which the index lacks, and jobs claimed again meanwhile."""
+        """Drop ended jobs. Pending jobs, absent in the index, and jobs claimed again meanwhile stay."""
         found = [word.decode(errors="replace") for word in self._connection.eval(_ENTERED, 1, holder.held)]
         entries = dict(zip(found[::2], found[1::2], strict=True))
         ended = sorted(entries.keys() - set(self._unfinished(list(entries))))

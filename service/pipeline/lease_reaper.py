@@ -153,7 +153,7 @@ class LeaseReaper:
             except DamagedError as error:
                 self._fail(message.task_id, message.stage, error)
                 return
-        # Without wait, because the machine causes a first loss more often than the task does.
+        # No wait: the machine causes a first loss more often than the task does.
         self._indexer.failed(attempt, at_once=attempt.number == 1)
 
     def _lose_check(self, message: IngestMessage) -> None:

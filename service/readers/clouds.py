@@ -239,7 +239,7 @@ _OBJECT: Final = 2
 #: Planes are fitted to noisy points in windows of 7 x 7 pixels; the depth may differ by this many deviations.
 _RADIUS: Final = 3
 _DEVIATIONS: Final = 4.0
-#: Steepest surface in such a window: depth grows by at most this factor of the lateral distance.
+#: Steepest surface in a window: the ratio of depth to lateral distance is at most this.
 _SLOPE: Final = 3.0
 
 
