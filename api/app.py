@@ -90,7 +90,7 @@ def create_app(settings: Settings, services: Services | None = None) -> FastAPI:
     problems.install(app, problem_page)
     pages.install(app, opened)
     for router in (*_ROUTERS, *map(asset_router, AssetKind), *datasets.routers, *pages.routers):
-        # Add the routes built at import: `include_router` would rebuild them at the first request, and would silence
+        # Adds the routes built at import: `include_router` would rebuild them at the first request, and would silence
         # warnings for the whole process, which is unsafe while another application is built.
         app.router.routes.extend(router.routes)
     app.mount("/static", StaticFiles(directory=STATIC), name="static")

@@ -112,14 +112,12 @@ FILTERS: Final[Mapping[str, Callable[..., str]]] = {
 
 
 def host_name(host: str) -> str:
-    """Return the name in a Host header, without port and brackets."""
     if host.startswith("["):
         return host[1:].partition("]")[0]
     return host.rpartition(":")[0] if host.count(":") == 1 else host
 
 
 def is_loopback(host: str) -> bool:
-    """Check whether an address to bind is reachable only from this machine."""
     if host == "localhost":
         return True
     try:

@@ -49,7 +49,6 @@ class Snapshot:
         self._sums: Mapping[str, float] = {}
 
     def add_parts(self, latencies_s: Mapping[str, float | None]) -> None:
-        """Set the latency of each part [s]; None: it does not answer."""
         for part, seconds in latencies_s.items():
             self._set("graspd_part_up", part, value=float(seconds is not None))
             if seconds is not None:

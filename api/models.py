@@ -88,7 +88,7 @@ class JobDetail(Job):
     hand_digest: str
     object_digest: str
     choice: Choice | None = Field(None, description="how a chart resolved the fidelity auto, if requested")
-    note: str | None = Field(None, description="note on the numbers; absent: none")
+    note: str | None = Field(None, description="why fewer grasps than requested were found; absent: not applicable")
     outcomes: dict[str, int] = Field(
         {}, description="rejected candidates by outcome, of a job that found fewer grasps than wanted"
     )

@@ -116,7 +116,7 @@ def describe(error: Exception) -> tuple[str, str, int, str]:
 
 
 def _is_full(error: BaseException | None) -> bool:
-    """Check whether the disk was full: FastAPI reports an error during the reading of a body as a bad request."""
+    """Check whether the disk was full: FastAPI reports an error during the read of a body as a bad request."""
     return isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
 
 
@@ -200,7 +200,6 @@ def install(app: FastAPI, page: Callable[[Request, dict[str, Any]], Response]) -
         assert isinstance(error, RequestValidationError)
         return validation_answer(request, error)
 
-    #: Handler of the outermost middleware for requests that reached no other handler.
     app.state.answer_error = answer_any
     for kind in (GraspdError, ApiError, HTTPException):
         app.add_exception_handler(kind, any_error)

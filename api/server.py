@@ -1,8 +1,8 @@
 """Server of the application: one uvicorn server in this process, on a socket that is bound first.
 
-uvicorn limits the time between requests; `BodyLimit` limits the time between pieces of a body. Without `TimedProtocol`
-two kinds of connections would stay open forever: those with partial or no headers, and those whose body continues after
-the response. No code reads such a body, and each of its bytes restarts uvicorn's limit.
+uvicorn limits the time between requests; `BodyLimit` limits the time between pieces of a body. `TimedProtocol` limits
+two further kinds of connections: those with partial or no headers, and those whose body continues after the response.
+No code reads such a body, and each of its bytes restarts uvicorn's limit.
 """
 
 from __future__ import annotations
@@ -29,11 +29,10 @@ _TOO_SLOW: Final = b"HTTP/1.1 408 Request Timeout\r\nConnection: close\r\nConten
 
 
 def serve(settings: Settings) -> None:
-    """Answer requests until SIGINT or SIGTERM."""
     listener = bind(settings.host, settings.port)
     with listener:
         listener.listen(socket.SOMAXCONN)
-        # Spool uploads in this folder, because /tmp may be in memory.
+        # Uploads are spooled in this folder, because /tmp may be in memory.
         spool = settings.data_dir / "uploads"
         spool.mkdir(parents=True, exist_ok=True)
         tempfile.tempdir = str(spool)
@@ -49,8 +48,8 @@ def configuration(app: ASGIApp, settings: Settings) -> uvicorn.Config:
         app,
         http=TimedProtocol,
         ws="none",
-        # A trusted proxy may state any client address and so evade limits per address. No proxy, including loopback,
-        # is trusted unless the variable lists it.
+        # A trusted proxy may state any client address and so evade limits per address. No proxy, including loopback, is
+        # trusted unless the variable lists it.
         proxy_headers=bool(os.environ.get("FORWARDED_ALLOW_IPS")),
         log_config=None,
         access_log=False,

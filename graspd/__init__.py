@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
     __version__: str
 
-#: Module that defines a public name; the others are errors.
+#: Module that defines a public name; all other public names are errors.
 _LIVES_IN: Final = {
     "synthesize": "graspd.synthesis",
     **dict.fromkeys(("open", "Grasps", "Grasp", "Postures"), "graspd.grasps"),

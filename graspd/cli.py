@@ -19,7 +19,6 @@ from graspd.service.model.errors import did_you_mean
 from graspd.service.model.libraries import imports, own_process
 from graspd.service.model.version import PACKAGE_VERSION
 
-#: Command, module of its group, panel of the overview, help.
 COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("demo", "graspd.demo", "Make grasps", "Make grasps, scenes and pictures of built-in data, and a results page."),
     ("synth", "graspd.commands.synth", "Make grasps", "Generate grasps of a hand file on an object file."),
@@ -59,7 +58,6 @@ COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("admin", "graspd.admin", "Administration", "Maintenance: kernels, index, store, pictures."),
 )
 
-#: Group, its command, module of the command, help.
 JOINED: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("admin", "kernels", "graspd.commands.worker", "Compile all kernels ahead of time."),
     ("admin", "index", "graspd.service.run.commands", "Rebuild the index from the store or export its tables."),
@@ -78,7 +76,6 @@ PACKAGES: Final[dict[str, tuple[str, str]]] = {
     "graspd.demo": ("warp", "all"),
 }
 
-#: Class of typer, or of click in an older typer.
 UsageError: Final[Any] = typer.BadParameter.__base__
 
 
@@ -86,16 +83,16 @@ class LazyGroup(TyperGroup):
     """Group whose overview needs no import: calling a command imports its package."""
 
     def main(self, *args: Any, **extra: Any) -> Any:
-        """Run the command; a usage error prints one line and exits with code 2, as any other invalid input."""
+        """Run the command; a usage error prints one line and exits with code 2, like any other invalid input."""
         try:
             code = super().main(*args, **extra | {"standalone_mode": False})
         except UsageError as error:
             code = error.exit_code
-            if said := usage_line(error):  # else it is help, already printed
+            if said := usage_line(error):  # Without a line, help is already printed.
                 typer.echo(f"graspd: {said}", err=True)
         except typer.Abort:
             code = 1
-            typer.echo("graspd: stopped at a question", err=True)
+            typer.echo("graspd: stopped at a prompt", err=True)
         sys.exit(code)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
@@ -119,7 +116,6 @@ class Deferred(TyperCommand):
         self.module = module
 
     def make_context(self, info_name: Any, args: Any, parent: Any = None, **extra: Any) -> Any:
-        # Completion omits commands whose package is not installed.
         if extra.get("resilient_parsing") and missing_extra(self.module):
             return super().make_context(info_name, args, parent, **extra)
         return load(self.module, str(self.name), parent).make_context(info_name, args, parent, **extra)
@@ -178,7 +174,6 @@ def missing_extra(module: str) -> str | None:
 
 
 def build() -> typer.Typer:
-    """Build the root command with a lightweight entry for every command."""
     app = typer.Typer(
         cls=LazyGroup,
         help="Make datasets of stable, contact-rich multi-finger grasps by differentiable simulation.",
@@ -205,10 +200,10 @@ def _entry() -> None:
 
 
 def main() -> None:
-    """Run the `graspd` command (entry point)."""
     own_process()
-    # No command draws with MuJoCo; its import would otherwise start a process to search for GLFW.
+    # Commands do not draw with MuJoCo, whose import would start a process to search for GLFW without this setting.
     os.environ.setdefault("MUJOCO_GL", "disable")
-    # Otherwise pydantic searches all installed packages for plugins. To enable plugins, set the variable to "".
+    # Without this setting pydantic searches all installed packages for plugins. To enable plugins, set the variable to
+    # "".
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     at_the_door(build())

@@ -64,7 +64,7 @@ def demo(
 
 
 def run(client: Client, request: JobRequest, out: Path, console: Console) -> tuple[JobDetail, list[Path]]:
-    """Submit the job, watch it, and fetch its files: return it and its shards."""
+    """Submit the job, watch it, and fetch its files; return the job and its shards."""
     job = client.submit(request)
     console.print(f"job {job.id[:12]}: {request.grasps} grasps of {request.hand} on {request.object}")
     with JobDisplay(console) as display:
@@ -78,7 +78,6 @@ def run(client: Client, request: JobRequest, out: Path, console: Console) -> tup
 
 
 def print_results(console: Console, job: JobDetail, paths: dict[str, list[str] | str]) -> None:
-    """Print yield, means, worker time and the paths of all files."""
     console.print(f"{yield_of(job)}; {means_of(job)}")
     for stage in job.stages:
         console.print(f"{stage.stage.value:<11} {count(stage.tasks)} × {duration(stage.seconds / stage.tasks)}")
@@ -89,8 +88,7 @@ def print_results(console: Console, job: JobDetail, paths: dict[str, list[str] |
 
 
 def write_pages(out: Path, job: JobDetail, shards: list[Path]) -> dict[str, list[str] | str]:
-    """Write the contact sheet of the best grasps, views of the first batch, and an index.html with both.
-    Return the paths of shards, pictures and page."""
+    """Write a sheet of the best grasps, views of the first batch, and an index.html; return all paths."""
     from graspd.worker.rendering.sheets import views_page
 
     pages: dict[str, bytes] = {}
@@ -112,7 +110,7 @@ def write_pages(out: Path, job: JobDetail, shards: list[Path]) -> dict[str, list
 
 def draw_grasps(job: JobDetail, base: Shard) -> bytes:
     """Return a PNG of the best grasps of a shard, ranked by ε."""
-    # Importing Warp takes seconds; check the options first.
+    # Importing Warp takes seconds, so options are checked first.
     from graspd.worker.engines import backend
     from graspd.worker.hands.load import load_hand
     from graspd.worker.objects.prepare import load_object

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 PICTURED: Final = 4
 EDGE: Final = 220
 PICTURE_S: Final = 10.0
-#: Largest picture that a notebook receives [bytes].
 PICTURE_BYTES: Final = 300_000
 #: Columns of the table shown if no picture can be drawn.
 _FIGURES: Final = ("epsilon", "contact_area_cm2", "penetration_depth_mm")
@@ -34,7 +33,6 @@ _MORE: Final = {
 
 
 def frame_of(grasps: Grasps) -> Any:
-    """Return a `pandas.DataFrame`; see `Grasps.to_pandas`."""
     try:
         import pandas
     except ModuleNotFoundError:
@@ -75,7 +73,6 @@ def html_of(grasps: Grasps) -> str:
 
 
 def viewer_of(grasps: Grasps, *, host: str, port: int) -> Viewer:
-    """Start a viewer of the grasps; see `Grasps.view`."""
     try:
         from graspd.worker.files.provenance import hand_of_shard, neighbours_of_shard, object_of_shard
         from graspd.worker.viewing import Viewer, ViewerContent, missing
@@ -89,13 +86,7 @@ def viewer_of(grasps: Grasps, *, host: str, port: int) -> Viewer:
 
 
 def sheet_of(grasps: Grasps, count: int, edge: int, limit_s: float = math.inf) -> bytes:
-    """Return a PNG sheet of the best `count` grasps, `edge` pixels each.
-
-    Raises:
-        InputError: there are no grasps, or they are on several objects.
-        NotFoundError: the file of the hand or the object is not found.
-        TaskCancelled: after `limit_s` [s].
-    """
+    """Return a PNG sheet of the best grasps, `edge` pixels each; errors as in `Grasps.plot`, and TaskCancelled."""
     from graspd.commands.grasp_sheet import GraspSheet
     from graspd.worker.engines.devices import Device
     from graspd.worker.execution_context import ExecutionContext

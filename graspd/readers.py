@@ -25,6 +25,6 @@ def hand_surface(shard: Any, rows: Any) -> Any:
     Raises:
         NotFoundError: the shard's hand is not found.
     """
-    from graspd.worker.files.clouds import hand_surface as found  # imports the reader of hands
+    from graspd.worker.files.clouds import hand_surface as found
 
     return found(shard, rows)

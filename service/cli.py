@@ -1,4 +1,4 @@
-"""Common parts of all commands: one-line errors with exit codes, JSON on the last line, logs."""
+"""Common parts of all commands: one-line errors with exit codes, JSON output, logs."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ JsonFlag = Annotated[bool, typer.Option("--json", help="Print one JSON object on
 
 
 def reporting_errors(command: Callable[P, R]) -> Callable[P, R]:
-    """Convert errors to one line on stderr and an exit code: 2 for the caller's mistake, 1 for all others."""
+    """Convert errors to one line on stderr and an exit code: 2 for invalid input, 1 for all others."""
 
     @functools.wraps(command)
     def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -47,7 +47,7 @@ def reporting_errors(command: Callable[P, R]) -> Callable[P, R]:
         except ValidationError as error:
             fail(refusal(error), InputError.exit_code)
         except BrokenPipeError:
-            _silence(sys.stdout)  # the reader (head, less) has closed the pipe
+            _silence(sys.stdout)  # The reader (head, less) has closed the pipe.
             raise typer.Exit(0) from None
         except KeyboardInterrupt:
             fail("interrupted", 130)
@@ -56,20 +56,18 @@ def reporting_errors(command: Callable[P, R]) -> Callable[P, R]:
 
 
 class CommandGroup(typer.Typer):
-    """Commands that report errors in one line, see `reporting_errors`."""
-
     def command(self, *names: Any, **options: Any) -> Callable[[Callable[P, R]], Callable[P, R]]:  # type: ignore[override]
         add = super().command(*names, **options)
         return lambda command: add(reporting_errors(command))
 
 
 def at_the_door(command: Callable[[], object]) -> None:
-    """Run the command line; report system errors in one line. Other exceptions are bugs and keep their trace."""
+    """Run the command line; report system errors in one line. Other exceptions are bugs and show their trace."""
     for descriptor in range(3):
         try:
             os.fstat(descriptor)
         except OSError:
-            # Otherwise the next opened file would get this descriptor, and the printed output.
+            # Otherwise the next opened file gets this descriptor, and receives the printed output.
             os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
@@ -112,7 +110,7 @@ def _silence(stream: TextIO | None) -> None:
 
 
 def write_output(path: Path, content: bytes) -> None:
-    """Write a user's output file: atomically, unless it is a device, a pipe or a link."""
+    """Write an output file: atomically, unless the path is a device, a pipe or a link."""
     if path.is_symlink() or (path.exists() and not path.is_file()):
         path.write_bytes(content)
         return
@@ -128,7 +126,7 @@ def write_output(path: Path, content: bytes) -> None:
 
 @contextlib.contextmanager
 def told_to_stop() -> Iterator[list[int]]:
-    """Yield a list that receives the first stop signal (Ctrl-C, SIGTERM); a second one ends the process."""
+    """Yield a list that receives the first stop signal (Ctrl-C, SIGTERM); a second signal ends the process."""
     asked: list[int] = []
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
@@ -140,7 +138,7 @@ def told_to_stop() -> Iterator[list[int]]:
     try:
         for number in before:
             signal.signal(number, note)
-    except ValueError:  # not in the main thread: signals belong to another owner
+    except ValueError:  # Not in the main thread: signals belong to another owner.
         before = {}
     try:
         yield asked
@@ -155,8 +153,8 @@ def fail(message: str, code: int) -> NoReturn:
 
 
 def plain_console(*, stderr: bool = False) -> Console:
-    """Return a terminal that prints verbatim; Rich would read `[red]` as a style and `:x:` as a sign."""
-    from rich.console import Console  # imported only when something is drawn
+    """Return a terminal that prints verbatim; Rich reads `[red]` as a style and `:x:` as a sign."""
+    from rich.console import Console
 
     return Console(stderr=stderr, markup=False, emoji=False, highlight=False)
 
@@ -176,7 +174,6 @@ def emit(value: BaseModel | dict[str, Any]) -> None:
 
 
 def report(value: BaseModel | dict[str, Any], text: str, *, json: bool) -> None:
-    """Print a result as JSON or as text."""
     if json:
         emit(value)
     else:
@@ -184,7 +181,7 @@ def report(value: BaseModel | dict[str, Any], text: str, *, json: bool) -> None:
 
 
 def load_settings(**overrides: Any) -> Settings:
-    """Load the settings of the environment and the given command options; InputError for a bad value."""
+    """Load settings from the environment and the given command options; InputError for an invalid value."""
     from graspd.service.settings import GONE, Settings
 
     if gone := [f"{name} was removed: {GONE[name]}" for name in sorted(GONE) if os.environ.get(name)]:
@@ -203,7 +200,7 @@ class EngineSettings:
 
 
 def engine_settings() -> EngineSettings:
-    """Load them from the environment; the module of settings, slow to import, only if one is set."""
+    """Load engine settings from the environment; import the slow module of settings only if a variable is set."""
     if not any(name.upper().startswith("GRASPD_") for name in os.environ):
         return EngineSettings()
     found = load_settings()
@@ -217,7 +214,7 @@ def log_to_stderr(settings: Settings, process: str = "graspd") -> None:
 
 
 def keep_private(settings: Settings) -> None:
-    """Restrict files of this process and its children, and a data folder that others can read, to their user."""
+    """Make new files of this process and its children, and a readable data folder, private to the user."""
     os.umask(0o077)
     with contextlib.suppress(OSError):
         status = settings.data_dir.stat()

@@ -27,7 +27,7 @@ def with_options(model: type[BaseModel], place: Place) -> Callable[[Callable[...
         at = [parameter.name for parameter in own].index("options")
         parameters = [*own[:at], *map(_parameter, added), *own[at + 1 :]]
         parameters = [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in parameters]
-        del wrapper.__wrapped__  # its signature differs
+        del wrapper.__wrapped__  # The wrapped command has another signature.
         wrapper.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         wrapper.__annotations__ = {one.name: one.annotation for one in parameters}
         return wrapper
@@ -48,15 +48,15 @@ def _parameter(row: Row) -> inspect.Parameter:
 
 
 def parsed_options(model: type[ModelT], values: dict[str, Any]) -> ModelT:
-    """Validate the given options; InputError names the first invalid option as typed."""
+    """Validate the given options; InputError names the first invalid option as on the command line."""
     options = {row.name: row.flags[0].partition("/")[0] for place in EVERYWHERE for row in rows(model, place)}
     names = {name: f"--{name.replace('_', '-')}" for name in model.model_fields}
-    # The name of a dataset is an argument.
+    # The dataset's name is an argument, not an option.
     return accepted(model, values, names={**names, "name": "NAME", **options})
 
 
 def pairs(texts: Iterable[str]) -> dict[str, str | int | float]:
-    """Parse `name=value` of each `--option`, numbers as numbers, as in HTTP. InputError for another form."""
+    """Parse `name=value` of each `--option`; values that are numbers become numbers, as in HTTP."""
     split = [text.partition("=") for text in texts]
     for name, equals, value in split:
         if not equals:

@@ -1,7 +1,4 @@
-"""Generated files: tables of the documentation, type stubs of keywords.
-
-Pages contain tables between `<!-- NAME -->` and `<!-- /NAME -->`; `python -m graspd.service.docs` rewrites all.
-"""
+"""`python -m graspd.service.docs` rewrites the tables of the documentation and the type stubs of keywords."""
 
 from __future__ import annotations
 

@@ -16,7 +16,6 @@ IMAGE: Final = "image"
 
 
 def arrow() -> Any:
-    """Import pyarrow; InputError if it is not installed."""
     try:
         import pyarrow
         import pyarrow.parquet
@@ -45,7 +44,7 @@ def schema_of(columns: Mapping[str, str], also: Mapping[str, str] | None = None)
 
 
 def write(file: Path, schema: Any, groups: Iterable[Sequence[Mapping[str, Any]]]) -> int:
-    """Write rows, each group of them as one row group; return their number."""
+    """Write rows, each group as one row group; return the number of rows."""
     pa = arrow()
     file.parent.mkdir(parents=True, exist_ok=True)
     count = 0
@@ -70,4 +69,4 @@ def read(file: Path, wanted: Iterable[str]) -> dict[str, list[Any]]:
                 )
             return dict(found.read(columns=names).to_pydict())
     except (OSError, pa.ArrowException, MemoryError) as error:
-        raise InputError(f"{file} is no Parquet file that can be read: {error}") from None
+        raise InputError(f"{file} is not a readable Parquet file: {error}") from None

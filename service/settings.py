@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from sqlalchemy import URL
 
 
-#: Obsolete variables, with their replacements.
 GONE: Final = {
     "GRASPD_SHARD_PACK": "a task makes one shard of all its batches; unset it, and see GRASPD_TASK_S",
     "GRASPD_KEEPER_SHARDS": "one controller leads and the others stand by; unset it",
@@ -179,7 +178,7 @@ class Settings(BaseSettings):
 
 
 def sqlite_url(path: Path) -> URL:
-    """Return SQLAlchemy's URL of a file with any path: in a text URL it would end at a question mark."""
-    from sqlalchemy import URL  # only API and controller need it, and its import is slow
+    """Return SQLAlchemy's URL of a file with any path: in a text URL the path would end at a question mark."""
+    from sqlalchemy import URL  # Only API and controller need this slow import.
 
     return URL.create("sqlite", database=str(path))

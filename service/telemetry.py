@@ -20,11 +20,10 @@ from graspd.service.model.errors import without_secrets
 if TYPE_CHECKING:
     from graspd.service.settings import Settings
 
-#: Subjects of a log line, in the order of display.
 SUBJECTS: Final = ("request", "key", "job", "task", "attempt", "worker")
 _bound: ContextVar[Mapping[str, Any]] = ContextVar("bound", default=MappingProxyType({}))
 _ORDINARY: Final = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "about", "taskName"}
-#: RQ logs every idle poll, httpx every request.
+#: Loggers with too many lines: RQ logs every idle poll, httpx every request.
 _TALKATIVE: Final = ("rq.worker", "rq.job", "rq.queue", "httpx")
 
 
@@ -104,19 +103,17 @@ def _time(record: logging.LogRecord) -> str:
 
 
 log = logging.getLogger(__name__)
-#: Well below the minute after which a health check declares the process dead.
+#: Interval of updates [s], well below the minute after which a health check declares the process dead.
 _EVERY_S: Final = 5.0
 
 
 class HeartbeatFile:
-    """File touched at most every few seconds, regardless of the number of calls."""
-
     def __init__(self, path: Path | None) -> None:
         self._path = path
         self._again = 0.0
 
     def touch(self) -> None:
-        """Update the heartbeat. A full disk is logged once and otherwise ignored."""
+        """Update the heartbeat at most every few seconds. A full disk is logged once and otherwise ignored."""
         now = time.monotonic()
         if self._path is None or now < self._again:
             return

@@ -19,7 +19,6 @@ from typing import Final
 
 log = logging.getLogger(__name__)
 
-#: An entry starts with the SHA-256 of the rest.
 _DIGEST_BYTES: Final = 32
 _LIMIT_BYTES: Final = 2 << 30
 
@@ -43,7 +42,7 @@ def load(file: Path) -> bytes | None:
 
 
 def keep(file: Path, content: bytes, *, limit_bytes: int = _LIMIT_BYTES) -> None:
-    """Write an entry; remove the least recently used ones of its folder above `limit_bytes`."""
+    """Write an entry after its SHA-256; remove the least recently used entries of its folder above `limit_bytes`."""
     with suppress(OSError):
         write_whole(file, [hashlib.sha256(content).digest(), content])
         make_room(file.parent, file.suffix, limit_bytes, keep=file)
@@ -73,7 +72,7 @@ def make_room(folder: Path, suffix: str, limit_bytes: int, *, keep: Path) -> Non
     for _, size, file in sorted(found, reverse=True):
         used += size
         if used > limit_bytes and file != keep:
-            # A process that has it open can still read it.
+            # A process with the open file can still read it.
             file.unlink(missing_ok=True)
 
 
@@ -91,12 +90,12 @@ def _root(xdg: str, home: str, temporary: str) -> Path:
     except (OSError, RuntimeError) as error:
         trouble = str(error)
     root = _private(Path(temporary))
-    log.warning("no cache in the home folder (%s); what can be computed again is kept in %s", trouble, root)
+    log.warning("no cache in the home folder (%s); reproducible files are in %s", trouble, root)
     return root
 
 
 def _private(temporary: Path) -> Path:
-    """Create a folder writable by this user only. If another user has put one there, nothing is stored or found."""
+    """Create a folder writable by this user only. A folder of another user at this path is not used."""
     mine = temporary / f"graspd-cache-{os.geteuid()}"
     with suppress(OSError):
         mine.mkdir(mode=0o700, exist_ok=True)

@@ -1,13 +1,9 @@
 """Authentication of a request by key, session cookie or proxy; permissions of the caller.
 
-While no key was ever made, the service is open to this machine only. After the first key it stays closed, even if the
-last key is revoked or expired.
-
-A proxy in front of the service may authenticate people (OIDC); it is trusted only from its address and with its secret.
-
-The proxy sends `Authorization: Basic user:secret`, which oauth2-proxy builds from `--basic-auth-password`, and the
-person's groups in X-Forwarded-Groups. Any client can send such headers, so both the connection's address and the secret
-must be the proxy's, and duplicate headers are refused.
+Before the first key, the service is open to this machine only. Afterwards it stays closed, even if all keys are revoked
+or expired. A proxy in front of the service may authenticate people (OIDC): `Authorization: Basic user:secret`, which
+oauth2-proxy builds from `--basic-auth-password`, and the person's groups in X-Forwarded-Groups. Any client can send
+such headers, so both the connection's address and the secret must be the proxy's, and duplicate headers are refused.
 """
 
 from __future__ import annotations
@@ -142,7 +138,6 @@ def _is_elsewhere(address: str) -> bool:
 
 
 GROUPS: Final = "x-forwarded-groups"
-#: Group name that means any authenticated person.
 ANYBODY: Final = "*"
 _LEAST_SECRET: Final = 16
 _LONGEST_USER: Final = 200

@@ -1,7 +1,6 @@
 """Bearer keys with scopes. A key is shown only once, at its creation; only its SHA-256 is stored.
 
-All API processes read the keys from one JSON file (mode 600). A key made, rotated or revoked on the command line takes
-effect at the next request.
+All API processes read the keys from one JSON file (mode 600), so changes on the command line apply to the next request.
 """
 
 from __future__ import annotations
@@ -32,10 +31,7 @@ SESSION_S: Final = 12 * 3600
 
 
 class Scope(StrEnum):
-    """Permission of a key; each scope includes the one before it.
-
-    `submit` covers resources submitted with the same key, `admin` those of all keys.
-    """
+    """Permission of a key, each including the one before: `submit` covers own resources, `admin` those of all keys."""
 
     READ = "read"
     SUBMIT = "submit"
@@ -66,7 +62,7 @@ class ProjectLimits(BaseModel):
 
 
 class Key(BaseModel):
-    """Key as stored. Rotation does not change its id; later keys with the same name have other ids."""
+    """Stored key. Rotation does not change its id; later keys with the same name have other ids."""
 
     id: str = ""
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._@+-]{0,63}$")
@@ -80,7 +76,7 @@ class Key(BaseModel):
 
     @model_validator(mode="after")
     def _has_an_id(self) -> Self:
-        # For keys older than ids: during a rotation the old and the new secret have the same name and thus the same id.
+        # Keys older than ids: during a rotation the old and the new secret have the same name and thus the same id.
         self.id = self.id or _sha256(f"name {self.name}")[:16]
         return self
 
@@ -132,7 +128,7 @@ class KeyFile:
             if any(key.name == name and key.is_live for key in document.keys):
                 raise ConflictError(f"there is a key named {name!r}; revoke or rotate it, or take another name")
             if "@" in name:
-                raise InputError(f"{name!r} is no key name: names with an @ belong to people whom a proxy signs in")
+                raise InputError(f"{name!r} is no key name: names with an @ are reserved for users of a proxy")
             token = PREFIX + secrets.token_urlsafe(32)
             try:
                 key = Key(
@@ -169,14 +165,12 @@ class KeyFile:
         return token
 
     def limit(self, name: str, limits: KeyLimits) -> KeyLimits:
-        """Change the given limits of a key; return all of its limits."""
         with self._changing() as document:
             for key in (found := _live(document, name)):
                 key.limits = key.limits.model_copy(update=limits.model_dump(exclude_unset=True))
         return found[-1].limits
 
     def projects(self) -> dict[str, ProjectLimits]:
-        """Return projects that have keys or limits, by name."""
         document = self._read()
         named = {key.project: ProjectLimits() for key in document.keys if key.project}
         return dict(sorted((named | document.projects).items()))
@@ -185,7 +179,6 @@ class KeyFile:
         return self._read().projects.get(project, ProjectLimits())
 
     def limit_project(self, project: str, limits: ProjectLimits) -> ProjectLimits:
-        """Change the given limits of a project; return all of its limits."""
         if not re.fullmatch(PATTERN, project):
             raise InputError(_no_project(project))
         with self._changing() as document:
@@ -210,7 +203,7 @@ class KeyFile:
         return f"{claim}.{self._sign(claim)}"
 
     def find_session(self, cookie: str) -> Key | None:
-        """Return the valid key of a session; revoking the key ends its sessions. None without a signing secret."""
+        """Return the valid key of a session, which ends when its key is revoked. None without a signing secret."""
         claim, _, signature = cookie.partition(".")
         if not self._read().session_secret or not hmac.compare_digest(signature.encode(), self._sign(claim).encode()):
             return None

@@ -1,8 +1,8 @@
 """Quotas of a key, and of all keys of a project: grasps in unfinished jobs, and requests per day; idempotency keys.
 
-Redis counts them in one atomic step for all API processes. Loss of Redis resets quotas, but no job is lost. From
-submission to end, a job counts with its requested grasps. The index is asked for ended jobs only if the quota would be
-exceeded, so a submission needs one round trip.
+Redis counts in one atomic step for all API processes; its loss resets quotas, but loses no job. From submission to end,
+a job counts with its requested grasps. The index is queried for ended jobs only if the quota would be exceeded, so a
+submission needs one round trip.
 """
 
 from __future__ import annotations
@@ -172,7 +172,7 @@ class Quotas:
             yield claim
 
     def _refuse_spent(self, project: str) -> None:
-        """Raise QuotaError if a project's GPU seconds of today are used up. Its earlier jobs continue."""
+        """Raise QuotaError if a project's GPU seconds of today are used up; its earlier jobs continue."""
         most = self._limits_of(project).gpu_seconds_per_day if project else None
         if most and (used := self._gpu_seconds(project, f"{datetime.now(UTC):%Y-%m-%d}")) >= most:
             raise QuotaError(
@@ -189,7 +189,6 @@ class Quotas:
         if key.project:
             limits = self._limits_of(key.project)
             most = limits.grasps_in_flight or 0, limits.grasps_per_day or 0
-            # Names of keys contain no colon.
             words = f"the project {key.project!r}"
             found.append(_Holder(f"project:{key.project}", words, *most, counts_jobs=False))
         return [holder for holder in found if holder.grasps or holder.today]
@@ -238,7 +237,7 @@ class Quotas:
         return met.decode(), int(amount)
 
     def _forget_ended(self, holder: _Holder) -> None:
-        """Drop ended jobs, except pending ones, which the index lacks, and jobs claimed again meanwhile."""
+        """Drop ended jobs. Pending jobs, absent in the index, and jobs claimed again meanwhile stay."""
         found = [word.decode(errors="replace") for word in self._connection.eval(_ENTERED, 1, holder.held)]
         entries = dict(zip(found[::2], found[1::2], strict=True))
         ended = sorted(entries.keys() - set(self._unfinished(list(entries))))
@@ -277,8 +276,8 @@ _FREE: Final = "if redis.call('GET', KEYS[1]) == ARGV[1] then redis.call('DEL', 
 class Idempotency:
     """Idempotency-Key (IETF draft): the same key with a different body is an input error.
 
-    Identical requests give the same job even without a key, because a job's id depends on its content. Redis stores for
-    a day only the content of each key, not the response; if Redis loses it, only this check is lost.
+    Identical requests give the same job even without a key, because a job's id depends on its content. Redis stores the
+    content of each key for a day, but no response; if Redis loses it, only this check is lost.
     """
 
     def __init__(self, connection: Any) -> None:

@@ -50,7 +50,7 @@ class Assets:
         return library.load_asset_files(self._services.store, asset.kind, asset.digest)
 
     def model(self, asset: AssetView) -> bytes:
-        """Return the prepared hand or object as binary glTF; NotFoundError until it has been checked."""
+        """Return the prepared hand or object as binary glTF; NotFoundError before its check."""
         return get_sealed(self._services.store, names.asset_model(asset.kind, asset.digest))
 
     def add(
@@ -63,10 +63,11 @@ class Assets:
         shared: bool = False,
         rename: bool = False,
     ) -> AssetView:
-        """Store an upload. The controller queues the check of a hand or an object; a network is checked here.
+        """Store an upload. Workers check hands and objects; a network is checked here.
 
-        With `self_test` the check of a hand ends with grasps. All projects may use `shared` assets. With `rename` the
-        asset gets the next free name if its name is taken; content that exists already keeps its name.
+        With `self_test` the check of a hand includes grasps. All projects may use `shared` assets. With `rename` the
+        asset gets
+        the next free name if its name is taken; content that exists already keeps its name.
         """
         found = network_report(files, name) if kind is AssetKind.NETWORK else None
         project = project_scope().project
@@ -74,7 +75,6 @@ class Assets:
         known = self._find(kind, digest)
         if known is None and self._find(kind, digest, EVERYTHING):
             raise ConflictError(f"this {kind.value} is private to another project; upload it without sharing it")
-        # A refused upload does not occupy its name.
         if known and (rename or known.verdict == "refuse"):
             return known
         if rename and self._holder(kind, name):
@@ -84,7 +84,7 @@ class Assets:
         said = {"owner": caller_id(), "project": project, "shared": shared, "self_test": self_test}
         asset = library.store_files(store, kind, name, files, said=said)
         if found is not None:
-            # Write a network's check, which no worker makes, before the record: the record makes it effective.
+            # A network's check precedes its record, because the record makes it effective.
             put_document(store, names.asset_check(kind, asset.digest), found)
         # With two simultaneous uploads under one name, the later one must find the record of the earlier one.
         with recording(self._services) as (connection, put):
@@ -98,10 +98,7 @@ class Assets:
         return facts_of(self.model(asset))
 
     def correct(self, name: str, corrections: HandCorrections, new_name: str = "") -> AssetView:
-        """Create a hand from the same files with corrected facts in `asset.json`, and queue its check.
-
-        Without a new name the hand gets its old name with the next free number.
-        """
+        """Create a hand from the same files with corrected facts, and queue its check; default name: with a number."""
         hand = self.one(AssetKind.HAND, name)
         facts = self.hand_facts(hand)
         archive = self._services.store.get(names.asset_files(AssetKind.HAND, hand.digest))
@@ -114,7 +111,6 @@ class Assets:
             raise LimitError(f"the corrected asset.json exceeds {MAX_BYTES} bytes; give fewer corrections")
         files["asset.json"] = text
         if not new_name:
-            # Equal corrections give the same hand.
             for mark in ({}, marks_of(files, project_scope().project)):
                 files.update(mark)
                 if known := self._find(AssetKind.HAND, digest_files(AssetKind.HAND, files)):
@@ -151,7 +147,6 @@ class Assets:
         return digest_files(kind, files)
 
     def _find(self, kind: AssetKind, name: str, scope: ProjectScope | None = None) -> AssetView | None:
-        """Return an asset in a scope (default: the caller's), or None."""
         try:
             return self._services.index.assets.get(kind, name, scope=scope or project_scope())
         except NotFoundError:

@@ -49,7 +49,7 @@ class Datasets:
         return actions.cancel(self._services, name)
 
     def retry(self, name: str) -> DatasetView:
-        """Restart a dataset by `actions.retry`; restarted cells count against the quota."""
+        """Restart a dataset; restarted cells count against the quota."""
         dataset = self._owned(name)
         again = dataset.states[State.FAILED] + dataset.states[State.CANCELLED]
         grasps = again * dataset.options.grasps
@@ -162,8 +162,6 @@ class Pair:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Content of the comparison page."""
-
     one: DatasetView
     other: DatasetView
     settings: list[tuple[str, str, str]]

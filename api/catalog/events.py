@@ -84,8 +84,6 @@ async def service_events(overview: Overview, request: Request) -> AsyncIterator[
 
 
 class Webhooks:
-    """Webhooks of the caller's project, and their deliveries."""
-
     def __init__(self, services: Services) -> None:
         self._services = services
 
@@ -126,7 +124,6 @@ class Webhooks:
         return self._services.index.outbox.log(self._owned(webhook).id, limit=limit)
 
     def delete(self, webhook: str) -> None:
-        """Delete a webhook; its pending deliveries are dropped."""
         hook = self._owned(webhook)
         # Delete the record first: an interrupted deletion then leaves only a row that a rebuild drops.
         self._services.store.delete(names.webhook(hook.id))

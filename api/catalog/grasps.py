@@ -1,7 +1,6 @@
 """Grasps: search by metrics, distributions of a job, and details of one grasp from its base shard.
 
-Details: postures, metrics at every threshold, the validator's verdict for each push, the scene, and the trajectory
-(approach, grasp, lift).
+Details: postures, metrics at every threshold, verdict for each push, scene, and trajectory (approach, grasp, lift).
 """
 
 from __future__ import annotations
@@ -40,7 +39,6 @@ _KEPT_STATISTICS: Final = 256
 #: Number of cached base shards. A shard of 32 grasps takes about 60 kB; a page needs at most one shard per row.
 _KEPT_SHARDS: Final = 64
 _BINS: Final = 20
-#: Filters of the index with equal names in requests.
 _SHARED: Final = GraspFilter.model_fields.keys() & models.GraspQuery.model_fields.keys()
 MEAN_METRICS: Final[tuple[Metric, ...]] = tuple(metric.name for metric in indexed(IndexLevel.OFFERED))
 
@@ -113,10 +111,7 @@ class Grasps:
             raise NotFoundError(f"{key} holds no grasps that can be shown: {error}") from None
 
     def statistics(self, job: JobView | models.JobDetail) -> tuple[list[models.Histogram], models.Diversity | None]:
-        """Return distributions and diversity of a job's valid grasps, or of all stored ones if not validated.
-
-        The result is cached while the number of grasps is unchanged.
-        """
+        """Return distributions and diversity of a job's valid grasps, or without validation of all stored ones."""
         validated = job.request.validation != "none"
         count = job.valid if validated else job.grasps
         return self._statistics(job.id, validated, count) if count else ([], None)

@@ -73,7 +73,6 @@ class Shards:
         return self._services.index.shards.job_of(shard_id, scope=project_scope())
 
     def assets_of(self, ids: Collection[str]) -> dict[str, tuple[str, str]]:
-        """Return the digests of the hand and the object of each shard."""
         return self._services.index.shards.assets_of(ids)
 
 

@@ -50,10 +50,7 @@ FINGERPRINT_S: Final = 1.0
 
 
 class Overview:
-    """Read-only data of the home page, probes and Prometheus.
-
-    Workers, queue and health are visible to all; data of jobs is limited to the caller's scope.
-    """
+    """Data of the home page, probes and Prometheus; data of jobs is limited to the caller's scope."""
 
     def __init__(self, services: Services, jobs: Jobs) -> None:
         self._services = services
@@ -152,9 +149,7 @@ class Overview:
         return self._services.queue.now(lease_s=max(2, round(self._services.settings.lease_s)))
 
 
-#: Least time between two probes of the parts [s].
 KEPT_S: Final = 2.0
-#: A part that does not answer within this time counts as unavailable [s].
 PATIENCE_S: Final = 2.0
 _INCOMPLETE: Final = "the controller is rebuilding the index from the store; until it is complete, jobs are missing"
 
@@ -200,7 +195,7 @@ class Probes:
             except BusyError as error:
                 return part.model_copy(update={"ok": False, "detail": str(error)})
             except StoreUnavailable:
-                return part  # the probe of the store reports this
+                return part  # The probe of the store reports this error.
             self._service = service
         return part
 

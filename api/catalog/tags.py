@@ -103,7 +103,7 @@ _COLUMNS: Final = (*GraspView.model_fields, "tags")
 
 
 class GraspExports:
-    """Writes selected grasps to files, which stay on the service's disk until they are sent."""
+    """Writer of selected grasps to files, which stay on the service's disk until the response is sent."""
 
     def __init__(self, services: Services, grasps: Grasps, tags: Tags) -> None:
         self._services = services
@@ -111,10 +111,7 @@ class GraspExports:
         self._tags = tags
 
     def made(self, places: Sequence[Grasp], format: Format, said: Mapping[str, Any]) -> tuple[int, Iterator[bytes]]:
-        """Write a file of these grasps, which must be visible to the caller; return its size and its bytes.
-
-        `said` describes the selection.
-        """
+        """Write a file of these grasps, all visible to the caller, described by `said`; return size and bytes."""
         file = TemporaryFile()  # noqa: SIM115 (it is closed once it is sent)
         try:
             {"csv": self._csv, "json": self._json, "zip": self._zip}[format](file, places, said)

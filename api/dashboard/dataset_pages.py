@@ -29,7 +29,7 @@ from graspd.service.model.states import AssetKind, State
 from graspd.service.pipeline.datasets.spec import DatasetRequest
 
 PAGE_SIZE: Final = 20
-#: Most cells of a matrix that is shown as a table; larger ones are shown as a paginated list.
+#: Most cells of a matrix that is shown as a table; a larger matrix is a paginated list.
 MATRIX_CELLS: Final = 1000
 _CELLS_AT_ONCE: Final = 200
 Fields = Annotated[FormData, fields_of(4000)]

@@ -17,7 +17,6 @@ from graspd.service.model.states import State
 from graspd.service.store.records import STABILITY, latest
 from graspd.service.store.store import Store
 
-#: Size of a chart's plot area; the SVG stretches it to the page.
 WIDTH: Final = 600.0
 HEIGHT: Final = 160.0
 
@@ -33,8 +32,6 @@ class Plot:
 
 @dataclass(frozen=True)
 class Bar:
-    """Bar of a histogram, and the address of its grasps."""
-
     x: float
     y: float
     width: float
@@ -73,12 +70,9 @@ def bars(histogram: Histogram, path: str, where: dict[str, str]) -> list[Bar]:
 
 @dataclass(frozen=True)
 class TwinBar:
-    """Shares of two sets of grasps in one bin."""
-
     x: float
     one: float
     other: float
-    """Heights of both bars."""
     low: float
     high: float
     shares: tuple[float, float]
@@ -107,7 +101,8 @@ class Tile:
     """One hand on one object.
 
     `made` counts grasps of status `standing`; `share` is the valid share of validated candidates. The checkbox sends
-    `value`; the link is `href`."""
+    `value`; the link is `href`.
+    """
 
     hand: str
     object: str
@@ -122,7 +117,6 @@ class Tile:
     progress: float | None = None
     note: str = ""
     scene: str = "free"
-    """Kind of scene for which the grasps are valid."""
 
     @property
     def shade(self) -> str:
@@ -132,8 +126,6 @@ class Tile:
 
 @dataclass(frozen=True)
 class Grid:
-    """Matrix with objects as rows and hands as columns."""
-
     hands: list[str]
     rows: list[tuple[str, list[Tile | None]]]
     hidden: int = 0
@@ -200,12 +192,9 @@ PITCH: Final = (40, 30)
 
 @dataclass(frozen=True)
 class CellSquare:
-    """Cell of a map, ready to draw."""
-
     outcome: studies.Outcome
     text: str
     said: str
-    """Description in one line, for the tooltip."""
     ringed: bool
 
 
@@ -232,8 +221,6 @@ class Panel:
 
 @dataclass(frozen=True)
 class Share:
-    """Part of a bar of width 100."""
-
     outcome: studies.Outcome
     count: int
     x: float
@@ -242,8 +229,6 @@ class Share:
 
 @dataclass(frozen=True)
 class MapDrawing:
-    """One map with the numbers below it."""
-
     map: studies.StabilityMap
     panels: list[Panel]
     counts: dict[studies.Outcome, int]

@@ -1,8 +1,8 @@
-"""Hand and object of a job's form: a known asset, or a file from the user.
+"""Hand and object of a job's form: a known asset, or an uploaded file.
 
-The form shows exactly what the job will use. A refused file is neither dropped nor replaced by a known object: it stays
-in the store, the form refers to it, and the next submission checks it again with the form's options. Each fix suggested
-by a refusal is a button of the form, so users need no options of the command line.
+The form shows exactly what the job will use. A refused file stays in the store, and the form refers to it: the next
+submission checks it again with the form's options. Each fix suggested by a refusal is a button, so the form needs no
+options of the command line.
 """
 
 from __future__ import annotations
@@ -63,8 +63,6 @@ class Refusal:
 
 @dataclass(frozen=True)
 class AssetChoice:
-    """Hand or object of a form."""
-
     name: str = ""
     """Name of the job's asset; empty: not chosen yet."""
     refused: Refusal | None = None
@@ -173,7 +171,7 @@ def pressed(fields: FormData, kind: AssetKind) -> dict[str, Any]:
 
 
 def _checked(assets: Assets, asset: AssetView) -> AssetChoice:
-    """Wait briefly for the check of an upload, so that the user presses the button only once."""
+    """Wait briefly for the check of an upload, so that one press of the button suffices."""
     deadline = time.monotonic() + _CHECK_WAIT_S
     while asset.verdict is None and time.monotonic() < deadline:
         time.sleep(0.2)
@@ -194,12 +192,11 @@ def choices(assets: Assets, kind: AssetKind, shown: str, one: AssetChoice) -> li
 
 
 def asset_choices(assets: Assets, kind: AssetKind) -> list[tuple[str, str]]:
-    """Return the names to choose from; those still being checked are marked."""
+    """Return the names to choose from; names still being checked are marked."""
     try:
         known = assets.page(kind, limit=200).items
     except GraspdError:
         return []
-    # Use the newest version of each name.
     newest = {asset.name: asset for asset in reversed(known)}
     return [
         (name, name if one.builtin or one.verdict else f"{name} (being checked)")

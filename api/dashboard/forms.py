@@ -48,8 +48,6 @@ def fields_of(most: int) -> Any:
 
 @dataclass(frozen=True)
 class FormInput:
-    """Form field of a job's option."""
-
     name: str
     label: str
     hint: str
@@ -76,7 +74,7 @@ class FormInput:
 
 
 def inputs_of(section: str = "", *, cells: bool = False) -> list[FormInput]:
-    """Return fields of a job's form, in one section or all; with `cells`, those of a dataset's form."""
+    """Return fields of a job's form, in one section or all; with `cells`, of a dataset's form."""
     shown = [(row, row.form) for row in rows(JobOptions, "job") if row.form is not None]
     return [
         FormInput.of(row, form) for row, form in shown if section in ("", form.section) and (form.cells or not cells)
@@ -132,7 +130,6 @@ def _submit(request: Request, jobs: Jobs, assets: Assets, fields: FormData) -> H
     }
     form |= {one.name: fields.get(one.name) == "true" for one in inputs_of() if one.kind == "checkbox"}
     things = {kind: chosen(request, assets, fields, kind) for kind in FILE_FIELDS}
-    # No default, so that a form without an object has none.
     form |= {kind.value: one.name for kind, one in things.items()}
     shown = DEFAULTS | form | {"units": fields.get("units") or "m"}
     refused = {one.place(kind): one.refused.problem for kind, one in things.items() if one.refused}
@@ -195,7 +192,7 @@ def _form(
     )
 
 
-#: Cache lifetime [s]: costs of batches change slowly, and reading two thousand of them is slow for a page.
+#: Cache lifetime [s]: costs of batches change slowly, and a read of two thousand is slow for a page.
 KEPT_S: Final = 60.0
 WORDS: Final = {
     "draft": "Fewest points and starts, for a first look.",
@@ -205,7 +202,6 @@ WORDS: Final = {
 
 
 def listed(text: str) -> list[str]:
-    """Split names of a form field at commas or spaces."""
     return text.replace(",", " ").split()
 
 
@@ -219,7 +215,6 @@ class Expectations:
 
     def of(self, form: Mapping[str, Any]) -> list[tuple[str, str, Estimate | None]]:
         """Return each offered fidelity, its description, and its estimate for a form; None if that is not possible."""
-        # Ignore empty fields.
         wanted = {
             key: value for key, value in form.items() if key not in ("hand", "object", "fidelity") and value != ""
         }

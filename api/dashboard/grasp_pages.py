@@ -80,7 +80,6 @@ def grasps_page(
         weakest=list(_WEAKEST.items()),
         limits={metric.name: metric.limits for metric in indexed(IndexLevel.OFFERED)},
         sort=query.sort,
-        # The URL omits the default.
         sorts=[("" if key == GraspQuery().sort else key, label) for key, label, _ in COLUMNS],
         descending=query.order == "desc",
         links={key: _sort_link(request, query, key) for key, _, _ in COLUMNS},

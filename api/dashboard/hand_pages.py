@@ -21,7 +21,6 @@ from graspd.service.store.asset_summary import hand_line, limit_line, self_test_
 from graspd.service.store.descriptions import MAX_ENTRIES, HandFacts
 
 PAGE_SIZE: Final = 50
-#: Polling interval [s]; a check takes seconds.
 _CHECK_S: Final = 2
 _MAX_FIELDS: Final = 16 + 3 * MAX_ENTRIES
 
@@ -34,7 +33,7 @@ def hands_page(
 ) -> HTMLResponse:
     """Refused hands are included; their pages state the reason."""
     page = assets.page(AssetKind.HAND, limit=PAGE_SIZE, cursor=cursor, refused=True)
-    # Facts contain data from the upload as well as findings of the check, so they may be of any type.
+    # Facts contain data from the upload besides findings of the check, so they may be of any type.
     numbers = {
         hand.digest: [
             len(told) if isinstance(told, list) else 0 for told in map(hand.facts.get, ("dofs", "fingertips"))

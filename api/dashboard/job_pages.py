@@ -104,7 +104,6 @@ _DEPTH_COLOURS: Final = np.array(
     np.float64,
 )
 _NOTHING: Final = (12, 15, 20)
-#: Colours of background, table, object, then of neighbours.
 _CLASSES: Final = np.array(
     [(24, 29, 33), (96, 108, 118), (23, 163, 152), (227, 171, 98), (88, 134, 214), (190, 98, 160), (150, 178, 82)],
     np.uint8,
@@ -112,7 +111,7 @@ _CLASSES: Final = np.array(
 
 
 class Pictures:
-    """Decodes pictures of views shards, with a cache of recent shards."""
+    """Decoder of pictures of views shards, with a cache of recent shards."""
 
     def __init__(self, store: Store) -> None:
         self._fetch = lru_cache(maxsize=_KEPT_SHARDS)(partial(read_checked, store))
@@ -137,7 +136,7 @@ class Pictures:
 
 
 def paint_depth(depth: NDArray[Any]) -> NDArray[np.uint8]:
-    """Colour depth (H, W) [m] as (H, W, 3) over the range of this picture; dark where nothing was hit."""
+    """Colour depth (H, W) [m] as (H, W, 3) over the range of this picture; dark without a surface."""
     seen = np.isfinite(depth)
     painted = np.empty((*depth.shape, 3), np.uint8)
     painted[:] = _NOTHING

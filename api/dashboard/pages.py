@@ -241,7 +241,6 @@ def _deleted(id: str) -> RedirectResponse:
     return RedirectResponse(f"/deleted?done={id}", status_code=303)
 
 
-#: Routers of all pages, in matching order.
 routers: Final = (
     router,
     job_pages.router,

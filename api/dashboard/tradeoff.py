@@ -31,8 +31,6 @@ _NO_FIDELITY: Final = "as published"
 
 @dataclass(frozen=True)
 class Axis:
-    """Accuracy that can be selected."""
-
     label: str
     unit: str = "%"
     more_is_better: bool = True
@@ -83,7 +81,6 @@ class Run(BaseModel):
 
     @property
     def name(self) -> str:
-        """Method, and whether its grasps were filtered in the scene afterwards."""
         return f"{self.method}, filtered" if self.way == FILTERED else self.method
 
     @property
@@ -101,13 +98,10 @@ class Run(BaseModel):
 
     @property
     def first_s(self) -> float | None:
-        """Time to the first of these grasps [s]."""
         return self.seconds_to_first_valid if self.seconds_to_first is None else self.seconds_to_first
 
 
 class Measured(BaseModel):
-    """Results of one `graspd chart`."""
-
     runs: list[Run]
     created: str | None = None
     device: str | None = None
@@ -245,7 +239,7 @@ def _labelled(points: list[Point]) -> list[Point]:
         offers = [(move, is_left) for move in _MOVES for is_left in (False, True)]
         boxes = [point.label_box(move, is_left=is_left) for move, is_left in offers]
         costs = [sum(_covered(box, other) for other in taken) + _outside(box) for box in boxes]
-        # Among equal places use the first one, which is the nearest.
+        # Of equal places the first one, nearest to the point, is used.
         best = costs.index(min(costs))
         move, is_left = offers[best]
         taken.append(boxes[best])

@@ -39,8 +39,8 @@ class RateLimit(HttpMiddleware):
     """Finds the key of a request (`scope["state"]["key"]`) and enforces the limits of that key.
 
     A request without a key counts against its address. An open service serves only one machine and has no limits.
-
-    Refusals are 429 with Retry-After; every counted response has RateLimit and RateLimit-Policy
+    Refusals
+    are 429 with Retry-After; every counted response has RateLimit and RateLimit-Policy
     (draft-ietf-httpapi-ratelimit-headers-10).
     """
 
@@ -68,7 +68,7 @@ class RateLimit(HttpMiddleware):
         request = Request(scope)
         name = f"key:{key.name}" if key else f"address:{request.client.host if request.client else ''}"
         allowance = _allowance_of(key, self.settings)
-        # Not the request's id: a caller could choose equal ids, so that many requests count as one.
+        # The request's id is unsuitable: a caller could choose equal ids, so that many requests count as one.
         number = uuid.uuid4().hex
         admission = await self.rates.enter(name, allowance, number)
         if admission is None:
@@ -173,8 +173,6 @@ redis.call('PEXPIRE', KEYS[1], math.ceil(tonumber(ARGV[2]) * 1000))
 
 @dataclass(frozen=True)
 class Allowance:
-    """Limits of a caller; 0: no limit."""
-
     per_minute: int
     concurrency: int
 
@@ -247,14 +245,13 @@ MAX_BODY_BYTES: Final = 1 << 20
 PIECE_S: Final = 30.0
 #: Least transfer rate of a body [bytes/s]; otherwise single bytes could keep a connection open forever.
 LEAST_BYTES_S: Final = 16 << 10
-#: Additional size for multipart framing and the other fields of an upload.
 _FORM_SLACK_BYTES: Final = 64 << 10
 #: Most digits of a Content-Length; Python parses thousands of digits slowly, or refuses them.
 _MOST_DIGITS: Final = 18
 
 
 class BodyLimit(HttpMiddleware):
-    """Refuses bodies whose Content-Length exceeds the limit; aborts those that become too long or slow."""
+    """Refuses bodies whose Content-Length exceeds the limit; aborts bodies that become too long or slow."""
 
     def __init__(
         self, app: ASGIApp, *, upload_paths: frozenset[str], upload_bytes: int, piece_s: float = PIECE_S
@@ -294,7 +291,7 @@ class BodyLimit(HttpMiddleware):
                 return {"type": "http.disconnect"}
             if received > limit:
                 refusal = _too_large(limit)
-                # Simulate a disconnect, so that the application stops; its response is replaced below.
+                # Simulates a disconnect, so that the application stops; its response is replaced below.
                 return {"type": "http.disconnect"}
             return message
 
@@ -328,7 +325,6 @@ def _body_refusal(scope: Scope, limit: int, *, is_upload: bool) -> Exception | N
         return _too_large(limit)
     if declared != b"0" or b"transfer-encoding" in given:
         try:
-            # Routes make further checks.
             if is_upload:
                 authorize(Request(scope), KeyScope.SUBMIT)
             elif scope["path"].startswith("/v1/"):

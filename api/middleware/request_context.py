@@ -1,7 +1,7 @@
 """Middleware of all routes: request ids, security headers, HEAD (RFC 9110 §9.3.2), prefix, origin.
 
-The application's paths have no prefix. The prefix is removed from incoming paths here, unless the proxy already did so,
-and added to addresses in response headers. Rendering adds it to addresses in pages (`with_prefix`).
+The application's paths have no prefix: it is removed from incoming paths here, unless the proxy already did so, and
+added to addresses in response headers. Rendering adds it to addresses in pages (`with_prefix`).
 """
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ from graspd.service.telemetry import bind
 
 _access = logging.getLogger("graspd.access")
 _log = logging.getLogger("graspd.api")
-#: Paths that monitoring systems request every few seconds.
 _QUIET: Final = ("/static/", "/healthz", "/readyz", "/metrics")
 
 SAFE_METHODS: Final = frozenset({"GET", "HEAD", "OPTIONS"})
@@ -122,8 +121,6 @@ def _route(scope: Scope) -> str:
 
 
 class Head(HttpMiddleware):
-    """Answers HEAD as GET if no route handles HEAD itself."""
-
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["method"] != "HEAD" or any(
             route.matches(dict(scope))[0] is Match.FULL for route in scope["app"].routes
@@ -188,7 +185,7 @@ class RootPath(HttpMiddleware):
     def _below(self, where: str, host: str) -> str:
         parts = urlsplit(where)
         if parts.netloc not in ("", host) or not parts.path.startswith("/"):
-            return where  # for example a signed address of the store
+            return where  # Such as a signed address of the store.
         return parts._replace(path=f"{self.prefix}{parts.path}").geturl()
 
 
@@ -200,8 +197,8 @@ def with_prefix(page: str, prefix: str) -> str:
 class SameOrigin(HttpMiddleware):
     """Refuses requests that a page of another site triggers in a visitor's browser.
 
-    Browsers send the origin of the requesting page (Sec-Fetch-Site, Origin); other clients do not. While no keys
-    exist, only names of this machine are accepted as the host, to prevent DNS rebinding.
+    Browsers send the origin of the requesting page (Sec-Fetch-Site, Origin); other clients do not. While no keys exist,
+    only names of this machine are accepted as the host, to prevent DNS rebinding.
     """
 
     def __init__(self, app: ASGIApp, *, allowed_hosts: frozenset[str] | None) -> None:

@@ -48,7 +48,6 @@ _ADDED: Final = {
 
 @cache
 def asset_router(kind: AssetKind) -> APIRouter:
-    """Create the routes of one kind of asset."""
     router = APIRouter(prefix=f"/v1/{kind.value}s", tags=[f"{kind.value}s"])
 
     @router.get("", dependencies=READ, name=f"list_{kind}s")
@@ -155,11 +154,10 @@ def store_upload(
     options: str = "",
     **said: bool,
 ) -> AssetView:
-    """Store an upload as an asset with immutable content, and its check task. Before that the upload is a temporary
-    file.
+    """Store an upload as an asset with immutable content, and its check task; until then it is a temporary file.
 
-    `said`: `self_test`, `shared` and `rename`, as in `Assets.add`. The number of uploads is limited, which bounds their
-    memory.
+    `said`: `self_test`, `shared` and `rename`, as in `Assets.add`. The number of concurrent uploads is limited, which
+    bounds their memory.
     """
     filename = file.filename or ""
     with _one_of_few():

@@ -119,12 +119,10 @@ PagingOf = Annotated[Paging, Depends(_paging)]
 
 
 def next_address(request: Request, cursor: str) -> str:
-    """Return path and query of the page that starts at a cursor."""
     url = request.url.include_query_params(cursor=cursor)
     return f"{url.path}?{url.query}"
 
 
-#: Most uploads unpacked and packed at once; each may need the size of one of its files in memory.
 UPLOADS: Final = 4
 #: Most forms with an upload at once; they also wait for the check of the upload.
 FORMS: Final = 8

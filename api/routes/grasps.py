@@ -53,7 +53,6 @@ async def export_grasps(
 async def exported(
     request: Request, tags: Tags, exports: GraspExports, selection: Selection, format: Format
 ) -> StreamingResponse:
-    """Return the file of a selection as a response."""
     said = selection.model_dump(mode="json", exclude_none=True)
     size, chunks = await request.app.state.exports.run(lambda: exports.made(tags.chosen(selection), format, said))
     headers = {

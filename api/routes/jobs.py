@@ -78,8 +78,7 @@ def retry(job_id: str, jobs: JobsOf) -> JobDetail:
 
 @router.delete("/{job_id}", status_code=204, dependencies=SUBMIT, responses=responses(404, 409))
 def delete(job_id: str, jobs: JobsOf) -> None:
-    """Delete an ended job. After a grace time its shards are deleted, unless another job needs them; until then
-    `POST .../restore` restores the job."""
+    """Delete an ended job; `POST .../restore` restores it. Shards that no other job needs stay for a grace time."""
     jobs.delete(job_id)
 
 
@@ -141,9 +140,9 @@ def get_shard(shard_id: str, shards: ShardsOf) -> Shard:
     ),
 )
 def get_file(shard_id: str, request: Request, shards: ShardsOf) -> Response:
-    """Send the HDF5 file: from the store if it signs addresses, else through the API; Range is supported.
+    """Send the HDF5 file, or redirect to the store if it signs addresses. A damaged file is refused.
 
-    If-None-Match and If-Range are supported. A file that does not match its checksum is refused.
+    Range, If-None-Match and If-Range are supported.
     """
     shard = shards.intact(shard_id)
     # The id depends on the content, so cached copies never become stale.
@@ -151,7 +150,6 @@ def get_file(shard_id: str, request: Request, shards: ShardsOf) -> Response:
     if is_known(request.headers, headers["ETag"]):
         return Response(status_code=304, headers=headers)
     only_head = request.method == "HEAD"
-    # A signed address is valid for GET only.
     if not only_head and (address := shards.address(shard)) is not None:
         return RedirectResponse(address, status_code=307)
     size = shards.size(shard)

@@ -118,7 +118,7 @@ def revoke_key(name: NameArgument, json: JsonFlag = False) -> None:
 
 
 def duration(text: str) -> timedelta:
-    """Parse a time such as 90d, 12h, 30m or 45s; raise InputError for anything else."""
+    """Parse a time such as 90d, 12h, 30m or 45s; InputError for anything else."""
     match = re.fullmatch(r"(\d{1,6})([smhd])", text.strip())
     if match is None:
         raise InputError(f"{text!r} is not a duration; write 90d, 12h, 30m or 45s")

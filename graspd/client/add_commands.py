@@ -1,6 +1,7 @@
 """`graspd hands add`, `objects add`, `networks add`: upload an asset or a set, and wait for its check.
 
-A hand is a folder, or a description with the files it needs, which are packed into one ZIP."""
+A hand is a folder, or a description with the files it needs, which are packed into one ZIP.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +41,6 @@ from graspd.service.store.object_sets import Objects, files_of_set
 NameOption = Annotated[str | None, typer.Option("--name", help="Name of the asset; default: the file's name.")]
 SharedOption = Annotated[bool, typer.Option("--shared", help="Share it with all projects, not only the key's project.")]
 WaitOption = Annotated[bool, typer.Option("--wait/--no-wait", help="Wait for the check by a worker.")]
-#: Longest wait for a check, without and with a self-test [s].
 _CHECK_S: Final = 120.0
 _SELF_TEST_S: Final = 900.0
 
@@ -131,10 +131,7 @@ def _add(
 
 @contextmanager
 def upload_of(path: Path) -> Iterator[tuple[Path, str]]:
-    """Yield the file to send, and the name of the hand's description in it (empty: chosen by the service).
-
-    The file is the path itself, or a temporary ZIP of the files it needs.
-    """
+    """Yield the file to send (the path, or a temporary ZIP), and the hand's description in it (empty: not chosen)."""
     alone = not path.is_dir() and (path.suffix.lower() not in SUFFIXES or not path.is_file())
     files, main = ({}, "") if alone else files_of_hand(path)
     if len(files) <= 1 and not path.is_dir():
@@ -148,7 +145,7 @@ def upload_of(path: Path) -> Iterator[tuple[Path, str]]:
 
 
 def one_of_set(path: Path, name: str | None) -> Objects:
-    """Return a mesh file as a set of one object; raise InputError for anything else."""
+    """Return a mesh file as a set of one object; InputError for anything else."""
     if path.suffix.lower() not in MESHES or not path.is_file():
         raise InputError(f"several sizes need a mesh file or a folder of meshes, not {path}")
     return {name or name_of_upload(path.name): {path.name: path.read_bytes()}}
@@ -167,7 +164,6 @@ def sweep(objects: Objects, sizes: Sequence[float]) -> Objects:
 
 
 def name_of_set(path: Path) -> str:
-    """Return the name of the set made from a folder or ZIP."""
     place = path.resolve()
     return name_of_upload(f"{place.name}.zip" if place.is_dir() else place.name)
 

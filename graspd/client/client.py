@@ -1,4 +1,4 @@
-"""Thin HTTP client: exchanges documents of `api.models`; raises problem documents as exceptions."""
+"""HTTP client: exchanges documents of `api.models`; raises problem documents as exceptions."""
 
 from __future__ import annotations
 
@@ -27,11 +27,10 @@ from graspd.service.pipeline.datasets.spec import DatasetRequest, Matrix
 _PATIENCE_S: Final = 30.0
 _CONNECT_S: Final = 5.0
 _TIMEOUT: Final = httpx.Timeout(_PATIENCE_S, connect=_CONNECT_S)
-#: The server sends a keep-alive every 15 s.
+#: Longest wait for data of a stream [s]: the server sends a keep-alive every 15 s.
 _STREAM_TIMEOUT: Final = httpx.Timeout(40.0, connect=5.0)
 _POLL_S: Final = 0.3
 _DATASET_POLL_S: Final = 1.0
-#: Rows per page.
 _PAGE: Final = 200
 #: Waits before retries if the service reports too many requests [s].
 _WAITS_S: Final = (2.0, 5.0, 10.0, 20.0)
@@ -99,7 +98,7 @@ class Client(AbstractContextManager["Client"]):
         self_test: bool = False,
         shared: bool = False,
     ) -> AssetView:
-        """Upload a file or a ZIP; `options` override its `asset.json`. Raise InputError if it is unreadable.
+        """Upload a file or a ZIP; `options` override its `asset.json`. InputError if it is unreadable.
 
         With `self_test` the check of a hand includes the self-test; a `shared` asset is usable by every project.
         """
@@ -146,7 +145,7 @@ class Client(AbstractContextManager["Client"]):
         return path
 
     def watch(self, job_id: str) -> Iterator[Job]:
-        """Yield a job at each change until it ends; reconnects after a restart of the API."""
+        """Yield a job at each change until it ends; reconnect after a restart of the API."""
         while True:
             try:
                 for event, data in self._events(path_of("jobs", job_id, "events")):
@@ -160,7 +159,6 @@ class Client(AbstractContextManager["Client"]):
             time.sleep(_POLL_S)
 
     def wait(self, job_id: str, on_progress: Callable[[Job], None] | None = None) -> JobDetail:
-        """Return the job in its final state."""
         for job in self.watch(job_id):
             if on_progress is not None:
                 on_progress(job)
@@ -257,7 +255,7 @@ def path_of(*parts: str) -> str:
 
 
 def _matrix_body(matrix: Matrix) -> dict[str, Any]:
-    """Build the body of a matrix; empty fields are omitted, because an older service may not know them."""
+    """Build the body of a matrix without empty fields, which an older service may reject."""
     return {name: value for name, value in matrix.model_dump(mode="json").items() if value not in ({}, "")}
 
 
@@ -281,7 +279,6 @@ def _authorization(key: str) -> dict[str, str]:
 
 
 def events_of(answer: httpx.Response) -> Iterator[tuple[str, Any]]:
-    """Yield (event, decoded data) of a text/event-stream."""
     for event in EventSource(answer).iter_sse():
         if event.data:
             yield event.event, event.json()
@@ -289,7 +286,6 @@ def events_of(answer: httpx.Response) -> Iterator[tuple[str, Any]]:
 
 @contextmanager
 def _translated(url: str) -> Iterator[None]:
-    """Convert network errors to UnavailableError."""
     try:
         yield
     except (httpx.ConnectError, httpx.ConnectTimeout):

@@ -51,8 +51,6 @@ SpecOption = Annotated[
 
 
 class Spec(JobOptions):
-    """Keys of a spec: those of a job's options, and these."""
-
     SUBMITTED = True
 
     name: Name | None = None
@@ -71,8 +69,6 @@ class Spec(JobOptions):
 
 @dataclass(frozen=True)
 class PlanRequest:
-    """Request of a command, from a spec and options."""
-
     name: str
     hands: str
     objects: str
@@ -111,7 +107,7 @@ def wanted(
 
 
 def read_spec(file: Path) -> dict[str, Any]:
-    """Return the keys of a spec; raise InputError if the file is none."""
+    """Return the keys of a spec; InputError if the file is none."""
     kind, load = ("JSON", json.loads) if file.suffix == ".json" else ("TOML", tomllib.loads)
     try:
         found = load(file.read_text())
@@ -364,7 +360,7 @@ def _matrix(client: Client, asked: PlanRequest) -> tuple[Objects | None, dict[st
 
 
 def _estimate(client: Client, matrix: dict[str, Any], files: Objects | None) -> Estimate:
-    """Return the cost; raise InputError for an unknown name that is not among the files to upload."""
+    """Return the cost; InputError for an unknown name that is not among the files to upload."""
     asked = matrix | {"sets": []} if files is not None else matrix
     found = client.estimate(parsed_options(Matrix, asked))
     unknown = [name for name in found.unknown if name not in (files or {})]

@@ -1,6 +1,6 @@
 """Terminal output of the commands: progress, jobs, assets, estimates and datasets.
 
-Progress of a job is one bar per stage with rate and time left on a terminal, and plain lines elsewhere.
+A job's progress is one bar per stage with rate and time left on a terminal, and plain lines elsewhere.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ UrlOption = Annotated[
 
 
 def open_client(url: str | None, *, key: str | None = None) -> Client:
-    """Return a client of the API from the option, the settings or the data folder; the key is that of the settings."""
+    """Return a client of the API from the option, the settings or the data folder, with the settings' key."""
     settings = load_settings()
     if key is None and settings.api_key:
         key = settings.api_key.get_secret_value()
@@ -49,7 +49,7 @@ YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Delete without con
 
 
 def confirm(question: str, what: str, *, yes: bool) -> None:
-    """Ask before a deletion; raise InputError if the answer is no, or without a terminal."""
+    """Ask before a deletion; InputError if the answer is no, or without a terminal."""
     if yes:
         return
     if not sys.stdin.isatty():
@@ -59,7 +59,6 @@ def confirm(question: str, what: str, *, yes: bool) -> None:
 
 
 def say_deleted(what: str, name: str, *, json: bool, undo: str = "") -> None:
-    """Report a deletion, and the command that undoes it."""
     report({"deleted": name, "kind": what}, f"{what} {name} is deleted", json=json)
     if undo and not json:
         typer.echo(f"`{undo}` restores it within the grace time (GRASPD_SHARD_GRACE_S)", err=True)
@@ -97,7 +96,7 @@ def watch(client: Client, job_id: str) -> JobDetail:
 
 
 def show_job(job: JobDetail, *, json: bool, url: str, must_succeed: bool = True) -> None:
-    """Report the result of a job; raise TaskError if it failed or was cancelled and `must_succeed`."""
+    """Report the result of a job; TaskError if it failed or was cancelled and `must_succeed`."""
     if json:
         emit(job_summary(job))
     else:
@@ -158,7 +157,6 @@ def yield_of(job: JobDetail) -> str:
 
 
 def means_of(job: JobDetail) -> str:
-    """Format the means over the valid grasps in one line."""
     mean = job.mean
     return (
         f"mean ε {metric(mean.epsilon)}, contact {metric(mean.contact_area_cm2)} cm², "
@@ -279,7 +277,7 @@ def _size_of(stage: StageStatus, job: Job) -> tuple[int, str]:
     return (job.requested, "grasps") if stage.stage is Stage.SYNTHESIZE else (stage.tasks, "tasks")
 
 
-#: A table with more hands does not fit a terminal: each cell then has a line.
+#: Most hands in a table that fits a terminal; with more hands each cell has a line.
 _MOST_COLUMNS: Final = 6
 _SHOWN_RATES: Final = 8
 _STYLES: Final = {
@@ -379,7 +377,6 @@ def watch_dataset(client: Client, name: str, console: Console) -> DatasetView:
 
 
 def _yield(made: Validated) -> str:
-    """Format the yield in short form: `at 94 %`."""
     return f"at {valid_yield(made)}" if made.validated else "not validated"
 
 

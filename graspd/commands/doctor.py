@@ -1,4 +1,4 @@
-"""Checks of GPUs and kernels for `graspd doctor`, each in its own process: a driver may crash it."""
+"""Checks of GPUs and kernels for `graspd doctor`, each in its own process, because a driver may crash it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ _GPU_S: Final = 120.0
 _KERNELS_S: Final = 900.0
 _GIB: Final = 2**30
 _MEMORY_LOW: Final = 2 * _GIB
-#: Paths that exist on a machine with a GPU driver.
 _TRACES: Final = (Path("/proc/driver/nvidia/version"), Path("/dev/nvidiactl"))
 Child = Callable[[Sequence[str]], "subprocess.CompletedProcess[str]"]
 
@@ -34,7 +33,6 @@ def checks_of(settings: Settings) -> list[Check]:
 
 
 def run_child(arguments: Sequence[str]) -> subprocess.CompletedProcess[str]:
-    """Run this module as a process. Raises subprocess.TimeoutExpired."""
     limit_s = _GPU_S if arguments[0] == "gpus" else _KERNELS_S
     return subprocess.run(
         [sys.executable, "-m", "graspd.commands.doctor", *arguments],
@@ -47,7 +45,7 @@ def run_child(arguments: Sequence[str]) -> subprocess.CompletedProcess[str]:
 
 
 def gpu(settings: Settings, *, child: Child = run_child, has_driver: Callable[[], bool] | None = None) -> Finding:
-    """Check which GPUs Warp finds, and whether their memory is free; `has_driver`: whether there appears to be one."""
+    """Check which GPUs Warp finds, and whether their memory is free; `has_driver`: a driver seems to be installed."""
     found, wrong = _answer(child, ["gpus"])
     if wrong:
         return bad(
@@ -92,7 +90,6 @@ def kernels(settings: Settings, *, child: Child = run_child) -> Finding:
 
 
 def _answer(child: Child, arguments: Sequence[str]) -> tuple[dict[str, Any], str]:
-    """Return the answer of a child process, and its error ("" if none)."""
     try:
         done = child(arguments)
     except subprocess.TimeoutExpired as error:
@@ -142,7 +139,6 @@ def _tell_kernels(wanted: str) -> dict[str, Any]:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Print one line of JSON on stdout."""
     told = _tell_gpus() if arguments[0] == "gpus" else _tell_kernels(arguments[1])
     sys.stdout.write(f"{json.dumps(told)}\n")
     sys.stdout.flush()

@@ -27,7 +27,6 @@ from graspd.worker.validation.robust import Robustness
 
 app = CommandGroup(add_completion=False)
 
-#: Columns of the printed table: key, heading, digits.
 _COLUMNS: Final = (
     *(("n", "n", 0), ("gsr", "GSR", 2), ("sgs", "SGS", 2), ("pd_mm", "PD", 2), ("spd_mm", "SPD", 2)),
     *(("ca_cm2", "CA", 1), ("iv_cm3", "IV", 2), ("epsilon", "ε", 2), ("wrench_volume", "Vol", 2)),
@@ -133,7 +132,7 @@ def evaluate_command(
 
 
 def _checked_level(protocol: str, level: str) -> str:
-    """Return the level, or the protocol's default if empty; raise InputError for an invalid one."""
+    """Return the level, or the protocol's default if empty; InputError for an invalid one."""
     if protocol not in get_args(Protocol):
         raise InputError(f"unknown protocol {protocol!r}; choose {one_of(protocol, get_args(Protocol))}")
     levels = get_args(LiftLevel if protocol == "lift" else Level)
@@ -203,7 +202,8 @@ def _table(rows: list[dict[str, Any]], whole: dict[str, Any]) -> Table:
     friction = " ".join(sorted({f"{row['mu']:g}" for row in rows}))
     table = Table(
         title=f"{stated}; ε at μ = {friction}, contact at 5 mm; medians",
-        caption="GSR share held; SGS held per s; PD, SPD mm; CA cm²; IV cm³; SD cm; D share of the first component",
+        caption="GSR: held share; SGS: held grasps per s; PD, SPD: penetration, self-penetration [mm]; CA: contact "
+        "area [cm²]; IV: intersection volume [cm³]; SD: displacement [cm]; D: variance share of the first component",
         title_justify="left",
         caption_justify="left",
         box=SIMPLE_HEAD,

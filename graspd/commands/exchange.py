@@ -25,7 +25,6 @@ app = CommandGroup(no_args_is_help=True)
 
 #: Formats of robots and their simulators; the first has two names.
 ROBOTS: Final = ("moveit", "urdf+yaml", "mujoco", "usd", "glb", "isaac", "csv")
-#: Training formats: they take a folder of shards.
 TRAINING: Final = ("dexlearn", "dexgraspnet2", "graspgen", "huggingface", "lerobot")
 EXPORTS: Final = ("images", "replicator", "webdataset", "dexgraspbench", *TRAINING, *ROBOTS)
 IMPORTS: Final = (
@@ -173,7 +172,7 @@ def read_sets(format_: str, source: Path, hand: str | None, obj: str | None, opt
         raise InputError(f"{format_} files contain neither hand nor object; give --hand and --object")
     if format_ == "multidex" and not (options["robot"] and options["object_name"]):
         raise InputError("a multidex file contains many robots and objects; select one of each by --robot and --name")
-    # Reader of each format, and its own options.
+    # Reader of each format, with its options.
     readers: dict[str, tuple[Callable[..., list[Any]], tuple[str, ...]]] = {
         "dexgraspbench": (dexgraspbench.read, ()),
         "dexlearn": (dexgraspbench.read, ()),

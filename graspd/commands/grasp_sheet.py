@@ -41,7 +41,8 @@ from graspd.worker.rendering.trajectory_pictures import (
 )
 
 Kind = Literal["one side", "three sides", "way"]
-#: Edge of a grasp's picture [px] and rays per pixel. Path tracing time grows with both: three sides cost half of one.
+#: Edge of a grasp's picture [px], and rays per pixel. Path tracing time grows with both: three small pictures take half
+#: as long as one large picture.
 LOOKS: Final[dict[Kind, tuple[int, int]]] = {"one side": (300, SAMPLES), "three sides": (160, 8), "way": (300, SAMPLES)}
 
 
@@ -56,17 +57,14 @@ class GraspSheet:
     kind: Kind
     run: ExecutionContext
     edge: int | None = None
-    """Edge of one picture [px]; None: as in `LOOKS`."""
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height of one picture [px]."""
         edge = self.edge or LOOKS[self.kind][0]
         return edge, edge
 
     @property
     def scene(self) -> str:
-        """Kind of scene that the grasps were planned in; empty: none."""
         spec = _scene_of(self.shard)
         return "" if spec is None else spec.kind
 
@@ -107,7 +105,7 @@ class GraspSheet:
 
 
 def around_of(shard: Shard, rows: NDArray[np.intp]) -> PictureScenes:
-    """Return the surroundings of grasps of a base shard: the scenes they were planned in, or none."""
+    """Return the surroundings of grasps of a base shard: the scenes in which they were planned, or none."""
     if (spec := _scene_of(shard)) is None:
         return PictureScenes()
     poses = np.asarray(shard["scene/object_pose"], float)
@@ -147,7 +145,6 @@ class GraspAnimation:
     rows: NDArray[np.intp]
     run: ExecutionContext
     width: int | None = None
-    """Width [px]; None: `WIDTH`."""
 
     def file(self, suffix: str) -> bytes:
         """Return the film as GIF, WebP or animated PNG."""

@@ -84,7 +84,7 @@ def _bar(what: str, first: str = "", *, quiet: bool) -> Iterator[ExecutionContex
     """Yield a context whose progress is shown on a terminal."""
     columns = (TextColumn(f"  {what}       {{task.description}}", markup=False), BarColumn(), TimeElapsedColumn())
     console = plain_console(stderr=True)
-    # Outside a terminal its end would print an empty line.
+    # Outside a terminal, the end of the progress bar would print an empty line.
     with Progress(*columns, console=console, disable=quiet or not console.is_terminal, transient=True) as bar:
         task = bar.add_task(first, total=1.0)
 

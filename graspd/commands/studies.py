@@ -144,7 +144,7 @@ def _measured(names: tuple[str, ...], hand: str, obj: str, *, quick: bool, long:
 
 
 def _read(path: Path, kind: str, parse: Callable[[Any], Any]) -> Any:
-    """Parse a JSON file of `graspd KIND --out`; raise InputError for any other file."""
+    """Parse a JSON file of `graspd KIND --out`; InputError for any other file."""
     try:
         return parse(loads(path.read_text()))
     except OSError as error:
@@ -175,7 +175,6 @@ def _say(line: str) -> None:
     typer.echo(line, err=True)
 
 
-#: Default methods of the comparison.
 PEERS = ("fast_graspd", "graspit", "graspd2022", "dfc", "autograsp")
 
 
@@ -236,7 +235,7 @@ def chart(
     if source is not None:
         _finish(_read_chart(source), out, data_dir, publish=publish, json=json)
         return
-    turns(knobs=knob or ())  # report a wrong name before an hour of work
+    turns(knobs=knob or ())  # Report a wrong name before an hour of work.
     if scene != "free" and sweep:
         raise InputError("--sweep is for charts of free objects; omit --scene")
     place = _place(scene)
@@ -343,5 +342,5 @@ def _things(objects: Sequence[str]) -> list[Any]:
         return object_from_path(text, face_error_m=error)
 
     for text in objects:
-        load(text, 1e-3)  # report a wrong file before an hour of work
+        load(text, 1e-3)  # Report a wrong file before an hour of work.
     return [ChartObject(name_of(Path(text)), partial(load, text)) for text in objects]

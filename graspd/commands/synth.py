@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from graspd.worker.execution_context import Progress as Report
 
 app = CommandGroup()
-#: Exit code of a run that found fewer grasps than requested.
 FEWER: Final = 3
 
 
@@ -49,7 +48,7 @@ def synth(
     A grasp in a scene is valid if approach, closing and lift touch nothing else and the lifted object is held.
     Exit code 3: fewer grasps than requested. Ctrl-C saves the validated ones.
     """
-    from graspd.worker.files.provenance import id_of_columns  # help and completion need no engine
+    from graspd.worker.files.provenance import id_of_columns  # Help and completion need no engine.
     from graspd.worker.files.synthesis import synthesized_as
 
     if not out.parent.is_dir():
@@ -91,7 +90,7 @@ def _bar(*, quiet: bool) -> Iterator[Report]:
     if quiet or not sys.stderr.isatty():
         yield lambda done, total, message: None
         return
-    # Without a bar, its library need not be loaded.
+    # The library is imported only if the bar is shown.
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
     began = time.perf_counter()

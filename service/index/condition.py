@@ -1,4 +1,4 @@
-"""Condition of an index without opening it: unlike opening, this changes nothing."""
+"""Condition of an index, read without opening the index, because opening changes it."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class IndexCondition:
 
     kind: str
     revision: str
-    """Revision of its tables; "" if it has none yet."""
+    """Revision of the tables; "" before the first open."""
     newest: str
     connections: tuple[int, int] = (0, 0)
     """Used and allowed connections; zeros if unknown."""
@@ -38,17 +38,12 @@ class IndexCondition:
 
     @property
     def is_ready(self) -> bool:
-        """Whether opening it changes nothing."""
+        """Whether an open would change nothing."""
         return bool(self.revision) and self.revision == self.newest
 
 
 def look(url: str | URL) -> IndexCondition | None:
-    """Return the condition of an index; None if the file of an SQLite index does not exist yet.
-
-    Raises:
-        InputError, IndexUnavailable: as in `Database`.
-        IndexDamaged: the file has invalid content.
-    """
+    """Return the condition of an index; None without a file. Errors as in `Database`, and IndexDamaged."""
     try:
         parsed = make_url(url)
         if parsed.get_backend_name() == "sqlite":

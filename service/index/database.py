@@ -1,8 +1,8 @@
-"""Connection to the index database, SQLite in WAL mode or PostgreSQL; makes tables at the first open.
+"""Connection to the index database: SQLite in WAL mode, or PostgreSQL. The first open makes the tables.
 
-There are no migrations, because the index follows from the store. `graspd admin index rebuild` replaces one of another
-revision. Missing columns of metrics are added at the open, so a new metric needs no new revision. Grasps whose shards
-lack it have NULL. The column of a removed metric stays.
+There are no migrations, because the index follows from the store: `graspd admin index rebuild` replaces an index of
+another revision. Columns of new metrics are added at the open; grasps without such a value have NULL. The column of
+a removed metric stays.
 """
 
 from __future__ import annotations
@@ -47,34 +47,31 @@ log = logging.getLogger(__name__)
 T = TypeVar("T")
 #: Revision of `service.index.tables`: it changes with every change of the tables except for new metrics.
 REVISION: Final = "0022"
-#: Table with the revision. A graspd of 0.2 reads it, and refuses an index of an unknown revision.
+#: Table with the revision. graspd 0.2 reads it, and refuses an index of an unknown revision.
 REVISION_TABLE: Final = "alembic_version"
-#: A job of a million grasps is one transaction of a few seconds, for which others wait.
+#: Wait for other writers [s]: a job of a million grasps is one transaction of a few seconds.
 _BUSY_TIMEOUT_S: Final = 20.0
 #: Key of PostgreSQL's advisory lock for making tables, one process at a time: the letters "grsp".
 _TABLES_LOCK: Final = 0x67727370
-#: Key of the lock for writing, one process at a time; it ends with its transaction: the letters "grsq".
+#: Key of the lock for writing, held until the end of a transaction by one process: the letters "grsq".
 _TURN_LOCK: Final = 0x67727371
-#: Exceptions of SQLAlchemy for an unusable URL.
 UNUSABLE: Final = (ArgumentError, NoSuchModuleError, ModuleNotFoundError, ValueError)
 #: Codes of SQLite for a file with invalid content.
 _DAMAGED: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 
 
 class Database:
-    """An engine, with reads and writes as context managers."""
+    """Connection pool; reads and writes are context managers."""
 
     def __init__(self, url: str | URL, *, anew: bool = False) -> None:
-        """Connect, and make the tables of an empty database; `anew` replaces those of another revision.
+        """Connect, and make the tables of an empty database; `anew` replaces tables of another revision.
 
-        Raises:
-            InputError: the URL names no known database.
-            IndexUnavailable: the database is unavailable or read-only, or is of another revision.
+        Raises InputError for a URL of no known database, IndexUnavailable if the database does not answer, is read-only
+        or has another revision.
         """
         self._url = url
         self._anew = anew
         self.was = ""
-        """Revision of the dropped tables, if any."""
         self._file = _file_of(url)
         self._write_lock = threading.Lock()
         self._opening = threading.Lock()
@@ -87,7 +84,7 @@ class Database:
 
     @contextmanager
     def reading(self, within: Connection | None = None) -> Iterator[Connection]:
-        """Yield a connection for queries, which all see the same snapshot, or the given one."""
+        """Yield a connection whose queries all see one snapshot, or the given connection."""
         if within is not None:
             yield within
             return
@@ -100,10 +97,10 @@ class Database:
 
     @contextmanager
     def writing(self, within: Connection | None = None) -> Iterator[Connection]:
-        """Yield a transaction, or the given one: all of it is committed or nothing.
+        """Yield a transaction, or the given one: all of it is committed, or nothing.
 
-        Writers take turns because states are derived from facts read in the same transaction: two concurrent ones would
-        each miss the other's facts.
+        Writers run one at a time: states are derived from rows that concurrent transactions would not see of each
+        other.
         """
         if within is not None:
             yield within
@@ -123,18 +120,17 @@ class Database:
             return connection.execute(query).mappings().all()
 
     def one(self, query: Select[Any], what: str, within: Connection | None = None) -> RowMapping:
-        """Return the first row; NotFoundError, which says `what` there is not, without rows."""
+        """Return the first row; NotFoundError `there is no {what}` without rows."""
         if not (found := self.rows(query, within)):
             raise NotFoundError(f"there is no {what}")
         return found[0]
 
     def column(self, query: Select[Any]) -> list[Any]:
-        """Return the first column of the rows."""
         with self.reading() as connection:
             return list(connection.scalars(query))
 
     def among(self, query: Select[Any], column: ColumnElement[Any], wanted: Iterable[Any]) -> list[Any]:
-        """Return the rows whose column has one of the wanted values, for any number of these."""
+        """Return the rows whose column has one of the wanted values; the number of values is unlimited."""
         with self.reading() as connection:
             return list(rows_among(connection, query, column, wanted))
 
@@ -144,7 +140,7 @@ class Database:
             return connection.scalar(query)
 
     def ping(self) -> float:
-        """Return the seconds that a query takes."""
+        """Return the duration of a query [s]."""
         start = time.perf_counter()
         self.value(select(1))
         return time.perf_counter() - start
@@ -179,7 +175,7 @@ class Database:
 
     @contextmanager
     def _fixed(self) -> Iterator[None]:
-        """Convert errors; move a damaged file away, so that the next call makes a new one."""
+        """Convert errors; move a damaged file away, so that the next call makes a new file."""
         try:
             with mapped():
                 yield
@@ -194,27 +190,24 @@ class Database:
 
 
 class IndexPart:
-    """Reads or writes of one subject."""
-
     def __init__(self, database: Database) -> None:
         self.database = database
 
 
 def chunks(ids: Sequence[T], size: int = 1000) -> Iterable[Sequence[T]]:
-    """Yield ids in parts for one statement each: databases limit the number of parameters."""
+    """Yield ids in parts of one statement each: databases limit the number of parameters."""
     return (ids[start : start + size] for start in range(0, len(ids), size))
 
 
 def rows_among(
     connection: Connection, query: Select[Any], column: ColumnElement[Any], wanted: Iterable[Any]
 ) -> Iterator[Any]:
-    """Yield the rows whose column has one of the wanted values, for any number of these."""
     for some in chunks(list(wanted)):
         yield from connection.execute(query.where(column.in_(some)))
 
 
 def _file_of(url: str | URL) -> SqliteFile | None:
-    """Return the file of an SQLite index; None for another database or one in memory; InputError for no URL."""
+    """Return the file of an SQLite index; None for another database or one in memory; InputError for an invalid URL."""
     try:
         parsed = make_url(url)
         is_file = parsed.get_backend_name() == "sqlite" and parsed.database and parsed.database != ":memory:"
@@ -240,13 +233,13 @@ def unusable(error: Exception) -> InputError:
 
 
 def connect_postgres(url: str | URL) -> Engine:
-    """Return an engine that refuses encodings other than UTF-8, and makes no tables."""
+    """Return an engine without making tables; InputError for an encoding other than UTF-8."""
     engine = create_engine(url, pool_pre_ping=True, pool_size=5, max_overflow=10)
 
-    # Before SQLAlchemy inspects the connection: it fails on SQL_ASCII databases, which return bytes.
+    # Runs before SQLAlchemy inspects the connection: the inspection fails on SQL_ASCII databases, which return bytes.
     @event.listens_for(engine, "connect", insert=True)
     def _is_utf8(connection: Any, _record: Any) -> None:
-        info = getattr(connection, "info", None)  # only psycopg has it
+        info = getattr(connection, "info", None)
         if info is not None and (encoding := info.parameter_status("server_encoding")) != "UTF8":
             raise InputError(
                 f"the database of the index has encoding {encoding}, and names need UTF-8; make one by "
@@ -261,7 +254,7 @@ def _sqlite_engine(url: str | URL) -> Engine:
 
     @event.listens_for(engine, "connect")
     def _pragmas(connection: Any, _record: Any) -> None:
-        connection.isolation_level = None  # transactions start only in `writing`
+        connection.isolation_level = None  # Only `writing` begins transactions.
         for pragma in ("journal_mode=WAL", "synchronous=NORMAL", "foreign_keys=ON", "temp_store=MEMORY"):
             connection.execute(f"PRAGMA {pragma}")
 
@@ -306,7 +299,7 @@ def _of_another_revision(found: str) -> str:
 
 @contextmanager
 def _making(engine: Engine) -> Iterator[Connection]:
-    """Yield a transaction while no other process makes tables; all of it is committed or nothing."""
+    """Yield a transaction while no other process makes tables; all of it is committed, or nothing."""
     with engine.connect() as connection:
         if connection.dialect.name == "postgresql":
             connection.execute(text("SELECT pg_advisory_lock(:key)"), {"key": _TABLES_LOCK})
@@ -317,19 +310,19 @@ def _making(engine: Engine) -> Iterator[Connection]:
             connection.commit()
         finally:
             if connection.dialect.name == "postgresql":
-                connection.rollback()  # it failed, or the lock could not be released
+                connection.rollback()  # The statement failed, or the lock could not be released.
                 connection.execute(text("SELECT pg_advisory_unlock(:key)"), {"key": _TABLES_LOCK})
                 connection.commit()
 
 
 @contextmanager
 def mapped() -> Iterator[None]:
-    """Convert errors of the database: InputError, IndexDamaged, IndexUnavailable."""
+    """Convert errors of the database to InputError, IndexDamaged or IndexUnavailable."""
     try:
         yield
     except DataError as error:
-        # The data is at fault, not the database: retries would never end.
-        raise InputError(f"the index cannot hold this: {_line(error)}") from error
+        # The value is invalid, not the database: retries would never end.
+        raise InputError(f"the index cannot store this value: {_line(error)}") from error
     except (OverflowError, UnicodeEncodeError):
         raise InputError("the index stores only whole numbers below 2^63 and Unicode text; give such values") from None
     except SQLAlchemyError as error:
@@ -346,7 +339,7 @@ def _line(error: Exception) -> str:
 
 
 def _add_missing_metrics(connection: Connection) -> list[str]:
-    """Add missing columns and indexes in the caller's transaction; return the names of the columns."""
+    """Add missing columns and indexes within the given transaction; return the names of the columns."""
     found = inspect(connection)
     there = {column["name"] for column in found.get_columns(grasps.name)}
     missing = [metric.name for metric in indexed() if metric.name not in there]
@@ -360,22 +353,19 @@ def _add_missing_metrics(connection: Connection) -> list[str]:
     return missing
 
 
-#: Files that SQLite holds beside an open database: the write-ahead log and its shared memory.
+#: Files that SQLite writes beside an open database: the write-ahead log and its shared memory.
 _COMPANIONS: Final = ("-wal", "-shm")
 Identity = tuple[int, int] | None
 
 
 class SqliteFile:
-    """File of an SQLite index; a lock prevents a process from opening it while another moves it away."""
+    """File of an SQLite index; a lock prevents an open while another process moves the file away."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
 
     def identity(self) -> Identity:
-        """Return device and inode of the file that has the name now; None if there is none.
-
-        A process with a removed file open would read and write data that no other process sees.
-        """
+        """Return device and inode of the named file, None if absent: another process may replace an open file."""
         try:
             facts = self.path.stat()
         except FileNotFoundError:
@@ -384,7 +374,7 @@ class SqliteFile:
 
     @contextmanager
     def opening(self) -> Iterator[None]:
-        """Hold the lock among processes. Files that belonged to a missing database are removed."""
+        """Hold the lock among processes, and remove files that belonged to a missing database."""
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             lock = self._beside(".lock").open("w")
@@ -398,7 +388,7 @@ class SqliteFile:
             yield
 
     def set_aside(self, damaged: Identity) -> None:
-        """Move a damaged file away, unless another process did; call it within `opening`."""
+        """Move a damaged file away, unless another process did; requires `opening`."""
         if damaged is None or self.identity() != damaged:
             return
         suffix = f".damaged-{datetime.now(UTC):%Y%m%dT%H%M%S}"
@@ -411,15 +401,12 @@ class SqliteFile:
         return self.path.with_name(f"{self.path.name}{name}")
 
 
-#: Rows are written with one statement that runs for each: it is faster to build than one with all of them.
+#: Rows are written by one statement per row, which SQLAlchemy builds faster than one statement for all rows.
 Row = Mapping[str, Any]
 
 
 def upsert(connection: Connection, table: Table, rows: Sequence[Row], *, keep: Sequence[str] = ()) -> None:
-    """Insert rows; for existing primary keys update all given columns except `keep`.
-
-    All rows have the same columns. Of two rows with one key the last one counts.
-    """
+    """Insert rows with equal columns; of two rows with one key the last counts. `keep` are columns without update."""
     if not rows:
         return
     keys = [column.name for column in table.primary_key]
@@ -433,7 +420,7 @@ def upsert(connection: Connection, table: Table, rows: Sequence[Row], *, keep: S
 
 
 def update_rows(connection: Connection, table: Table, rows: Sequence[Row], *, state: str) -> None:
-    """Update rows by `id`, if their column `state` still has that value."""
+    """Update rows by `id` whose column `state` is unchanged since the read."""
     if not rows:
         return
     values: dict[str, Any] = {name: bindparam(f"new_{name}") for name in rows[0] if name != "id"}

@@ -13,21 +13,21 @@ from graspd.service.index.database import Database
 from graspd.service.index.tables import assets, attempts, dataset_cells, datasets, grasps, jobs, shards, spent, tasks
 from graspd.service.parquet import schema_of, write
 
-#: Exported tables. The others contain the present state (workers, notes) or internal data.
+#: Exported tables. Other tables contain present state (workers, notes) or internal data.
 TABLES: Final[Mapping[str, Table]] = {
     table.name: table for table in (grasps, shards, jobs, tasks, attempts, assets, datasets, dataset_cells, spent)
 }
-#: Rows of a row group, the part of a file in memory.
+#: Rows of a row group, the part of a file that is in memory at once.
 GROUP: Final = 20_000
 
 
 def export(database: Database, folder: Path) -> dict[str, int]:
     """Write each of `TABLES` as `folder/NAME.parquet`, from one snapshot; return the number of rows of each.
 
-    Integers are int64, other numbers float64, JSON is text; rows are in the order of their primary key. InputError:
-    pyarrow is not installed.
+    Integers are int64, other numbers float64, JSON is text. Rows are ordered by primary key. Raises InputError without
+    pyarrow.
     """
-    # Before the query, so that a missing package is reported at once.
+    # The import precedes the query, so that a missing package is reported at once.
     schemas = {name: schema_of({c.name: _word(c) for c in table.columns}) for name, table in TABLES.items()}
     with database.reading() as connection:
         return {
@@ -47,6 +47,5 @@ def _groups(connection: Connection, table: Table) -> Iterator[list[dict[str, Any
 
 
 def _word(column: Column[Any]) -> str:
-    """Return the type of a column in the words of `service.parquet.type_of`."""
     kinds = {BigInteger: "int64", Integer: "int64", Float: "float64", Boolean: "bool_"}
     return next((word for kind, word in kinds.items() if isinstance(column.type, kind)), "text")

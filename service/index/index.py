@@ -1,4 +1,4 @@
-"""The index for API and controller."""
+"""The index of API and controller."""
 
 from __future__ import annotations
 
@@ -23,13 +23,12 @@ from graspd.service.index.tags import Tags
 class Index:
     """SQL rows derived from the store; `url` is an SQLAlchemy URL.
 
-    Reads answer the API; only API and controller write. Every method raises IndexUnavailable if the database is
-    unavailable. Cursors are opaque, `limit` is cut to 200; an unknown id is a NotFoundError.
+    Only API and controller write. Every method raises IndexUnavailable if the database does not answer. Cursors are
+    opaque, `limit` is at most 200, and an unknown id is a NotFoundError.
     """
 
     def __init__(self, url: str | URL, *, anew: bool = False) -> None:
         self.database = database = Database(url, anew=anew)
-        # Read-only parts.
         self.jobs = Jobs(database)
         self.grasps = Grasps(database)
         self.shards = Shards(database)
@@ -42,12 +41,10 @@ class Index:
         self.usage = Usage(database)
         self.feed = Feed(database)
         self.dataset_feed = DatasetFeed(database)
-        # Write-only parts.
         self.write = Changes(database)
         self.write_dataset = DatasetChanges(database)
         self.live = Live(database)
         self.removals = Removals(database)
-        # Both.
         self.notes = Notes(database)
         self.damage = KnownDamage(database)
         self.outbox = Outbox(database)

@@ -18,13 +18,13 @@ _CHANGES: Final = "changes"
 _MARK: Final = "mark"
 _SCAN_PAUSE: Final = "integrity scan pause"
 _SERVICE: Final = "service"
-#: Stored names of records; the count includes all.
+#: Most stored names of damaged records; their count has no limit.
 _NAMED: Final = 50
 
 
 @dataclass(frozen=True)
 class IndexCompleteness:
-    """How an index became complete, perhaps except for unreadable records."""
+    """Result of filling an index: complete, perhaps except for unreadable records."""
 
     at: str
     left_out: int = 0
@@ -34,18 +34,18 @@ class IndexCompleteness:
 
 @dataclass(frozen=True)
 class StoreMark:
-    """Mark by which index and store are compared in age."""
+    """Mark that shows whether index or store is an older copy."""
 
     mark: str = ""
-    """Mark that both have; empty if there is none yet."""
+    """Mark that index and store share; empty before the first."""
     before: str = ""
-    """Previous mark of the store during an update; otherwise the same."""
+    """Previous mark of the store during an update; otherwise equal."""
     changes: int = 0
 
 
 @dataclass(frozen=True)
 class ScanNote:
-    """Progress of the controller's scan of the store in this round."""
+    """Progress of the controller's integrity scan in this round."""
 
     started: str = ""
     ended: str = ""
@@ -56,7 +56,7 @@ class ScanNote:
 
 class Notes(IndexPart):
     def completeness(self) -> IndexCompleteness | None:
-        """Return the completeness, None while a new index may lack records of the store."""
+        """Return the completeness; None while a new index may lack records of the store."""
         value = self._get(_REBUILT)
         return None if value is None else IndexCompleteness(value["at"], value["left_out"], tuple(value["names"]))
 
@@ -65,12 +65,11 @@ class Notes(IndexPart):
         self._set(_REBUILT, value, within)
 
     def service(self, *, within: Connection | None = None) -> str | None:
-        """Return the id of the index's service; None for a new one."""
         value = self._get(_SERVICE, within)
         return None if value is None else str(value["id"])
 
     def name_service(self, identity: str, *, instead: bool = False) -> str:
-        """Set the id of the index's service if it has none, or `instead` of it; return the valid one."""
+        """Set the id of the index's service if unset, or `instead` of it; return the valid id."""
         with self.database.writing() as connection:
             known = None if instead else self.service(within=connection)
             if known is None:
@@ -100,7 +99,7 @@ class Notes(IndexPart):
         self._set(_SCAN, asdict(note))
 
     def pause_scan(self, lasts_s: float, *, begin: bool = False) -> bool:
-        """Pause the controller's scan for `lasts_s` from now [s]; return False if `begin` and it is paused already."""
+        """Pause the integrity scan for `lasts_s` [s]; with `begin`, return False if it is paused already."""
         with self.database.writing() as connection:
             if begin and self.is_scan_paused(within=connection):
                 return False
@@ -120,7 +119,7 @@ class Notes(IndexPart):
 
 @dataclass(frozen=True)
 class Damage:
-    """An object of the store that is not as it was written."""
+    """Object of the store with damaged or missing content."""
 
     key: str
     what: str
@@ -129,10 +128,10 @@ class Damage:
 
 
 class KnownDamage(IndexPart):
-    """Objects of the store that were found damaged or missing, and not fixed since."""
+    """List of damaged and missing objects of the store."""
 
     def known(self, *, limit: int = 100) -> tuple[int, list[Damage]]:
-        """Return the number of damaged objects that are not fixed, and the first of them."""
+        """Return the number of damaged objects, and the first of them."""
         query = select(damage).order_by(damage.c.found, damage.c.key).limit(limit)
         with self.database.reading() as connection:
             count = int(connection.scalar(select(func.count()).select_from(damage)) or 0)
@@ -147,7 +146,7 @@ class KnownDamage(IndexPart):
                 connection.execute(delete(damage).where(damage.c.key.in_(list(intact))))
 
     def replace(self, found: Sequence[Damage]) -> None:
-        """Replace the list of damage after a full scan of the store."""
+        """Replace the list after a full scan of the store."""
         with self.database.writing() as connection:
             connection.execute(delete(damage).where(damage.c.key.not_in([one.key for one in found])))
         self.mark(found)

@@ -1,4 +1,4 @@
-"""Outbox: ends of jobs and datasets in order, webhooks, and their deliveries."""
+"""Outbox: ends of jobs and datasets in order, webhooks, and deliveries."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ class DueDelivery:
 
 
 def note_ends(connection: Connection, rows: Sequence[dict[str, Any]]) -> None:
-    """Append ends to the feed within a transaction; writers take turns, so numbers appear in order.
+    """Append ends to the feed within a transaction.
 
-    A number is the time in milliseconds, or the last number plus 1. A rebuilt index thus continues after the
-    numbers of the lost one.
+    The number of an end is the time in milliseconds, or the last number plus 1: a rebuilt index thus continues after
+    the numbers of a lost one. Writers run one at a time, so numbers appear in order.
     """
     if rows:
         first = max(last_end(connection) + 1, int(time.time() * 1000))
@@ -58,14 +58,13 @@ class Outbox(IndexPart):
         return [(row["name"], row["events"]) for row in self.database.rows(query.limit(limit))]
 
     def tell_dataset(self, name: str, events: int, row: dict[str, Any]) -> None:
-        """Append the end of a dataset, once for each number of events."""
         with self.database.writing() as connection:
             untold = (datasets.c.name == name, datasets.c.told < events)
             if connection.execute(update(datasets).where(*untold).values(told=events)).rowcount:
                 note_ends(connection, [row])
 
     def add(self, hook: Webhook, *, seen: int | None = None, within: Connection | None = None) -> None:
-        """Add a webhook; it receives ends after `seen`, by default those from now on."""
+        """Add a webhook; it receives ends after `seen`, by default all future ends."""
         with self.database.writing(within) as connection:
             last = seen if seen is not None else last_end(connection)
             row = {name: getattr(hook, name) for name in ("id", "url", "created", "owner", "project")}
@@ -96,7 +95,7 @@ class Outbox(IndexPart):
         return [DeliveryView(**row) for row in self.database.rows(query)]
 
     def plan(self) -> None:
-        """Create deliveries of new ends; a webhook that is far behind misses the oldest."""
+        """Create deliveries of new ends; above the limit of waiting deliveries, a webhook loses its oldest ends."""
         for hook in self.hooks():
             mine = (ends.c.project == hook.project, ends.c.seq > hook.seen)
             query = select(ends.c.seq, ends.c.state).where(*mine).order_by(ends.c.seq).limit(_AT_ONCE)
@@ -121,7 +120,6 @@ class Outbox(IndexPart):
                 connection.execute(update(webhooks).where(webhooks.c.id == hook.id).values(seen=found[-1]["seq"]))
 
     def due(self, now: float) -> list[DueDelivery]:
-        """Return the due deliveries, the oldest of each webhook."""
         hooks = {hook.id: hook for hook in self.hooks()}
         first = (
             select(func.min(deliveries.c.seq).label("seq"), deliveries.c.webhook)

@@ -18,37 +18,37 @@ Tests = tuple[ColumnElement[bool], ...]
 
 
 def seen(scope: ProjectScope, table: Table) -> Tests:
-    """Return the conditions on a table with projects, or on tables joined to it."""
+    """Return the scope's conditions on a table with projects, or on tables joined to it."""
     return () if scope.everything else (table.c.project == scope.project,)
 
 
 def seen_with_job(scope: ProjectScope, table: Table) -> Tests:
-    """Return the conditions on a table of parts of jobs."""
+    """Return the scope's conditions on a table of parts of jobs."""
     of_project = select(jobs.c.id).where(jobs.c.project == scope.project)
     return () if scope.everything else (table.c.job_id.in_(of_project),)
 
 
 def seen_assets(scope: ProjectScope) -> Tests:
-    """Return the conditions on hands and objects: the project's own, built-in and shared ones."""
+    """Return the scope's conditions on hands and objects: own, built-in and shared ones."""
     if scope.everything:
         return ()
     return (or_(assets.c.project == scope.project, assets.c.builtin.is_(True), assets.c.shared.is_(True)),)
 
 
 def nearest_asset(scope: ProjectScope) -> ColumnElement[int]:
-    """Return the order of assets of one name: the project's own come first, then shared ones."""
+    """Return the order of assets of one name: own ones first, then shared ones."""
     shared = or_(assets.c.builtin.is_(True), assets.c.shared.is_(True))
     return case((assets.c.project == scope.project, 0), (shared, 1), else_=2)
 
 
 def seen_shards(scope: ProjectScope, shard: ColumnElement[Any]) -> Tests:
-    """Return the conditions on shard ids: those that a job of the project makes or reuses."""
+    """Return the conditions on ids of shards that a job of the project makes or reuses."""
     wanted = (tasks.c.shard_id == shard, tasks.c.job_id == jobs.c.id, jobs.c.project == scope.project)
     return () if scope.everything else (exists().where(*wanted),)
 
 
 MAX_LIMIT: Final = 200
-#: Upper bound of whole numbers in all databases.
+#: Upper bound of integers in all databases.
 _MOST: Final = 2**63
 
 
@@ -60,7 +60,7 @@ def page_rows(
     cursor: str | None,
     descending: bool = True,
 ) -> tuple[Sequence[RowMapping], str | None]:
-    """Return the rows of a page in the order of a key, and the cursor of the next page; InputError as in `decode`."""
+    """Return the rows of a page in the order of a key, and the next page's cursor; InputError as in `decode`."""
     size = page_size(limit)
     if cursor is not None:
         start = decode(cursor, *(part.type.python_type for part in key))
@@ -71,7 +71,6 @@ def page_rows(
 
 
 def encode(*key: Any) -> str:
-    """Encode a sort key as text, safe in a URL."""
     return base64.urlsafe_b64encode(json.dumps(key, separators=(",", ":")).encode()).decode().rstrip("=")
 
 
@@ -89,7 +88,6 @@ def decode(cursor: str, *kinds: type | tuple[type, ...]) -> tuple[Any, ...]:
 
 
 def page_size(limit: int) -> int:
-    """Return a limit between 1 and `MAX_LIMIT`."""
     if limit < 1:
         raise InputError("the limit must be at least 1")
     return min(limit, MAX_LIMIT)

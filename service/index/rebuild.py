@@ -43,7 +43,6 @@ log = logging.getLogger(__name__)
 RecordT = TypeVar("RecordT", bound=Record)
 #: Exceptions for an invalid record, here or in the database; none of them means an unavailable backend.
 _OF_THE_RECORD: Final = (DamagedError, InputError, DataError, ValueError, TypeError, LookupError, ArithmeticError)
-#: Concurrent reads, to hide the latency of a remote store.
 _READERS: Final = 16
 _SHOWN_DIFFERENCES: Final = 50
 
@@ -53,10 +52,9 @@ Progress = Callable[[str, int], object]
 
 
 def rebuild(index: Index, store: Store, *, progress: Progress = lambda what, number: None) -> dict[str, int]:
-    """Replace all rows by those derived from the store. The old rows stay until all new ones exist.
+    """Replace all rows by rows derived from the store; return the numbers of read records by kind, and of omitted ones.
 
-    A damaged record is omitted and named in the log and in `index.notes.completeness()`. Return the number of records
-    read of each kind, and of omitted ones.
+    The old rows stay until all new ones exist. The log and `index.notes.completeness()` name each damaged record.
     """
     with index.database.writing() as connection:
         connection.execution_options(**{QUIET: True})
@@ -76,7 +74,7 @@ def rebuild(index: Index, store: Store, *, progress: Progress = lambda what, num
 
 
 class _Rebuild:
-    """One rebuild: each record has its own savepoint, so that an invalid one leaves no rows."""
+    """One rebuild: each record has its own savepoint, so that an invalid record leaves no rows."""
 
     def __init__(self, index: Index, store: Store, connection: Connection, progress: Progress) -> None:
         self._index, self._store, self._connection, self._progress = index, store, connection, progress
@@ -95,7 +93,7 @@ class _Rebuild:
                     self._index.write.add_asset(load_asset(self._store, kind, digest), check, within=self._connection)
 
     def jobs(self) -> None:
-        """Read jobs, then their failed attempts in order, then users' actions."""
+        """Read jobs, then failed attempts in order, then users' actions."""
         known = []
         for key, data in self._read(names.JOBS, lambda key: key.endswith("/job.json") and key.count("/") == 2):
             with self._each(key, "jobs"):
@@ -138,7 +136,7 @@ class _Rebuild:
                 self._index.outbox.add(hook, seen=self._seen.get(hook.id, self._last), within=self._connection)
 
     def tags(self) -> None:
-        """Read the last version of each tag: earlier ones remain from interrupted changes."""
+        """Read the last version of each tag; earlier versions remain after interrupted changes."""
         last = {key.rpartition("/")[0]: (key, data) for key, data in sorted(self._read(names.TAGS))}
         for key, data in last.values():
             with self._each(key):
@@ -154,7 +152,7 @@ class _Rebuild:
     def _read(
         self, prefix: str, wanted: Callable[[str], bool] = lambda key: key.endswith(".json")
     ) -> Iterator[tuple[str, bytes]]:
-        """Yield keys and bytes of records; those removed since the listing are skipped."""
+        """Yield keys and bytes of records; records removed since the listing are skipped."""
         keys = [entry.key for entry in self._store.list(prefix) if wanted(entry.key) and not self._is_gone(entry.key)]
         with ThreadPoolExecutor(_READERS) as pool:
             for key, data in zip(keys, pool.map(self._bytes, keys), strict=True):
@@ -208,7 +206,7 @@ def differences(index: Index, store: Store) -> list[str]:
 
 
 def missing_names(index: Index, store: Store) -> list[str]:
-    """Return shards and jobs that only the index or only the store has, one line each; reads no record of the store."""
+    """Return shards and jobs that only the index or only the store has, one line each, without reading records."""
     gone = {f"jobs {name}" for what, name in pending(store) if what == "job"}
     stored = {
         f"shards {entry.key.rpartition('/')[2].removesuffix('.json')}"
@@ -234,7 +232,7 @@ def _compare(table: Table, live: Connection, derived: Connection) -> Iterator[st
         else:
             for column in ours[key]:
                 if ours[key][column] != theirs[key][column]:
-                    yield f"{name}: {column} is {ours[key][column]!r}, the store says {theirs[key][column]!r}"
+                    yield f"{name}: {column} is {ours[key][column]!r}, in the store {theirs[key][column]!r}"
 
 
 def _rows(table: Table, connection: Connection) -> dict[tuple[Any, ...], dict[str, Any]]:
@@ -247,12 +245,12 @@ def _rows(table: Table, connection: Connection) -> dict[tuple[Any, ...], dict[st
 
 
 def _lasting(row: dict[str, Any]) -> dict[str, Any]:
-    """Return a row without present state: that a task is running, and its progress when it stopped."""
+    """Return a row without present state: whether a task runs, and its progress."""
     if row.get("state") == State.RUNNING.value:
         row["state"] = State.QUEUED.value
     if row.get("state") in (State.QUEUED.value, State.CANCELLED.value) and "worker" in row:
         row["worker"] = None
-    if "verdict" in row:  # attempts of a check are not in the store: it has a result or is repeated
+    if "verdict" in row:  # The store does not contain attempts of a check.
         row["last_attempt"] = 0
         if row["verdict"] is None:
             row["message"] = None

@@ -1,7 +1,7 @@
 """Tables of the index. `LIVE_COLUMNS` are present state (progress, queue marks); the rest is derived.
 
-A change here needs another `REVISION` in `database`, which a test enforces. Metrics of grasps need none: see
-`database`. `applied` and `planned` of datasets are the planner's progress; tags are names that users give to grasps.
+A change needs another `REVISION` in `database`, which a test enforces, except for metrics of grasps. `applied` and
+`planned` of datasets are the planner's progress; tags are users' names for grasps.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ jobs: Final = Table(
     Column("origin", JSON(none_as_null=True)),
     *ownership(),
     Column("cancelled", Boolean, nullable=False),
-    # Batches of each of its tasks.
+    # Number of batches per task.
     Column("span", Integer, nullable=False),
     Column("created", String(32), nullable=False),
     Column("finished", String(32)),
     Column("reason", Text),
-    # Digests of its neighbours, separated by spaces; a list would need a table.
+    # Digests of the neighbours, separated by spaces; a list would need a table.
     Column("neighbours", String(300), nullable=False, server_default=""),
     Column("choice", JSON(none_as_null=True)),
     Column("network_digest", String(32), nullable=False, server_default=""),
@@ -128,11 +128,10 @@ shards: Final = Table(
     Column("seconds", Float, nullable=False),
     Column("created", String(32), nullable=False),
     Column("manifest", JSON, nullable=False),
-    # Project of the job that requested it first.
     Column("charged", String(32), nullable=False, server_default=""),
     Index("shards_newest", "created", "id"),
     Index("shards_by_kind", "kind", "created", "id"),
-    # They contain all columns of sums over shards: a row itself is as long as its manifest.
+    # Sums over shards read only these columns: a row itself is as long as its manifest.
     Index("shards_sums", "kind", "hand", "object", "count", "valid", "candidates", "size_bytes", "validated"),
     Index("shards_of_task", "id", "count", "valid", "candidates", "rechecked", "recheck_held", "validated"),
     Index("shards_made", "created", "kind", "count", "valid", "seconds"),
@@ -197,7 +196,7 @@ workers: Final = Table(
     *required(String(32), "started", "seen"),
     Column("reason", String(300), nullable=False, server_default=""),
 )
-#: Costs of deleted shards, a row per project, day and device: deleted results count as usage.
+#: Costs of deleted shards by project, day and device, because deleted results count as usage.
 spent: Final = Table(
     "spent",
     metadata,
@@ -219,7 +218,7 @@ damage: Final = Table(
     Column("found", String(32), nullable=False),
 )
 _PROGRESS: Final = ("progress_done", "progress_total", "progress_message")
-#: Columns of present state, and tables that contain nothing else: a rebuild resets them.
+#: Columns and tables of present state, which a rebuild resets.
 LIVE_COLUMNS: Final = frozenset({"queued", "not_before", "applied", "planned", "charged", "told", "seen", *_PROGRESS})
 LIVE_TABLES: Final = frozenset({"workers", "notes", "damage", "spent", "ends", "deliveries"})
 datasets: Final = Table(
@@ -235,7 +234,7 @@ datasets: Final = Table(
     Column("events", Integer, nullable=False),
     Column("applied", Integer, nullable=False, default=0),
     Column("planned", Boolean, nullable=False, default=False),
-    # Number of events for which its end was reported; -1: not reported.
+    # Number of events at the last reported end; -1: not reported.
     Column("told", Integer, nullable=False, server_default="-1"),
     Column("neighbours", String(300), nullable=False, server_default=""),
     Column("network_digest", String(32), nullable=False, server_default=""),
@@ -280,7 +279,7 @@ tags: Final = Table(
     *ownership(),
     Index("tags_by_name", "name", "project"),
 )
-#: Grasps of a tag. Some may be missing: their shards were deleted with the last job that needed them.
+#: Grasps of a tag. Some may be missing, because their shards were deleted with the last job that needed them.
 tagged: Final = Table(
     "tagged",
     metadata,
@@ -289,7 +288,7 @@ tagged: Final = Table(
     Column("row", Integer, primary_key=True),
     Index("tagged_grasps", "shard_id", "row"),
 )
-#: Live: a rebuilt index starts a new feed.
+#: Present state: a rebuilt index starts a new feed.
 ends: Final = Table(
     "ends",
     metadata,
@@ -310,10 +309,9 @@ webhooks: Final = Table(
     Column("states", JSON, nullable=False),
     Column("created", String(32), nullable=False),
     *ownership(),
-    # Live: ends up to here have deliveries.
+    # Present state: ends up to this number have deliveries.
     Column("seen", BigInteger, nullable=False, server_default="0"),
 )
-#: Live: a log.
 deliveries: Final = Table(
     "deliveries",
     metadata,

@@ -17,14 +17,13 @@ from graspd.service.model.records import Grasp, Tag
 
 class Tags(IndexPart):
     def all(self, *, scope: ProjectScope = EVERYTHING) -> list[TagView]:
-        """Return tags by name, with the number of existing grasps of each."""
         there = (grasps.c.shard_id == tagged.c.shard_id) & (grasps.c.row == tagged.c.row)
         number = select(func.count()).select_from(tagged.join(grasps, there)).where(tagged.c.tag == tags.c.id)
         query = select(tags, number.scalar_subquery().label("grasps")).where(*seen(scope, tags))
         return [TagView(**row) for row in self.database.rows(query.order_by(tags.c.name, tags.c.project))]
 
     def named(self, name: str, *, scope: ProjectScope = EVERYTHING) -> str:
-        """Return the id of a tag by name or id, of equal names the own project's; NotFoundError if none is in scope."""
+        """Return the id of a tag by name or id, own tags first; NotFoundError if none is in scope."""
         own_first = case((tags.c.id == name, 0), (tags.c.project == scope.project, 1), else_=2)
         query = select(tags.c.id).where((tags.c.name == name) | (tags.c.id == name), *seen(scope, tags))
         found = self.database.value(query.order_by(own_first, tags.c.project).limit(1))
@@ -33,7 +32,7 @@ class Tags(IndexPart):
         return str(found)
 
     def of(self, wanted: Collection[Grasp], *, scope: ProjectScope = EVERYTHING) -> dict[Grasp, list[str]]:
-        """Return the names of the tags of each of these grasps that has one."""
+        """Return the names of the tags of each given grasp that has any."""
         found: dict[Grasp, list[str]] = {}
         query = select(tagged.c.shard_id, tagged.c.row, tags.c.name).order_by(tags.c.name)
         query = query.where(tags.c.id == tagged.c.tag, *seen(scope, tags))

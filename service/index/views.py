@@ -1,4 +1,4 @@
-"""Answers of the index: plain frozen records, ready for JSON. Times are RFC 3339 in UTC."""
+"""Results of queries of the index: frozen records, ready for JSON. Times are RFC 3339 in UTC."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Page(View, Generic[T]):
 
 
 class Validated(View):
-    """Numbers of grasps and of valid grasps. Grasps without validation are not failures: the yield omits them."""
+    """Numbers of grasps and of valid grasps. The yield omits grasps without validation."""
 
     grasps: int = Field(0, description="grasps stored so far")
     valid: int = Field(
@@ -77,7 +77,7 @@ class JobView(Validated):
     recheck_held: int = Field(0, description="rechecked grasps that held")
     outcomes: dict[str, int] = Field({}, description="rejected candidates by outcome")
 
-    @computed_field(description="note on the numbers; null: none")  # type: ignore[prop-decorator]
+    @computed_field(description="why fewer grasps than requested were found; null: not applicable")  # type: ignore[prop-decorator]
     @property
     def note(self) -> str | None:
         request = self.request
@@ -107,8 +107,6 @@ class TaskView(View):
 
 
 class AttemptView(View):
-    """A failed attempt of a task."""
-
     task_id: str
     number: int
     reason: str
@@ -147,7 +145,7 @@ class ShardView(View):
 
 @with_fields(valid=values(optional=False), created=values(optional=True))
 class GraspView(View):
-    """One grasp with its quality in the index; the contact thresholds are those of the manifest (5 mm)."""
+    """One grasp with its quality in the index; contact metrics at the threshold of the manifest (5 mm)."""
 
     shard_id: str
     row: int
@@ -203,8 +201,6 @@ class WorkerView(View):
 
 
 class FailureGroup(View):
-    """Failed attempts that share an error name and stage."""
-
     stage: str
     kind: str
     attempts: int
@@ -215,8 +211,6 @@ class FailureGroup(View):
 
 
 class Stats(Validated):
-    """Totals of the whole service."""
-
     jobs: dict[State, int]
     tasks: dict[State, int]
     shards: int
@@ -225,7 +219,7 @@ class Stats(Validated):
 
 
 class EndView(View):
-    """A job or a dataset that ended."""
+    """Ended job or dataset."""
 
     seq: int = Field(description="sequence number, larger for later ends; value of `since` in the next request")
     kind: Literal["job", "dataset"]
@@ -237,7 +231,7 @@ class EndView(View):
 
 
 class WebhookView(View):
-    """A webhook: address that receives a message when a job or dataset ends."""
+    """URL that is notified when a job or dataset ends."""
 
     id: str
     url: str
@@ -251,7 +245,7 @@ class WebhookView(View):
 
 
 class TagView(View):
-    """A name that a user gave to grasps."""
+    """User's name for grasps."""
 
     id: str
     name: str
@@ -263,7 +257,7 @@ class TagView(View):
 
 
 class DeliveryView(View):
-    """Result of a delivery of an end to an address."""
+    """Delivery of an end to a URL, and its result."""
 
     seq: int
     kind: str
@@ -289,7 +283,7 @@ class UsageDay(View):
 
 
 class MatrixCell(Validated):
-    """One hand x object of the matrix."""
+    """One hand on one object of the matrix."""
 
     hand: str
     object: str
@@ -316,7 +310,7 @@ class DatasetView(Validated):
     tasks_failed: int
     progress: float = Field(ge=0, le=1)
     seconds: float = Field(description="total worker time [s]")
-    eta_s: float | None = Field(description="expected time until it ends, at the current number of running tasks [s]")
+    eta_s: float | None = Field(description="expected time until the end, at the current number of running tasks [s]")
     shards: int
     size_bytes: int
     created: str
@@ -326,7 +320,7 @@ class DatasetView(Validated):
     cancelled: bool = Field(description="whether its user cancelled it; `retry` resumes it")
     outcomes: dict[str, int] = Field({}, description="rejected candidates by outcome")
 
-    @computed_field(description="why it ended with fewer grasps than requested; null: it did not")  # type: ignore[prop-decorator]
+    @computed_field(description="why the dataset has fewer grasps than requested; null: it has all")  # type: ignore[prop-decorator]
     @property
     def reason(self) -> str | None:
         if not self.state.is_final or self.options.want != "valid":
@@ -336,12 +330,12 @@ class DatasetView(Validated):
 
     @property
     def counted(self) -> int:
-        """Grasps that count under its options: valid ones, else all."""
+        """Grasps that count under the dataset's options: valid ones, else all."""
         return self.valid if self.options.standing == "valid" else self.grasps
 
 
 class CellView(Validated):
-    """One hand x object of a dataset: an ordinary job, or one to be planned."""
+    """One hand on one object of a dataset: a job, planned or not."""
 
     position: int = Field(description="index of the cell, ordered by hand, then by object, from 0")
     hand: str
@@ -361,12 +355,12 @@ class CellView(Validated):
     reason: str | None = Field(description="why it failed, or found fewer grasps than requested")
 
     def counted(self, options: JobOptions) -> int:
-        """Return the grasps that count under its dataset's options: valid ones, else all."""
+        """Grasps that count under the dataset's options: valid ones, else all."""
         return self.valid if options.standing == "valid" else self.grasps
 
 
 class SnapshotView(View):
-    """A snapshot of a dataset, without its list of shards."""
+    """Snapshot of a dataset, without its list of shards."""
 
     dataset: str
     digest: str
@@ -378,13 +372,11 @@ class SnapshotView(View):
     size_bytes: int
 
     def counted(self, options: JobOptions) -> int:
-        """Return the grasps that count under its dataset's options: valid ones, else all."""
+        """Grasps that count under the dataset's options: valid ones, else all."""
         return self.valid if options.standing == "valid" else self.grasps
 
 
 class ObjectSetView(View):
-    """The newest version of a named set of objects."""
-
     name: str
     digest: str
     objects: list[str]

@@ -13,23 +13,22 @@ from graspd.service.model.errors import one_of
 
 
 class Model(BaseModel):
-    """Base class of the domain models: frozen, unknown fields are errors."""
+    """Base class of domain models: frozen; unknown fields are errors."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-#: A name given by a user: only letters, digits, dot, dash and underscore, because file names and URLs contain it.
+#: Name given by a user. Letters, digits, dot, dash and underscore only, because file names and URLs contain it.
 NAME: Final = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
 Name = Annotated[str, Field(pattern=NAME)]
-#: Name of a tag: words of such characters, separated by single spaces.
+#: Name of a tag: words of the characters of `Name`, separated by single spaces.
 TagName = Annotated[
     str,
     StringConstraints(strip_whitespace=True, max_length=64, pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*( [A-Za-z0-9._-]+)*$"),
 ]
-#: Lower-case hexadecimal SHA-256, shortened to 32 digits (128 bits).
 DIGEST: Final = r"^[0-9a-f]{32}$"
 Digest = Annotated[str, Field(pattern=DIGEST)]
-#: An id or an empty text. Any client can write to Redis, so this pattern bounds the values read from there.
+#: An id or an empty text. Any client can write to Redis, so this pattern bounds values from there.
 Word = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{0,64}$")]
 
 _WORDS: Final = {
@@ -46,11 +45,11 @@ _WORDS: Final = {
 }
 #: Pydantic's error types for bounds, with the name of each bound.
 _BOUNDS: Final = {"greater_than_equal": "ge", "greater_than": "gt", "less_than_equal": "le", "less_than": "lt"}
-_NAMES: Final = "must begin with a letter or digit and hold at most 64 letters, digits, dots, dashes and underscores"
-#: Beginning of pydantic's messages, which the field's name replaces.
+_NAMES: Final = "must begin with a letter or digit and have at most 64 letters, digits, dots, dashes and underscores"
+#: Prefix of pydantic's messages, which the field's name replaces.
 _SUBJECT: Final = re.compile(r"^(Value error, )|^\w+ should ")
 _CLASS: Final = re.compile(r"_[A-Z]\w*$|constrained-\w+$")
-#: Typer's message about choices; pydantic's key for them is `expected`.
+#: Typer's message about choices; pydantic's key for choices is `expected`.
 _CHOICES: Final = re.compile(r"'(?P<word>.*?)' is not one of (?P<expected>'.*')")
 
 
@@ -59,7 +58,7 @@ def refusal(
 ) -> str:
     """Return the first error after its location: `scene.touch: must be at least -1`; with `model`, the whole range."""
     first = error.errors(include_url=False)[0]
-    # For a union of models, pydantic adds the name of the model that it tested.
+    # For a union of models, pydantic adds the name of the tested model.
     place = [str(part) for part in first["loc"] if not _CLASS.match(str(part))]
     if place and names:
         named = names.get(place[0], place[0])
@@ -105,10 +104,10 @@ def words(entry: Mapping[str, Any]) -> str:
 
 
 def first_line(error: BaseException) -> str:
-    """Return the first line of a library's message, which may be followed by a dump of its internals."""
+    """Return the first line of a library's message; a dump of internals may follow."""
     return (str(error).strip().splitlines() or [type(error).__name__])[0]
 
 
 def why(error: Exception) -> str:
-    """Return a library's message about a file; for a system error, only its text without number and path."""
+    """Return a library's message about a file; for a system error, its text without number and path."""
     return getattr(error, "strerror", None) or str(error)

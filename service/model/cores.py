@@ -11,12 +11,11 @@ from pathlib import Path, PurePosixPath
 from typing import Final
 
 ROOT: Final = Path("/")
-#: Cache lifetime of a quota [s].
 _LATELY_S: Final = 2.0
 
 
 def available_cores(root: Path = ROOT) -> int:
-    """Return the number of cores for this process: its affinity or, if less, its control group's quota, rounded up."""
+    """Return the number of cores of this process: its affinity, or its control group's quota, rounded up, if less."""
     given = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, min([given, *(math.ceil(quota) for quota in _lately(root, int(time.monotonic() / _LATELY_S)))]))
 
@@ -32,14 +31,14 @@ def _quotas(root: Path) -> Iterator[float]:
     for text in _limits(root, "cpu.max"):
         try:
             quota, period = map(int, text.split())
-        except ValueError:  # "max 100000"
+        except ValueError:  # "max 100000" means no limit.
             continue
         if quota > 0 and period > 0:
             yield quota / period
 
 
 def available_memory(root: Path = ROOT) -> int:
-    """Return the memory for this process [bytes]: the machine's, or its control group's limit if less."""
+    """Return the memory of this process [bytes]: the machine's, or its control group's limit if less."""
     limits = (text.strip() for text in _limits(root, "memory.max"))
     given = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     return min([given, *(int(text) for text in limits if text.isdigit() and int(text) > 0)])

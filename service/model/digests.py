@@ -13,7 +13,7 @@ from graspd.service.model.renamed import original
 from graspd.service.model.states import AssetKind, Stage
 from graspd.service.model.version import STAGE_REVISIONS
 
-#: Increment when payloads change but grasps do not.
+#: Revision to increase when payloads change but grasps do not.
 _PAYLOAD_REVISION: Final = 2
 
 
@@ -29,7 +29,7 @@ def digest_json(value: object) -> str:
 
 
 def digest_files(kind: AssetKind, files: Mapping[str, bytes]) -> str:
-    if hasattr(files, "digest"):  # an archive on disk (`service.store.assets.ZipFiles`)
+    if hasattr(files, "digest"):  # Archive on disk (`service.store.assets.ZipFiles`).
         digests = {name: files.digest(name) for name in files}
     else:
         digests = {name: digest_bytes(data) for name, data in files.items()}
@@ -37,7 +37,7 @@ def digest_files(kind: AssetKind, files: Mapping[str, bytes]) -> str:
 
 
 def digest_variant(digest: str, options: Mapping[str, object] | None) -> str:
-    """Return the digest of a hand or object that is read with further options; without options, `digest`."""
+    """Return the digest of a hand or object with these read options; without options, `digest`."""
     return digest_json({"files": digest, "options": dict(options)}) if options else digest
 
 
@@ -58,7 +58,7 @@ def shard_id(
         "revision": revision,
         "hand": hand_digest,
         "object": object_digest,
-        "names": [request.hand, request.object],  # written into the shard
+        "names": [request.hand, request.object],
         "batch": batch,
         "count": count,
         "seed": request.seed,
@@ -76,7 +76,7 @@ def shard_id(
     elif stage is Stage.SCENE:
         inputs_of |= {"scenes": request.scenes}
         if request.in_scene:
-            # Scenes made before the grasps use the planner's mesh of the object.
+            # Scenes made before the grasps depend on the planner's mesh of the object.
             inputs_of |= {"scene": request.place.model_dump(mode="json"), "face_error_m": request.knobs.face_error_m}
     elif stage is Stage.RENDER:
         inputs_of |= {k: getattr(request, k) for k in ("views", "stereo", "width", "height", "channels")}
@@ -87,7 +87,7 @@ def _verdict_text(request: JobRequest, batches: range) -> dict[str, object]:
     found: dict[str, object] = {}
     if request.want == "valid":
         found |= {"want": request.want, "budget": request.budget}
-        # The revision of the stage covers the default.
+        # Digests omit the default distance; a new default requires a new revision of the stage.
         found |= {} if request.min_distance == MIN_DISTANCE_M else {"min_distance": request.min_distance}
     if request.validation != "none":
         rechecks = sum(map(request.rechecks_of, batches))

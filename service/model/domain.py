@@ -32,19 +32,19 @@ from graspd.service.model.scene_spec import (
 )
 from graspd.service.model.states import AssetKind
 
-#: Number of grasps of a batch, which is the unit of seeds and of kernel launches.
+#: Grasps per batch, the unit of seeds and kernel launches.
 BATCH_SIZE: Final = 32
-#: Channels that are optional, unlike colour, depth and segmentation; in the order of shards and digests.
+#: Optional channels besides colour, depth and segmentation, in the order of shards and digests.
 EXTRA_CHANNELS: Final = ("distance", "normals", "occlusion")
 
-#: Default rechecks per job and batches per recheck: for one grasp, the DexGraspBench protocol takes as long
-#: as planning, validation and measurement of two or three valid grasps.
+#: Default rechecks per job, and batches per recheck: for one grasp, the DexGraspBench protocol takes as long as
+#: planning, validation and measurement of two or three valid grasps.
 RECHECKS: Final = 8
 _RECHECK_EVERY: Final = 2
 
-#: graspd's own methods that cannot plan in scenes; workers report those of other packages.
+#: graspd's own methods that cannot plan in scenes; workers report further ones of other packages.
 FREE_ONLY_METHODS: Final = ("autograsp", "dfc", "graspd2022", "graspit")
-#: Methods that start from network proposals for an object on a table; their option `network` names the network.
+#: Methods that start from network proposals for an object on a table; the option `network` names the network.
 NETWORK_METHODS: Final = ("learned",)
 #: graspd's own methods; other packages can add methods.
 METHODS: Final = ("fast_graspd", "graspit", "graspd2022", "dfc", *NETWORK_METHODS, "autograsp")
@@ -59,7 +59,7 @@ _REFEREES_IN_WORDS: Final = {
 _FACES_IN_WORDS: Final = {"drawn": "as dropped", "all": "every stable face"}
 _WANTS_IN_WORDS: Final = {"valid": "valid grasps", "candidates": "all candidates"}
 _SCENES_IN_WORDS: Final = {"free": "free object", "table": "table", "bin": "bin", "shelf": "shelf"}
-SHAKE_NEEDS_A_SCENE: Final = "shake moves an object lifted out of a scene: choose a scene, such as table"
+SHAKE_NEEDS_A_SCENE: Final = "shake needs a lift out of a scene: choose a scene, such as table"
 
 
 def _sparse(default: Any, **facts: Any) -> Any:
@@ -271,7 +271,7 @@ class JobOptions(Model):
     @field_validator("channels")
     @classmethod
     def _in_order(cls, value: tuple[str, ...]) -> tuple[str, ...]:
-        # Sort: another order of channels must give the same job.
+        # Sorted, because another order of channels must give the same job.
         return tuple(name for name in EXTRA_CHANNELS if name in value)
 
     @model_validator(mode="before")
@@ -289,7 +289,7 @@ class JobOptions(Model):
         if self.target and self.fidelity != AUTO:
             raise ValueError("a target requires fidelity auto")
         if self.mass is not None and self.density is not None:
-            raise ValueError("mass and density both: give one of them")
+            raise ValueError("mass and density exclude each other: give one")
         if self.validation == "dexgraspbench" and self.matter:
             raise ValueError(
                 f"validation dexgraspbench gives all objects {MASS_KG:g} kg and friction "
@@ -351,7 +351,7 @@ class JobOptions(Model):
 
     @property
     def beside(self) -> tuple[NamedNeighbour, ...]:
-        """Neighbours: first those of the scene document, then dropped ones."""
+        """Neighbours: of the scene document, then dropped ones."""
         placed = self.scene.neighbours if isinstance(self.scene, SceneDocument) else ()
         return (*placed, *self._dropped)
 
@@ -366,7 +366,6 @@ class JobOptions(Model):
 
     @property
     def network(self) -> str:
-        """Name or digest of the network that proposes starts; empty: none."""
         return str(self.options.get("network", "")) if self.method in NETWORK_METHODS else ""
 
     @property
@@ -380,12 +379,12 @@ class JobOptions(Model):
 
     @property
     def counted(self) -> Literal["valid", "feasible"]:
-        """Grasps that count towards the wanted number: valid, or feasible without validation."""
+        """Grasps that count towards the wanted number: valid, or without validation feasible."""
         return "feasible" if self.validation == "none" else "valid"
 
     @property
     def standing(self) -> Literal["valid", "feasible", "kept"]:
-        """Grasps counted in tables: valid ones, or without validation all stored ones."""
+        """Grasps that tables count: valid, or without validation all stored ones."""
         return "kept" if self.counted == "feasible" and self.want == "candidates" else self.counted
 
     def rechecks_of(self, batch: int) -> int:
@@ -417,7 +416,7 @@ def batches_of(grasps: int) -> int:
 
 
 def check_known(options: JobOptions) -> None:
-    """Raise ValueError if a neighbour or the network has no digest: later a name may refer to other files."""
+    """Raise ValueError if a neighbour or the network has no digest: its name may later refer to other files."""
     if any(one.digest is None for one in options.beside):
         raise ValueError("each neighbour of a stored job has the digest of its files")
     if options.network and not re.fullmatch(DIGEST, options.network):

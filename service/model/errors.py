@@ -1,10 +1,7 @@
-"""Errors that graspd raises on purpose.
+"""Errors that graspd raises on purpose, and "did you mean" hints.
 
 A message is one line that states the problem and the fix. `exit_code` and `status` map errors to exit codes and HTTP
-statuses; `slug` names the problem type (RFC 9457).
-
-Messages and log lines never contain secrets, even in quoted texts. This module also has functions for "did you mean"
-hints.
+statuses; `slug` names the problem type (RFC 9457). Messages and log lines never contain secrets, even in quoted texts.
 """
 
 from __future__ import annotations
@@ -14,7 +11,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar, Final, Self
 
-#: Line breaks with surrounding space (all those of `str.splitlines`) and control characters.
+#: Line breaks with surrounding space (all of `str.splitlines`) and control characters.
 _BREAK: Final = re.compile(r"\s*[\n\r\v\f\x1c-\x1e\x85\u2028\u2029]\s*")
 _CONTROL: Final = re.compile(r"[\x00-\x1f\x7f-\x9f]")
 
@@ -37,7 +34,7 @@ class GraspdError(Exception):
 
 
 class InputError(GraspdError):
-    """The caller made a mistake."""
+    """The input of a request or command is invalid."""
 
     slug, status, exit_code, title = "invalid-input", 422, 2, "The request cannot be used"
 
@@ -185,7 +182,6 @@ def _below(kind: type[GraspdError]) -> Iterator[type[GraspdError]]:
         yield from _below(one)
 
 
-#: Errors by problem type, for the client and the reference page.
 ERRORS: Final = {error.slug: error for error in _below(GraspdError) if error is not AssetError}
 ERRORS[GraspdError.slug] = GraspdError
 

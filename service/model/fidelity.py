@@ -11,7 +11,7 @@ from graspd.service.model.errors import did_you_mean
 
 
 class Fidelity(Model):
-    """Settings of the planner that decide accuracy and cost. `graspd chart` measures the cost of each."""
+    """Planner settings that decide accuracy and cost. `graspd chart` measures the cost of each fidelity."""
 
     name: str = Field("custom", max_length=64)
     starts: int = Field(4, ge=1, le=64, description="starts for each grasp; half as many with rollouts")
@@ -69,7 +69,7 @@ FIDELITIES: Final[dict[str, Fidelity]] = {
         fine_iterations=60,
         polish_iterations=15,
     ),
-    # As in the paper: plain descent with one rate, one contact sweep, no penetration penalty, no selection.
+    # Settings of the paper: plain descent with one rate, one contact sweep, no penetration penalty, no selection.
     "paper": Fidelity(
         name="paper",
         starts=1,
@@ -88,11 +88,11 @@ FIDELITIES: Final[dict[str, Fidelity]] = {
 }
 
 
-#: Value of requests for the cheapest fidelity that meets the target; the stored job has that fidelity.
+#: Value for the cheapest fidelity that meets the target; the stored job has that fidelity.
 AUTO: Final = "auto"
 
 
-#: Fidelities for users; the others are for comparisons.
+#: Fidelities for users; other fidelities are for comparisons.
 OFFERED: Final = ("draft", "standard", "fine")
 
 

@@ -1,7 +1,7 @@
 """Installed libraries: cached versions, and imports without garbage collection.
 
-The modules of one process contain half a million objects. Garbage collections during imports, and full collections
-later and at exit, scan all of them. This takes half of the time of start and exit.
+The modules of one process contain half a million objects. Garbage collections during imports, later, and at exit scan
+all of them, which takes half of the time of start and exit.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _ours = False
 
 
 def own_process() -> None:
-    """Mark this process as graspd's own: garbage collection excludes imported objects, which stay until exit."""
+    """Mark this process as graspd's own: imported objects stay until exit, without garbage collection."""
     global _ours
     _ours = True
 

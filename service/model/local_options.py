@@ -1,4 +1,4 @@
-"""Options for grasps made in this process: options of a job, with files instead of names, and options of the run."""
+"""Options of grasps made in this process: options of a job, with files instead of names, and options of the run."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from graspd.service.model.scene_spec import MOST_NEIGHBOURS, MOST_SCENES, SceneS
 
 _LOCAL: Final[tuple[Place, ...]] = ("synth", "python")
 _COMMAND: Final[tuple[Place, ...]] = ("synth",)
-#: Fields of a job that describe its scene; in this process `SceneSpec` replaces them.
+#: Scene fields of a job; in this process `SceneSpec` replaces them.
 _OF_PLACE: Final = {"scene", "faces", "neighbours", "touch", "scenes"}
 
 

@@ -11,7 +11,6 @@ MASS_KG: Final = 0.1
 FRICTION: Final = 0.6
 #: Gravity, and the acceleration of pushes, in the protocol [m/s^2].
 ACCELERATION: Final = 10.0
-#: Upper bound of the mass that a hand lifts [kg].
 MOST_KG: Final = 100.0
 
 Mass = Annotated[float, Field(gt=0, le=MOST_KG, allow_inf_nan=False)]

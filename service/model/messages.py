@@ -18,12 +18,11 @@ class Origin(Model):
     request: str = Field("", max_length=64, description="id of the HTTP request")
     key: str = Field("", max_length=64, description="name of the API key")
 
-    # Ignore further fields of a newer API.
     model_config = ConfigDict(frozen=True, extra="ignore")
 
 
 class TaskMessage(Model):
-    """Message for a task; a worker needs only this message and the store."""
+    """Message of a task: with the store, all that a worker needs."""
 
     # The alias is needed because the message's field `schema` is an attribute of BaseModel.
     schema_: int = Field(alias="schema", description="oldest schema that can express the message")
@@ -52,7 +51,7 @@ class TaskMessage(Model):
 
 
 class IngestMessage(Model):
-    """Message for a task that checks an uploaded hand, object or network in a child process."""
+    """Message of a task that checks an uploaded hand, object or network in a child process."""
 
     schema_: int = Field(alias="schema")
     newest_schema: int = Field(0, ge=0)

@@ -1,9 +1,9 @@
 """Table of all grasp metrics; axes of robustness, grasp types and approach directions.
 
 Storage (`service.store.columns`), manifests, index, API, dashboard, dataset cards and docs derive from this table. A
-new metric needs a row here and a function that computes it (`MEASURES` in `worker.quality.table`); make it `optional`,
-since older shards lack it. The index adds its column when it is next opened (`service.index.database`). A yes-or-no
-property of a grasp is a verdict, not a metric.
+new metric needs a row here and a function (`MEASURES` in `worker.quality.table`); make it `optional`, since older
+shards lack it. The index adds the column at its next open (`service.index.database`). A yes-or-no property of a grasp
+is a verdict, not a metric.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final, Literal
 
-#: Names shorter than this are symbols with unchanged case.
+#: Shorter names are symbols with unchanged case.
 _SYMBOL: Final = 4
 
 
 class IndexLevel(IntEnum):
-    """How the index stores a metric; each level includes those before it."""
+    """Storage of a metric in the index; each level includes the levels before it."""
 
     NO = 0
     KEPT = 1
@@ -257,7 +257,7 @@ MOST_ROBUST_MODELS: Final = 64
 
 
 class Axis(IntEnum):
-    """Parameter perturbed from the nominal model. Shards contain its numbers: add new axes at the end only."""
+    """Parameter perturbed from the nominal model. Shards contain its number: add new axes at the end only."""
 
     NONE = 0
     SHAPES = 1
@@ -304,16 +304,15 @@ class GraspType(IntEnum):
     LATERAL = 3
 
 
-#: Directions fall into cells of equal area: bands of equal height z (Archimedes), each divided into equal azimuth
-#: ranges.
+#: Cells of directions have equal area: bands of equal height z (Archimedes), each divided into equal azimuth ranges.
 BANDS: Final = 4
 SECTORS: Final = 12
 
 DIRECTION_CELLS: Final = BANDS * SECTORS
 
 #: Distance below which two grasps of a job are near-duplicates [m]: mean over corresponding points of the hand's
-#: surface. Twice this distance is hardly visible in a picture; fewer than 1 in 100 pairs of batches have
-#: near-duplicates.
+#: surface. Twice this distance is hardly visible in a picture; near-duplicates occur in fewer than 1 in 100 pairs of
+#: batches.
 MIN_DISTANCE_M: Final = 0.005
 
 

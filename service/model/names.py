@@ -1,4 +1,4 @@
-"""Keys of the object store: this module builds every key that graspd writes (table in ARCHITECTURE.md)."""
+"""Keys of the object store: this module builds all keys that graspd writes (table in ARCHITECTURE.md)."""
 
 from __future__ import annotations
 
@@ -89,7 +89,6 @@ def dataset_events(dataset: str) -> str:
 
 
 def event(events: str, number: int, what: str) -> str:
-    """Return the key of one of `job_events` or `dataset_events`; numbers start at 1."""
     return f"{events}/{number:06}-{what}.json"
 
 
@@ -134,7 +133,7 @@ log = logging.getLogger(__name__)
 
 
 def refuse_long(name: str) -> str:
-    """Return the name; InputError if it is too long and a user can choose another."""
+    """Return the name; InputError if a name that users choose is too long."""
     if len(name) > MOST:
         raise InputError(
             f"the name {name} has {len(name)} characters, and at most {MOST} are allowed; give a shorter one"
@@ -144,7 +143,7 @@ def refuse_long(name: str) -> str:
 
 @lru_cache(maxsize=4096)
 def fitted(name: str, most: int = MOST) -> str:
-    """Return the name, shortened if too long to its beginning and a digest, so that it is unique; logged once."""
+    """Return the name; a long one becomes its beginning and a digest, so that it is unique, and is logged once."""
     if len(name) <= most:
         return name
     short = f"{name[: most - 9]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"

@@ -18,8 +18,6 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
 class MeshOptions(Model):
-    """Options for reading a mesh file."""
-
     units: Annotated[Literal["m", "mm", "cm", "in"], _SIZE] = Field("m", description="unit of the mesh")
     scale_to: Annotated[Positive | None, _SIZE] = Field(None, description="longest extent after scaling [m]")
     keep_largest: Annotated[bool, _READ] = Field(False, description="keep only the largest of several components")
@@ -46,5 +44,5 @@ class ObjectOptions(MeshOptions):
     @model_validator(mode="after")
     def _one_of_mass_and_density(self) -> Self:
         if self.mass is not None and self.density is not None:
-            raise ValueError("mass and density both: give one of them")
+            raise ValueError("mass and density exclude each other: give one")
         return self

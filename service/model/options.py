@@ -1,6 +1,6 @@
-"""Metadata of job options in addition to type, default, bounds and description; tables derived from the options.
+"""Metadata of job options besides type, default, bounds and description; tables derived from the options.
 
-`rows` is the only source for the command line, the dashboard's forms, the Python signatures and the docs' tables.
+Command line, dashboard forms, Python signatures and tables of the docs derive from `rows`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from graspd.service.model.errors import InputError
 
 ModelT = TypeVar("ModelT", bound=BaseModel)
 FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
-#: Places of an option: a job of the service, the command `graspd synth`, `graspd.synthesize`, an asset's file.
+#: Places of an option: job of the service, command `graspd synth`, `graspd.synthesize`, file of an asset.
 Place = Literal["job", "synth", "python", "asset"]
 EVERYWHERE: Final[tuple[Place, ...]] = ("job", "synth", "python")
 JOB: Final[tuple[Place, ...]] = ("job",)
@@ -49,9 +49,9 @@ class Option:
     keyword: str = ""
     """Keyword of `graspd.synthesize`; empty: the option's name."""
     typed: str = ""
-    """Description for command line and form, if it differs from the HTTP document."""
+    """Description for command line and form, if it differs from the description for HTTP."""
     schema: int = 0
-    """First schema of task messages that has the field; 0: all have it."""
+    """First schema of task messages with the field; 0: all schemas have it."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class Row:
 
     @property
     def kind(self) -> Any:
-        """Type read by a command line or form: bool, int, float, str, a Literal of strings, or list[str]."""
+        """Type for a command line or form: bool, int, float, str, a Literal of strings, or list[str]."""
         return _kind(self.field.annotation)
 
 
@@ -119,7 +119,7 @@ def accepted(model: type[ModelT], values: Mapping[str, Any], *, names: Mapping[s
 
 
 def with_keywords(model: type[BaseModel], place: Place) -> Callable[[FunctionT], FunctionT]:
-    """Decorate a function that takes `**options`: show each option as a keyword in its signature."""
+    """Decorate a function that takes `**options`: its signature shows each option as a keyword."""
 
     def decorate(function: FunctionT) -> FunctionT:
         written = inspect.signature(function)
@@ -140,7 +140,7 @@ def keywords_of(model: type[BaseModel], place: Place) -> list[tuple[str, Row, st
 
 
 def type_text(annotation: Any) -> str:
-    """Format an annotation for callers: without bounds, and a model as the mapping that it is made from."""
+    """Format an annotation for callers: without bounds, and models as mappings."""
     origin, inner = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
         return type_text(inner[0])

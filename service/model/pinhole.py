@@ -11,7 +11,7 @@ from graspd.service.model.transforms import Floats
 
 #: Neighbouring pixels whose depths differ by more than this share belong to two surfaces.
 EDGE: Final = 0.02
-#: Cost of a side with only one pixel, equal to that of an edge between faces.
+#: Cost of a side with only one pixel, equal to the cost of an edge between faces.
 _BEND_UNKNOWN: Final = 0.5
 
 
@@ -32,8 +32,8 @@ def back_project(k: Floats, depth: NDArray[Any]) -> Floats:
 def surface_normals(points: Floats) -> Floats:
     """Compute unit normals (H, W, 3) toward the camera of points (H, W, 3); nan where undefined.
 
-    The tangents are one-sided differences, on the side with less bend and no jump: on a plane, 1 / z is linear in
-    pixels. So each normal is that of the face that its pixel shows.
+    Tangents are one-sided differences, on the side with less bend and no jump. On a plane 1 / z is linear in pixels, so
+    each normal belongs to the face that its pixel shows.
     """
     along, down = _tangent(points, 1), _tangent(points, 0)
     normal = np.cross(down, along)

@@ -1,8 +1,8 @@
 """Planning of jobs in pure functions: tasks and their states, fair scheduling, outcomes of candidates.
 
-A job is split into batches of `BATCH_SIZE` grasps, the unit of seeds and launches, and its batches into ranges of
-`JobRecord.span`. Each range is a chain of tasks, one per requested stage: synthesize -> scene -> render, or for grasps
-planned in scenes: scene -> synthesize -> render.
+A job is split into batches of `BATCH_SIZE` grasps, the unit of seeds and launches. Ranges of `JobRecord.span` batches
+are chains of tasks, one task per requested stage: synthesize -> scene -> render, or for grasps planned in scenes:
+scene -> synthesize -> render.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class TaskFacts:
     last_attempt: int = 0
     exhausted: bool = False
     retried_upto: int = 0
-    """Last attempt before a user's retry of the job; attempts up to this number are ignored."""
+    """Number of the last attempt before the latest retry by a user; attempts up to this number are ignored."""
     running: bool = False
 
 
@@ -110,13 +110,13 @@ def message_of(job: JobRecord, task: PlannedTask, *, attempt: int, max_attempt: 
     )
 
 
-#: First schema of each newer option. A job with such an option needs a worker with that schema; older workers can run
-#: all other jobs.
+#: First schema of each newer option. Jobs with such an option need workers with that schema; older workers run all
+#: other jobs.
 _SCHEMAS: Final = {row.name: row.option.schema for row in rows(JobOptions, "job") if row.option.schema}
 
 
 def needed_schema(request: JobRequest, since: Mapping[str, int] = _SCHEMAS) -> int:
-    """Return the oldest schema that can express a request, which is that of its newest option in use."""
+    """Return the oldest schema that can express a request: the schema of its newest option in use."""
     fields = JobRequest.model_fields
     used = [schema for name, schema in since.items() if getattr(request, name) != fields[name].get_default()]
     used += [SCHEMA_OF_NETWORKS] if request.network else []
@@ -159,7 +159,7 @@ def batch_states(chain: Sequence[TaskFacts], *, job_cancelled: bool) -> list[Sta
 
 
 def batch_ready(states: Sequence[State]) -> list[bool]:
-    """Return which tasks of a range can start now: unfinished, with all earlier ones succeeded."""
+    """Return which tasks of a range are ready to start: unfinished, with all earlier tasks succeeded."""
     return [
         not state.is_final and all(before is State.SUCCEEDED for before in states[:i]) for i, state in enumerate(states)
     ]
@@ -185,16 +185,15 @@ def _own_state(facts: TaskFacts, *, job_cancelled: bool) -> State:
 
 
 T = TypeVar("T")
-#: Most jobs in one scheduling round; the others follow in later rounds.
+#: Most jobs in one scheduling round; other jobs follow in later rounds.
 JOBS_A_ROUND: Final = 64
-#: Number of remembered turns. It exceeds the number of jobs with waiting tasks, because a forgotten job comes first
-#: again.
+#: Number of remembered turns: more than jobs with waiting tasks, because a forgotten job comes first again.
 _REMEMBERED: Final = 100_000
 
 
 @dataclass(frozen=True)
 class WaitingJob:
-    """A job with tasks ready for the queue, and the owner of its share (see `share_of`)."""
+    """Job with tasks ready for the queue, and the owner of its share (see `share_of`)."""
 
     id: str
     key: str
@@ -202,12 +201,11 @@ class WaitingJob:
 
 def share_of(project: str, key: str) -> str:
     """Return the owner of a job's share of the queue: its project, or else its key ("" without keys)."""
-    # Names of keys contain no space.
     return f"project {project}" if project else key
 
 
 class RoundRobin:
-    """Fair scheduling state: who was served last. Its loss, when the process ends, costs at most one turn."""
+    """Fair scheduling: order of the latest turns. Their loss, when the process ends, costs at most one turn."""
 
     def __init__(self) -> None:
         self._served: dict[str, int] = {}
@@ -287,7 +285,7 @@ def shortfall(
 
 
 def limit_told(hand: str, friction: float, grasps: int, lifts: float, bound: float, wanted: float | None = None) -> str:
-    """Describe a hand's payload limit in a sentence; `bound` [kg] is that of actuators and friction, inf: none."""
+    """Describe a hand's payload limit in a sentence; `bound` [kg] follows from actuators and friction, inf: none."""
     most = f", and at most {bound:.2g} kg by actuator effort" if math.isfinite(bound) else ""
     less = "" if wanted is None else f"; {wanted:.3g} kg are wanted"
     return f"{hand} lifts {lifts:.2g} kg at friction {friction:g} in the best of {grasps} grasps{most}{less}"

@@ -8,18 +8,17 @@ from typing import Annotated, Final
 
 from pydantic import Field
 
-#: Pattern of project names: lower case, so that names never differ only in case.
+#: Lower case, so that names never differ only in case.
 PATTERN: Final = r"^[a-z0-9][a-z0-9-]{0,31}$"
-#: Project of a key, job or dataset; empty: the unnamed project.
 Project = Annotated[str, Field(pattern=rf"^$|{PATTERN}")]
-#: File that is added to a private upload of a project. The same mesh in two projects thus has two digests, and digests
-#: reveal nothing about other projects.
+#: File added to a project's private upload. The same mesh thus has another digest in each project, and digests reveal
+#: nothing about other projects.
 MARK: Final = "graspd-project.txt"
 
 
 @dataclass(frozen=True)
 class ProjectScope:
-    """Visible resources: those of one project plus shared hands and objects, or all resources."""
+    """Visible resources: of one project, with shared hands and objects, or all resources."""
 
     project: str = ""
     """Project whose resource is used if two projects have the same name."""

@@ -1,7 +1,6 @@
 """JSON records of the store: jobs, datasets, tags, user actions, failed attempts.
 
-`datasets/{name}/dataset.json` lists the jobs of its cells, so that later changes of algorithms or names do not change a
-dataset.
+`datasets/{name}/dataset.json` lists the jobs of its cells, so later algorithms or names do not change a dataset.
 """
 
 from __future__ import annotations
@@ -25,12 +24,11 @@ from graspd.service.model.projects import Project
 from graspd.service.model.states import AssetKind, Priority, Stage
 from graspd.service.model.version import STAGE_REVISIONS
 
-#: Most batches of a task.
 MOST_BATCHES: Final = 64
 
 
 class Record(BaseModel):
-    """Base class of the records. Unknown fields, as of a newer graspd, are ignored."""
+    """Base class of records; unknown fields, of a newer graspd, are ignored."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
@@ -41,7 +39,7 @@ class Choice(Record):
     target: str = Field(description="required accuracy")
     chart: str = Field(description="key of the chart in the store")
     measured_on: Literal["hand and object", "hand", "all"] = Field(
-        description="runs of the chart that count: those of the same hand and object, of the same hand, or all"
+        description="runs of the chart that count: of the same hand and object, of the same hand, or all"
     )
     reached: float = Field(description="accuracy of the chosen fidelity in these runs")
 
@@ -72,7 +70,7 @@ class JobRecord(Record):
     @model_validator(mode="before")
     @classmethod
     def _as_it_was_meant(cls, data: Any) -> Any:
-        # Records of version 1 had neither validator nor revisions.
+        # Records of version 1 have neither validator nor revisions.
         if isinstance(data, dict) and data.get("version") == 1:
             request = {"want": "candidates", "validation": "none", **data.get("request", {})}
             return {**data, "request": request, "revisions": dict.fromkeys(STAGE_REVISIONS, 1)}
@@ -93,7 +91,7 @@ class JobRecord(Record):
 
 
 class JobEvent(Record):
-    """A later user action on a job. `retried` maps each failed task to its last attempt before the retry."""
+    """Later user action on a job. `retried` maps each failed task to its last attempt before the retry."""
 
     number: int = Field(ge=1)
     what: Literal["cancelled", "retried"]
@@ -103,7 +101,7 @@ class JobEvent(Record):
 
 
 class AttemptRecord(Record):
-    """A failed attempt of a task. `last`: no further attempt unless a user retries the job."""
+    """Failed attempt of a task. `last`: no further attempt unless a user retries the job."""
 
     task_id: str
     job_id: str
@@ -126,7 +124,7 @@ class AttemptRecord(Record):
 
 
 class Member(Record):
-    """A hand or object of a dataset, in the version at the dataset's creation."""
+    """Hand or object of a dataset, in the version at the dataset's creation."""
 
     name: Name
     digest: Digest
@@ -134,7 +132,7 @@ class Member(Record):
 
 @dataclass(frozen=True)
 class Cell:
-    """One hand x object of a dataset, and its job."""
+    """One hand on one object of a dataset, and its job."""
 
     position: int
     hand: Member
@@ -142,14 +140,15 @@ class Cell:
     job_id: str
     fidelity: str = ""
     choice: Choice | None = None
-    """Reason for that choice; None also for datasets older than this field."""
+    """Reason for the chosen fidelity; None also for datasets older than this field."""
 
 
 class DatasetRecord(Record):
-    """`dataset.json`: a dataset.
+    """`dataset.json`. `jobs` has one id per cell, hand by hand, then object by object.
 
-    `jobs` has one id per cell, hand by hand, then object by object. With fidelity `auto`, `fidelities` has the chart's
-    choice per cell at creation, and `chosen` the index of its reason in `choices`.
+    With fidelity `auto`, `fidelities` has the chart's choice per cell at creation, and `chosen` the index of its reason
+    in
+    `choices`.
     """
 
     version: Literal[1] = 1
@@ -186,7 +185,7 @@ class DatasetRecord(Record):
 
 
 class DatasetEvent(Record):
-    """A later user action on a dataset. The last action decides whether the dataset is cancelled."""
+    """Later user action on a dataset. The last action decides whether the dataset is cancelled."""
 
     number: int = Field(ge=1)
     what: Literal["cancelled", "retried"]
@@ -194,8 +193,6 @@ class DatasetEvent(Record):
 
 
 class SnapshotShard(Record):
-    """A file of a snapshot."""
-
     id: Digest
     kind: Literal["base", "scene", "views"]
     key: str
@@ -210,13 +207,13 @@ class SnapshotShard(Record):
     @field_validator("key")
     @classmethod
     def _taken_apart(cls, key: str, info: ValidationInfo) -> str:
-        # A snapshot of 0.2 may refer to a part of a pack; each shard has its own file now.
+        # A snapshot of 0.2 may refer to a part of a pack; now each shard is a file.
         stages = {kind: stage for stage, kind in names.SHARD_KINDS.items()}
         return names.shard_file(stages[info.data["kind"]], info.data["id"]) if "@" in key else key
 
 
 class Snapshot(Record):
-    """An immutable list of the shards of a dataset at one moment."""
+    """Immutable list of the shards of a dataset at one moment."""
 
     version: Literal[1] = 1
     dataset: Name
@@ -231,7 +228,7 @@ class Snapshot(Record):
 
 
 class ObjectSet(Record):
-    """A version of a named set of objects; the newest is current."""
+    """Version of a named set of objects; the newest version counts."""
 
     version: Literal[1] = 1
     name: Name
@@ -286,7 +283,7 @@ Row = Annotated[int, Field(ge=0, lt=2**31)]
 
 
 class Tag(Record):
-    """`tags/{id}/{number:06}.json`: version of a tag after a user's change. The last is current; `gone`: deleted."""
+    """`tags/{id}/{number:06}.json`: version of a tag after a change. The last version counts; `gone`: deleted."""
 
     version: Literal[1] = 1
     id: Digest

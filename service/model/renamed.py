@@ -1,7 +1,4 @@
-"""Names of graspd 0.2 in stores, shards and queues, with their present names.
-
-Old names are accepted everywhere when reading, but written only into tasks for workers of 0.2.
-"""
+"""Names of graspd 0.2, which readers accept everywhere; only tasks for workers of 0.2 are written with them."""
 
 from __future__ import annotations
 
@@ -46,13 +43,13 @@ def has_old_names(document: bytes) -> bool:
 
 def renamed(value: Any) -> Any:
     if isinstance(value, dict):
-        # The options next to a method are the planner's own, so they are not renamed.
+        # Options next to a method are the planner's own and are not renamed.
         own = {"options"} if "method" in value else set()
         found = {KEYS.get(key, key): inner if key in own else renamed(inner) for key, inner in value.items()}
         for key, names in VALUES.items():
             if isinstance(old := found.get(key), str):
                 found[key] = names.get(old, old)
-        if "rechecks" in found:  # options of a job
+        if "rechecks" in found:
             found.pop(_REMOVED, None)
         return found
     if isinstance(value, list):
@@ -78,7 +75,7 @@ def _of_chart(name: str) -> str:
 
 
 def original(request: dict[str, Any]) -> dict[str, Any]:
-    """Return a job's request with the names of graspd 0.2: ids of jobs and shards are digests of these names."""
+    """Return a job's request with the names of graspd 0.2, whose digests are the ids of jobs and shards."""
     found = {
         _OLD_KEYS.get(key, key): _OLD_VALUES[key].get(value, value) if key in _OLD_VALUES else value
         for key, value in request.items()
@@ -87,7 +84,7 @@ def original(request: dict[str, Any]) -> dict[str, Any]:
 
 
 def for_worker_of(revision: int, stage: str, message: dict[str, Any]) -> dict[str, Any]:
-    """Convert a task message to the names of its revision: during rolling upgrades workers of 0.2 also run."""
+    """Convert a task message to the names of its revision: workers of 0.2 may run during an upgrade."""
     request = message.get("request")
     if not isinstance(request, dict) or not 0 < revision <= _REVISIONS.get(stage, 0):
         return message

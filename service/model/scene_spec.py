@@ -1,6 +1,6 @@
-"""Scenes: a kind, or a document of supports, neighbours and the target's pose.
+"""Scenes: a kind, or a document of supports, neighbours and the target's pose. z of the scene frame is up.
 
-The scene frame has z up. A support is a half-space (everything below a plane) or a box.
+A support is a half-space (everything below a plane) or a box.
 """
 
 from __future__ import annotations
@@ -20,14 +20,13 @@ from graspd.service.model.errors import InputError, did_you_mean
 SceneKind = Literal["free", "table", "bin", "shelf", "file"]
 KINDS: Final = ("free", "table", "bin", "shelf")
 MOST_SUPPORTS: Final = 32
-#: Values of the clearance of fingertips from supports [mm]: lower limit, clearance of the whole hand, default.
+#: Clearance of fingertips from supports [mm]: lower limit, clearance of the whole hand, default.
 LEAST_TOUCH: Final = -1.0
 MOST_TOUCH: Final = 2.0
 TOUCH: Final = 0.0
 SCENE_FILES: Final = (".json", ".yaml", ".yml")
 MOST_NEIGHBOURS: Final = 8
 MOST_SCENES: Final = 4096
-#: Largest extent of a scene [m].
 FARTHEST_M: Final = 10.0
 MAX_FILE_BYTES: Final = 64 * 1024
 
@@ -48,7 +47,7 @@ Pose = Annotated[tuple[_Metres, _Metres, _Metres, _Number, _Number, _Number, _Nu
 
 
 class HalfSpace(Model):
-    """A half-space: everything below a plane."""
+    """Half-space below a plane."""
 
     kind: Literal["half_space"] = "half_space"
     normal: Vector = (0.0, 0.0, 1.0)
@@ -64,8 +63,6 @@ class HalfSpace(Model):
 
 
 class Box(Model):
-    """A box centred at its pose."""
-
     kind: Literal["box"] = "box"
     size: tuple[_Extent, _Extent, _Extent]
     """Full extents x y z [m]."""
@@ -73,8 +70,6 @@ class Box(Model):
 
 
 class NeighbourSpec(Model):
-    """Another object in the scene."""
-
     object: str = Field(min_length=1, max_length=1024)
     """A built-in object or a mesh; in a scene file, relative paths start at the file's folder."""
     pose: Pose | None = Field(
@@ -94,12 +89,12 @@ class SceneSpec(Model):
     kind: SceneKind = "free"
     supports: Supports = Field((), max_length=MOST_SUPPORTS)
     target: Pose | None = None
-    """Pose of the object in the scene; None: it is dropped onto the support below."""
+    """Pose of the object in the scene; None: drop onto the support below."""
     faces: Literal["drawn", "all"] = "drawn"
     """drawn: resting faces with their frequency after drops; all: one scene for each stable face."""
 
     touch: Touch = TOUCH
-    """Clearance of fingertips to supports [mm]: 2, as for the rest of the hand; 0: contact; negative: they press."""
+    """Clearance of fingertips to supports [mm]: 2, as for the rest of the hand; 0: contact; negative: pressed in."""
     neighbours: tuple[NeighbourSpec, ...] = Field((), max_length=MOST_NEIGHBOURS)
 
     @model_validator(mode="after")
@@ -118,7 +113,7 @@ class SceneSpec(Model):
         return self
 
     def told(self) -> dict[str, Any]:
-        """Return the scene for a shard's attribute; neighbours' digests are in another attribute."""
+        """Return the scene for a shard's attribute; another attribute has the neighbours' digests."""
         return self.model_dump(mode="json", exclude={"neighbours": {"__all__": {"digest"}}})
 
     def _check_neighbours(self) -> None:
@@ -128,7 +123,7 @@ class SceneSpec(Model):
         if self.kind == "free":
             raise ValueError("neighbours need a scene: choose table, bin, shelf or a scene file, not free")
         if len(placed) > 1:
-            raise ValueError("give all neighbours a pose, or none: those without are dropped together")
+            raise ValueError("give all neighbours a pose, or none: neighbours without a pose are dropped together")
         if placed == {True} and self.kind != "file":
             raise ValueError("neighbours with poses need a scene file")
         if placed == {False} and self.target is not None:
@@ -199,10 +194,9 @@ def _loaded(text: str, path: Path) -> object:
 BIN_SIZE: Final = (0.40, 0.30)
 BIN_HEIGHT: Final = 0.15
 WALL: Final = 0.02
-#: Width and depth of a shelf's boards, and the height between them [m]; it is open towards -x.
+#: Width and depth of a shelf's boards, and the height between them [m]; the side towards -x is open.
 SHELF_SIZE: Final = (0.80, 0.35)
 SHELF_HEIGHT: Final = 0.35
-#: Least cosine between the vertical and the normal of a table.
 UPRIGHT: Final = 1 - 1e-6
 
 
@@ -244,7 +238,7 @@ def _shelf() -> tuple[HalfSpace | Box, ...]:
 
 
 class NamedNeighbour(NeighbourSpec):
-    """Another object in the scene, by its name in the service."""
+    """Object in the scene, by its name in the service."""
 
     object: Name = Field(description="name of an object known to the service")
 
@@ -253,7 +247,7 @@ def _whole(value: str | NamedNeighbour) -> NamedNeighbour:
     return NamedNeighbour(object=value) if isinstance(value, str) else value
 
 
-#: A neighbour in a request: a name, or a name with a pose.
+#: Neighbour in a request: a name, or a name with a pose.
 BesideOption = Annotated[
     Annotated[Name, Tag("name")] | Annotated[NamedNeighbour, Tag("neighbour")],
     Discriminator(lambda value: "name" if isinstance(value, str) else "neighbour"),
@@ -262,7 +256,7 @@ BesideOption = Annotated[
 
 
 class SceneDocument(Model):
-    """A complete scene within a request."""
+    """Complete scene within a request."""
 
     supports: Supports = Field(
         min_length=1, max_length=MOST_SUPPORTS, description="supports around the object, in the scene frame, z up [m]"
@@ -287,7 +281,7 @@ def _form(value: object) -> str:
     return "document" if isinstance(value, dict | SceneDocument) else "kind"
 
 
-#: A scene in a request: a kind or a document, discriminated so that errors refer to the intended form.
+#: Scene in a request: a kind or a document, discriminated so that errors refer to the intended form.
 SceneOption = Annotated[
     Annotated[Literal["free", "table", "bin", "shelf"], Tag("kind")] | Annotated[SceneDocument, Tag("document")],
     Discriminator(_form),
@@ -301,7 +295,7 @@ def scene_of(
     touch: float = TOUCH,
     beside: Sequence[NeighbourSpec] = (),
 ) -> SceneSpec:
-    """Return the scene of a request, with neighbours in addition to those of its document; ValueError if invalid."""
+    """Return the scene of a request, with neighbours in addition to its document's ones; ValueError if invalid."""
     try:
         if not isinstance(option, SceneDocument):
             return SceneSpec(kind=option, faces=faces, touch=touch, neighbours=tuple(beside))
@@ -314,7 +308,7 @@ def scene_of(
 
 
 def known_name(text: str) -> str:
-    """Return the name of an object; InputError for a file, because the service needs a name."""
+    """Return the name of an object; InputError for a file, because a job needs a name known to the service."""
     if "/" in text or Path(text).is_file():
         raise InputError(f"the neighbour {text} is a file: `graspd objects add {text}` first, then give its name")
     return text

@@ -6,7 +6,7 @@ from enum import StrEnum
 
 
 class State(StrEnum):
-    """State of a job or task. A task that lost its worker returns from `running` to `queued`."""
+    """State of a job or task. A task returns from `running` to `queued` if its worker is lost."""
 
     QUEUED = "queued"
     RUNNING = "running"
@@ -20,7 +20,7 @@ class State(StrEnum):
 
 
 class Stage(StrEnum):
-    """Stage of a task. `ingest` checks uploads; the others make shards."""
+    """Stage of a task. `ingest` checks uploads; other stages make shards."""
 
     INGEST = "ingest"
     SYNTHESIZE = "synthesize"
@@ -29,7 +29,7 @@ class Stage(StrEnum):
 
 
 class AssetKind(StrEnum):
-    """Kinds of uploaded assets. A network proposes grasps of one hand (`service.store.network_file`)."""
+    """Kind of an uploaded asset. A network proposes grasps of one hand (`service.store.network_file`)."""
 
     HAND = "hand"
     OBJECT = "object"
@@ -37,7 +37,7 @@ class AssetKind(StrEnum):
 
 
 class Priority(StrEnum):
-    """Priority of a task: `interactive` tasks come first, except for every fourth task of a worker."""
+    """Priority of a task. `interactive` tasks precede `bulk` ones, except in every fourth task of a worker."""
 
     INTERACTIVE = "interactive"
     BULK = "bulk"

@@ -12,9 +12,8 @@ from pydantic import BeforeValidator, TypeAdapter
 
 Outcome = Literal["good", "weak", "broken", "refused"]
 
-#: Outcomes from best to worst; `refused` is separate: a check rejected the input before the computation.
+#: Outcomes from best to worst; `refused`: a check rejected the input before the computation.
 OUTCOMES: Final[tuple[Outcome, ...]] = ("good", "weak", "broken", "refused")
-#: JSON has no nan.
 _Number = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]
 
 
@@ -95,7 +94,7 @@ class Stability:
     maps: list[StabilityMap]
 
     def as_json(self) -> dict[str, Any]:
-        """Return a JSON object with None for numbers that JSON lacks; `from_json` reads them as nan."""
+        """Return a JSON object with None for numbers that JSON lacks; `from_json` reads None as nan."""
         return dict(_plain(asdict(self)))
 
 
@@ -110,7 +109,7 @@ def counts(cells: Iterable[MapCell]) -> dict[Outcome, int]:
 
 
 def graded(value: float, weak: float, broken: float) -> Outcome:
-    if not value < broken:  # also for nan
+    if not value < broken:  # True for nan too.
         return "broken"
     return "good" if value < weak else "weak"
 
@@ -145,7 +144,7 @@ def between(ticks: Sequence[Any], value: float) -> float:
 
 
 def _exponent(text: str) -> str:
-    """Shorten an exponent (1e-05 to 1e-5), or use an exponent where the result is shorter."""
+    """Shorten an exponent (1e-05 to 1e-5), or use an exponent if the result is shorter."""
     if "e" not in text:
         digits = f"{float(text):e}".split("e")
         shorter = f"{digits[0].rstrip('0').rstrip('.')}e{int(digits[1])}"
@@ -164,7 +163,7 @@ def _plain(value: Any) -> Any:
 
 _RECORD: Final = TypeAdapter(Stability)
 
-#: Modes of a row of a chart in scenes: planned in the scene, or for a free object and filtered afterwards.
+#: Modes of a row of a chart in scenes: planned in the scene, or planned around a free object and filtered.
 IN_SCENE: Final = "in the scene"
 FILTERED: Final = "free, filtered"
 
@@ -172,5 +171,5 @@ FILTERED: Final = "free, filtered"
 FREE: Final = {"gsr": True, "dexgraspbench": True, "hard": True, "robust": True, "epsilon": True, "pd_mm": False}
 IN_SCENES: Final = {"lift": True, "lift_dexgraspbench": True, "lift_hard": True, "robust": True}
 
-#: Speeds: end to end, then the planner's own, the only one in charts of graspd 0.1.
+#: Speeds: end to end, then the planner's own, the only speed in charts of graspd 0.1.
 SPEEDS: Final = ("end_to_end_per_second", "valid_per_second")

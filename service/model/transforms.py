@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 IDENTITY_POSE: Floats = np.array([0.0, 0, 0, 1, 0, 0, 0])
-#: Names of the components of a pose (7,) in tables.
 POSE_PARTS: Final = ("x", "y", "z", "qw", "qx", "qy", "qz")
 
 
@@ -61,7 +60,7 @@ def slerp(a: Floats, b: Floats, share: float) -> Floats:
     cosine = float(a @ b)
     b, cosine = (-b, -cosine) if cosine < 0 else (b, cosine)
     angle = float(np.arccos(min(cosine, 1.0)))
-    # Nearly parallel: the chord equals the arc.
+    # Nearly parallel quaternions: the chord equals the arc.
     weights = (1 - share, share) if angle < 1e-6 else np.sin([(1 - share) * angle, share * angle]) / np.sin(angle)
     turned = weights[0] * a + weights[1] * b
     return np.asarray(turned / np.linalg.norm(turned))
@@ -73,7 +72,7 @@ def quat_from_matrix(matrix: Floats) -> Floats:
     trace = np.trace(m, axis1=-2, axis2=-1)
     d = np.diagonal(m, axis1=-2, axis2=-1)
     k = np.argmax(np.concatenate([trace[..., None], d], axis=-1), axis=-1)
-    # Rows of the symmetric matrix 4 q q^T: each is parallel to q; the one with the largest diagonal is most accurate.
+    # Rows of the symmetric matrix 4 q q^T are parallel to q; the row with the largest diagonal is most accurate.
     outer = np.empty((*m.shape[:-2], 4, 4))
     outer[..., 0, 0] = 1 + trace
     for i in range(3):
@@ -138,7 +137,7 @@ def apply(pose: Floats, points: Floats) -> Floats:
 
 
 def spread_directions(count: int) -> Floats:
-    """Return (count, 3) evenly spread unit vectors: a golden spiral."""
+    """Return (count, 3) unit vectors on a golden spiral, evenly spread."""
     k = np.arange(count)
     z = 1 - (2 * k + 1) / count
     turn, across = np.pi * (3 - np.sqrt(5)) * k, np.sqrt(1 - z**2)

@@ -1,4 +1,4 @@
-"""Versions that are part of every content address: increase one when the bytes of a result may change."""
+"""Versions in content addresses: increase one when the bytes of a result may change."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from typing import Final
 
 PACKAGE_VERSION: Final = "0.2.0"
 
-#: Newest schema of task messages, and the oldest that this version still reads. A message contains the range of schemas
-#: that can read it, so workers of two versions may run in parallel (`service/model/workers.py`).
+#: Newest schema of task messages, and the oldest readable one. A message states the schemas that can read it, so
+#: workers of two versions may run in parallel (`service/model/workers.py`).
 TASK_SCHEMA: Final = 6
 OLDEST_TASK_SCHEMA: Final = 2
 #: First schema with tasks of several batches.
 SCHEMA_OF_RANGES: Final = 6
-#: First schema whose workers fetch the network named by a request's options.
+#: First schema whose workers fetch the network of a request's options.
 SCHEMA_OF_NETWORKS: Final = 4
 
-#: Revision of each stage's algorithm. Part of a result's digest, so results of two revisions never collide.
+#: Revision of each stage's algorithm. Digests of results contain it, so results of two revisions never collide.
 STAGE_REVISIONS: Final = {"synthesize": 31, "scene": 5, "render": 6}

@@ -1,4 +1,4 @@
-"""Webhooks: notifications to a user's URL when a job or dataset ends, and their signatures."""
+"""Webhooks: signed notifications to a URL when a job or dataset ends."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from graspd.service.model.records import Record
 
 End = Literal["succeeded", "failed", "cancelled"]
 MAX_URL: Final = 500
-#: Most webhooks of one project, and most waiting deliveries of one webhook.
 MOST_HOOKS: Final = 20
 MOST_WAITING: Final = 1000
 SIGNATURE: Final = "X-Graspd-Signature"
@@ -46,7 +45,7 @@ def check_url(url: str) -> str:
     if parts.scheme not in ("http", "https") or not host or parts.username is not None or len(url) > MAX_URL:
         raise InputError("the address of a webhook is https://host/path, without a user, of at most 500 characters")
     if not url.isascii() or any(ord(letter) <= 32 or ord(letter) == 127 for letter in url):
-        raise InputError("the address of a webhook holds characters that no address has; write them as %xx")
+        raise InputError("the address of a webhook has invalid characters; write them as %xx")
     return url
 
 

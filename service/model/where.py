@@ -5,9 +5,9 @@
     factor       not factor | ( expression ) | NAME | NAME op VALUE
     op           < <= > >= = == !=
 
-Metrics are compared with numbers; `hand`, `object` and `type` are compared with words; flags need no comparison.
-Comparisons with a missing number are false. The text is parsed to a tree and never evaluated as code.
-`service.readers.where` applies it to base shards, `service.index.queries.grasps` to the index.
+Metrics are compared with numbers; `hand`, `object` and `type` with words; flags need no comparison. Comparisons with a
+missing number are false. The text is parsed to a tree and never evaluated as code. `service.readers.where` applies the
+tree to base shards, `service.index.queries.grasps` to the index.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from typing import Final
 from graspd.service.model.errors import InputError, one_of
 from graspd.service.model.metrics import GRASP_METRICS, GraspType
 
-#: Limits on length and nesting depth of an expression.
 LONGEST: Final = 1000
 _DEEPEST: Final = 40
 _METRICS: Final = {metric.name: metric for metric in GRASP_METRICS if not metric.code}

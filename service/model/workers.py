@@ -1,6 +1,6 @@
-"""Reports and capabilities of workers, requirements of tasks: several versions run in parallel.
+"""Reports and capabilities of workers, requirements of tasks: several versions may run in parallel.
 
-A message contains a range of schemas: from the oldest that can express it to the newest known to its writer. A worker
+A message states a range of schemas: from the oldest that can express it to the newest that its writer knows. A worker
 also reads a range, and has one revision of each stage.
 """
 
@@ -20,7 +20,7 @@ from graspd.service.model.messages import IngestMessage, TaskMessage
 from graspd.service.model.states import Stage
 from graspd.service.model.version import OLDEST_TASK_SCHEMA, PACKAGE_VERSION, STAGE_REVISIONS, TASK_SCHEMA
 
-#: Any client can write to Redis: values read from there are bounded in length and size.
+#: Any client can write to Redis, so values from there have bounded lengths and sizes.
 HostWord = Annotated[str, Field(max_length=300)]
 Count = Annotated[int, Field(ge=0, lt=2**31)]
 Amount = Annotated[float, Field(ge=0, le=1e15, allow_inf_nan=False)]
@@ -44,7 +44,7 @@ class WorkerBeat:
     seen: Annotated[str, Field(max_length=32)]
     reason: Annotated[str, Field(max_length=300)] = ""
     schemas: tuple[Count, Count] = (0, 0)
-    """Oldest and newest task message that the worker can read; workers of graspd 0.1 report none and get no tasks."""
+    """Oldest and newest readable task message; workers of graspd 0.1 report none and get no tasks."""
     revisions: Annotated[dict[HostWord, Count], Field(max_length=16)] = field(default_factory=dict)
     done: Amount = 0.0
     total: Amount = 0.0

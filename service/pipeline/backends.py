@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Services:
-    """Store, index and queue. API and controller open the index; workers use `open_store` and the queue."""
+    """Store, index and queue. Only API and controller open the index; workers use `open_store` and the queue."""
 
     settings: Settings
     store: Store
@@ -26,10 +26,8 @@ class Services:
     def open(cls, settings: Settings, *, patience: int = 3, make: bool = True, anew: bool = False) -> Self:
         """Open all three; create the data folder and the index. Redis need not answer yet.
 
-        Args:
-            patience: attempts to reach Redis before it counts as unavailable.
-            make: create a missing store folder, else raise NotFoundError.
-            anew: empty an index of another revision; see `Database`.
+        `patience` is the number of attempts to reach Redis. `make` creates a missing store folder (else NotFoundError);
+        `anew` empties an index of another revision.
         """
         from graspd.service.index.index import Index
         from graspd.service.queue.rq_queue import open_queue

@@ -1,7 +1,7 @@
-"""The controller: one loop for all work that no worker may do. If killed, its successor continues.
+"""Controller: one loop for all work outside workers. After a kill, another controller continues.
 
-It reconciles: it writes events to the index, and queues unfinished tasks of the index that the queue lacks. One
-controller leads; the others stand by (`service.pipeline.leading`).
+A round writes events to the index, and queues unfinished tasks of the index that the queue lacks. One controller leads;
+the others stand by (`service.pipeline.leading`).
 """
 
 from __future__ import annotations
@@ -46,22 +46,22 @@ _EVENTS_A_ROUND: Final = 2000
 _LONGEST_BACKLOG: Final = 10_000
 _FORGET_WORKERS_AFTER_S: Final = 3600.0
 _WORKERS_EVERY_S: Final = 2.0
-#: How long the capabilities of a worker count after its last registration.
+#: Validity of a worker's capabilities after its last registration [s].
 _REMEMBERED_S: Final = 60.0
-#: Interval at which progress of tasks is published: the interval at which pages poll it.
+#: Interval at which progress of tasks is published, equal to the polling interval of pages [s].
 _PROGRESS_EVERY_S: Final = 0.5
 _LONGEST_PAUSE_S: Final = 5.0
 _COLLECT_EVERY_S: Final = 5.0
 #: Interval of the check that store and index still belong to this service.
 _IDENTIFY_EVERY_S: Final = 30.0
-#: Time that a running read of the store has to end after the controller stops [s].
+#: Longest wait for a running read of the store after a stop [s].
 _LAST_READ_S: Final = 3.0
 #: Least wait between two parts of large jobs [s]: longer than the sleep of a writer that waits for SQLite.
 _ENTERING_GAP_S: Final = 0.15
 
 
 class Controller:
-    """Index events, queue ready tasks, recover tasks of lost workers, keep the list of workers."""
+    """Index events, queue ready tasks, recover tasks of lost workers, update the list of workers."""
 
     def __init__(self, services: Services, *, clock: Callable[[], float] = time.monotonic) -> None:
         self._services = services
@@ -78,9 +78,9 @@ class Controller:
         self._seen: dict[str, tuple[float, WorkerBeat]] = {}
         self._held: set[str] = set()
         self._has_news = False
-        """Whether events arrived since the queue was filled."""
+        """Whether events arrived since the last fill of the queue."""
         self._made = False
-        """Whether events arrived since store and index got their mark."""
+        """Whether events arrived since the last mark of store and index."""
         self._started = False
         self._alive = HeartbeatFile(services.settings.heartbeat_file)
         self._workers = 0
@@ -94,7 +94,7 @@ class Controller:
             PeriodicDuty(clock, self._mark, _WORKERS_EVERY_S),
             PeriodicDuty(clock, self._indexer.flush, _WORKERS_EVERY_S),
             PeriodicDuty(clock, self._look_after_workers, _WORKERS_EVERY_S, share=0.1),
-            # Each lease is checked three times before it can count as lost.
+            # A lease is checked three times before it counts as lost.
             PeriodicDuty(clock, self._look_after_queue, interval_s, longest_s=services.settings.lease_s / 3),
             PeriodicDuty(clock, self._feed_new, 0.0),
             PeriodicDuty(clock, self._pass_on_progress, min(_PROGRESS_EVERY_S, interval_s), share=0.1),
@@ -105,13 +105,13 @@ class Controller:
         ]
 
     def run(self, stop: threading.Event) -> None:
-        """Run rounds until `stop` is set. Wait with growing pauses for an unavailable backend."""
+        """Run rounds until `stop` is set; wait with growing pauses for an unavailable backend."""
         with self._beside(stop):
             self._run(stop)
 
     @contextmanager
     def _beside(self, stop: threading.Event) -> Iterator[None]:
-        """Run webhooks beside the rounds, and the integrity scan if the settings enable it."""
+        """Run webhooks, and the integrity scan if enabled, in parallel with the rounds."""
         duties = {"webhooks": WebhookDispatcher(self._services, stop).run}
         if self._services.settings.integrity_scan_mb_per_s:
             duties["integrity scan"] = IntegrityScan(self._services, stop).run
@@ -128,13 +128,13 @@ class Controller:
     def _run(self, stop: threading.Event) -> None:
         pause = 0.0
         while not stop.is_set():
-            # Also while a backend is unavailable: a restarted controller would wait just as long.
+            # Touched even while a backend is unavailable: a restarted controller would wait just as long.
             self._alive.touch()
             try:
                 self.round(wait_s=self._services.settings.controller_interval_s)
                 pause = 0.0
             except BusyError:
-                raise  # another service works here: to continue would undo its work
+                raise  # Another service has taken over the store; further rounds would undo its work.
             except UnavailableError as error:
                 pause = min(_LONGEST_PAUSE_S, max(0.25, 2 * pause))
                 log.warning("%s; the controller tries again in %.2g s", error, pause)
@@ -148,9 +148,8 @@ class Controller:
                 self._mark()
 
     def round(self, *, wait_s: float = 0.0) -> None:
-        """Index new events, then check queue, leases and workers.
-
-        UnavailableError: a backend is unavailable; run it again. BusyError: another service has taken over the store.
+        """Index new events, then check queue, leases and workers; BusyError if another service has taken over the
+        store.
         """
         self._identify()
         self._see_to_the_index()
@@ -164,7 +163,7 @@ class Controller:
             raise away[0]
 
     def _mark(self) -> None:
-        """Renew the mark of index and store after changes: older copies of the index are then rebuilt."""
+        """Renew the mark of index and store after changes; an older copy of the index is then detected and rebuilt."""
         notes = self._services.index.notes
         present, changes = notes.marked(), notes.changes()
         if changes != present.changes or self._made:
@@ -175,7 +174,7 @@ class Controller:
             self._known, self._made = fresh, False
 
     def _pass_on_progress(self) -> None:
-        """Publish the changed progress of tasks, as workers report it."""
+        """Publish changed progress of tasks from the reports of workers."""
         busy = (beat for beat in self._services.queue.workers() if beat.task_id)
         found = {beat.task_id: (beat.done, beat.total, beat.message) for beat in busy}
         if changed := {task: one for task, one in found.items() if self._progress.get(task) != one}:
@@ -187,9 +186,9 @@ class Controller:
         return self._has_plans
 
     def _enter_large_job(self) -> None:
-        """Enter the next tasks of a job that is too large for one transaction; others can write in between.
+        """Enter the next tasks of a job that is too large for one transaction; other writers can run in between.
 
-        Such jobs alternate. After a kill, the successor continues from a note in the index.
+        Such jobs alternate. A note in the index stores the position, so another controller can continue.
         """
         if not (jobs := self._services.index.write.entering()):
             return
@@ -203,10 +202,10 @@ class Controller:
 
     def _look_after_workers(self) -> None:
         self._announce()
-        # A worker that ends in order reports it, but its registration disappears a moment earlier.
+        # A worker reports its regular end, but its registration disappears a moment earlier.
         present = self._services.queue.workers()
         self._workers = len(present)
-        # A worker that is briefly silent still counts when tasks are held back.
+        # A briefly silent worker still counts in the decision whether tasks are held back.
         now = self._clock()
         self._seen |= {beat.name: (now, beat) for beat in present}
         self._seen = {name: one for name, one in self._seen.items() if now - one[0] < _REMEMBERED_S}
@@ -233,7 +232,7 @@ class Controller:
             self._indexer.made(manifest)
         complete_if_new(self._services.index, self._services.store)
         made = self._services.index.notes.completeness()
-        # Records that were left out may be fixed by now.
+        # Omitted records may be repaired by now.
         if made is None or made.left_out or self._is_stale():
             self._make_whole()
         else:
@@ -243,7 +242,7 @@ class Controller:
     def _is_stale(self) -> bool:
         """Return whether index or store was replaced by an older copy."""
         present = self._services.index.notes.marked()
-        # A controller that is killed between the two writes leaves the previous mark in the store.
+        # A kill between the two writes leaves the previous mark in the store.
         if present.mark == self._known or newest_mark(self._services.store) in (present.mark, present.before):
             self._known = present.mark
             return False
@@ -263,7 +262,7 @@ class Controller:
                 log.warning("%s", error)
 
     def _index_events(self, wait_s: float) -> None:
-        """Apply new events; those that need the store wait while it is unavailable."""
+        """Apply new events; events that need the store wait while it is unavailable."""
         if len(self._backlog) < _LONGEST_BACKLOG:
             wait_s = wait_s if not self._backlog else 0.0
             self._backlog += self._services.queue.consume(limit=_EVENTS_A_ROUND, wait_s=wait_s)
@@ -282,10 +281,10 @@ class Controller:
         self._services.queue.announce(PART, 5 * self._services.settings.controller_interval_s + 5)
 
     def _look_after_queue(self) -> None:
-        # If Redis can be read but not written, as on a full disk, no worker can send a heartbeat. Then this call fails
+        # If Redis is readable but not writable, as on a full disk, no worker can send a heartbeat. This call then fails
         # first, and no worker counts as lost.
         self._announce()
-        # Waiting tasks are read before leases, so that a task taken in between counts as held.
+        # Waiting tasks are read before leases, so that a task taken in between counts as leased.
         waiting = self._services.queue.waiting()
         leases = self._services.queue.leases()
         lost = self._reaper.reap(leases)
@@ -304,12 +303,11 @@ class Controller:
     def _feed(self, present: set[str] | None = None, missing: Collection[str] = ()) -> None:
         """Queue ready tasks; without the queue's content (`present`), the marks of the index decide.
 
-        The queue's own state then prevents a second entry, also of a task that its job queues at this moment. Only the
-        `missing` are queued regardless of that state.
+        The queue refuses a second entry of a task, also while a job is queued concurrently, except for `missing` tasks.
         """
         depths = self._services.queue.depths()
         now = time.time()
-        # Every worker finds a waiting task when it ends one.
+        # Two tasks per worker, so that a worker that ends a task finds another one waiting.
         window = max(self._services.settings.queue_window, 2 * self._workers)
         held: set[str] = set()
         for priority in Priority:
@@ -358,9 +356,9 @@ def _noted(away: list[UnavailableError]) -> Iterator[None]:
 
 
 class PeriodicDuty:
-    """A duty that runs at most once in `every_s`, and for at most `share` of the time.
+    """Duty called in each round: runs at most once per `every_s`, and for at most `share` of the time.
 
-    It is called in each round. If the work fails, or returns True because some is left, it also runs in the next one.
+    After an error, or a result True because work is left, the duty also runs in the next round.
     """
 
     def __init__(

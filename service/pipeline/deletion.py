@@ -1,8 +1,8 @@
 """Deletion of assets, jobs and datasets by users.
 
-`deletions/{what}/{id}.json` is written under the index's write lock, in the same step that removes the rows. From then
-on the resource does not exist: a rebuild omits it, and nothing of that id is accepted. The garbage collector
-(`service.pipeline.garbage_collector`) removes its objects, then the record itself. If killed, it restarts.
+One step under the index's write lock writes `deletions/{what}/{id}.json` and removes the rows. From then on the
+resource does not exist: rebuilds omit it, and nothing of its id is accepted. The garbage collector
+(`service.pipeline.garbage_collector`) then removes its objects and the record, and can resume after a kill.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def delete_asset(
 ) -> None:
     """Delete a hand, object or network; `scope` restricts what an error message names.
 
-    ConflictError: it comes with graspd, or a job, a dataset or a set of objects needs it.
+    ConflictError: the asset is built in, or a job, a dataset or a set of objects needs it.
     """
     asset = services.index.assets.get(kind, name)
     if asset.builtin:
@@ -61,15 +61,12 @@ def delete_asset(
 
 
 def delete_job(services: Services, job_id: str, *, owner: str = "") -> None:
-    """Delete a job; its shards follow after a grace time unless another job needs them.
-
-    ConflictError: it is unfinished, or a dataset contains it.
-    """
+    """Delete a job; shards that no other job needs follow later. ConflictError: unfinished, or in a dataset."""
     job = services.index.jobs.get(job_id)
     try:
         record = read_record(JobRecord, services.store, names.job_record(job_id))
     except (NotFoundError, DamagedError):
-        record = None  # its shards are then unknown, and stay
+        record = None  # Shards of an unreadable record are unknown, and stay.
     with recording(services) as (connection, put):
         if user := services.index.removals.user_of_job(job_id, within=connection):
             raise ConflictError(f"job {job_id} {user}")
@@ -81,10 +78,7 @@ def delete_job(services: Services, job_id: str, *, owner: str = "") -> None:
 
 
 def delete_dataset(services: Services, name: str, *, owner: str = "", with_snapshots: bool = False) -> None:
-    """Delete a dataset; jobs that were planned for it alone follow.
-
-    ConflictError: it is unfinished, or it has snapshots and `with_snapshots` is False.
-    """
+    """Delete a dataset, and the jobs planned for it alone. ConflictError: unfinished, or with unconfirmed snapshots."""
     dataset = services.index.datasets.get(name)
     if not dataset.state.is_final:
         raise ConflictError(f"dataset {name!r} is {dataset.state}; cancel it first: graspd datasets cancel {name}")
@@ -101,10 +95,7 @@ def delete_dataset(services: Services, name: str, *, owner: str = "", with_snaps
 
 
 def put_away(services: Services, deletion: Deletion) -> None:
-    """Move the deleted objects below `removed/`, its own record last, then remove the deletion's record.
-
-    Do nothing for a resource that was restored meanwhile.
-    """
+    """Move the deleted objects below `removed/`, the deletion's record last; nothing if the resource was restored."""
     record = _record_of(deletion)
     with services.index.database.writing():
         if not services.store.exists(names.deletion(deletion.what, deletion.id)):
@@ -127,10 +118,10 @@ def restore(
     permit: Callable[[Deletion], None],
     among: Callable[[Deletion], bool] = lambda _: True,
 ) -> Deletion:
-    """Restore what a user deleted, by name or id, unchanged; a dataset with its deleted jobs.
+    """Restore a deleted resource by name or id, unchanged; a dataset with its deleted jobs.
 
-    `permit` raises if a deletion may not be restored; `among` tells whether it is in scope. NotFoundError: nothing of
-    that name was deleted within the grace time. ConflictError: the name is in use again, or a dependency is deleted.
+    `permit` raises for a forbidden deletion; `among` tests the scope. NotFoundError: nothing of this name was deleted
+    within the grace time. ConflictError: the name is in use again, or a dependency is deleted.
     """
     known = [one for one in deletions(services.store, what) if name in (one.id, one.name) and among(one)]
     if not known:
@@ -147,7 +138,7 @@ def restore(
 
 
 def _restore(services: Services, deletion: Deletion, connection: Connection) -> None:
-    """Restore objects, then rows, then remove the deletion. Called under the index's write lock."""
+    """Restore objects, then rows, then remove the deletion; requires the index's write lock."""
     store, record, folder = services.store, _record_of(deletion), removed_folder(deletion)
     waiting = names.deletion(deletion.what, deletion.id)
     if not store.exists(waiting) and store.exists(record):
@@ -162,7 +153,7 @@ def _restore(services: Services, deletion: Deletion, connection: Connection) -> 
         _enter(services, deletion, connection)
     except ConflictError:
         if not store.exists(waiting):
-            put_record(store, waiting, deletion)  # the controller removes it again
+            put_record(store, waiting, deletion)  # The controller will remove it again.
         raise
     store.delete(waiting)
     store.delete(f"{folder}/deletion.json")
@@ -225,7 +216,7 @@ def _require(services: Services, wanted: Collection[tuple[AssetKind, str]], conn
 
 
 def _record_of(deletion: Deletion) -> str:
-    """Return the key of the record whose presence makes the thing exist."""
+    """Return the key of the record whose presence makes the resource exist."""
     if deletion.what == "job":
         return names.job_record(deletion.id)
     if deletion.what == "dataset":

@@ -1,4 +1,4 @@
-"""Choose the cheapest fidelity that reaches a wanted accuracy according to the stored charts."""
+"""Choice of the cheapest fidelity that reaches a wanted accuracy in the stored charts."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class ChosenFidelity(NamedTuple):
 
 @dataclass
 class _Chart:
-    """A stored chart, with its measured hands and objects."""
+    """Stored chart, with its measured hands and objects."""
 
     key: str
     content: Row
@@ -55,10 +55,10 @@ class _Chart:
 
 
 class Resolver:
-    """Replace `auto` by a fidelity. Each chart is read once, at the first request that needs it.
+    """Replaces `auto` by a fidelity. Each chart is read once, at the first request that needs it.
 
-    A request for a free object uses the newest chart of free objects; one with a scene uses the newest chart of that
-    kind of scene (`charts_of`). They are never mixed: a grasp that resists six pushes may fail to leave a bin.
+    Requests for a free object use the newest chart of free objects; requests with a scene use the newest chart of that
+    kind of scene (`charts_of`): a grasp that resists six pushes may fail to leave a bin.
     """
 
     def __init__(self, store: Store) -> None:
@@ -70,15 +70,12 @@ class Resolver:
         return self.choose(request)[0]
 
     def choose(self, request: JobRequest) -> tuple[JobRequest, Choice | None]:
-        """Return the request with `auto` replaced by a fidelity, and the reason; None without `auto`.
-
-        InputError: no chart exists for its scene, or no fidelity meets the target.
-        """
+        """Return the request with `auto` replaced, and the reason (None without `auto`); InputError without a match."""
         if request.fidelity != AUTO:
             return request, None
         chart = self._chart(request)
         pair = (request.hand, request.object)
-        # Hands that the chart lacks share one result.
+        # All hands without runs in the chart share one result.
         hand = request.hand if request.hand in chart.hands else ""
         key = (request.method, request.target, *(pair if pair in chart.pairs else (hand, "")))
         if key not in chart.found:
@@ -118,14 +115,14 @@ def parse_target(text: str, *, in_scene: bool = False) -> tuple[str, float]:
     metric, sign, bound = found.groups()
     if metric not in known:
         where = "in scenes" if in_scene else "of free objects"
-        raise InputError(f"{text!r}: charts {where} hold {', '.join(known)}; write {examples}")
+        raise InputError(f"{text!r}: charts {where} contain {', '.join(known)}; write {examples}")
     if (sign == ">=") != known[metric]:
         raise InputError(f"{text!r}: write {metric}{'>=' if known[metric] else '<='}{bound}")
     return metric, float(bound)
 
 
 def cheapest(chart: Row, target: str, *, method: str, hand: str, object_: str) -> ChosenFidelity:
-    """Return the fidelity of a method with most valid grasps per second among those that meet a target; or InputError.
+    """Return the fidelity of a method with most valid grasps per second that meets a target; InputError if none does.
 
     Runs of the same hand and object count; else runs of the hand; else all. In a chart of scenes only grasps planned
     for them count, by lifted grasps per second.

@@ -25,20 +25,17 @@ from graspd.service.store.records import DeletedJob, Deletion, load_dataset, rea
 
 log = logging.getLogger(__name__)
 RecordT = TypeVar("RecordT", bound=Record)
-#: Time for deletions in one round of the controller [s].
 BUDGET_S: Final = 0.5
 _AT_ONCE: Final = 200
 
 
 class GarbageCollector:
-    """Carry out deletions; if killed, the successor continues."""
-
     def __init__(self, services: Services, *, clock: Callable[[], float] = time.monotonic) -> None:
         self._services = services
         self._clock = clock
 
     def advance(self, budget_s: float = BUDGET_S) -> bool:
-        """Work for at most `budget_s`. Return whether work is left."""
+        """Work for at most `budget_s`; return whether work is left."""
         deadline = self._clock() + budget_s
         for _, deletion in self._records(Deletion, names.DELETIONS):
             if self._clock() > deadline or not self._carry_out(deletion, deadline):
@@ -47,7 +44,7 @@ class GarbageCollector:
         return False
 
     def collect(self, budget_s: float = BUDGET_S) -> bool:
-        """Remove objects deleted before the grace time, and shards unused since. Return whether work is left."""
+        """Remove objects deleted before the grace time, and unused shards; return whether work is left."""
         deadline = self._clock() + budget_s
         before = timestamp(self._services.settings.shard_grace_s)
         # The record of the deletion sorts first and is removed last.
@@ -59,10 +56,10 @@ class GarbageCollector:
                 self._services.store.delete(key)
         known = self._services.index.notes.completeness()
         if known is not None and known.left_out:
-            return False  # a job with an unreadable record may need one of them
+            return False  # A job with an unreadable record may need one of these shards.
         for key, released in self._records(DeletedJob, names.RELEASED):
             if released.at > before:
-                break  # the following ones are younger
+                break  # All further records are younger.
             for stage, shard in self._unneeded(released):
                 if self._clock() > deadline:
                     return True
@@ -79,10 +76,10 @@ class GarbageCollector:
                 log.warning("%s", error)
 
     def _carry_out(self, deletion: Deletion, deadline: float) -> bool:
-        """Remove rows again, if the process ended after the record, then objects. Return whether all is done."""
+        """Remove rows that a killed process left, then objects; return whether all is done."""
         with self._services.index.database.writing() as connection:
             if not self._services.store.exists(names.deletion(deletion.what, deletion.id)):
-                return True  # restored since it was listed
+                return True  # The resource was restored after the listing.
             removals = self._services.index.removals
             if deletion.what == "job":
                 removals.remove_job(deletion.id, within=connection)
@@ -106,7 +103,7 @@ class GarbageCollector:
                 if self._clock() > deadline:
                     return False
                 try:
-                    # The dataset was cancelled, perhaps too recently for its jobs to be.
+                    # The jobs of a recently cancelled dataset may still be unfinished.
                     with contextlib.suppress(ConflictError):
                         job_actions.cancel(self._services, job)
                     delete_job(self._services, job)
@@ -121,7 +118,7 @@ class GarbageCollector:
             yield from ((stage, shard) for stage, shard in some if shard in unneeded)
 
     def _remove_shard(self, stage: Stage, shard: str) -> None:
-        """Remove the manifest first, which ends the shard; a job entered meanwhile waits and makes it again."""
+        """Remove the manifest first, which ends the shard; a job entered meanwhile makes the shard again."""
         with self._services.index.database.writing() as connection:
             if self._services.index.removals.remove_shard(shard, within=connection):
                 self._services.store.delete(names.shard_manifest(stage, shard))

@@ -1,6 +1,6 @@
-"""HTTP client of webhooks: POST to a user's address; public machines only, bounded time and bytes.
+"""HTTP client of webhooks: POST to a user's URL, on public machines only, with bounded time and bytes.
 
-The name is resolved here, all its addresses are checked, and the connection uses one of them. A name that later
+The name is resolved here, all its addresses are checked, and the connection uses one of them, so a name that later
 resolves to another machine (DNS rebinding) has no effect. Redirects are not followed.
 """
 
@@ -20,9 +20,7 @@ from urllib.parse import urlsplit
 
 from graspd.service.model.errors import InputError
 
-#: Time limit of the whole exchange [s].
 PATIENCE_S: Final = 10.0
-#: Time limit of name resolution [s].
 LOOK_UP_S: Final = 5.0
 #: Most bytes read of the answer after its status line and headers.
 _READ_BYTES: Final = 1024
@@ -45,7 +43,7 @@ class RefusedAddress(InputError):
 
 @dataclass(frozen=True)
 class Response:
-    """Response to a delivery: a status, or a short reason why there is none."""
+    """Response to a delivery: a status, or a short reason for its absence."""
 
     status: int | None
     detail: str = ""
@@ -66,9 +64,9 @@ def networks(text: str) -> Networks:
 
 
 def is_public(address: Address) -> bool:
-    """Check whether an address is public, also the IPv4 address in an IPv6 one.
+    """Check whether an address is public; an IPv6 address also by the IPv4 address in it.
 
-    Loopback, private, link-local, shared, multicast and reserved addresses are not.
+    Loopback, private, link-local, shared, multicast and reserved addresses are not public.
     """
     if any(address in network for network in _INSIDE):
         return False
@@ -84,14 +82,12 @@ def is_public(address: Address) -> bool:
 
 
 def reachable(host: str, port: int, allowed: Networks) -> list[str]:
-    """Return a host's addresses, all public or in the networks `allowed`; else raise RefusedAddress or OSError."""
+    """Return a host's addresses; RefusedAddress unless all are public or in `allowed`, OSError without any."""
     found = list(dict.fromkeys(str(info[4][0]) for info in _looked_up(host, port)))
     for one in found:
         address = ipaddress.ip_address(one.partition("%")[0])
         if not is_public(address) and not any(address in network for network in allowed):
-            raise RefusedAddress(
-                "the address is not one of the public internet; the operator may allow it: GRASPD_WEBHOOK_NETWORKS"
-            )
+            raise RefusedAddress("the address is not public; the operator can allow it: GRASPD_WEBHOOK_NETWORKS")
     return found
 
 
@@ -115,7 +111,7 @@ def _looked_up(host: str, port: int) -> list[Any]:
 def post(
     url: str, body: bytes, headers: Mapping[str, str], *, allowed: Networks = (), patience_s: float = PATIENCE_S
 ) -> Response:
-    """Send a body and return the status of the answer. Never raises, whatever the receiver does."""
+    """Send a body and return the status of the answer; never raises."""
     parts = urlsplit(url)
     host = parts.hostname or ""
     port = parts.port or (443 if parts.scheme == "https" else 80)
@@ -127,7 +123,7 @@ def post(
         return Response(None, str(error), is_final=True)
     except (OSError, ValueError):
         return Response(None, "the host of the address cannot be looked up")
-    # A socket's time-out restarts with each byte; this one limits the whole exchange.
+    # A socket's time-out restarts with each byte; this timer limits the whole exchange.
     end = threading.Timer(patience_s, connection.cut)
     end.daemon = True
     end.start()
@@ -145,7 +141,7 @@ def post(
 
 
 class _Connection(http.client.HTTPConnection):
-    """A connection to one of the checked addresses, within `patience_s`; the library would resolve the name again."""
+    """Connection to one of the checked addresses, within `patience_s`; the library would resolve the name again."""
 
     def __init__(self, scheme: str, host: str, port: int, addresses: Sequence[str], patience_s: float) -> None:
         super().__init__(host, port)
@@ -159,7 +155,7 @@ class _Connection(http.client.HTTPConnection):
         self.sock = self._context.wrap_socket(dialled, server_hostname=self.host) if self._context else dialled
 
     def cut(self) -> None:
-        """Close it from another thread, in any state."""
+        """Close the connection from another thread, in any state."""
         with contextlib.suppress(OSError):
             if self.sock is not None:
                 self.sock.shutdown(socket.SHUT_RDWR)

@@ -1,8 +1,8 @@
 """Identity of the service of a store, an index and a Redis.
 
 Two services on one of them would undo each other's work. The store contains a chain of create-only records; the last
-one is the service that works on it. Index and Redis repeat its id. If one of them is lost, the other identifies the
-service. If both are empty they count as a second service; `graspd admin index rebuild` makes it the present one.
+record identifies its service. Index and Redis repeat the id. If one of them is lost, the other identifies the service;
+empty ones count as a second service, and `graspd admin index rebuild` makes it the present one.
 """
 
 from __future__ import annotations
@@ -42,7 +42,6 @@ class Identity:
     """Service ids in store, index, Redis and data folder."""
 
     chain: Sequence[str]
-    """Ids in the store; the last one counts."""
     index: str | None = None
     redis: str | None = None
     folder: str | None = None
@@ -80,16 +79,15 @@ def identify(
     take_over: bool = False,
     holds_redis: bool = False,
 ) -> str:
-    """Check that store, index and Redis belong to one service, and write its id where it is missing; return the id.
+    """Check that store, index and Redis belong to one service; write its id where it is missing; return the id.
 
     Args:
         folder: data folder that also stores the id.
         ask_redis: False while Redis is not started.
-        take_over: become the service of the store, whichever it was before.
+        take_over: replace the service of the store by this one.
         holds_redis: this process has the controller's lease, so Redis belongs to its service in any case.
 
-    Raises:
-        BusyError: one of them belongs to another service.
+    Raises BusyError if one of them belongs to another service.
     """
     # Redis is read first and the store last, so that concurrent new processes see each other's writes.
     redis = services.queue.service() if ask_redis else None
@@ -123,7 +121,6 @@ def identify(
 
 
 def identify_if_redis_answers(services: Services, *, folder: Path | None = None, take_over: bool = False) -> str:
-    """Call `identify`; if Redis is unavailable, use store, index and folder only."""
     try:
         return identify(services, folder=folder, take_over=take_over)
     except QueueUnavailable:
@@ -143,7 +140,7 @@ def service_ids(store: Store) -> list[str]:
 
 
 def recorded(folder: Path | None) -> str | None:
-    """Return the id of the service that last ran in a data folder."""
+    """Return the id of the last service that ran in a data folder."""
     if folder is not None:
         with contextlib.suppress(OSError, UnicodeDecodeError):
             return (folder / _FILE).read_text().strip() or None

@@ -1,4 +1,4 @@
-"""Apply events to the index. An event only refers to the store, from which the index is filled."""
+"""Application of events to the index. An event only refers to the store, which has the data."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _NEEDS_STORE: Final = frozenset({EventKind.FINISHED, EventKind.FAILED})
 
 
 class Indexer:
-    """Apply events; notify listeners when a job's state changes."""
+    """Apply events; notify listeners of changed job states."""
 
     def __init__(self, services: Services) -> None:
         self._services = services
@@ -47,9 +47,8 @@ class Indexer:
         self._readers = ThreadPoolExecutor(_READERS, thread_name_prefix="manifests")
 
     def apply(self, events: Sequence[Event]) -> list[int]:
-        """Update the index. An event that is applied twice changes nothing more.
-
-        Return the positions of events that need the unavailable store; apply these again later.
+        """Update the index idempotently; return the positions of events that need the unavailable store, to repeat
+        later.
         """
         started: dict[str, str] = {}
         finished: list[int] = []
@@ -108,7 +107,7 @@ class Indexer:
             yield from zip(some, self._readers.map(self._load, [events[place] for place in some]), strict=True)
 
     def _load(self, event: Event) -> ShardManifest | Exception:
-        """Read the manifest of a shard. Many are read at once, because most of the time is latency."""
+        """Read the manifest of a shard; reads run in parallel, because most of the time is latency."""
         try:
             assert event.stage is not None
             return load_manifest(self._services.store, event.stage, event.output)
@@ -154,7 +153,7 @@ class Indexer:
         self._services.index.write.add_asset(asset, load_check(self._services.store, kind, digest))
 
     def failed(self, attempt: AttemptRecord, *, at_once: bool = False) -> None:
-        """Index a failed attempt; the next follows after a back-off, or at once."""
+        """Index a failed attempt; the next one follows after a back-off, or at once."""
         wait = 0.0 if at_once else backoff(self._services.settings.retry_backoff_s, attempt.number)
         not_before = time.time() + wait
         state = self._services.index.write.add_attempt(attempt, not_before=not_before)
@@ -183,11 +182,11 @@ class Indexer:
             kind, _, digest = event.output.partition("/")
             self.checked(AssetKind(kind), digest)
         elif event.kind is EventKind.FAILED and event.stage is Stage.INGEST:
-            # Without a result the upload is undecided: its check is repeated until it has one.
+            # Without a result the upload is undecided: the check is repeated.
             self._defer(event)
         elif event.kind is EventKind.FAILED:
             self.failed(read_record(AttemptRecord, self._services.store, attempt_key(event.task_id, event.attempt)))
-        else:  # deferred, returned or cancelled
+        else:
             self._tally.add("graspd_task_handbacks_total", event.stage or "", event.kind.value)
             if event.kind is EventKind.DEFERRED:
                 self._defer(event)
@@ -211,7 +210,7 @@ class Indexer:
 
 @contextmanager
 def _left_out(what: str) -> Iterator[None]:
-    """Skip a bad event: any process with access to Redis can write one, and it must not block others."""
+    """Skip an invalid event: any client of Redis can write one, and it must not block others."""
     try:
         yield
     except UnavailableError:
@@ -220,15 +219,15 @@ def _left_out(what: str) -> Iterator[None]:
         log.exception("%s is ignored", what)
 
 
-#: Most names of errors with their own series: more than an engine raises, and a bound against forged names.
+#: Most error names with a series of their own, as a bound against forged names; an engine raises fewer.
 MOST_KINDS: Final = 60
 OTHER_KIND: Final = "other"
 
 
 class Tally:
-    """Counts for `/metrics` in memory; `flush` adds them to the sums in Redis, so every API shows the same values.
+    """Counts for `/metrics` in memory; `flush` adds them to the sums in Redis, which all API processes show.
 
-    The sums restart from zero when Redis is lost, which Prometheus counts as a restart. A repeated event counts twice.
+    A loss of Redis resets the sums, which Prometheus counts as a restart. A repeated event counts twice.
     """
 
     def __init__(self, count: Callable[[Mapping[str, float]], None]) -> None:

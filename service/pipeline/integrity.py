@@ -48,7 +48,7 @@ _RECORDS: Final[tuple[tuple[str, type[Any]], ...]] = (
     (r"webhooks/[^/]+\.json", Webhook),
     (r"tags/[^/]+/[^/]+\.json", Tag),
 )
-#: In the order in which a scan reads them; it stores its position.
+#: Folders in the order of a scan, which stores its position.
 FOLDERS: Final = (
     names.SHARDS,
     names.ASSETS,
@@ -78,7 +78,6 @@ BAD_MANIFEST: Final = "its manifest is damaged"
 FOREIGN: Final = "graspd did not write it"
 #: Time for which a file may lack its manifest [s].
 _ON_ITS_WAY_S: Final = 60.0
-#: Called after each read part with its bytes.
 Read = Callable[[int], object]
 #: Called with the key of each object that was written without a checksum.
 Unsealed = Callable[[str], None]
@@ -87,7 +86,7 @@ Unsealed = Callable[[str], None]
 def scan(
     store: Store, *folders: str, read: Read = lambda size: None, unsealed: Unsealed = lambda key: None
 ) -> Iterator[tuple[str, Damage | None]]:
-    """Yield every object that can be checked, of all folders or some, with its damage or None."""
+    """Yield every checkable object of all or some folders, with its damage or None."""
     for folder in folders or FOLDERS:
         for entry in store.list(folder):
             if is_checked(entry.key):
@@ -95,7 +94,7 @@ def scan(
 
 
 def may_await_manifest(store: Store, one: Damage) -> bool:
-    """Check whether a file may only wait for its manifest, which its worker puts next."""
+    """Check whether a recent file may still lack its manifest, which its worker writes next."""
     try:
         return one.what == NO_MANIFEST and (age_of(store.stamp(one.key)[1]) or 0.0) < _ON_ITS_WAY_S
     except NotFoundError:
@@ -103,7 +102,6 @@ def may_await_manifest(store: Store, one: Damage) -> bool:
 
 
 def is_checked(key: str) -> bool:
-    """Check whether `examine` supports an object of this name."""
     return key.startswith(f"{names.SHARDS}/") or key.endswith(_SEALED)
 
 
@@ -120,15 +118,15 @@ def examine(
         if ending == "json":
             return _manifest(store, key, STAGES[kind], shard, read, unsealed)
         manifest = names.shard_manifest(STAGES[kind], shard)
-        # A worker puts the manifest last; it may have arrived since the listing.
+        # A worker writes the manifest last; it may have arrived since the listing.
         orphan = not store.exists(manifest) and store.exists(key) and not store.exists(manifest)
         return Damage(key, NO_MANIFEST, shard) if orphan else None
     except NotFoundError:
-        return None  # removed since it was listed
+        return None  # The object was removed after the listing.
 
 
 def _sealed(store: Store, key: str, read: Read, unsealed: Unsealed) -> Damage | None:
-    """Check an object with its own checksum; without one, check its content as far as possible."""
+    """Check an object by its own checksum; without one, check its content as far as possible."""
     match = _UPLOAD.fullmatch(key)
     model = next((model for pattern, model in _RECORDS if re.fullmatch(pattern, key)), None)
     try:

@@ -1,4 +1,4 @@
-"""Integrity scan of the store by the controller: repeated, rate-limited, resumed where it stopped."""
+"""Integrity scan of the store by the controller: repeated, rate-limited, resumed at its last position."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ from graspd.service.pipeline.integrity import FOLDERS, examine, is_checked, may_
 log = logging.getLogger(__name__)
 #: Least interval of rounds over a small store [s].
 ROUND_S: Final = 3600.0
-#: Interval of checks of known damage, so that fixed objects are soon removed from the list [s].
+#: Interval of checks of known damage, so that repaired objects soon leave the list [s].
 _AGAIN_S: Final = 60.0
 _KNOWN: Final = 1000
-#: Keys in memory at once; the folder is listed again for the next ones.
+#: Keys in memory at once; further keys need another listing of the folder.
 _KEYS: Final = 10_000
-#: Least cost of an object, so that a million small ones are not read at once [bytes].
+#: Least cost of an object, so that a million small objects are not read at once [bytes].
 _LEAST: Final = 16 * 2**10
-#: Most backlog that is caught up at once after a pause [s].
+#: Most backlog that is read at once after a pause [s].
 _BURST_S: Final = 0.25
 #: Interval of queries whether `graspd admin store verify` pauses the scan [s].
 _PAUSE_S: Final = 5.0
 
 
 class Interrupted(Exception):
-    """The process shall stop, or `graspd admin store verify` reads the store."""
+    """The process stops, or `graspd admin store verify` reads the store."""
 
 
 class IntegrityScan:
-    """Read through the store; record new and fixed damage in the index."""
+    """Read through the store; record new and repaired damage in the index."""
 
     def __init__(
         self, services: Services, stop: threading.Event, *, clock: Callable[[], float] = time.monotonic
@@ -49,7 +49,7 @@ class IntegrityScan:
         self._looked = clock()
 
     def run(self) -> None:
-        """Run until `stop` is set. Wait for an unavailable backend."""
+        """Run until `stop` is set; wait for an unavailable backend."""
         while not self._stop.is_set():
             try:
                 if self._may_read() and self.advance():
@@ -59,7 +59,7 @@ class IntegrityScan:
             except GraspdError as error:
                 log.warning("%s; the integrity scan continues later", error)
             except Exception:
-                log.exception("the integrity scan failed; it continues later")
+                log.exception("the integrity scan failed and will continue later")
             self._stop.wait(_PAUSE_S)
 
     def _may_read(self) -> bool:
@@ -99,7 +99,7 @@ class IntegrityScan:
             self.look_again()
 
     def look_again(self) -> None:
-        """Check known damage again; remove fixed and deleted objects from the list."""
+        """Check known damage again; remove repaired and deleted objects from the list."""
         self._looked = self._clock()
         _, known = self._services.index.damage.known(limit=_KNOWN)
         if well := [one.key for one in known if self._is_well(one)]:

@@ -1,4 +1,4 @@
-"""Actions of a user on jobs: submit, cancel, retry. `planning` contains the planning."""
+"""Actions of a user on jobs: submit, cancel, retry."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _SUNK_M: Final = 1e-3
 
 
 def submit(services: Services, request: JobRequest, *, priority: Priority | None = None) -> tuple[JobView, bool]:
-    """Call `prepare`, then `enter`. Equal requests give the same job; for a failed or cancelled one see `retry`."""
+    """Call `prepare`, then `enter`. Equal requests give the same job; for a failed or cancelled job see `retry`."""
     return enter(services, prepare(services, request, priority=priority))
 
 
@@ -60,8 +60,8 @@ def prepare(
 
     Raises:
         NotFoundError, ConflictError: as in `usable`, also of neighbours and network.
-        InputError: one of them failed its check; the network is of another hand; no chart meets the target; the object
-            or a neighbour penetrates a support of its scene (SceneError).
+        InputError: a failed check; a network of another hand; no chart meets the target; the object or a neighbour
+            penetrates a support of its scene (SceneError).
     """
     hand = usable(services, AssetKind.HAND, request.hand, scope)
     obj = usable(services, AssetKind.OBJECT, request.object, scope)
@@ -90,12 +90,8 @@ def prepare(
 def enter(services: Services, record: JobRecord, *, keeps_assets: bool = False) -> tuple[JobView, bool]:
     """Record a planned job and queue its first tasks; return it, and whether it is new. The controller enters the rest.
 
-    Args:
-        keeps_assets: a dataset protects hand, object, neighbours and network from deletion meanwhile.
-
-    Raises:
-        NotFoundError: one of them was deleted meanwhile.
-        ConflictError: the same job was deleted, and its objects are still being removed.
+    With `keeps_assets` a dataset protects hand, object, neighbours and network from deletion meanwhile. NotFoundError:
+    one of them was deleted. ConflictError: the same job was deleted, and its objects are still being removed.
     """
     key = names.job_record(record.id)
     # A dataset needs its jobs even after an interruption, and its planner must not hold the lock during store access.
@@ -115,9 +111,9 @@ def enter(services: Services, record: JobRecord, *, keeps_assets: bool = False) 
 
 
 def cancel(services: Services, job_id: str, *, cause: str = "") -> JobView:
-    """Stop a job: waiting tasks never start, running ones stop at the next launch. Finished shards stay.
+    """Stop a job: waiting tasks never start, running ones stop at the next launch; finished shards stay.
 
-    The causing event of a dataset, if any, is stored with the job's event. ConflictError for a job that has ended.
+    The job's event names the causing event of a dataset, if any. ConflictError for a job that has ended.
     """
     with _changing(services, job_id, _refuse_ended) as add:
         in_queue = services.index.feed.unfinished_tasks(job_id)
@@ -155,21 +151,21 @@ class Routes:
     def place(self, need: Requirements) -> Route:
         """Return the route of a task.
 
-        A task that all workers of its stage can do goes to all; one that some can do goes to those; one that none can
-        do is held back. Without workers, this version's are assumed.
+        If all workers of its stage are capable, the task enters their common list; if some are, a separate list; if
+        none is,
+        the task is held back. Without workers, this version's capabilities are assumed.
         """
         here = self._here.get(need.stage) or [own_ability()]
         lacking = {one.lacks(need) for one in here} - {""}
         if all(one.lacks(need) for one in here):
-            return Route(held=f"held back, because no present worker can do it: {'; '.join(sorted(lacking))}")
+            return Route(held=f"held back, because no present worker is capable: {'; '.join(sorted(lacking))}")
         return Route(apart=bool(lacking))
 
 
 def queue_tasks(services: Services, ready: Sequence[ReadyTask], *, routes: Routes, again: bool = False) -> set[str]:
-    """Queue tasks and mark them in the index; tasks that no worker can do wait, with a reason in the job.
+    """Queue tasks and mark them in the index; tasks without a capable worker wait. Return the reasons of waiting.
 
-    The mark comes first: the controller queues marked tasks that are missing; unmarked ones might run twice. Return the
-    reasons why tasks are held back.
+    The mark comes first: the controller queues marked tasks that are missing; unmarked ones might run twice.
     """
     to_queue: dict[tuple[Priority, bool], list[TaskMessage]] = defaultdict(list)
     held: dict[str, list[str]] = defaultdict(list)
@@ -191,7 +187,7 @@ def queue_tasks(services: Services, ready: Sequence[ReadyTask], *, routes: Route
 
 
 def _start(services: Services, job_id: str) -> None:
-    """Queue the part of a job that fits the queue's window. The controller queues the rest."""
+    """Queue the part of a job that fits the queue's window; the controller queues the rest."""
     try:
         room = services.settings.queue_window - sum(services.queue.depths().values())
         if room > 0:
@@ -245,7 +241,7 @@ def _told(services: Services, job_id: str) -> JobView:
 
 
 def check_scene(options: JobOptions, obj: AssetView, beside: Sequence[AssetView] = ()) -> None:
-    """Raise SceneError for an object whose centre of mass lies in a support: its hull then penetrates the support.
+    """Raise SceneError if an object's centre of mass lies in a support, because its hull then penetrates the support.
 
     Without a measured centre, and for checks that need meshes, the first task reports the error.
     """

@@ -24,11 +24,9 @@ if TYPE_CHECKING:
     from graspd.service.queue.rq_queue import RqQueue
 
 log = logging.getLogger(__name__)
-#: Part name of the leading controller's registration; an API of graspd 0.2 expects the same name.
+#: Name of the leading controller's registration, which an API of graspd 0.2 expects.
 PART: Final = "keeper"
-#: Renewals per lease.
 _RENEWALS: Final = 3.0
-#: Longest delay until a process notices that it shall stop [s].
 _LOOK_S: Final = 0.1
 
 
@@ -56,7 +54,7 @@ class Leadership:
     def held(self, stop: threading.Event) -> Iterator[threading.Event]:
         """Hold the lease, then release it; yield an event that is set when another process leads or `stop` is set.
 
-        The lease is lost only if Redis reports another holder: while Redis is unavailable, no process can take it.
+        Only another holder in Redis ends the lease: while Redis is unavailable, no process can take it.
         """
         over, done = threading.Event(), threading.Event()
         thread = threading.Thread(target=self._renew, args=(stop, over, done), name="controller-lease", daemon=True)
@@ -68,11 +66,11 @@ class Leadership:
             done.set()
             thread.join(self._lease_s)
             if stop.is_set():
-                with suppress(QueueUnavailable):  # the lease expires by itself
+                with suppress(QueueUnavailable):  # The lease expires by itself.
                     self._queue.resign(self.holder)
 
     def _renew(self, stop: threading.Event, over: threading.Event, done: threading.Event) -> None:
-        due = -math.inf  # also while the work stops
+        due = -math.inf  # Renewal continues while the work stops.
         while not done.wait(_LOOK_S) and not stop.is_set():
             if time.monotonic() < due:
                 continue

@@ -39,7 +39,7 @@ class LeaseReaper:
         self._missing: dict[str, float] = {}
 
     def reap(self, leases: Collection[Lease]) -> list[Lease]:
-        """Take tasks from workers without a heartbeat for a lease; return those leases."""
+        """Take tasks from workers without a heartbeat for a lease; return their leases."""
         now = self._clock()
         lease_s = self._services.settings.lease_s
         # Time without checks, because Redis was unavailable or this process suspended, does not count as silence.
@@ -73,7 +73,9 @@ class LeaseReaper:
     def _recover(self, missing: list[str]) -> None:
         """Recover lost events from the store; queue tasks again whose result the store lacks."""
         again = []
-        for made in take_apart(self._services.store) if missing else ():  # from a worker of 0.2, in a rolling upgrade
+        for made in (
+            take_apart(self._services.store) if missing else ()
+        ):  # Written by a worker of 0.2, in a rolling upgrade.
             self._indexer.made(made)
         for task, (stage, shard) in self._services.index.feed.outputs(missing).items():
             if self._find(task, Stage(stage), shard):
@@ -129,9 +131,9 @@ class LeaseReaper:
                 self._lose_check(message)
         except UnavailableError:
             raise
-        except Exception:  # any client of Redis can forge a lease: it must not block the others
+        except Exception:  # Any client of Redis can forge a lease, which must not block others.
             log.exception("the lease of task %s is ignored", lease.task_id)
-        # Removed only now: if the store was unavailable, the next round finds the lease again.
+        # The lease is removed last: if the store was unavailable, the next round finds the lease again.
         self._services.queue.release(lease)
 
     def _lose_task(self, worker: str, message: TaskMessage) -> None:
@@ -151,12 +153,12 @@ class LeaseReaper:
             except DamagedError as error:
                 self._fail(message.task_id, message.stage, error)
                 return
-        # A first loss is more often caused by the machine than by the task, so there is no wait.
+        # No wait: the machine causes a first loss more often than the task does.
         self._indexer.failed(attempt, at_once=attempt.number == 1)
 
     def _lose_check(self, message: IngestMessage) -> None:
         if message.attempt >= message.max_attempt:
-            ended = f"the check of this {message.kind.value} ended its worker {message.attempt} times"
+            ended = f"the check of this {message.kind.value} crashed its worker {message.attempt} times"
             reason = f"{ended}; delete it to try again"
             found = {"verdict": "refuse", "message": reason, "repairs": [], "facts": {}}
             put_document(self._services.store, names.asset_check(message.kind, message.digest), found)

@@ -1,4 +1,4 @@
-"""Number of batches per task of a job: long enough to keep a worker busy, at most a fair share."""
+"""Number of batches per task of a job: long enough to fill a worker, at most a fair share."""
 
 from __future__ import annotations
 
@@ -21,13 +21,11 @@ from graspd.service.pipeline.backends import Services
 _LOOKED_AT: Final = 64
 #: Workers assumed if none is present: a service may start them once a task waits.
 _EXPECTED: Final = 8
-#: How long measured workers and rates are cached [s].
+#: Cache lifetime of measured workers and rates [s].
 _KNOWN_S: Final = 10.0
 
 
 class TaskRanges:
-    """Choose the ranges of jobs during planning."""
-
     def __init__(
         self, services: Services, *, scope: ProjectScope = EVERYTHING, clock: Callable[[], float] = time.monotonic
     ) -> None:
@@ -50,7 +48,7 @@ class TaskRanges:
         able = [worker for worker in self._workers if Stage.SYNTHESIZE in worker.stages]
         if any(worker.ability.schemas[1] < SCHEMA_OF_RANGES for worker in able):
             return job
-        # A user of a small job sees its grasps batch by batch; a GPU makes them all in one launch.
+        # A small job shows its grasps batch by batch; a GPU makes them all in one launch.
         if job.priority is Priority.INTERACTIVE and not (able and all(one.device.startswith("cuda") for one in able)):
             return job
         rate = Rates(self._costs, job.request, {one.device for one in able}).of(job.request.hand, job.request.object)
@@ -63,7 +61,7 @@ class TaskRanges:
 def span_of(batches: int, by_time: int, workers: int) -> int:
     """Return the batches per task of a job; `by_time` batches last as long as a task should.
 
-    All tasks of a job but the last have equal length, and no worker is idle while another has two tasks.
+    All tasks but the last have equal length, and no worker is idle while another has two tasks.
     """
     most = max(1, min(by_time, MOST_BATCHES, -(-batches // max(1, workers))))
     return -(-batches // -(-batches // most))

@@ -1,4 +1,4 @@
-"""Records and rows in one step: records of one write transaction of the index count together."""
+"""Records and rows in one step: the records of one write transaction of the index appear together."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ log = logging.getLogger(__name__)
 def recording(services: Services, made: Sequence[str] = ()) -> Iterator[tuple[Connection, Put]]:
     """Yield a write transaction of the index and a function that puts records; undo them, and `made`, on failure.
 
-    No other process writes meanwhile: checks before a record is put still hold when the rows are written.
+    No other process writes meanwhile: checks before the records still hold at the write of the rows.
     """
     keys = list(made)
 

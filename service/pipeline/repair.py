@@ -24,7 +24,7 @@ _OF_ASSET: Final = re.compile(r"assets/(hand|object|network)/([0-9a-f]{32})/(.+)
 
 
 def repair(services: Services, found: Sequence[Damage]) -> tuple[list[Damage], list[Damage]]:
-    """Move damaged objects below `damaged/`, and queue what can be made again; return what was repaired, and the rest.
+    """Move damaged objects below `damaged/`, and queue what can be made again; return repaired objects, and the rest.
 
     A worker stores a repaired shard only if its checksum equals the manifest's.
     """
@@ -39,7 +39,7 @@ def repair(services: Services, found: Sequence[Damage]) -> tuple[list[Damage], l
 
 
 def _fix(services: Services, one: Damage, harmed: set[str]) -> str:
-    """Repair one object; return the reason if that is impossible, else ""."""
+    """Repair one object; return the reason if this is impossible, else ""."""
     if one.what == FOREIGN:
         services.store.set_aside(one.key)
         return ""
@@ -70,7 +70,7 @@ def _fix(services: Services, one: Damage, harmed: set[str]) -> str:
 def _asset(services: Services, key: str, kind: AssetKind, digest: str, file: str) -> str:
     """Move derived files of a hand or an object away; a new check and the next task make them again.
 
-    Assets of graspd itself are stored again from the program.
+    Built-in assets are stored again from the program.
     """
     if (kind, digest) in {(one.kind, one.digest) for one in builtin_assets()}:
         services.store.set_aside(key)

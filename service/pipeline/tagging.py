@@ -1,4 +1,4 @@
-"""Add tags to grasps and remove them: the record, then the rows, under one write lock of the index."""
+"""Tags of grasps: each change writes the record, then the rows, under one write lock of the index."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.recording import recording
 from graspd.service.store.records import Deletion, drop_older, newest_version, put_record, put_version, removed_folder
 
-#: Called with the tag to change, None for a new one; raises if that is not allowed.
+#: Called with the tag to change, None for a new one; raises if the change is not allowed.
 Permit = Callable[[Tag | None], None]
 
 
 def give(services: Services, name: str, grasps: Collection[Grasp], *, project: str, owner: str, permit: Permit) -> int:
-    """Give a tag to grasps, created if needed; return how many did not have it. LimitError: more than `MOST_TAGGED`."""
+    """Give a tag to grasps; return how many did not have it. LimitError: more than `MOST_TAGGED`."""
 
     def added(tag: Tag) -> Tag:
         members = tag.members | set(grasps)
@@ -32,7 +32,7 @@ def give(services: Services, name: str, grasps: Collection[Grasp], *, project: s
 
 
 def take_off(services: Services, tag: str, grasps: Collection[Grasp], *, permit: Permit) -> int:
-    """Remove a tag, by its id, from grasps. Return how many had it."""
+    """Remove a tag, by its id, from grasps; return how many had it."""
     before, after = _change(
         services, tag, lambda one: one.model_copy(update={"grasps": by_shard(one.members - set(grasps))}), permit
     )
@@ -40,7 +40,7 @@ def take_off(services: Services, tag: str, grasps: Collection[Grasp], *, permit:
 
 
 def remove(services: Services, tag: str, *, permit: Permit, owner: str = "") -> None:
-    """Delete a tag by its id; the grasps stay, and the list of them is stored for the grace time."""
+    """Delete a tag by its id; its list of grasps is stored for the grace time."""
 
     def gone(one: Tag) -> Tag:
         said = {"name": one.name, "submitter": one.owner, "project": one.project}
@@ -66,7 +66,7 @@ def bring_back(services: Services, tag: Tag) -> None:
 def _change(
     services: Services, tag: str, change: Callable[[Tag], Tag], permit: Permit, *, fresh: Tag | None = None
 ) -> tuple[Tag, Tag]:
-    """Return the tag before and after. Writers hold the index's lock, so they see each other's changes."""
+    """Return the tag before and after; the index's lock makes changes sequential."""
     with recording(services) as (connection, put):
         found = newest_version(services.store, tag)
         known = None if found is None or found.gone else found
@@ -81,7 +81,7 @@ def _change(
             put_version(put, after)
             services.index.tags.put(after, within=connection)
     if is_changed:
-        # Only after the rows are committed, and while no other process reads the last version.
+        # Older versions are dropped only after the commit, and while no other process reads the last version.
         with services.index.database.writing():
             drop_older(services.store, after)
     return before, after

@@ -59,7 +59,7 @@ def with_network(
 ) -> Options:
     """Return options with the digest of their network; unchanged if their method uses none.
 
-    Errors as in `usable`; InputError if it proposes grasps of another hand.
+    Errors as in `usable`; InputError if the network proposes grasps of another hand.
     """
     if not options.network:
         return options

@@ -1,7 +1,7 @@
 """Webhook dispatcher: signed reports of ends, one at a time to each address, retried with back-off.
 
-An address that does not accept a delivery pauses with all its deliveries. Projects take turns; within one, the least
-recently tried address comes first. Addresses that failed last share half of the slots, so the others are not delayed.
+A failed delivery pauses all deliveries to its address. Projects take turns; within a project, the least recently used
+address comes first. Addresses that failed last share half of the slots, so the others are not delayed.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.http_client import Networks, Response, networks, post
 
 log = logging.getLogger(__name__)
-#: Most concurrent deliveries, and the share of those to addresses that failed last.
+#: Most concurrent deliveries, and the share of addresses that failed last.
 AT_ONCE: Final = 32
 SLOW_AT_ONCE: Final = AT_ONCE // 2
 _PAUSE_S: Final = 1.0
-#: Interval: the summary of a large dataset takes a while.
+#: Interval of rounds [s]: the summary of a large dataset takes a while.
 _DATASETS_EVERY_S: Final = 5.0
 _FORGET_EVERY_S: Final = 3600.0
 Post = Callable[..., Response]
 
 
 class WebhookDispatcher:
-    """Runs beside the rounds of the controller, so that a silent address delays nothing else."""
+    """Runs in parallel with the controller's rounds, so that a silent address delays nothing else."""
 
     def __init__(self, services: Services, stop: threading.Event, *, send: Post = post) -> None:
         self._services = services
@@ -70,7 +70,7 @@ class WebhookDispatcher:
         self._pool.shutdown(wait=False, cancel_futures=True)
 
     def start_deliveries(self, *, now: float | None = None) -> list[Future[None]]:
-        """Create deliveries of new ends, and start those that are due and have a slot."""
+        """Create deliveries of new ends, and start due ones while slots are free."""
         out = self._services.index.outbox
         if time.monotonic() > self._forget_again:
             out.forget_old()
@@ -90,7 +90,7 @@ class WebhookDispatcher:
         return started
 
     def _in_turn(self, found: list[DueDelivery]) -> list[DueDelivery]:
-        """Sort by turns of projects, and of keys without one; in each, the least recently tried first."""
+        """Sort by turns of projects, or of keys without a project; within each, the least recently used first."""
         of_project: dict[str, list[DueDelivery]] = {}
         for due in sorted(found, key=lambda one: self._last.get(one.hook.id, (0.0, False))):
             of_project.setdefault(due.hook.project or f"key {due.hook.owner}", []).append(due)
@@ -139,5 +139,4 @@ class WebhookDispatcher:
 
 
 def body_of(end: EndView) -> bytes:
-    """Return the body of a webhook: the end as in `/v1/events`."""
     return json.dumps(end.model_dump(mode="json"), sort_keys=True, separators=(",", ":")).encode()

@@ -1,4 +1,4 @@
-"""Connections to Redis: its address, configured or of the data folder's embedded server, and a client."""
+"""Connections to Redis, whose URL is configured or belongs to the data folder's embedded server."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _MAX_SOCKET_PATH: Final = 100
 
 
 def redis_url(settings: Settings) -> str:
-    """Return the URL of Redis: GRASPD_REDIS_URL, or the server of `graspd up` for the data folder."""
+    """Return the URL of Redis: GRASPD_REDIS_URL, or the data folder's embedded server."""
     if settings.redis_url is not None:
         return settings.redis_url.get_secret_value()
     secret = password(settings.data_dir)
@@ -64,9 +64,7 @@ def password_file(data_dir: Path) -> Path:
 
 
 def socket_path(data_dir: Path) -> Path:
-    """Return the socket of a data folder's embedded Redis: inside the folder, or if that path is too long,
-    in a private folder derived from it.
-    """
+    """Return the socket of a data folder's embedded Redis: in the folder; for a long path, in a private folder."""
     path = data_dir.resolve() / "redis" / "redis.sock"
     if len(os.fsencode(path)) <= _MAX_SOCKET_PATH:
         return path

@@ -1,7 +1,6 @@
-"""Parsing of graspd's entries in Redis, which any Redis client may have written.
+"""Parsing of graspd's entries in Redis.
 
-Any client can write any value under any name. Unreadable entries are skipped; `sweep` removes those that would block
-graspd permanently.
+Any client can write any value under any name. Unreadable entries are skipped; `sweep` removes permanent obstacles.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ _ADAPTERS: Final[dict[type, TypeAdapter[Any]]] = {kind: TypeAdapter(kind) for ki
 _ATTEMPT: Final = re.compile(r"(.+)-([0-9]{1,9})")
 #: Limit of the unpacked message; a real one has a few kilobytes.
 _MESSAGE_BYTES: Final = 1 << 20
-#: A stream rejects entries older than its newest: one this far in the future would block it permanently.
+#: Future time of an entry that would block a stream: a stream rejects entries older than its newest.
 _FUTURE_MS: Final = 24 * 3600 * 1000
 
 
@@ -40,7 +39,6 @@ def task_of(job: str) -> tuple[str, int]:
 
 
 def is_wrong_type(error: Exception) -> bool:
-    """Check whether Redis reports a value of another type under the name."""
     return str(error).startswith("WRONGTYPE")
 
 
@@ -50,7 +48,7 @@ def message(data: bytes | None) -> Message | None:
     try:
         raw = renamed(json.loads(zlib.decompressobj().decompress(data, _MESSAGE_BYTES))[2][0])
         return message_type(raw).model_validate(raw)
-    except Exception:  # forged data may raise any error
+    except Exception:  # Forged data may raise any error.
         return None
 
 

@@ -1,9 +1,9 @@
 """Redis lists of waiting tasks: one per priority and stage, so that workers can serve selected stages.
 
-While workers of two versions are present, a task that only some can do waits in a separate list. Its name ends in the
-requirements, `bulk-synthesize.2.10` for schema 2 and revision 10; other workers never read it.
+During an upgrade, a task that only some workers can do waits in a separate list. Its name ends in the requirements,
+`bulk-synthesize.2.10` for schema 2 and revision 10; other workers never read it.
 
-Names of RQ's keys come from RQ itself. Its own readers clean up as they read, so read-only code uses keys.
+RQ defines the names of its keys. Its readers modify data as they read, so read-only code uses keys.
 """
 
 from __future__ import annotations
@@ -74,7 +74,6 @@ def place_of(name: str) -> tuple[Priority, Stage]:
 
 
 def is_apart(name: str) -> bool:
-    """Check whether only some workers of its stage can serve a list."""
     return name not in _PLACES and _common(name) in _PLACES
 
 
@@ -102,7 +101,6 @@ def list_key(name: str) -> str:
 
 
 def held_key(name: str) -> str:
-    """Return the key of the leases of tasks taken from a list."""
     return str(StartedJobRegistry.key_template.format(name))
 
 

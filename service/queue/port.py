@@ -17,18 +17,18 @@ from graspd.service.model.workers import Amount, Count, HostWord, WorkerBeat
 Message = TaskMessage | IngestMessage
 
 
-#: Every n-th task of a worker is bulk first: steady interactive work must not block the rest.
+#: Every n-th task of a worker is bulk first, so that steady interactive work does not block bulk work.
 BULK_EVERY: Final = 4
 
 
 def priority_order(taken: int) -> tuple[Priority, ...]:
-    """Return the order of priorities for the next task of a worker that has taken this many."""
+    """Return the order of priorities for a worker's next task after `taken` tasks."""
     priorities = (Priority.INTERACTIVE, Priority.BULK)
     return priorities[::-1] if taken % BULK_EVERY == BULK_EVERY - 1 else priorities
 
 
 class EventKind(StrEnum):
-    """Type of an event. Events of a task come from its worker, `job` events from controller and API."""
+    """Type of an event. Workers send events of tasks, controller and API send `job` events."""
 
     STARTED = "started"
     FINISHED = "finished"
@@ -40,7 +40,6 @@ class EventKind(StrEnum):
     """A stopping worker returned the task; the attempt does not count."""
     CANCELLED = "cancelled"
     LEFT = "left"
-    """A worker ended regularly; it is not lost."""
     JOB = "job"
     """The job's state changed; `message` is the new state."""
 
@@ -49,8 +48,6 @@ _LONGEST: Final = 2000
 
 
 class Event(Model):
-    """One event of a task or job."""
-
     kind: EventKind
     at: Annotated[str, Field(max_length=32)]
     task_id: Word = ""
@@ -71,13 +68,11 @@ class Event(Model):
 
 @dataclass(frozen=True)
 class Lease:
-    """Lease of a worker on a task."""
-
     task_id: str
     attempt: int
     key: Any
     beat: str
-    """Value that changes with every heartbeat; only the change has a meaning."""
+    """Value that changes with every heartbeat and has no other meaning."""
 
 
 Place = tuple[Priority, Stage]
@@ -85,9 +80,7 @@ Place = tuple[Priority, Stage]
 
 @dataclass(frozen=True)
 class QueueStatus:
-    """Numbers of waiting and running tasks (some zeros omitted); living workers by name, with the time
-    since their last heartbeat by Redis's clock [s].
-    """
+    """Numbers of waiting and running tasks; living workers, with seconds since their heartbeat by Redis's clock."""
 
     depth: Mapping[Place, int] = field(default_factory=dict)
     oldest_s: Mapping[Place, float] = field(default_factory=dict)

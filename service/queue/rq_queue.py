@@ -1,7 +1,7 @@
 """Queue on Redis: RQ for tasks and leases, a bounded stream for events.
 
-Each priority and stage has an RQ queue, so that workers can serve selected stages. RQ's own retries, scheduler,
-maintenance and result storage are unused: each loses or repeats work in ways the controller does not.
+Each priority and stage has an RQ queue. RQ's own retries, scheduler, maintenance and result storage are unused: each
+loses or repeats work in ways that the controller does not.
 """
 
 from __future__ import annotations
@@ -50,10 +50,10 @@ from graspd.service.queue.port import Event, Lease, Message, Place, QueueStatus
 from graspd.service.settings import Settings
 
 EVENTS: Final = "graspd:events"
-#: Event limit, 20 MB at most: a minute of controller downtime at four hundred tasks per second. Lost events are
-#: restored from the store.
+#: Most events, 20 MB: a minute of controller downtime at four hundred tasks per second. Lost events are restored from
+#: the store.
 EVENTS_KEPT: Final = 50_000
-#: Consumer group, named as in graspd 0.2: a controller continues where one of 0.2 ended.
+#: Consumer group, named as in graspd 0.2, so that a controller continues where one of 0.2 ended.
 _GROUP: Final = "keeper"
 WORKERS: Final = "graspd:workers"
 #: Lease of the leading controller. graspd 0.2 uses the same one, so both versions exclude each other.
@@ -68,8 +68,7 @@ _WORKER: Final = b"graspd:worker:"
 class RqQueue:
     """Tasks and their leases, events, living workers, and sums.
 
-    Every method raises QueueUnavailable if Redis does not answer. The queue is not authoritative: lost tasks are queued
-    again from the index.
+    Every method raises QueueUnavailable if Redis does not answer. Tasks lost here are queued again from the index.
     """
 
     def __init__(self, connection: Redis) -> None:
@@ -89,10 +88,9 @@ class RqQueue:
     def enqueue(
         self, messages: Sequence[Message], priority: Priority, *, again: bool = False, apart: bool = False
     ) -> int:
-        """Append tasks to a priority; return how many. One (id and attempt) that waits or runs is not queued twice.
+        """Append tasks to a priority; return how many. A waiting or running task (id and attempt) is not queued twice.
 
-        `again` replaces remaining data of tasks that the caller found missing. `apart` appends them to separate lists,
-        because only some workers of the stage can do them.
+        `again` replaces remaining data of tasks that the caller found missing. `apart` appends to the separate lists.
         """
         stale = [cancel_key(message.task_id) for message in messages]
         if again:
@@ -141,7 +139,7 @@ class RqQueue:
             return dict(depths)
 
     def clear_untaken(self, present: Collection[WorkerBeat]) -> None:
-        """Remove separate lists without capable workers. The controller then finds their tasks missing."""
+        """Remove separate lists without capable workers; the controller then finds their tasks missing."""
         abilities = [(stage, beat.ability) for beat in present for stage in beat.stages]
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             for name in without_takers(known_lists(self.connection), abilities):
@@ -149,14 +147,14 @@ class RqQueue:
                 for job in self.connection.lrange(key, 0, -1):
                     pipe.delete(job_key(entries.text(job)))
                 pipe.delete(key)
-                # Leases of tasks still held are read under the list's name.
+                # Leases of running tasks are read under the list's name.
                 if not self.connection.exists(held_key(name)):
                     pipe.srem(LISTS, key)
             pipe.execute()
 
     def leases(self) -> list[Lease]:
-        """Return the leases of all workers, living or dead. Reading changes nothing."""
-        # RQ's own readers also clean up, which moves lost tasks and runs callbacks: so read the keys directly.
+        """Return the leases of all workers, living or dead; reading changes nothing."""
+        # RQ's own readers also move lost tasks and run callbacks, so the keys are read directly.
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             keys = [held_key(name) for name in known_lists(self.connection)]
             for key in keys:
@@ -173,12 +171,12 @@ class RqQueue:
         """Return worker and message of a lost lease, one round trip each; None for data that Redis has lost."""
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             pipe.hmget(job_key(entries.text(lease.key[1].partition(b":")[0])), "worker_name", "data")
-            (found,) = pipe.execute(raise_on_error=False)  # the name may have a value of another type
+            (found,) = pipe.execute(raise_on_error=False)  # The name may have a value of another type.
         worker, data = (None, None) if isinstance(found, Exception) else found
         return entries.text(worker), entries.message(data)
 
     def release(self, lease: Lease) -> None:
-        """Remove the lease of a lost worker; a worker that still lives detects this and stops."""
+        """Remove the lease of a lost worker; a worker that still lives detects the loss and stops."""
         key, entry = lease.key
         name = entries.text(entry)
         with _mapped(), self.connection.pipeline(transaction=True) as pipe:
@@ -215,7 +213,7 @@ class RqQueue:
                 self.connection.xack(EVENTS, _GROUP, *event_ids)
 
     def tail(self, after: str, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
-        """Return events after an id, for any number of readers. `"$"`: only future ones; `"0"`: all stored."""
+        """Return events after an id, for any number of readers; `"$"`: only future ones, `"0"`: all stored."""
         with _mapped():
             found = self.connection.xread({EVENTS: after}, count=limit, block=int(wait_s * 1000) or None)
         return [(event_id, event) for event_id, event in entries.events(found) if event is not None]
@@ -226,12 +224,11 @@ class RqQueue:
             self.connection.set(_part_key(part), "1", px=int(seconds * 1000))
 
     def announced(self, part: str) -> bool:
-        """Check whether such an announcement is valid."""
         with _mapped():
             return bool(self.connection.exists(_part_key(part)))
 
     def service(self) -> str | None:
-        """Return the identity of the service that owns this queue; None if unset, or Redis was lost."""
+        """Return the identity of the service that owns this queue; None if unset, or lost by Redis."""
         with _mapped():
             found = self.connection.get(_SERVICE)
         return None if found is None else entries.text(found)
@@ -250,10 +247,10 @@ class RqQueue:
             try:
                 if lease.owned():
                     return bool(lease.reacquire())
-                self.resign(holder)  # lease of an ended process of the same name
+                self.resign(holder)  # Lease of an ended process of the same name.
                 if lease.acquire(blocking=False, token=holder):
                     return True
-                if self.connection.ttl(LEAD) == -1:  # a key without expiry is not a lease
+                if self.connection.ttl(LEAD) == -1:  # A key without expiry is not a lease.
                     self.connection.delete(LEAD)
             except LockError:
                 pass
@@ -306,12 +303,11 @@ class RqQueue:
             found = self.connection.hgetall(METRICS)
         sums: dict[str, float] = {}
         for name, raw in found.items():
-            with suppress(ValueError):  # forged
+            with suppress(ValueError):
                 sums[entries.text(name)] = float(raw)
         return sums
 
     def tidy(self) -> None:
-        """Remove data of dead workers and refused entries."""
         # RQ cleans its registries of workers in its own maintenance, which is off.
         with _mapped(), self.connection.pipeline(transaction=False) as pipe:
             lists = known_lists(self.connection)
@@ -332,7 +328,7 @@ class RqQueue:
         self.connection.close()
 
     def _of_group(self, after: str, limit: int, wait_s: float) -> list[tuple[str, Event | None]]:
-        """Read events of the controllers' consumer group; create it if necessary."""
+        """Read events of the controllers' consumer group; create the group if necessary."""
         block = int(wait_s * 1000) or None
         read = partial(self.connection.xreadgroup, _GROUP, _GROUP, {EVENTS: after}, count=limit, block=block)
         try:
@@ -340,12 +336,12 @@ class RqQueue:
         except ResponseError as error:
             if not str(error).startswith("NOGROUP"):
                 raise
-        with suppress(ResponseError):  # created concurrently
+        with suppress(ResponseError):
             self.connection.xgroup_create(EVENTS, _GROUP, id="0", mkstream=True)
         return entries.events(read())
 
     def _known(self, found: Sequence[tuple[str, Event | None]]) -> list[tuple[str, Event]]:
-        """Return the readable events; acknowledge the unreadable ones, which are discarded."""
+        """Return the readable events; acknowledge and discard the unreadable ones."""
         self.acknowledge([event_id for event_id, event in found if event is None])
         return [(event_id, event) for event_id, event in found if event is not None]
 
@@ -381,7 +377,7 @@ def cancel_key(task_id: str) -> str:
 
 
 def lease_state(connection: Any, job: Job, execution: Execution) -> tuple[bool, bool]:
-    """Return whether the worker still holds a task, and whether it is cancelled. Reading changes nothing."""
+    """Return whether the worker has the lease of a task, and whether the task is cancelled; reading changes nothing."""
     with connection.pipeline(transaction=False) as pipe:
         pipe.zscore(job.started_job_registry.key, execution.composite_key)
         pipe.exists(cancel_key(entries.task_of(job.id)[0]))
@@ -397,7 +393,6 @@ def renew_lease(pipe: Any, job: Job, execution: Execution, ttl: int) -> None:
 
 
 def list_worker(connection: Any, beat: Mapping[str, Any], lease_s: float) -> None:
-    """Register a worker for the duration of a lease [s]."""
     with connection.pipeline() as pipe:
         pipe.set(worker_key(beat["name"]), json.dumps(beat), ex=max(2, round(lease_s)))
         pipe.sadd(WORKERS, beat["name"])
@@ -421,7 +416,6 @@ def _part_key(part: str) -> str:
     return f"graspd:part:{part}"
 
 
-#: Fixed names with their Redis types.
 _KINDS: Final = {
     **dict.fromkeys((LEAD, _SERVICE), "string"),
     **dict.fromkeys((WORKERS, RQ_WORKERS, LISTS), "set"),

@@ -9,7 +9,7 @@
     pictures = Pictures(shards)                                            # a picture and the grasps of its scene
     clouds = pictures.clouds(points=1024, noise="stereo")                  # point clouds of a simulated depth camera
 
-`service.readers.torch_data` wraps them for PyTorch; no other module here imports torch.
+`service.readers.torch_data` has datasets for PyTorch; no other module here imports torch.
 """
 
 from graspd.service.readers.clouds import Clouds

@@ -41,12 +41,12 @@ class Clouds(Sequence[dict[str, Any]]):
         camera/intrinsics (3, 3) K [px], camera/extrinsics (4, 4) E, table to camera; for fused views (V, ...)
         table/plane (4,) n and d of n.x = d, the table's top; table/height [m] of the top along n in the table's frame
         object/pose (7,): pose of the object's frame
-        grasp/hand_pose (K, 7), likewise for other `postures`; also grasp/hand_pose_camera (not for fused views),
-            grasp/hand_pose_table, grasp/hand_pose_object in these frames; grasp/joint_positions (K, J)
+        grasp/hand_pose (K, 7), likewise for other `postures`; grasp/joint_positions (K, J)
+        grasp/hand_pose_camera (not for fused views), grasp/hand_pose_table, grasp/hand_pose_object in these frames
         grasp/base_row (K,), base_id, and the columns of `grasp_quality` of the pictures
 
-    Points, plane and poses are in `frame`. The grasps are those that `pictures` selects: by default the valid ones that
-    are clear in the scene.
+    Points, plane and poses are in `frame`. `pictures` selects the grasps: by default valid ones that are clear in the
+    scene.
     """
 
     def __init__(
@@ -64,8 +64,7 @@ class Clouds(Sequence[dict[str, Any]]):
         touch_m: float = TOUCH_M,
         seed: int = 0,
     ) -> None:
-        """
-        Args:
+        """Args:
             pictures: the pictures and the selection of grasps in their scenes.
             points: P, number of points of a cloud.
             noise: a depth camera by name (`depth_noise.NOISES`) or a `DepthNoise`; None: perfect depth.
@@ -78,16 +77,15 @@ class Clouds(Sequence[dict[str, Any]]):
             touch_m: largest distance of a contact [m].
             seed: seed of the sampled points and the noise; equal seeds and epochs give equal clouds.
 
-        Raises:
-            InputError: an unknown noise, frame or posture, or a number out of range.
+        Raises InputError for an unknown noise, frame or posture, or a number out of range.
         """
         chosen = frame or ("table" if fuse else "camera")
         if chosen not in FRAMES or (fuse and chosen == "camera"):
             raise InputError(
-                f"clouds {'of several views ' * fuse}cannot be in the frame {chosen!r}; take table or object"
+                f"clouds {'of several views ' * fuse}cannot be in the frame {chosen!r}; choose table or object"
             )
         if unknown := set(postures) - set(POSTURES):
-            raise InputError(f"there is no posture {sorted(unknown)[0]!r}; choose of {', '.join(POSTURES)}")
+            raise InputError(f"there is no posture {sorted(unknown)[0]!r}; choose from {', '.join(POSTURES)}")
         if points < 1 or voxel_m < 0 or touch_m <= 0 or seed < 0:
             raise InputError(
                 "clouds need at least one point, a voxel of 0 or more, a touch above 0 and a seed of 0 or more"
@@ -130,7 +128,7 @@ class Clouds(Sequence[dict[str, Any]]):
         seen = len(pixel)
         if seen >= self.points:
             pixel = pixel[draw.choice(seen, self.points, replace=False)]
-        elif seen:  # each point appears at least once
+        elif seen:
             pixel = np.concatenate([pixel, pixel[draw.integers(seen, size=self.points - seen)]])
         normals = transforms.quat_rotate(into[3:], _of(views, pixel, CloudView.normals))
         cloud: dict[str, Any] = {
@@ -206,20 +204,18 @@ def _words(place: PictureAddress) -> tuple[int, int]:
 def graspness(points: NDArray[Any], hands: NDArray[Any], *, touch_m: float = TOUCH_M) -> Floats:
     """Compute the share of the grasps whose hand touches each point.
 
-    Wang et al. 2021 (Graspness Discovery in Clutters, eq. 1) sample poses of a parallel gripper around each point and
-    count those that hold and are clear. A multi-finger hand touches several places, and its grasps are optimised
-    instead of sampled. Here graspness counts the valid grasps of a scene that touch the point.
+    Wang et al. 2021 (Graspness Discovery in Clutters, eq. 1) count poses of a parallel gripper, sampled around each
+    point,
+    that hold and are clear. A multi-finger hand touches several places, and its grasps are optimised. Here graspness
+    counts the valid grasps of a scene that touch the point.
 
     Args:
         points: (P, 3) in the object's frame [m].
         hands: (K, H, 3) points on the surface of the hand in each grasp, in the same frame [m].
-        touch_m: largest distance of a contact [m]. It should exceed half the spacing of the hand's points.
+        touch_m: largest distance of a contact [m]; more than half the spacing of the hand's points.
 
     Returns:
-        (P,) values between 0 and 1; 0 if there are no grasps.
-
-    Raises:
-        InputError: SciPy is absent.
+        (P,) values between 0 and 1; 0 if there are no grasps. Raises InputError without SciPy.
     """
     try:
         from scipy.spatial import cKDTree
@@ -243,7 +239,7 @@ _OBJECT: Final = 2
 #: Planes are fitted to noisy points in windows of 7 x 7 pixels; the depth may differ by this many deviations.
 _RADIUS: Final = 3
 _DEVIATIONS: Final = 4.0
-#: Steepest surface in such a window: depth grows by at most this factor of the lateral distance.
+#: Steepest surface in a window: the ratio of depth to lateral distance is at most this.
 _SLOPE: Final = 3.0
 
 
@@ -252,7 +248,7 @@ class CloudView:
 
     def __init__(self, columns: Mapping[str, Array], noise: DepthNoise | None, draw: np.random.Generator) -> None:
         self.columns, self._noise = columns, noise
-        self.extrinsics = np.asarray(columns["camera/extrinsics"], float)  # (4, 4), table to camera
+        self.extrinsics = np.asarray(columns["camera/extrinsics"], float)  # (4, 4), table to camera.
         self._back = transforms.invert(transforms.pose_from_matrix(self.extrinsics))
         self._k = np.asarray(columns["camera/intrinsics"], float)
         #: Measured depth (H, W) [m]; not finite: no measurement.
@@ -264,7 +260,7 @@ class CloudView:
     def pixels(self, *, whole: bool) -> tuple[Ints, Ints]:
         labels = self.columns["image/segmentation"]
         wanted = np.isfinite(self.seen) & ((labels > 0) if whole else (labels == _OBJECT))
-        if self._noise is None:  # a pixel without neighbours has no normal
+        if self._noise is None:  # A pixel without neighbours has no normal.
             wanted &= np.isfinite(self._normals[..., 0])
         row, column = np.nonzero(wanted & np.isfinite(self._true[..., 2]))
         return row, column

@@ -70,11 +70,9 @@ class DepthNoise:
     """Share of pixels that are holes at random."""
 
     def sigma(self, depth: Floats, angle: Floats) -> Floats:
-        """Return the standard deviation of depth on a plane [m]; quantisation adds variance step^2 / 12.
+        """Return the standard deviation of depth [m] on a plane at `depth` [m] along the axis.
 
-        Args:
-            depth: along the axis [m].
-            angle: angle of incidence [rad].
+        `angle` is the angle of incidence [rad]; quantisation adds variance step^2 / 12.
         """
         total = self.axial(depth, angle) ** 2 + self.depth_step_m**2 / 12
         if self.baseline_m:
@@ -93,16 +91,13 @@ class DepthNoise:
     def apply(
         self, depth: NDArray[Any], k: Floats, draw: np.random.Generator, *, angle: Floats | None = None
     ) -> Floats:
-        """Simulate the camera's measurement of a depth picture.
+        """Simulate the camera's measurement of a depth picture; return depth (H, W) [m], nan: a hole.
 
         Args:
             depth: (H, W) true depth along the axis [m]; not finite: no surface.
             k: (3, 3) intrinsics of the picture [px].
             draw: random generator; the same generator gives the same picture.
             angle: (H, W) angle of incidence [rad], if already computed.
-
-        Returns:
-            (H, W) depth [m]; nan: a hole.
         """
         true = np.where(np.isfinite(depth), np.asarray(depth, float), np.nan)
         angle = incidence(true, k) if angle is None else angle
@@ -144,8 +139,9 @@ def incidence(depth: Floats, k: Floats) -> Floats:
 def shadows(depth: Floats, focal_baseline: float) -> Bools:
     """Find the pixels (H, W) hidden from the right eye; disparity [px] is `focal_baseline` [px m] / depth.
 
-    Each pixel is projected into the other picture, which shows the nearest surface. Pixels are hidden if they are more
-    than one pixel of disparity behind that surface (as in a left-right check), or outside the picture.
+    Each pixel is projected into the other picture, which shows the nearest surface. A pixel is hidden if it is more
+    than
+    one pixel of disparity behind that surface (as in a left-right check), or outside the picture.
     """
     height, width = depth.shape
     with np.errstate(divide="ignore"):
@@ -154,7 +150,7 @@ def shadows(depth: Floats, focal_baseline: float) -> Bools:
     left = np.floor(at - 0.5).astype(int)
     rows = np.broadcast_to(np.arange(height)[:, None], left.shape)
     other = np.zeros((height, width))
-    for column in (left, left + 1):  # a surface leaves no gap between adjacent pixels
+    for column in (left, left + 1):  # A surface leaves no gap between adjacent pixels.
         inside = (column >= 0) & (column < width)
         np.maximum.at(other, (rows[inside], column[inside]), disparity[inside])
     nearest = np.clip(np.floor(at).astype(int), 0, width - 1)

@@ -30,7 +30,7 @@ _STAGES: Final = {kind: stage for stage, kind in names.SHARD_KINDS.items()}
 
 @dataclass(frozen=True)
 class ShardFile:
-    """A shard: a local file under `path`, or an object of a store under `key`."""
+    """Local file under `path`, or object of a store under `key`."""
 
     id: str
     kind: ShardKind
@@ -68,14 +68,15 @@ class ShardCache:
         try:
             check_content(path, sha256)
             facts = path.stat()
-            # Mark the file as recently used. Its modification time is unchanged, because it marks the file as verified.
+            # Marks the file as recently used. The modification time is unchanged, because it marks the file as
+            # verified.
             os.utime(path, ns=(time.time_ns(), facts.st_mtime_ns))
         except (FileNotFoundError, DamagedShard):
             return False
         return True
 
     def _checked(self, store: Store, key: str, sha256: str) -> Iterator[bytes]:
-        # Requests to a remote store would never return in a fork.
+        # Requests to a remote store never return in a fork.
         if os.getpid() != self._process and not store.url.startswith(("file:", "memory:")):
             raise InputError(
                 f"{store.url} cannot be read in a fork of the process that opened it; "
@@ -93,7 +94,7 @@ class ShardCache:
 
 @dataclass(frozen=True)
 class Shards:
-    """The shards of a dataset, ordered by hand, object, batch and id."""
+    """Shards of a dataset, ordered by hand, object, batch and id."""
 
     files: tuple[ShardFile, ...]
     store: Store | None = None
@@ -110,11 +111,10 @@ class Shards:
         return {file.id: file for file in self.files}
 
     def of(self, kind: str) -> tuple[ShardFile, ...]:
-        """Return the shards of one kind."""
         return tuple(file for file in self.files if file.kind == kind)
 
     def by_id(self, shard: str) -> ShardFile:
-        """Return a shard by its id; NotFoundError if it is not among these shards."""
+        """Return a shard by its id; NotFoundError if the id is not among these shards."""
         if shard not in self._by_id:
             raise NotFoundError(f"shard {shard[:12]} is not among the {len(self)} shards given")
         return self._by_id[shard]
@@ -159,7 +159,7 @@ def open_shards(
 
     Raises:
         NotFoundError: no such file, job, dataset or snapshot.
-        InputError: a store needs a job or dataset, or a file is not a shard.
+        InputError: a store without job or dataset, or a file that is not a shard.
         DamagedShard: a file of a folder does not match its checksum.
         StoreUnavailable: the store does not answer.
     """
@@ -178,7 +178,7 @@ def _paths(entry: Path) -> list[Path]:
         if next(entry.rglob("*.pack"), None) is not None:
             raise InputError(f"{entry} has shards in {PACKED}")
         if not found:
-            raise NotFoundError(f"{entry} holds no .h5 file")
+            raise NotFoundError(f"{entry} contains no .h5 file")
         return found
     if not entry.is_file():
         raise NotFoundError(f"{entry} does not exist")
@@ -196,7 +196,7 @@ def _local(path: Path) -> ShardFile:
 
 def _of_store(store: Store, job: str | None, dataset: str | None, snapshot: str | None) -> Iterator[ShardFile]:
     if (job is None) == (dataset is None):
-        raise InputError(f"name what to read of {store.url}: a job or a dataset")
+        raise InputError(f"name the data to read from {store.url}: a job or a dataset")
     if has_packs(store):
         raise InputError(f"{store.url} has shards in {PACKED}")
     if job is not None:

@@ -38,8 +38,7 @@ _KEPT: Final = 256
 class Grasps(Sequence[dict[str, Any]]):
     """Grasps of base shards. `grasps[i]` is a dictionary of column rows and `hand`, `object`, `shard_id`, `row`.
 
-    Names, units and frames of columns are those of docs/reference/dataset.md. Swept metrics have one value per contact
-    threshold of the shard.
+    Columns are described in docs/reference/dataset.md; swept metrics have one value per contact threshold of the shard.
     """
 
     def __init__(
@@ -60,8 +59,7 @@ class Grasps(Sequence[dict[str, Any]]):
             unvalidated: select instead only feasible grasps without validation.
             where: further selection: a function of the columns that returns a mask.
 
-        Raises:
-            InputError: unknown column, or a mask of wrong length.
+        Raises InputError for an unknown column, or a mask of wrong length.
         """
         check_known("base", columns)
         self.shards, self.columns = shards, tuple(columns)
@@ -94,7 +92,7 @@ class Grasps(Sequence[dict[str, Any]]):
             if file.hand == hand:
                 with open_shard(self.shards.path(file)) as opened:
                     return [str(name) for name in opened.attrs["joint_names"]]
-        raise InputError(f"none of the shards is of the hand {hand!r}")
+        raise InputError(f"no shard is of the hand {hand!r}")
 
     def arrays(self, *columns: str) -> dict[str, Array]:
         """Return columns of all grasps, by default those of samples; InputError if they do not fit into one array."""

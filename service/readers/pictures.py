@@ -60,9 +60,8 @@ class Pictures(Sequence[dict[str, Any]]):
         grasp/base_row (K,) row in the base shard `base_id`
         quality/epsilon and other `grasp_quality` columns (K, ...)
 
-    `object/pose` (7,) is the pose of the object's frame in the camera frame.
-
-    In a stereo pair the left picture comes before the right one.
+    `object/pose` (7,) is the pose of the object's frame in the camera frame. In a stereo pair the left picture comes
+    first.
     """
 
     def __init__(
@@ -76,9 +75,8 @@ class Pictures(Sequence[dict[str, Any]]):
         unvalidated: bool = False,
         with_grasps_only: bool = False,
     ) -> None:
-        """
-        Args:
-            shards: views shards, and the scene and base shards they were made from.
+        """Args:
+            shards: views shards, and their scene and base shards.
             columns: columns of the picture in a sample.
             grasp_quality: base columns of the grasps.
             clear: only grasps that are clear of table and neighbours in this scene.
@@ -86,9 +84,7 @@ class Pictures(Sequence[dict[str, Any]]):
             unvalidated: select instead only feasible grasps without validation.
             with_grasps_only: omit pictures of scenes without a grasp.
 
-        Raises:
-            InputError: unknown column.
-            NotFoundError: the scene or base shard of a views shard is not among the shards.
+        Raises InputError for an unknown column, NotFoundError if the scene or base shard of a views shard is missing.
         """
         check_known("views", columns)
         check_known("base", grasp_quality)
@@ -113,7 +109,6 @@ class Pictures(Sequence[dict[str, Any]]):
         return sample | self.scenes_of(place.scene_shard).grasps(place.scene, extrinsics) | place.names
 
     def columns_of(self, place: PictureAddress, columns: Iterable[str]) -> dict[str, Array]:
-        """Read columns of one picture; DamagedShard if they do not match their checksum."""
         wanted = list(columns)
         return self._table(place.file, wanted).row(self.shards.path(place.file), place.row, wanted)
 
@@ -126,7 +121,7 @@ class Pictures(Sequence[dict[str, Any]]):
     def _add(self, file: ShardFile, *, with_grasps_only: bool) -> None:
         with open_shard(self.shards.path(file)) as opened:
             scenes = np.asarray(opened["camera/scene_index"])
-            # For grasps planned in scenes these are in the base shard.
+            # The base shard contains the scenes of grasps planned in scenes.
             scene_shard = str(opened.attrs.get("base_shard") or opened.attrs.get("scene_shard") or "")
             if not scene_shard:
                 raise InputError(
@@ -152,7 +147,7 @@ class Pictures(Sequence[dict[str, Any]]):
 
     def scenes_of(self, shard: str) -> Scenes:
         found = self._scenes.get(shard)
-        if found is None:  # concurrent threads may both build it, with equal results
+        if found is None:  # Concurrent threads may both build the table, with equal results.
             found = self._scenes[shard] = Scenes(self.shards, shard, self._quality, **self._which)
             if len(self._scenes) > _KEPT:
                 self._scenes.popitem(last=False)

@@ -1,4 +1,4 @@
-"""Rows of a shard read past the HDF5 library, which runs only one thread at a time.
+"""Rows of a shard read without the HDF5 library, which runs only one thread at a time.
 
 A picture is one zlib-compressed chunk of its column; its checksum (Adler-32) reveals damage.
 """
@@ -37,7 +37,7 @@ class _Packed:
         if not self.shuffled or size == 1:
             return raw.copy().view(self.dtype).reshape(self.shape)
         turned = np.empty((len(raw) // size, size), np.uint8)
-        for byte, column in enumerate(raw.reshape(size, -1)):  # one byte plane at a time: twice as fast as transposing
+        for byte, column in enumerate(raw.reshape(size, -1)):  # One byte plane at a time: twice as fast as transposing.
             turned[:, byte] = column
         return turned.reshape(-1).view(self.dtype).reshape(self.shape)
 
@@ -52,7 +52,7 @@ class RowTable:
 
     @classmethod
     def of(cls, file: h5py.File, columns: Iterable[str], name: str) -> RowTable:
-        """Read the table of an open shard; values of columns that are not packed are read and checked."""
+        """Read the table of an open shard, with checked values of columns that are not packed."""
         found = {column: _packed(file[column]) for column in columns}
         packed = {column: places for column, places in found.items() if places is not None}
         held = {column: read_column(file, column, name) for column in found.keys() - packed}
@@ -93,7 +93,7 @@ def _packed(dataset: h5py.Dataset) -> _Packed | None:
     rest = (0,) * (dataset.ndim - 1)
     for row in range(rows):
         found = dataset.id.get_chunk_info_by_coord((row, *rest))
-        if found.filter_mask:  # a filter was skipped for this chunk
+        if found.filter_mask:  # A filter was skipped for this chunk.
             return None
         places[row] = found.byte_offset, found.size
     return _Packed(dataset.shape[1:], dataset.dtype, filters[0] == _SHUFFLE, places)

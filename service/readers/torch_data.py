@@ -37,7 +37,7 @@ def collate(samples: Sequence[Sample]) -> Sample:
     batch: Sample = {}
     for name in samples[0]:
         values = [sample[name] for sample in samples]
-        # Scenes may have equal numbers of grasps by chance, but the type of the batch must not depend on this.
+        # Scenes may have equal numbers of grasps by chance, but the type of the batch must not depend on the numbers.
         listed = pictures and name.startswith(OF_GRASPS)
         batch[name] = values if listed else default_collate(values)
     return batch
@@ -77,18 +77,16 @@ class ShuffledShards(IterableDataset[Sample]):
         ranks: int = 1,
         transform: Callable[[Sample], Sample] = tensors,
     ) -> None:
-        """
-        Args:
-            shards: see `open_shards`.
-            columns: columns of a sample.
-            valid: select only valid grasps.
-            unvalidated: select instead only feasible grasps without validation.
-            where: further selection: a function of the columns that returns a mask.
-            buffer: number of grasps from which the next one is drawn.
-            seed: seed of the order; `epoch` changes it.
-            rank: rank of this process in a distributed run.
-            ranks: number of processes of the distributed run.
-            transform: maps a sample of arrays to the value that the loader collates.
+        """Args:
+        shards: see `open_shards`.
+        columns: columns of a sample.
+        valid: select only valid grasps.
+        unvalidated: select instead only feasible grasps without validation.
+        where: further selection: a function of the columns that returns a mask.
+        buffer: number of grasps from which the next one is drawn.
+        seed: seed of the order; `epoch` changes it.
+        rank, ranks: rank of this process, and number of processes of a distributed run.
+        transform: maps a sample of arrays to the value that the loader collates.
         """
         self.epoch = 0
         self._shards, self._columns, self._where = shards, tuple(columns), where

@@ -36,8 +36,7 @@ class Waypoint:
 def way_of(shard: Shard, row: int) -> list[Waypoint]:
     """Return the trajectory of a grasp: pregrasp, grasp, squeeze; approach and lift if present.
 
-    The last waypoint of an approach and the pregrasp have the same hand pose; between them the open fingers close to
-    the pregrasp.
+    The last waypoint of an approach and the pregrasp have the same hand pose; in between the open fingers close.
     """
     rest = np.zeros(3)
 
@@ -87,7 +86,7 @@ def wrists_of(shard: Shard, rows: NDArray[np.integer[Any]]) -> Floats | None:
 
 
 def scene_spec_of(shard: Shard) -> SceneSpec | None:
-    """Return the scene of a shard's grasps, poses or pictures; None if it states none. InputError if invalid."""
+    """Return the scene of a shard's grasps, poses or pictures; None if not stated. InputError if invalid."""
     said = shard.attributes.get("scene")
     if said is None:
         return None

@@ -1,10 +1,8 @@
 """Addresses of a running service: its URL, and access for workers on other machines.
 
-The record contains the process that wrote it. If that process is gone, the service crashed: the record is ignored and
-replaced at the next start.
-
-The file for other machines is readable by its user only, and meant for a shared folder of a cluster. It is written
-atomically at every start, and removed with the service.
+The record of the URL names the process that wrote it. After a crash of that process the record is ignored, and
+replaced at the next start. The file for other machines is private to its user and meant for a shared folder of a
+cluster. Every start writes it atomically, and the end of the service removes it.
 """
 
 from __future__ import annotations
@@ -35,15 +33,16 @@ def record_address(folder: Path, url: str) -> None:
 
 
 def local_url(host: str, port: int) -> str:
-    """Return the URL at which this machine reaches an API that binds to a host; for all addresses the loopback's."""
+    """Return the local URL of an API that binds to a host; for all addresses, the loopback URL."""
     shown = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(host, f"[{host}]" if ":" in host else host)
     return f"http://{shown}:{port}"
 
 
 def bind(host: str, port: int) -> socket.socket:
-    """Bind a socket to the port, or to a free one for 0; BusyError if it is taken, InputError if it cannot be bound.
+    """Bind a socket to the port, or to a free one for 0; BusyError if it is taken, InputError if the address is
+    unusable.
 
-    While it is open, the API of a child process can listen there, and the system assigns the port to no other process.
+    While it is open, the API of a child process can listen there, and no other process gets the port.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     # asyncio disables Nagle's algorithm only on sockets with an explicit protocol; otherwise each body is 40 ms late.
@@ -55,14 +54,13 @@ def bind(host: str, port: int) -> socket.socket:
         bound.close()
         if error.errno == errno.EADDRINUSE:
             raise BusyError(
-                f"port {port} on {host} is taken; stop what uses it, or choose another with --port or GRASPD_PORT"
+                f"port {port} on {host} is in use; stop its process, or choose another with --port or GRASPD_PORT"
             ) from None
         raise InputError(f"the address {host}:{port} cannot be used: {error.strerror or error}") from None
     return bound
 
 
 def forget_address(folder: Path) -> None:
-    """Remove the record if this process wrote it."""
     record = _read(folder)
     if record is not None and record[1] == os.getpid():
         with contextlib.suppress(OSError):

@@ -1,4 +1,4 @@
-"""A child process of a supervisor: start, watch, restart with back-off, stop."""
+"""Child process of a supervisor: start, watch, restart with back-off, stop."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ from typing import IO, Final
 log = logging.getLogger(__name__)
 #: Environment variable by which a later `graspd up` identifies a child.
 _TOKEN: Final = "GRASPD_CHILD_TOKEN"
-#: Interval between checks for ended children [s].
 _WATCH_S: Final = 0.1
 _FIRST_PAUSE_S: Final = 0.2
 _LONGEST_PAUSE_S: Final = 10.0
@@ -31,7 +30,7 @@ _WELL_AFTER_S: Final = 20.0
 
 @dataclass
 class Child:
-    """A named process. All calls come from one thread, because the kernel ties the child to it."""
+    """Named process. All calls come from one thread, because the kernel ties the child to it."""
 
     name: str
     command: Sequence[str]
@@ -116,7 +115,6 @@ class Child:
 
 
 def keep_alive(children: Sequence[Child], stop: threading.Event) -> None:
-    """Start children and restart ended ones until stopped."""
     for child in children:
         child.start()
     while not stop.wait(_WATCH_S):
@@ -149,7 +147,6 @@ def end_leftovers(folder: Path) -> list[int]:
 
 
 def _has_token(pid: int, token: str) -> bool:
-    """Check whether a process was started with this token in its environment."""
     wanted = f"{_TOKEN}={token}".encode()
     try:
         return wanted in Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")
@@ -170,7 +167,6 @@ _STARTED: Final = 19
 def start_of(pid: int) -> str:
     """Return the start time of a process, unique per pid; "" if there is no such process."""
     with contextlib.suppress(OSError, IndexError):
-        # A program's name may contain blanks and brackets.
         words = Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(")")[2].split()
         return f"{words[_STARTED]} {_BOOT.read_text().strip()}"
     if _BOOT.exists():

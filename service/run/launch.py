@@ -1,7 +1,6 @@
-"""Launcher of a program that ends with its parent.
+"""Launcher of a program that ends with its parent: `launch PARENT_PID PROGRAM ARGUMENTS...`.
 
-Usage: `python -m graspd.service.run.launch PARENT_PID PROGRAM ARGUMENTS...`. On Linux the kernel signals the child
-(prctl survives exec). Elsewhere the next `graspd up` kills it by its pid file.
+On Linux the kernel signals the child (prctl survives exec). Elsewhere the next `graspd up` kills it by its pid file.
 """
 
 from __future__ import annotations

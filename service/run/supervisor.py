@@ -34,9 +34,8 @@ _PROBE_S: Final = 0.1
 #: Timeout for readiness: kernels compile at first use, perhaps on a busy machine [s].
 READY_S: Final = 1800.0
 _TOLD_EVERY_S: Final = 15.0
-#: After this many restarts a process will not become ready.
+#: Restarts after which a process counts as failed.
 _ENDS: Final = 5
-#: Timeout of an external Redis at the start [s].
 _REDIS_S: Final = 60.0
 _PROGRAM: Final = (sys.executable, "-m", "graspd")
 
@@ -77,7 +76,6 @@ class Supervisor:
 
     @property
     def api_url(self) -> str:
-        """URL of the API, e.g. http://127.0.0.1:8000."""
         return local_url(self.settings.host, self.settings.port)
 
     @property
@@ -85,7 +83,7 @@ class Supervisor:
         return {child.name: child.process.pid for child in list(self._children) if child.process is not None}
 
     def start(self) -> None:
-        """Lock the data folder and start the children without waiting for them.
+        """Lock the data folder and start the children without waiting for readiness.
 
         BusyError: another graspd owns the data folder (the message has its pid), or the port is taken.
         """
@@ -119,8 +117,8 @@ class Supervisor:
     ) -> bool:
         """Wait until Redis, controller, a worker and the API answer; False: `stop` was set before.
 
-        A process that ends repeatedly, or an external Redis that is silent, ends the wait before the `timeout` [s]: the
-        UnavailableError lists the absent parts and the logs. `say` is called every 15 s with the missing parts.
+        Raises UnavailableError, with the absent parts and the logs, after `timeout` [s], and earlier if a process ends
+        repeatedly or an external Redis is silent. `say` receives the missing parts every 15 s.
         """
         began = told = time.monotonic()
         starts, logs = self._starts(), self.settings.data_dir / "logs"
@@ -128,7 +126,7 @@ class Supervisor:
             while missing := self._missing(queue):
                 if stop is not None and stop.is_set():
                     return False
-                if "redis" in missing:  # the others may have ended because of it
+                if "redis" in missing:  # Other processes may have ended because Redis is missing.
                     starts = {**self._starts(), "redis": starts.get("redis", 0)}
                 now = time.monotonic()
                 patience = min(timeout, _REDIS_S) if "redis" in missing and self._wanted.redis_url else timeout
@@ -175,7 +173,6 @@ class Supervisor:
             return False
 
     def _settle(self) -> None:
-        """Fix the settings that all children share."""
         folder = self._wanted.data_dir.resolve()
         update: dict[str, object] = {"data_dir": folder}
         if self._api:
@@ -183,7 +180,7 @@ class Supervisor:
             update["port"] = reserved.getsockname()[1]
             if sys.platform == "linux":
                 self._locks.append(reserved)
-            else:  # there a second socket of one address is refused
+            else:  # Other systems refuse a second socket of one address.
                 reserved.close()
         self.settings = self._wanted.model_copy(update=update)
 
@@ -268,7 +265,6 @@ class Supervisor:
         self._locks = []
 
 
-#: Settings that `start` determines for the children.
 _SETTLED: Final = frozenset({"data_dir", "redis_url", "host", "port", "api_url"})
 
 

@@ -57,7 +57,7 @@ def provenance(licence: str | None, source: str | None) -> dict[str, Any]:
 
 
 def hand_options(**given: Any) -> dict[str, Any]:
-    """Return the keys of a hand's `asset.json` for options of `HandWords`; omit absent options."""
+    """Return the keys of a hand's `asset.json` for options of `HandWords`, without absent options."""
     words = HandWords(**given)
     options: dict[str, Any] = {
         "file": words.urdf,
@@ -75,7 +75,6 @@ def hand_options(**given: Any) -> dict[str, Any]:
 
 
 def sizes_of(text: str | None) -> tuple[float, ...]:
-    """Parse the sizes of `--scale-to` [m]; InputError unless all are positive numbers."""
     try:
         sizes = tuple(dict.fromkeys(float(part) for part in text.split(","))) if text else ()
     except ValueError:

@@ -1,4 +1,4 @@
-"""Summary of an asset's check for users: sizes and guesses. Repairs are in the check's messages."""
+"""Summary of an asset's check: sizes and guesses. The check's messages have the repairs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import typer
 
 from graspd.service.model.states import AssetKind
 
-#: Surface displacements up to this are rounding and are not reported [m].
+#: Smaller displacements of the surface are rounding and are not reported [m].
 _NOTHING_M = 1e-7
 _OVERRIDES = {"palm": "--palm LINK --approach x,y,z", "preshape": "--pre-shape JOINT=VALUE,..."}
 
@@ -34,7 +34,7 @@ def summary(kind: AssetKind, facts: Mapping[str, Any]) -> list[str]:
 
 
 def self_test_line(facts: Mapping[str, Any]) -> str:
-    """Return the self-test's result, `ready: 91 % hold, ...` or a warning; empty if it was not run."""
+    """Return the self-test's result, `ready: 91 % hold, ...` or a warning; empty without self-test."""
     tried = facts.get("self_test")
     return str(tried.get("says", "")) if isinstance(tried, Mapping) else ""
 

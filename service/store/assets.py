@@ -25,7 +25,7 @@ _BUILTIN_CREATED: Final = "2026-11-21T00:00:00Z"
 MAX_FILES: Final = 2000
 #: zlib's message for lack of memory, to distinguish it from damage.
 _NO_MEMORY: Final = "Error -4 "
-#: Limits on the length of one name and of all names together: every list of hands or objects contains them.
+#: Limits on one name and on all names together: every list of hands or objects contains them.
 MAX_NAME: Final = 255
 MAX_NAMES: Final = 128 << 10
 #: Limit on unpacked size over packed size: robot meshes compress about 4:1, so only ZIP bombs exceed it.
@@ -136,7 +136,7 @@ def _open_zip(file: IO[bytes]) -> zipfile.ZipFile:
 def _entries(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
     entries = [entry for entry in archive.infolist() if not entry.is_dir()]
     if len(entries) > MAX_FILES:
-        raise LimitError(f"the archive holds {len(entries)} files; at most {MAX_FILES} are taken")
+        raise LimitError(f"the archive holds {len(entries)} files; at most {MAX_FILES} are allowed")
     found = {}
     for entry in entries:
         name = check_path(entry.filename)

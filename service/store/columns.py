@@ -296,7 +296,6 @@ ATTRIBUTES: Final[dict[str, RootAttribute]] = {
 
 
 def check_known(kind: ShardKind, columns: Iterable[str]) -> None:
-    """Raise InputError for a column that no shard of this kind has."""
     if unknown := set(columns) - set(SCHEMAS[kind]):
         raise InputError(f"{kind} shards have no column {sorted(unknown)[0]!r}; docs/reference/dataset.md lists them")
 

@@ -29,7 +29,7 @@ def _small(facts: dict[str, Any]) -> dict[str, Any]:
 
 
 class Description(BaseModel):
-    """The keys that the service reads; the others are stored for the worker."""
+    """Keys that the service reads; other keys are stored for the worker."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
 
@@ -74,7 +74,6 @@ def _is_plain(value: Any, depth: int) -> bool:
 
 #: Limit far above any hand: the largest in use have about sixty joints.
 MAX_ENTRIES: Final = 256
-#: Largest distance of the palm from its link's frame [m].
 MAX_CENTRE_M: Final = 2.0
 #: Tolerance: numbers in messages and glTF are rounded.
 _ROUNDING: Final = 1e-6
@@ -87,7 +86,7 @@ Direction = Literal[-1, 0, 1]
 
 
 class PalmCorrection(Model):
-    """The palm in the frame of a link, with the hand in its pre-shape. Missing values are guessed again."""
+    """Palm in the frame of a link, with the hand in its pre-shape. Missing values are guessed again."""
 
     link: Text
     centre: tuple[Length, Length, Length] | None = Field(
@@ -97,7 +96,7 @@ class PalmCorrection(Model):
 
 
 class HandCorrections(Model):
-    """A user's corrections of wrong guesses about a hand. Missing values stay as found."""
+    """Corrections of wrong guesses about a hand. Missing values stay as found."""
 
     palm: PalmCorrection | None = None
     closing: dict[Text, Direction] = Field(

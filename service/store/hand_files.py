@@ -34,8 +34,9 @@ _ABOVE: Final = 4
 def files_of_hand(path: Path) -> tuple[dict[str, Path], str]:
     """Find a hand's files with relative names, and the name of its description (empty for a folder).
 
-    For a description: the files that it names, relative to the ROS package around it or else to its own folder. Links
-    to targets outside the hand's folder are ignored.
+    Files of a description are named relative to its ROS package, else to its folder. Links to targets outside the
+    hand's
+    folder are ignored.
     """
     files, main = (_of_folder(path), "") if path.is_dir() else _of_description(path)
     return files | _looks(files, path.resolve() if path.is_dir() else _package(path.resolve())), main
@@ -101,7 +102,7 @@ def _package(path: Path) -> Path:
 
 
 def _named_by(path: Path, root: Path) -> set[str]:
-    """Return names of the files below the root that a description and its includes may refer to."""
+    """Return names of files below the root that a description and its includes may refer to."""
     seen, waiting = {path}, [path]
     bases, folders, references = set(), {""}, set()
     found: set[str] = set()
@@ -111,7 +112,7 @@ def _named_by(path: Path, root: Path) -> set[str]:
         bases.add(file.parent.relative_to(root).as_posix())
         folders |= {unescape(folder) for folder in _FOLDER.findall(text)}
         references |= {unescape(reference) for reference in _REFERENCE.findall(text)}
-        # Names in an included file are relative to its folder or to that of the description, depending on the reader.
+        # Names in an included file are relative to its folder or to the description's, depending on the reader.
         found = {name for parts in product(references, bases, folders) for name in _names(*parts, root)}
         for name in sorted(found):
             inner = (root / name).resolve()
@@ -176,13 +177,13 @@ def format_of(name: str, data: bytes) -> Format | None:
     found = _FORMATS_OF.get(_root_element(text[:_HEAD_BYTES]))
     if found == "urdf" and any(sign in _COMMENT.sub("", text) for sign in _MACROS):
         return "xacro"
-    # Otherwise decide by the suffix, so that the reader reports the error in the file.
+    # Without a known root element the suffix decides, so that the reader reports the error in the file.
     return found or {".urdf": "urdf", ".xacro": "xacro", ".mjcf": "mjcf"}.get(suffix)  # type: ignore[return-value]
 
 
 def text_of(data: bytes) -> str:
-    """Decode XML or YAML by byte order mark or declaration, and strip both. Invalid UTF-8 is Latin 1."""
-    coding: str = json.detect_encoding(data)  # by the byte order mark, or the zeros in the first characters
+    """Decode XML or YAML by byte order mark or declaration, and strip both; invalid UTF-8 is Latin 1."""
+    coding: str = json.detect_encoding(data)  # The byte order mark, or zeros among the first characters, decides.
     if (declared := _DECLARED.match(data)) and _NAMED.match(said := declared[1].decode()):
         coding = said
     try:
@@ -214,7 +215,7 @@ def main_of(files: Mapping[str, bytes], wanted: str = "", *, where: str = "the h
                 f"{where} holds {len(found)} hand files ({names}); name one: --urdf {_short(found)}, or in a ZIP an "
                 f'asset.json with {{"file": "{_short(found)}"}}'
             )
-    raise InputError(f"{where} holds no hand file; a URDF, xacro or MJCF is needed, or the folder or ZIP it lies in")
+    raise InputError(f"{where} contains no hand file; give a URDF, xacro or MJCF, or its folder or ZIP")
 
 
 def _named(wanted: str, known: list[str], where: str) -> str:

@@ -1,8 +1,8 @@
 """Checksums of stored objects and of shards in folders; seals inside objects.
 
-A seal is the digest of the object, computed with zeros in place of the seal's 64 digits. It is the first field
-`checksum` of a JSON record, the comment of a ZIP (also `.npz`), or in the `extras` of a binary glTF's document. Objects
-of graspd 0.2 have no seal and are read without this check.
+A seal is the digest of an object, computed with zeros in place of the seal's 64 digits. JSON records have it as first
+field `checksum`, a ZIP (also `.npz`) as comment, and a binary glTF in the `extras` of its document. Objects of graspd
+0.2 have no seal and are read without this check.
 """
 
 from __future__ import annotations
@@ -71,13 +71,13 @@ class CheckedObjects:
         self._lock = threading.Lock()
 
     def check(self, key: str, sha256: str) -> None:
-        """Verify an object by reading it, unless that was done recently; DamagedShard if missing or damaged."""
+        """Verify an object by reading it, unless a recent check exists; DamagedShard if missing or damaged."""
         self._intact(key, sha256)
 
     def stream(self, key: str, sha256: str, start: int, length: int) -> Iterator[bytes]:
         """Yield bytes of an object; each block is read again and verified before any of it is returned.
 
-        The modification time does not reveal bit rot. DamagedShard at the call or from the iterator, which ends early.
+        Bit rot leaves the modification time unchanged. DamagedShard at the call or from the iterator, which ends early.
         """
         known = self._intact(key, sha256)
         end = min(known.size, start + length)

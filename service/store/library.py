@@ -27,7 +27,7 @@ UNPACKED_LIMIT_BYTES: Final = 2 * 2**30
 def publish_asset(
     store: Store, kind: AssetKind, name: str, files: Mapping[str, bytes], said: Mapping[str, object] | None = None
 ) -> Asset:
-    """Publish a hand or object: the archive first, its record last; see `store_files`, `record_asset`. Idempotent."""
+    """Publish a hand or object: the archive by `store_files`, then the record by `record_asset`. Idempotent."""
     return record_asset(store, store_files(store, kind, name, files, said))
 
 
@@ -118,7 +118,7 @@ def load_asset_files(store: Store, kind: AssetKind, digest: str) -> dict[str, by
 
 
 def load_check(store: Store, kind: AssetKind, digest: str) -> dict[str, object] | None:
-    """Load the report of ingest (`verdict`, `message`, `repairs`, `facts`); None before it has run."""
+    """Load the report of ingest (`verdict`, `message`, `repairs`, `facts`); None before its end."""
     key = names.asset_check(kind, digest)
     if not store.exists(key):
         return None

@@ -46,8 +46,6 @@ class GraspSummary(Record):
 
 
 class ShardManifest(Record):
-    """Inputs and contents of a shard."""
-
     version: Literal[1] = 1
     shard_id: Digest
     stage: Stage
@@ -85,7 +83,7 @@ class ShardManifest(Record):
     @model_validator(mode="before")
     @classmethod
     def _tried_what_it_holds(cls, data: Any) -> Any:
-        # Shards of early versions contained all candidates.
+        # Shards of early versions contain all candidates.
         if isinstance(data, dict) and "candidates" not in data and data.get("kind") == "base":
             return {**data, "candidates": data.get("counts", {}).get("N", 0)}
         return data
@@ -187,7 +185,7 @@ def _summaries(
 def publish_shard(store: Store, manifest: ShardManifest, data: bytes) -> bool:
     """Store a shard, manifest last; return False if it exists already, which is also success."""
     if not store.put(manifest.key, data):
-        # Two workers wrote at once, or one died between both writes: describe the bytes that are in the store.
+        # After concurrent writes, or an end between both writes, the manifest describes the bytes in the store.
         manifest = described_again(manifest.model_dump(mode="json"), store.get(manifest.key))
     return put_record(store, names.shard_manifest(manifest.stage, manifest.shard_id), manifest)
 
@@ -206,7 +204,7 @@ def shard_exists(store: Store, stage: Stage, shard: str) -> bool:
 
 
 def described_again(said: Mapping[str, Any], data: bytes) -> ShardManifest:
-    """Rebuild the manifest of a file; `said`, an existing manifest of the shard as JSON, provides the other fields."""
+    """Rebuild the manifest of a file; `said`, the shard's existing manifest as JSON, provides the other fields."""
     pictures = tuple(path for path in SCHEMAS["views"] if path.startswith("image/"))
     shard = read_shard(data, without=pictures, name=said["key"])
     told = {"sha256": hashlib.sha256(data).hexdigest(), "size_bytes": len(data)}

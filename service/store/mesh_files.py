@@ -15,14 +15,13 @@ from graspd.service.model.errors import InputError
 from graspd.service.store.assets import check_path
 
 _SCHEME: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):(/*)")
-#: Schemes with a path; its first part, a package or foreign folders, is optional.
+#: Schemes of names with a path, whose first part (a package or foreign folders) is optional.
 _OURS: Final = frozenset({"package", "model", "file"})
 
 
 @dataclass(frozen=True)
 class Reference:
     names: tuple[str, ...]
-    """Candidate names in the upload, in order of preference."""
     scheme: str = ""
     tails: tuple[str, ...] = ()
     """For names with a scheme: path tails, except the bare file name, that may be below any folder."""
@@ -71,7 +70,6 @@ def _inside(path: str, base: str) -> str:
 
 #: Most names that are read from one file; a material library has fewer.
 MAX_NAMES: Final = 64
-#: Size of the head searched for such names [bytes].
 HEAD_BYTES: Final = 2**20
 _SPACES: Final = rb"[ \t]+"
 _NAMED_BY: Final = {
@@ -79,7 +77,6 @@ _NAMED_BY: Final = {
     ".mtl": re.compile(rb"^[ \t]*map_Kd" + _SPACES + rb"([^\r\n]+)", re.MULTILINE | re.IGNORECASE),
     ".dae": re.compile(rb"<init_from>\s*(?:<ref>)?\s*([^<>\r\n]+?)\s*<"),
 }
-#: Suffixes of meshes that may refer to such files.
 MESHES: Final = (".obj", ".dae")
 _PICTURES: Final = (".png", ".jpg", ".jpeg")
 _TAKEN: Final = (".mtl", *_PICTURES)

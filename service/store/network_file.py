@@ -1,7 +1,7 @@
 """Files of proposal networks: `.npz` of schema `graspd/proposals@1`, arrays and a JSON text, no code.
 
-The architecture is fixed, so every array is checked against the shape implied by the joints.
-`baselines.learned.network` evaluates the network.
+The architecture is fixed, so the joints imply the shape of every array. `baselines.learned.network` evaluates the
+network.
 """
 
 from __future__ import annotations
@@ -34,14 +34,12 @@ ENCODER: Final = (7, 64, 128, 256)
 FEATURE: Final = 256
 #: Size of the condition: feature of the cloud, its height above the table, and the label.
 CONDITION: Final = FEATURE + 2
-#: Number of sines and cosines of the time.
 TIME_FEATURES: Final = 8
 HIDDEN: Final = 512
 BLOCKS: Final = 2
 #: Numbers of a grasp besides its joints: position, two columns of the rotation, approach direction.
 POSE: Final = 12
 _META: Final = "meta"
-#: Fields of a network in its JSON text.
 _SHARED: Final = ("hand", "hand_digest", "joint_names", "points", "steps", "about")
 #: Exceptions for bytes that are no archive of arrays.
 _BROKEN: Final = (OSError, ValueError, EOFError, KeyError, MemoryError, RuntimeError, zipfile.BadZipFile, zlib.error)
@@ -157,7 +155,7 @@ def from_bytes(data: bytes, what: str) -> ProposalNetwork:
             expected = _expected(joints)
             found = sorted(info.filename for info in archive.infolist())
             if found != sorted(f"{name}.npy" for name in [_META, *expected]):
-                raise InputError(f"{what}: its arrays are not those of {SCHEMA}: {_difference(found, expected)}")
+                raise InputError(f"{what}: its arrays differ from {SCHEMA}: {_difference(found, expected)}")
             arrays = {name: _read(archive, name, shape, what) for name, shape in expected.items()}
     except _BROKEN as error:
         raise InputError(f"{what} is no .npz file of {SCHEMA}: {error}") from None
@@ -171,7 +169,7 @@ def from_bytes(data: bytes, what: str) -> ProposalNetwork:
 
 def check_size(size: int, what: str) -> None:
     if size > MAX_BYTES:
-        raise LimitError(f"{what} has more than {MAX_BYTES >> 20} MiB; no proposal network needs as much")
+        raise LimitError(f"{what} has more than {MAX_BYTES >> 20} MiB; a proposal network is smaller")
 
 
 def _expected(joints: int) -> dict[str, tuple[int, ...]]:
@@ -260,7 +258,7 @@ def network_report(files: Mapping[str, bytes], name: str) -> dict[str, Any]:
         "points": network.points,
         "steps": network.steps,
         "about": "".join(letter for letter in " ".join(network.about.split()) if letter.isprintable()),
-        # Shards of `graspd synth` have this digest of the file.
+        # Digest of the file in shards of `graspd synth`.
         "file_digest": digest_bytes(data),
     }
     message = f"{name}: proposes grasps of {network.hand} ({network.hand_digest[:12]}), {joints} joints"

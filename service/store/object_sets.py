@@ -20,7 +20,6 @@ PREFERRED: Final = ("clean", "nontextured", "textured_simple", "textured", "coll
 _INNER: Final = ("google_16k", "google_64k", "google_512k", "poisson", "tsdf", "clouds", "meshes", "mesh", "visual")
 
 
-#: Files of each object by its name.
 Objects = dict[str, dict[str, bytes]]
 
 

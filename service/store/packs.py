@@ -26,7 +26,6 @@ from graspd.service.store.records import parse_record, put_record
 from graspd.service.store.store import Store
 
 log = logging.getLogger(__name__)
-#: Message for a store with packs.
 PACKED: Final = "packs of graspd 0.2; extract them with `graspd admin store upgrade`"
 _FOLDER: Final = "packs"
 _MAGIC: Final = b"graspd\x00\x01"
@@ -72,7 +71,7 @@ def _take_apart(store: Store, key: str, dead: list[str]) -> Iterator[ShardManife
         gone = {shard for record in dead for shard in json.loads(store.get(record))["shards"]}
         body, shards = _directory(key, data)
     except NotFoundError:
-        return  # another process has converted it
+        return  # Another process has converted the pack.
     except (DamagedError, ValueError, LookupError, TypeError) as error:
         log.error("the pack %s is damaged, and moved aside: %s", key, error)
         store.set_aside(key)

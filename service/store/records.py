@@ -73,7 +73,7 @@ def _records(model: type[RecordT], store: Store, prefix: str) -> list[RecordT]:
 
 
 def _added(make: Callable[..., EventT], store: Store, folder: str, put: Put | None) -> EventT:
-    """Write an event under the next free number; another process may take that number at the same time."""
+    """Write an event under the next free number, which another process may take at the same time."""
     while True:
         number = max((int(key.rpartition("/")[2].partition("-")[0]) for key in _keys(store, folder)), default=0) + 1
         event = make(number=number, at=timestamp())
@@ -211,7 +211,7 @@ What = Literal["hand", "object", "network", "job", "dataset", "tag"]
 
 
 class Deletion(Record):
-    """A deleted resource, with the facts that its removal needs after its own record is gone."""
+    """Deleted resource, with the facts that its removal needs after its own record is gone."""
 
     version: Literal[1] = 1
     what: What
@@ -226,7 +226,7 @@ class Deletion(Record):
 
 
 class DeletedJob(Record):
-    """A deleted job. After the grace time its shards are removed, unless another job needs them."""
+    """Deleted job. After the grace time its shards are removed, unless another job needs them."""
 
     version: Literal[1] = 1
     at: str
@@ -256,7 +256,7 @@ def removed_before(key: str, at: str) -> bool:
 def deletions(store: Store, what: str = "") -> list[Deletion]:
     """Return the deletions that can be undone, newest first; `what` selects one kind of resource."""
     found: dict[str, Deletion] = {}
-    # An object that the controller moves is in the second folder before it leaves the first.
+    # The controller moves an object to the second folder before it leaves the first.
     for folder, before_kind in ((names.DELETIONS, "/"), (names.REMOVED, "-")):
         for key in _keys(store, folder):
             if key.count("/") == 2 and (not what or key.split(before_kind)[1] == what):

@@ -32,11 +32,10 @@ _MOST_ITEMS: Final = 1000
 #: Largest expansion factor of deflate; size that a dataset may claim without stored data [bytes].
 _MOST_DEFLATED: Final = 1032
 _FREE_BYTES: Final = 1 << 16
-#: Limit of a file's unpacked size: this constant [bytes] plus a multiple of the file's size. Masks compress by a
-#: factor of a thousand, but no shard consists of masks alone.
+#: Limit of a file's unpacked size: this constant [bytes] plus a multiple of the file's size. Masks compress by a factor
+#: of a thousand, but no shard consists of masks alone.
 _FREE_IN_ALL: Final = 1 << 28
 _MOST_IN_ALL: Final = 64
-#: Exceptions that h5py and HDF5's filters raise for invalid bytes.
 _UNREADABLE: Final = (OSError, KeyError, ValueError, TypeError, RuntimeError, OverflowError, MemoryError)
 
 
@@ -130,7 +129,7 @@ class ShardH5(h5py.File):  # type: ignore[misc]
 
 @contextmanager
 def open_shard(source: bytes | Path, *, name: str = "") -> Iterator[h5py.File]:
-    """Open a shard for partial reading; DamagedShard if it does not match its checksum or is unreadable, also later."""
+    """Open a shard for partial reading; DamagedShard, also later, for damaged content or a wrong checksum."""
     name = name or (str(source) if isinstance(source, Path) else "shard")
     if isinstance(source, Path) and source.is_file():
         check_file(source)
@@ -159,10 +158,10 @@ def _check_contents(file: h5py.File, name: str) -> None:
             if len(seen) > _MOST_ITEMS:
                 raise InputError(f"{name} holds more than {_MOST_ITEMS} datasets and groups, too many for a shard")
             if not isinstance(group.get(key, getlink=True), h5py.HardLink):
-                raise InputError(f"{name}: {path} is a link; a shard holds its own values")
+                raise InputError(f"{name}: {path} is a link; a shard contains no links")
             item = group[key]
             if (address := h5py.h5o.get_info(item.id).addr) in seen:
-                raise InputError(f"{name}: {path} is a link; a shard holds its own values")
+                raise InputError(f"{name}: {path} is a link; a shard contains no links")
             seen.add(address)
             if isinstance(item, h5py.Group):
                 waiting.append((item, f"{path}/"))

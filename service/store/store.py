@@ -1,7 +1,7 @@
 """Object store: create-only writes of immutable objects; folder, S3, Google Cloud, Azure or memory.
 
-It uses only operations that every back end has: put if absent, get, range, list, delete. It never overwrites and needs
-no compare-and-swap.
+The operations are put if absent, get, range, list and delete. Nothing is overwritten, and no compare-and-swap is
+needed.
 """
 
 from __future__ import annotations
@@ -152,7 +152,7 @@ def open_store(url: str, *, public_endpoint: str | None = None, make: bool = Tru
 
     Args:
         public_endpoint: S3 endpoint for clients. Without it, AWS_ENDPOINT_URL is taken as internal to the service's
-            network: then downloads are not signed, and the API serves files.
+            network: downloads are not signed, and the API serves files.
         make: create a missing folder. Readers do not: an empty folder would hide a mistyped path.
     """
     parts = urlsplit(url)

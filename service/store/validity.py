@@ -1,7 +1,7 @@
 """Status of the grasps of a base shard: valid, feasible without validation, or neither.
 
 *Feasible*: within the geometric limits. *Valid*: feasible and held by a validator. A shard without validation has no
-valid grasps, whatever its column `quality/valid` contains: in that column graspd 0.1 marked feasible grasps.
+valid grasps, although graspd 0.1 marked feasible grasps in its column `quality/valid`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def valid(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
 
 
 def feasible(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
-    """Return the mask (N,) of grasps known to be within the geometric limits; valid grasps are."""
+    """Return the mask (N,) of grasps known to be within the geometric limits, such as valid grasps."""
     return np.asarray(columns.get("quality/feasible", columns["quality/valid"])) == 1
 
 

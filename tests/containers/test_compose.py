@@ -74,7 +74,7 @@ def test_any_user_plans_on_a_read_only_disk(project: Project) -> None:
     done = completed(command.split(), timeout=PATIENCE_S)
     said = done.stdout + done.stderr
     assert done.returncode == 0 and "Traceback" not in said, said[-3000:]
-    assert "kept in /tmp/graspd-cache-4321" in said, said[-3000:]
+    assert "reproducible files are in /tmp/graspd-cache-4321" in said, said[-3000:]
 
 
 def test_a_change_of_code_is_a_small_layer(project: Project) -> None:

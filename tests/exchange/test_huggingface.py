@@ -102,7 +102,7 @@ def test_what_is_no_table_of_grasps_is_told(folder: Path, tmp_path: Path, monkey
     with pytest.raises(InputError, match="block, mug"):
         huggingface.read(folder, hand="barrett", obj="block")
     (tmp_path / "x.parquet").write_bytes(b"PAR1 no table PAR1")
-    with pytest.raises(InputError, match="no Parquet file"):
+    with pytest.raises(InputError, match="not a readable Parquet file"):
         huggingface.read(tmp_path / "x.parquet", hand="barrett", obj="block")
     with pytest.raises(InputError, match="no column"):
         huggingface.read(next((folder / "pictures").iterdir()), hand="barrett", obj="block")

@@ -1,5 +1,5 @@
-// Choosing cells of a matrix, or grasps of a list: a press on a head takes its row or column, one box takes all, and the
-// bar says how many are chosen. `data-choose` of a form is the name of its boxes.
+// Selection of cells of a matrix, or of grasps of a list. A heading selects its row or column, one box selects all, and
+// the bar shows the number. `data-choose` of a form is the name of its boxes.
 (() => {
   "use strict";
   const boxes = (form) => [...form.querySelectorAll(`input[name="${form.dataset.choose}"]`)];
@@ -34,7 +34,7 @@
     wanted.forEach((box) => { box.checked = on; });
     tell(form);
   });
-  // A refresh brings fresh boxes: what was chosen stays chosen.
+  // A refresh replaces the boxes; the selection is restored.
   let kept = new Set();
   document.addEventListener("graspd:swapping", () => {
     kept = new Set([...forms()].flatMap((form) => boxes(form).filter((box) => box.checked).map((box) => box.value)));

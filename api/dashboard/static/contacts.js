@@ -1,16 +1,16 @@
-// Where a hand touches an object: signed distance of the hand's surface points from the object's mesh, as coloured dots.
+// Contacts: signed distance of the hand's surface points from the object's mesh, as coloured dots.
 import { Color, DynamicDrawUsage, Group, InstancedMesh, Matrix4, MeshBasicMaterial, SphereGeometry, Vector3 } from "./vendor/three.min.js";
 
-/** Points farther than this from the object are not shown [m]; it is the contact threshold of the index. */
+/** Largest distance of a shown point from the object [m]: the contact threshold of the index. */
 export const REACH_M = 0.005;
-/** How far from the surface distances are known [m]: deeper than any grasp that one looks at twice. */
+/** Largest computed distance from the surface [m]: more than the penetration of any plausible grasp. */
 const FIELD_M = 0.01;
 const DOT_M = 0.0013;
-/** Distances closer than this are one. */
+/** Distances that differ by less than this count as equal [m]. */
 const SAME_M = 1e-7;
-/** A triangle lower than this is a sliver [m]. */
+/** Height below which a triangle is a sliver [m]. */
 const SLIVER_M = 1e-6;
-// Blue to red by way of green: readable with the common colour blindnesses because lightness changes too.
+// Blue over green to red, with changing lightness for readers with common colour blindnesses.
 const STOPS = [[-0.001, 0xd1263c], [-0.0002, 0xf0803c], [0.0003, 0x14b87a], [0.002, 0x35a2f0], [REACH_M, 0xb9d4f5]];
 
 /** Signed distance from a triangle mesh, exact within `FIELD_M` of it; infinity elsewhere. */
@@ -24,16 +24,13 @@ export class DistanceField {
       const [a, b, c] = [0, 1, 2].map((k) => new Vector3().fromArray(at, 3 * index[t + k]));
       const ab = b.clone().sub(a), ac = c.clone().sub(a);
       const normal = ab.clone().cross(ac);
-      // A sliver of the triangulation has no direction of its own, and its neighbours cover it.
+      // A sliver of the triangulation has no normal, and its neighbours cover it.
       if (normal.length() < SLIVER_M * Math.max(ab.length(), ac.length(), b.distanceTo(c))) continue;
       this.#insert({ a, b, c, ab, ac, normal: normal.normalize() });
     }
   }
 
-  /**
-   * The side is told by the sum of the normals at the closest point, each weighted by its face's angle there
-   * (Baerentzen and Aanaes 2005): right on faces, edges and corners.
-   */
+  /** Signed by the sum of the normals at the closest point, weighted by face angles (Baerentzen and Aanaes 2005). */
   distance(point) {
     let best = Infinity;
     const closest = new Vector3(), away = new Vector3(), side = new Vector3();
@@ -49,7 +46,7 @@ export class DistanceField {
       best = Math.min(best, distance);
       side.addScaledVector(face.normal, weight);
     }
-    // Beyond that the nearest face may not be in the cell's list.
+    // Beyond `FIELD_M` the nearest face may be missing in the cell's list.
     if (best > FIELD_M) return Infinity;
     return away.dot(side) < 0 ? -best : best;
   }
@@ -103,11 +100,11 @@ function colourOf(distance, out) {
   return out.set(STOPS[last][1]);
 }
 
-/** Dots on the hand where it is near the object, in the object's frame. Those behind something shine through faintly. */
+/** Dots on the hand near the object, in the object's frame; hidden dots shine through faintly. */
 export class Contacts {
   constructor(hand, thing) {
     this.hand = hand;
-    // About the mesh, whose numbers have 32 bits: an object's own frame may lie far away.
+    // Relative to the mesh: numbers have 32 bits, and the origin of an object's frame may be far away.
     this.frame = thing.mesh;
     this.field = new DistanceField(thing.geometry);
     let count = 0;
@@ -125,7 +122,7 @@ export class Contacts {
     }
   }
 
-  /** Place the dots for the hand's present posture. Returns how many touch (within 1 mm) and the deepest point [m]. */
+  /** Place the dots for the hand's present posture; return the number within 1 mm and the lowest distance [m]. */
   update() {
     const place = new Matrix4();
     const colour = new Color();

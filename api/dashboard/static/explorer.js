@@ -1,4 +1,4 @@
-// The API explorer: Swagger UI over the service's own OpenAPI document, in the colours that the browser prefers.
+// API explorer: Swagger UI of the service's OpenAPI document, in the colour scheme of the browser.
 (() => {
   "use strict";
   const dark = matchMedia("(prefers-color-scheme: dark)");
@@ -11,6 +11,6 @@
     deepLinking: true,
     defaultModelsExpandDepth: 0,
     docExpansion: "list",
-    validatorUrl: null, // asks nobody elsewhere
+    validatorUrl: null, // no requests to other hosts
   });
 })();

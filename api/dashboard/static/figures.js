@@ -1,4 +1,4 @@
-// A hand that takes postures and an object, as three.js groups. Metres; poses are x y z, then quaternion w x y z.
+// Hand and object as three.js groups. Lengths are in metres; poses are x y z, then quaternion w x y z.
 import { Group, Matrix4, Mesh, MeshStandardMaterial, Quaternion, Vector3 } from "./vendor/three.min.js";
 
 const COLOURS = { palm: 0x59636f, finger: 0x7b8794, tip: 0x2bb5a8, object: 0xe8b878 };
@@ -22,12 +22,12 @@ function solid(geometry, look) {
   return mesh;
 }
 
-/** A hand: `pose` moves it; `group` is what to draw. */
+/** Hand: `pose` moves its links; `group` is the drawing. */
 export class Hand {
   constructor(model) {
     const looks = { palm: material(COLOURS.palm), finger: material(COLOURS.finger), tip: material(COLOURS.tip), own: material(0xffffff) };
     looks.own.vertexColors = true;
-    // The housing is seen through by itself.
+    // A separate material, because the housing can be transparent alone.
     looks.housing = looks.own.clone();
     this.looks = Object.values(looks);
     this.housing = [looks.palm, looks.housing];
@@ -56,7 +56,7 @@ export class Hand {
     this.group.add(this.bodies[0].group);
   }
 
-  /** Take a posture: pose of the root link, and joint positions by name. */
+  /** Set a posture: pose of the root link, and joint positions by name [rad or m]. */
   pose(rootPose, positions) {
     const [x, y, z, qw, qx, qy, qz] = rootPose;
     this.group.position.set(x, y, z);
@@ -73,17 +73,17 @@ export class Hand {
     this.group.updateMatrixWorld(true);
   }
 
-  /** Glass lets one see what happens behind a finger. */
+  /** Make the hand transparent. */
   setGlass(on) {
     glass(this.looks, on);
   }
 
-  /** The same of the root body alone. */
+  /** Make the root body transparent. */
   setHousingGlass(on) {
     glass(this.housing, on);
   }
 
-  /** Collision shapes instead of the meshes that the hand is shown by. */
+  /** Show collision shapes instead of visual meshes. */
   setCollision(on) {
     for (const { shown, collision } of this.bodies) {
       if (!collision) continue;
@@ -92,7 +92,7 @@ export class Hand {
     }
   }
 
-  /** Calls back with each surface point in the frame of a group. */
+  /** Call back with each surface point in the frame of a group. */
   eachPoint(frame, callback) {
     const point = new Vector3(), within = new Matrix4(), outward = frame.matrixWorld.clone().invert();
     for (const { group, points } of this.bodies) {
@@ -104,7 +104,7 @@ export class Hand {
   }
 }
 
-/** The object; `mesh` stands in it where the model says, `setWire` shows its triangles. */
+/** Object with its `mesh` at the pose in the model; `setWire` shows triangles. */
 export class Thing {
   constructor(model) {
     this.geometry = model.nodes[0].solid;
@@ -120,7 +120,7 @@ export class Thing {
   }
 }
 
-/** The posture between two, 0 to 1: straight for positions and joints, by the shorter arc for the rotation. */
+/** Interpolate two postures, 0 to 1: linear for positions and joints, slerp for the rotation. */
 export function between(first, second, share, names) {
   const mix = (a, b) => a + (b - a) * share;
   const [ax, ay, az, aw, ai, aj, ak] = first.hand_pose;

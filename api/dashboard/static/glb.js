@@ -1,11 +1,11 @@
-// Reads the binary glTF that graspd writes (worker/stages/models.py): nodes, triangles with normals, points. Nothing more.
+// Reader of graspd's binary glTF (worker/stages/models.py): nodes, triangles with normals, points.
 import { BufferAttribute, BufferGeometry } from "./vendor/three.min.js";
 
 const TYPES = { 5120: Int8Array, 5121: Uint8Array, 5123: Uint16Array, 5125: Uint32Array, 5126: Float32Array };
 const WIDTHS = { SCALAR: 1, VEC3: 3 };
 const POINTS = 0;
 
-/** The document of a GLB file: `{extras, nodes: [{name, translation, rotation, extras, children, solid, collision, points}]}`. */
+/** Document of a GLB file: `{extras, nodes: [{name, translation, rotation, extras, children, solid, collision, points}]}`. */
 export function readGlb(buffer) {
   const view = new DataView(buffer);
   if (view.getUint32(0, true) !== 0x46546c67) throw new Error("the model is no binary glTF");
@@ -48,7 +48,7 @@ export function readGlb(buffer) {
 
 const loading = new Map();
 
-/** The document behind an address, fetched once. */
+/** Document at a URL, fetched once. */
 export function loadGlb(address) {
   if (!loading.has(address)) {
     const promise = fetch(address).then(async (answer) => {

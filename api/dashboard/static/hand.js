@@ -1,4 +1,4 @@
-// The page of a hand: it stands in 3D with what was found of it, moves by a slider for each joint, and follows the form.
+// Page of a hand: 3D view with the findings of its check, a slider for each joint, and a form that moves the view.
 import { Box3, Quaternion, Vector3 } from "./vendor/three.min.js";
 import { loadGlb } from "./glb.js";
 import { Hand } from "./figures.js";
@@ -6,7 +6,7 @@ import { Marks } from "./marks.js";
 import { beforePalm, LiveStage } from "./stage.js";
 
 const ROOT = [0, 0, 0, 1, 0, 0, 0];
-/** Share of the way from open to closed at which a hand approaches; a gripper comes open. */
+/** Closed share of a hand on its approach; a gripper approaches open. */
 const PRESHAPE_SHARE = 0.25;
 const GRIPPER_DOFS = 2;
 const STEP = 0.02;
@@ -50,7 +50,7 @@ class HandPage {
     return [this.facts.lower[this.dofs[i]], this.facts.upper[this.dofs[i]]];
   }
 
-  /** Joint values at a share of the way from open to closed; what closes nothing stays. */
+  /** Joint values at a share from open to closed; joints without closing direction stay. */
   posture(share) {
     return this.closing().map((way, i) => {
       const [low, high] = this.limits(i);
@@ -83,14 +83,14 @@ class HandPage {
     ["x", "y", "z"].forEach((axis, i) => { this.field(`${name}_${axis}`).value = String(Number((scale * vector.getComponent(i)).toFixed(digits))); });
   }
 
-  /** The palm in the root frame, as the form says. */
+  /** Palm of the form, in the root frame. */
   palm() {
     const { at, turn } = this.frameOf(this.field("palm_link").value);
     const approach = this.vector("approach").applyQuaternion(turn);
     return { centre: this.vector("centre", 0.001).applyQuaternion(turn).add(at), approach: approach.length() > 1e-6 ? approach.normalize() : null };
   }
 
-  /** Where a fingertip's pad, or else the middle of its surface, is. */
+  /** Position of a fingertip's pad, or else of the middle of its surface. */
   spot({ group, points, name }) {
     const pad = this.hand.extras.pads.find((one) => this.hand.bodies[one.body].name === name);
     const flat = pad ? pad.points.flat() : points ?? [0, 0, 0];
@@ -118,7 +118,7 @@ class HandPage {
     this.stage.invalidate();
   }
 
-  /** How far the joints that close are on their way, 0 to 1. */
+  /** Mean closed share of the joints that close, 0 to 1. */
   share() {
     const ways = this.closing(), closing = this.dofs.map((_, i) => i).filter((i) => ways[i] !== 0);
     const shares = closing.map((i) => {
@@ -138,7 +138,7 @@ class HandPage {
     this.show();
   }
 
-  /** Another link says the same palm in other numbers. */
+  /** Express the palm in the frame of the selected link. */
   movePalm() {
     const before = this.frameOf(this.link), link = this.field("palm_link").value, after = this.frameOf(link);
     const back = after.turn.clone().invert();
@@ -150,7 +150,7 @@ class HandPage {
     this.show();
   }
 
-  /** A joint that closes another way opens at its other end. */
+  /** Set the pre-shape of a joint after a change of its closing direction. */
   turn(i) {
     const [low, high] = this.limits(i);
     const share = this.dofs.length <= GRIPPER_DOFS ? 0 : PRESHAPE_SHARE;
@@ -213,5 +213,5 @@ function find() {
 }
 
 find();
-// The page shows the hand as soon as its check has ended.
+// The page shows the hand when its check has ended.
 document.addEventListener("graspd:swapped", find);

@@ -1,5 +1,5 @@
-// Live pages: on each server event, and at most once a second, the page is fetched again and the regions marked
-// data-live are replaced. Without this script the pages read the same; they just do not move.
+// Live pages: each server event, at most once a second, fetches the page again and replaces the regions marked data-live.
+// Without this script the pages have the same content, but do not change.
 (() => {
   "use strict";
   const relative = new Intl.RelativeTimeFormat("en", { numeric: "auto", style: "short" });
@@ -14,7 +14,7 @@
     }
   }
 
-  /** What stands in a fresh region for an element of the old one. */
+  /** Element of a new region that replaces an element of the old region. */
   function twin(region, element) {
     const name = (attribute) => (element.getAttribute(attribute) ? `[${attribute}="${CSS.escape(element.getAttribute(attribute))}"]` : "");
     const mark = name("id") || `${name("name")}${name("value")}${name("href")}`;
@@ -28,7 +28,7 @@
     for (const region of document.querySelectorAll("[data-live]")) {
       const next = fresh.getElementById(region.id);
       const focused = region.contains(document.activeElement) ? document.activeElement : null;
-      // Nobody's typing is taken away.
+      // A region with a focused text field stays, to preserve the input.
       if (!next || focused?.matches("input:not([type=checkbox], [type=radio]), select")) continue;
       if (next.outerHTML === region.dataset.was) continue;
       const was = next.outerHTML;
@@ -54,7 +54,7 @@
     const source = new EventSource(document.body.dataset.events);
     const lamp = document.getElementById("lamp");
     const onEvent = () => { pending ??= setTimeout(() => refresh().catch(() => {}), document.hidden ? 10000 : pause); };
-    // A whole service changes all the time; one job's page is watched closely.
+    // A whole service changes all the time; the page of one job needs a short delay.
     const pause = document.body.dataset.events.includes("/v1/") ? 300 : 1000;
     source.addEventListener("progress", onEvent);
     source.addEventListener("end", () => { onEvent(); source.close(); });

@@ -1,11 +1,11 @@
-// What was found of a hand, drawn on it: the palm's frame and approach, which way fingertips close, and their pads.
+// Findings of a hand's check, drawn on the hand: palm frame, approach, closing directions, and pads of the fingertips.
 import { BufferAttribute, BufferGeometry, Group, InstancedMesh, Matrix4, Mesh, MeshBasicMaterial, MeshStandardMaterial, SphereGeometry, Vector3 } from "./vendor/three.min.js";
 
 const COLOURS = { approach: 0xdd7432, closing: 0x1f9c93, pad: 0xd6409f, axes: [0xc8343c, 0x3c9a4a, 0x3566c8] };
 const SIDES = 20;
 const Z = new Vector3(0, 0, 1);
 
-/** A unit arrow along z: profile of radius and height, turned about the axis. */
+/** Unit arrow along z: profile of radius and height, rotated about the axis. */
 function arrowGeometry() {
   const profile = [[0, 0], [0.03, 0], [0.03, 0.72], [0.09, 0.72], [0, 1]];
   const position = [], index = [];
@@ -29,7 +29,7 @@ function arrowGeometry() {
 
 const ARROW = arrowGeometry();
 
-/** An arrow that shines faintly through what stands before it. */
+/** Arrow that shines faintly through objects in front of it. */
 class Arrow {
   constructor(color) {
     this.group = new Group();
@@ -45,7 +45,6 @@ class Arrow {
   }
 }
 
-/** Dots on a body. */
 function dots(points, radius) {
   const sphere = new SphereGeometry(radius, 8, 6);
   const group = new Group();
@@ -59,7 +58,7 @@ function dots(points, radius) {
   return group;
 }
 
-/** All marks of a hand of a size [m]; `group` stands in the hand's root frame. */
+/** All marks of a hand of a size [m]; `group` is in the hand's root frame. */
 export class Marks {
   constructor(hand, size) {
     this.hand = hand;
@@ -81,7 +80,7 @@ export class Marks {
     for (const { group } of this.pads) group.visible = on;
   }
 
-  /** The palm's frame: z is the approach, as in the pictures of `graspd hands check`. */
+  /** Palm frame: z is the approach, as in the pictures of `graspd hands check`. */
   placePalm(centre, approach) {
     this.approach.place(centre, approach, 0.4 * this.size);
     const least = [0, 1, 2].reduce((a, b) => (Math.abs(approach.getComponent(b)) < Math.abs(approach.getComponent(a)) ? b : a));
@@ -90,7 +89,7 @@ export class Marks {
     this.axes.forEach((axis, k) => axis.place(centre, frame[k], (k === 2 ? 0.26 : 0.2) * this.size));
   }
 
-  /** An arrow at each fingertip: where it is, and where it goes as the hand closes. */
+  /** Arrow at each fingertip in the direction of closing. */
   placeClosing(ways) {
     for (const { group } of this.closing.values()) group.visible = false;
     for (const [name, from, to] of ways) {

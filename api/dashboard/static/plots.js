@@ -1,10 +1,10 @@
-// Bar charts by uPlot over the SVG that the page brings: the same numbers, with a reading under the pointer.
+// Bar charts by uPlot over the SVG of the page: the same numbers, with the value under the pointer.
 (() => {
   "use strict";
   const made = new Map();
 
   const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
-  // Canvas does not know light-dark(): let the browser resolve it.
+  // Canvas does not support light-dark(): the browser resolves it.
   function resolved(name) {
     const probe = document.createElement("i");
     probe.className = `probe-${name}`;

@@ -1,4 +1,4 @@
-// A hand or an object alone in 3D: what will be grasped, and with what.
+// Selected hand or object of a job's form in 3D.
 import { Vector3 } from "./vendor/three.min.js";
 import { loadGlb } from "./glb.js";
 import { Hand, Thing } from "./figures.js";
@@ -32,7 +32,7 @@ async function show(figure) {
   }
 }
 
-/** An empty stage: what stands there must not look like what is chosen. */
+/** Empty the stage: an old model must not look like the selected one. */
 function clear(figure) {
   const stage = stages.get(figure);
   if (stage?.shown) {

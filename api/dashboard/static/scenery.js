@@ -1,18 +1,17 @@
-// What stands around an object: tables, walls and boards, and other objects; and from where one sees past them.
+// Surroundings of an object: tables, walls, boards and other objects; and viewpoints that they do not hide.
 import { BufferAttribute, BufferGeometry, Group, Mesh, MeshStandardMaterial, Quaternion, Vector3 } from "./vendor/three.min.js";
 import { loadGlb } from "./glb.js";
 import { Thing } from "./figures.js";
 
-/** A half-space is shown as a disc [m]. */
+/** Radius of the disc that shows a half-space [m]. */
 const DISC_M = 0.32;
 const CORNERS = 96;
 const COLOURS = { support: 0xcfd4d6, wall: 0x8fa3b0, neighbour: 0xb4aebf };
-/** Sides that are looked from: each this far from the one before, and these far above the horizon. */
+/** Viewing directions: step of azimuth, and elevations [rad]. */
 const STEP = Math.PI / 8;
 const HEIGHTS = [0.45, 0.8, 1.15];
 const FAR_M = 0.6;
 
-/** A group of vertices with normals as a mesh. */
 function mesh(position, normal, index, look) {
   const geometry = new BufferGeometry();
   geometry.setAttribute("position", new BufferAttribute(new Float32Array(position), 3));
@@ -23,7 +22,7 @@ function mesh(position, normal, index, look) {
   return made;
 }
 
-/** The plane of a half-space as a disc about the foot of `middle`; from below one sees through it. */
+/** Plane of a half-space as a disc below `middle`, transparent from below. */
 function disc({ normal, offset }, middle) {
   const position = [0, 0, 0], normals = [0, 0, 1], index = [];
   for (let i = 0; i < CORNERS; i++) {
@@ -64,14 +63,14 @@ function box({ size, pose }) {
   return made;
 }
 
-/** Put something at a pose x y z, quaternion w x y z. */
+/** Move an object to a pose x y z [m], quaternion w x y z. */
 export function place(thing, [x, y, z, w, i, j, k]) {
   thing.position.set(x, y, z);
   thing.quaternion.set(i, j, k, w).normalize();
   return thing;
 }
 
-/** Everything of a scene but the hand and the object that is grasped. */
+/** Supports and neighbours of a scene. */
 export class Scenery {
   constructor(scene) {
     this.group = new Group();
@@ -79,7 +78,7 @@ export class Scenery {
     for (const support of scene.supports) this.group.add(support.kind === "box" ? box(support) : disc(support, middle));
   }
 
-  /** Other objects come as their models do; one that has none is left out. */
+  /** Load the neighbours' models; a neighbour without model is omitted. */
   async addNeighbours(scene, changed) {
     await Promise.all(scene.neighbours.map(async ({ digest, pose }) => {
       const model = await loadGlb(new URL(`../v1/objects/${digest}/model`, import.meta.url).href).catch(() => null);
@@ -92,7 +91,7 @@ export class Scenery {
   }
 }
 
-/** Hand and object as they stand in the scene (where there is one), and what stands around them. */
+/** Hand and object at their poses in the scene (if any), and the surroundings. */
 export function staged(grasp, hand, thing) {
   const all = new Group();
   all.add(hand.group, thing.group);
@@ -101,7 +100,7 @@ export function staged(grasp, hand, thing) {
   return { all, scenery: grasp.scene ? new Scenery(grasp.scene) : null };
 }
 
-/** Of the sides about a wanted one, the nearest from which no wall hides the object and the eye is above what it stands on. */
+/** Direction nearest to a wanted one from which no wall hides the object, and the camera is above the planes. */
 export function freeSide(wanted, scene, centre) {
   const around = Math.atan2(wanted.y, wanted.x);
   const planes = scene.supports.filter((support) => support.kind === "half_space");
@@ -117,7 +116,7 @@ export function freeSide(wanted, scene, centre) {
   return wanted;
 }
 
-/** Whether the line between two points goes through a box (slabs test of Kay and Kajiya 1986). */
+/** Whether the line between two points intersects a box (slabs test of Kay and Kajiya 1986). */
 function crosses(from, to, { size, pose }) {
   const [x, y, z, w, i, j, k] = pose;
   const back = new Quaternion(i, j, k, w).normalize().invert();

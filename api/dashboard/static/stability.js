@@ -1,4 +1,4 @@
-// Maps of failure: the cell under the pointer or the finger is said in words beneath its map.
+// Failure maps: the text below a map describes the cell under the pointer.
 (() => {
   "use strict";
   function say(event) {

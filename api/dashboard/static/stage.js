@@ -1,4 +1,4 @@
-// A lit stage with a camera that orbits. Draws only when something changed, so an idle page costs nothing.
+// Lit stage with an orbiting camera. Draws only after changes, so an idle page costs nothing.
 import {
   Box3, DirectionalLight, HemisphereLight, NoToneMapping, PCFShadowMap, PerspectiveCamera, Quaternion, Scene, Sphere, Vector3,
   WebGLRenderer, OrbitControls,
@@ -19,7 +19,7 @@ function lit(scene) {
   return { key, rim };
 }
 
-/** Everything needed to draw figures; without `canvas` it draws into one of its own (for thumbnails). */
+/** Scene, camera and renderer; without `canvas` it draws into its own canvas (for thumbnails). */
 export class Stage {
   constructor(canvas) {
     this.renderer = new WebGLRenderer({ canvas, antialias: true, alpha: true, preserveDrawingBuffer: !canvas });
@@ -33,7 +33,7 @@ export class Stage {
     this.sphere = new Sphere(new Vector3(), 0.1);
   }
 
-  /** Fill the view with a group, seen from a direction that points from it to the camera. */
+  /** Fill the view with a group; `direction` points from the group to the camera. */
   frame(group, direction, margin = 1.0) {
     group.updateMatrixWorld(true);
     new Box3().setFromObject(group).getBoundingSphere(this.sphere);
@@ -47,7 +47,7 @@ export class Stage {
     this.light();
   }
 
-  /** Keep the lamps over the viewer's shoulder. */
+  /** Move the lamps with the camera. */
   light() {
     const { center, radius } = this.sphere;
     const right = new Vector3().setFromMatrixColumn(this.camera.matrixWorld, 0);
@@ -82,7 +82,7 @@ export class Stage {
   }
 }
 
-/** A stage on the page: follows its canvas's size, mouse, touch and arrow keys. */
+/** Stage on the page: follows its canvas's size, mouse, touch and arrow keys. */
 export class LiveStage extends Stage {
   constructor(canvas) {
     super(canvas);
@@ -148,7 +148,7 @@ export class LiveStage extends Stage {
   }
 }
 
-/** Where to stand to see a grasp: beside the hand, a little above and behind it. */
+/** Viewing direction of a grasp: beside the hand, a little above and behind it. */
 export function besideHand(hand) {
   const turn = hand.group.getWorldQuaternion(new Quaternion());
   const approach = new Vector3(...(hand.extras.palm?.approach ?? [0, 0, 1])).applyQuaternion(turn);
@@ -159,7 +159,7 @@ export function besideHand(hand) {
   return side.multiplyScalar(1).addScaledVector(up, 0.55).addScaledVector(approach, -0.35);
 }
 
-/** Where one sees the palm of a hand that stands in its own frame. */
+/** Viewing direction of the palm of a hand in its own frame. */
 export function beforePalm(hand) {
   const approach = new Vector3(...hand.extras.palm.approach);
   const up = new Vector3(0, 0, 1);

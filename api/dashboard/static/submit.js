@@ -1,18 +1,16 @@
-// Uploads are sent and checked as soon as they are chosen, so that one sees what graspd made of them before submitting.
-// A file that was refused stays, is checked again when its units change or a fix is pressed, and holds the button: a form
-// runs what it shows.
-// Without this script the form sends the files itself.
+// Selected files are uploaded and checked at once, so that the form shows the result before the submission. A refused file
+// disables the button until a change of its units or a fix passes the check. Without this script the form sends the files.
 (() => {
   "use strict";
   const POLL_MS = 400;
   const PATIENCE_MS = 60000;
-  // The service may lie below a path of a proxy.
+  // A proxy may serve the service under a path.
   const root = new URL("..", document.currentScript.src).pathname;
   const form = document.getElementById("job");
   const button = form.querySelector("button.primary");
   const blocked = document.getElementById("blocked");
   const pause = (ms) => new Promise((done) => setTimeout(done, ms));
-  // A key that may only read has no button, whatever was uploaded.
+  // A key with scope read has no button, regardless of uploads.
   const readonly = button.disabled;
   const waiting = new Map();
 
@@ -22,7 +20,7 @@
     return body;
   }
 
-  /** A file that its check refused; `page` has the reason in words, and buttons that fix it. */
+  /** Refused file; `page` is HTML with the reason, and buttons of fixes. */
   class Refused extends Error {
     constructor(asset, page) { super(asset.message); this.page = page; }
   }
@@ -30,7 +28,7 @@
   async function check(kind, file, options) {
     const data = new FormData();
     data.append("file", file);
-    // A file of another content is another object, whatever it is called.
+    // Files with different content are different objects, even under the same name.
     data.append("rename", "true");
     if (Object.keys(options).length) data.append("options", JSON.stringify(options));
     let asset = await document_(await fetch(`${root}v1/${kind}s`, { method: "POST", body: data }));
@@ -46,7 +44,7 @@
     return asset;
   }
 
-  /** Say why the button is held, or let it go. */
+  /** Disable the button with a reason, or enable it. */
   function hold(thing, why) {
     if (why) waiting.set(thing, why); else waiting.delete(thing);
     button.disabled = readonly || waiting.size > 0;
@@ -60,7 +58,7 @@
     const said = thing.querySelector("[data-found]");
     const select = thing.querySelector(`select[name=${kind}]`);
     const figure = thing.querySelector("figure");
-    // The file that the form means, whether or not its check has ended.
+    // File of the form, checked or not.
     let held = null;
     let fixes = {};
     let round = 0;
@@ -90,7 +88,7 @@
       try {
         const asset = await check(kind, file, options);
         if (mine !== round) return;
-        // It is in the store: the form need not send it a second time.
+        // The store has the file: the form need not send it again.
         input.value = "";
         show(asset.name, asset.name, `${root}v1/${kind}s/${asset.digest}/model`);
         say(asset.verdict ? asset.message : "no worker has checked it yet; start one before you submit", "good");
@@ -105,7 +103,7 @@
     }
 
     input.addEventListener("change", () => {
-      // A dialog that was cancelled empties the field; the file stays what the form means.
+      // A cancelled dialog empties the field; the form still refers to the file.
       if (!input.files[0]) return;
       [held, fixes] = [input.files[0], {}];
       thing.querySelector("[data-refused]")?.remove();
@@ -124,7 +122,7 @@
       }
       upload();
     });
-    // Enter in the field of a fix presses its button, not that of the form.
+    // Enter in the field of a fix presses the button of the fix, not of the form.
     said.addEventListener("keydown", (event) => {
       if (event.key !== "Enter" || !event.target.matches("input")) return;
       event.preventDefault();
@@ -140,7 +138,7 @@
       say("", "");
       hold(thing, "");
     });
-    // Browsers put back what was chosen when one goes back to a page; the picture must follow.
+    // Browsers restore the selection on return to a page; the picture must match it.
     window.addEventListener("pageshow", (event) => { if (event.persisted && !held) select.dispatchEvent(new Event("change")); });
   }
 

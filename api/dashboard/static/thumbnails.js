@@ -1,4 +1,4 @@
-// Pictures of grasps in lists: one small stage draws them one after another as they come into view.
+// Pictures of grasps in lists: one small stage draws each picture when it scrolls into view.
 import { Vector3 } from "./vendor/three.min.js";
 import { loadGlb } from "./glb.js";
 import { between, Hand, Thing } from "./figures.js";
@@ -45,7 +45,7 @@ const seen = new IntersectionObserver((entries) => {
   for (const { isIntersecting, target } of entries) {
     if (!isIntersecting) continue;
     seen.unobserve(target);
-    // One after another, with a breath between, so that scrolling stays smooth.
+    // Sequential, with pauses, so that scrolling stays smooth.
     queue = queue.then(() => draw(target)).catch(() => { target.dataset.state = "failed"; }).then(() => new Promise(requestAnimationFrame));
   }
 }, { rootMargin: "300px" });

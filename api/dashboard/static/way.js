@@ -1,7 +1,7 @@
-// The way of a grasp on a slider: named postures at 0, 1, 2, ..., others between them.
+// Trajectory of a grasp on a slider: named postures at 0, 1, 2, ..., other waypoints in between.
 import { between } from "./figures.js";
 
-/** What the hand does on its way to a named posture, and what it did when it is there. */
+/** Motion of the hand before each named posture. */
 const DOING = { pregrasp: "approach", grasp: "closing", squeeze: "squeezing", lift: "lifting" };
 
 export class Way {
@@ -12,7 +12,7 @@ export class Way {
     this.last = points.at(-1).place;
   }
 
-  /** Posture of the hand and how far the object was carried, at a place of the slider. */
+  /** Posture of the hand and displacement of the object [m] at a slider position. */
   at(place) {
     let k = this.points.findIndex((point) => point.place > place) - 1;
     if (k < 0) k = this.points.length - 2;
@@ -22,12 +22,12 @@ export class Way {
     return { ...between(a, b, share, this.names), carried };
   }
 
-  /** Place of a named posture. */
+  /** Slider position of a named posture. */
   place(name) {
     return this.stops.find((stop) => stop.name === name)?.place ?? 0;
   }
 
-  /** In words where a place of the slider is. */
+  /** Describe a slider position. */
   say(place) {
     const near = this.stops.find((stop) => Math.abs(stop.place - place) < 0.02);
     if (near) return near.name;

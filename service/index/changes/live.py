@@ -1,4 +1,4 @@
-"""Changes of the present state: waiting and running tasks, and workers. All are idempotent."""
+"""Changes of present state: waiting and running tasks, and workers. All are idempotent."""
 
 from __future__ import annotations
 
@@ -17,10 +17,8 @@ _UNFINISHED = tasks.c.state.in_((State.QUEUED.value, State.RUNNING.value))
 
 
 class Live(IndexPart):
-    """Writes of data that the store does not contain."""
-
     def set_running(self, workers: Mapping[str, str]) -> dict[str, State]:
-        """Mark tasks as taken; `workers` maps tasks to workers. Return the changed states of jobs."""
+        """Mark tasks as running; `workers` maps tasks to workers. Return the changed states of jobs."""
         running = State.RUNNING.value
         with self.database.writing() as connection:
             waiting = select(tasks.c.id, tasks.c.job_id).where(tasks.c.state == State.QUEUED.value)
@@ -36,7 +34,6 @@ class Live(IndexPart):
             return dict.fromkeys(touched, State.RUNNING)
 
     def set_progress(self, progress: Mapping[str, tuple[float, float, str]]) -> None:
-        """Set the progress of running tasks: done, total, and activity."""
         rows = [
             {"id": task, "progress_done": done, "progress_total": total, "progress_message": clean(message)}
             for task, (done, total, message) in progress.items()
@@ -52,7 +49,7 @@ class Live(IndexPart):
     def set_waiting(
         self, task_ids: Sequence[str], *, not_before: float = 0.0, message: str | None = None
     ) -> dict[str, State]:
-        """Mark tasks as neither queued nor with a worker, not due before `not_before`; return their jobs' states."""
+        """Mark tasks as neither queued nor running, not due before `not_before`; return the states of their jobs."""
         values = {"queued": False, "not_before": not_before, "state": State.QUEUED.value, "worker": None}
         values |= {**NO_PROGRESS, "progress_message": message and clean(message)}
         touched: set[str] = set()
@@ -65,7 +62,7 @@ class Live(IndexPart):
     def set_asset_waiting(
         self, digests: Iterable[str], *, queued: bool, not_before: float = 0.0, message: str | None = None
     ) -> None:
-        """Mark checks that no worker holds, with the reason if known."""
+        """Mark checks as not running, with the reason if known."""
         values: dict[str, Any] = {"queued": queued, "not_before": not_before}
         if message is not None:
             values["message"] = clean(message)
@@ -73,7 +70,7 @@ class Live(IndexPart):
             connection.execute(update(assets).where(assets.c.digest.in_(list(digests))).values(**values))
 
     def set_workers(self, beats: Sequence[WorkerBeat], *, forget_before: str, lost_before: str = "9999") -> None:
-        """Record living workers; mark others as lost and delete them by the time they were last seen."""
+        """Record living workers; mark missing ones as lost, and delete them after a while."""
         rows = [
             fitted(workers, beat, stages=[stage.value for stage in beat.stages], task_id=beat.task_id or None)
             for beat in beats

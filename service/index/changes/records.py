@@ -1,4 +1,4 @@
-"""Jobs and datasets of the store as rows; only API and controller call these. All are idempotent."""
+"""Jobs and datasets of the store as rows, written by API and controller. All changes are idempotent."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ from graspd.service.model.records import (
 from graspd.service.model.states import State
 from graspd.service.store.manifests import ShardManifest
 
-#: Ranges entered in one transaction: it takes some tenths of a second, for which other writers wait.
+#: Ranges entered in one transaction of some tenths of a second, during which other writers wait.
 RANGES_AT_ONCE: Final = 500
 
 
@@ -66,7 +66,7 @@ class Changes(IndexPart):
             return settle(connection, record.id)
 
     def enter_job(self, record: JobRecord, *, within: Connection) -> None:
-        """Add a job with its first tasks; `enter_more` adds the others of large jobs."""
+        """Add a job with its first tasks; `enter_more` adds the other tasks of a large job."""
         is_new = within.scalar(select(jobs.c.id).where(jobs.c.id == record.id)) is None
         self._upsert_job(within, record)
         self._enter(within, record, 0, goes_on=is_new)
@@ -77,7 +77,7 @@ class Changes(IndexPart):
         return [name.removeprefix(ENTERING) for name in self.database.column(query)]
 
     def enter_more(self, job_id: str, record: JobRecord | None) -> None:
-        """Add the next tasks of such a job; None: its record is deleted, and no more follow."""
+        """Add the next tasks of a large job; None: its record is deleted, and no more tasks follow."""
         with self.database.writing() as connection:
             is_there = connection.scalar(select(jobs.c.id).where(jobs.c.id == job_id)) is not None
             note: Any = connection.scalar(select(notes.c.value).where(notes.c.name == ENTERING + job_id))
@@ -89,7 +89,7 @@ class Changes(IndexPart):
     def add_manifests(
         self, manifests: Iterable[ShardManifest], *, within: Connection | None = None
     ) -> dict[str, State]:
-        """Add shards and their grasps; the tasks of any job that make them have succeeded. Return the jobs' states."""
+        """Add shards with their grasps; the tasks that make them have succeeded. Return the states of their jobs."""
         new = {manifest.shard_id: manifest for manifest in manifests}
         touched: defaultdict[str, set[int]] = defaultdict(set)
         with self.database.writing(within) as connection:
@@ -107,13 +107,10 @@ class Changes(IndexPart):
     def add_attempt(
         self, attempt: AttemptRecord, *, not_before: float = 0.0, within: Connection | None = None
     ) -> State | None:
-        """Add a failed attempt. Return the job's state, or None for an unknown task.
-
-        The next attempt must not be queued before `time.time` is `not_before`.
-        """
+        """Add a failed attempt; the next one is due at `not_before` [s]. Return the job's state; None: unknown task."""
         with self.database.writing(within) as connection:
             if connection.scalar(select(tasks.c.id).where(tasks.c.id == attempt.task_id)) is None:
-                return None  # of a deleted job, or a forged one
+                return None  # The job is deleted, or the attempt is forged.
             upsert(connection, attempts, [fitted(attempts, attempt, stage=attempt.stage.value)])
             values: dict[str, Any] = {
                 "last_attempt": attempt.number,
@@ -130,7 +127,7 @@ class Changes(IndexPart):
             return None if touched is None else settle(connection, touched.job_id, [touched.batch])
 
     def set_job_events(self, job_id: str, events: Sequence[JobEvent], *, within: Connection | None = None) -> State:
-        """Set the actions of users on a job: all its events so far, in order."""
+        """Replace the user actions on a job by all its events so far, in order."""
         cancelled = bool(events) and events[-1].what == "cancelled"
         with self.database.writing(within) as connection:
             connection.execute(update(jobs).where(jobs.c.id == job_id).values(cancelled=cancelled))
@@ -143,7 +140,7 @@ class Changes(IndexPart):
             return settle(connection, job_id)
 
     def add_asset(self, asset: Asset, check: Mapping[str, Any] | None, *, within: Connection | None = None) -> None:
-        """Add a hand or object with the result of its check, None while that is pending."""
+        """Add a hand or object with the result of its check; None: the check is pending."""
         with self.database.writing(within) as connection:
             upsert(connection, assets, [asset_row(asset, check)], keep=("last_attempt", "queued", "not_before"))
 
@@ -158,7 +155,7 @@ class Changes(IndexPart):
         upsert(connection, tasks, rows, keep=[name for name in rows[0] if name != "priority"])
 
     def _enter(self, connection: Connection, record: JobRecord, first: int, *, goes_on: bool) -> None:
-        """Add some ranges from `first`. A note stores the next range and marks the job as unfinished."""
+        """Add some ranges from `first` on. A note stores the next range and marks the job as unfinished."""
         number = ranges_of(record.request.grasps, record.span)
         some = range(first, min(number, first + RANGES_AT_ONCE))
         self._upsert_tasks(connection, list(task_rows(record, some)))
@@ -223,7 +220,7 @@ class DatasetChanges(IndexPart):
             upsert(connection, dataset_cells, cells)
 
     def set_events(self, name: str, events: Sequence[DatasetEvent], *, within: Connection | None = None) -> None:
-        """Set the actions of users on a dataset: all its events so far, in order."""
+        """Replace the user actions on a dataset by all its events so far, in order."""
         cancelled = bool(events) and events[-1].what == "cancelled"
         number = max((event.number for event in events), default=0)
         values = {"cancelled": cancelled, "events": number, "planned": False}
@@ -243,6 +240,5 @@ class DatasetChanges(IndexPart):
             upsert(connection, object_sets, [row])
 
     def set_progress(self, name: str, **values: int) -> None:
-        """Set the columns `applied` or `planned`."""
         with self.database.writing() as connection:
             connection.execute(update(datasets).where(datasets.c.name == name).values(**values))

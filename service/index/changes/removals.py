@@ -1,4 +1,4 @@
-"""Removal of rows, after a check that nothing else needs them. All removals are idempotent."""
+"""Removal of rows that nothing else needs. All removals are idempotent."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Removals(IndexPart):
     """`within` makes a read or write part of a larger transaction, so that checks still hold at the write."""
 
     def user_of_asset(self, asset: AssetView, *, within: Connection) -> str:
-        """Return what needs a hand, object or network, in a few words; empty if nothing does."""
+        """Return in a few words what needs a hand, object or network; empty if nothing does."""
         kind, digest = asset.kind, asset.digest
         column = f"{kind.value}_digest"
         if job := within.scalar(select(jobs.c.id).where(jobs.c[column] == digest).limit(1)):
@@ -43,14 +43,14 @@ class Removals(IndexPart):
                 return user
             newest = select(object_sets).order_by(object_sets.c.name, object_sets.c.created, object_sets.c.digest)
             rows = {row["name"]: row for row in within.execute(newest).mappings()}
-            # In another project's set the name means another object, unless this one is shared.
+            # The name may mean another object in the set's project, unless this object is shared.
             near = [row for row in rows.values() if asset.shared or row["project"] == asset.project]
             if found := next((row["name"] for row in near if asset.name in row["objects"]), None):
                 return f"the set of objects {found!r}"
         return ""
 
     def user_of_job(self, job_id: str, *, within: Connection) -> str:
-        """Return why a job must stay, as words that follow its name; empty if it may be deleted."""
+        """Return why a job cannot be deleted, as words that follow its name; empty if it can."""
         state = within.scalar(select(jobs.c.state).where(jobs.c.id == job_id))
         if state is None:
             raise NotFoundError(f"there is no job {job_id!r}")
@@ -68,14 +68,14 @@ class Removals(IndexPart):
         return int(within.scalar(query) or 0)
 
     def planned_only(self, ids: Sequence[str]) -> list[str]:
-        """Return those of the jobs that only a dataset's planner made and that no dataset contains."""
+        """Return the given jobs that only a dataset's planner made and that no dataset contains."""
         planned = (jobs.c.priority == Priority.BULK.value, jobs.c.origin.is_(None))
         needed = exists().where(dataset_cells.c.job_id == jobs.c.id)
         query = select(jobs.c.id).where(jobs.c.id.in_(ids), *planned, ~needed)
         return self.database.column(query)
 
     def unneeded_shards(self, ids: Sequence[str]) -> set[str]:
-        """Return those of the shards that exist and that no task of any job makes or reads."""
+        """Return the existing shards among these ids that no task of any job makes or reads."""
         query = select(shards.c.id).where(shards.c.id.in_(ids), ~exists().where(tasks.c.shard_id == shards.c.id))
         return set(self.database.column(query))
 
@@ -98,7 +98,7 @@ class Removals(IndexPart):
             connection.execute(delete(datasets).where(datasets.c.name == name))
 
     def remove_shard(self, shard: str, *, within: Connection) -> bool:
-        """Remove a shard with its grasps unless a task needs it; return whether it may be deleted."""
+        """Remove a shard with its grasps unless a task needs it; return whether its files can be deleted."""
         if within.scalar(select(tasks.c.id).where(tasks.c.shard_id == shard).limit(1)) is not None:
             return False
         _remember_cost(shard, within)

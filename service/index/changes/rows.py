@@ -1,4 +1,4 @@
-"""Conversion of store records to rows, and the derived states of tasks and jobs, in one transaction."""
+"""Conversion of store records to rows, and derived states of tasks and jobs, in one transaction."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from graspd.service.model.states import State
 from graspd.service.store.manifests import ShardManifest
 
 Row = dict[str, Any]
-#: Limit for facts, repairs and message of a hand or object: they are in every list, and derive from untrusted files.
+#: Limit for facts, repairs and message of a hand or object: all lists contain them, and their source is untrusted.
 _MOST_FACTS: Final = 64 << 10
 _MOST_REPAIRS: Final = 100
 _LONGEST_TEXT: Final = 2000
@@ -48,7 +48,6 @@ def job_row(record: JobRecord) -> Row:
 
 
 def beside(options: JobOptions) -> str:
-    """Return the digests of the neighbours, separated by spaces."""
     return " ".join(dict.fromkeys(one.digest or "" for one in options.beside))
 
 
@@ -87,7 +86,7 @@ def clean(text: str, length: int | None = None) -> str:
 
 
 def fitted(table: Table, record: object, **others: Any) -> Row:
-    """Return a row of the attributes of a record, except `others`, with text that fits its columns."""
+    """Return a row of a record's attributes, except `others`, with text that fits its columns."""
     row = {column.name: getattr(record, column.name) for column in table.columns if column.name not in others} | others
     lengths = {column.name: getattr(column.type, "length", None) for column in table.columns}
     return {name: clean(value, lengths[name]) if isinstance(value, str) else value for name, value in row.items()}
@@ -145,22 +144,22 @@ def _short(facts: dict[str, Any]) -> dict[str, Any]:
 _JOBS_AT_ONCE: Final = 200
 _FACTS: Final = ("stage", "done", "last_attempt", "exhausted", "retried_upto")
 
-#: Option of a connection that suppresses reports of ends.
+#: Option of a connection that suppresses reports of ended jobs and datasets.
 QUIET: Final = "graspd_quiet"
-#: Prefix of a note's name, followed by a job's id: some of its tasks are not yet entered.
+#: Prefix of the note about a job with tasks still to enter; the job's id follows.
 ENTERING: Final = "entering "
 _WHOSE: Final = (jobs.c.project, jobs.c.owner)
 
 
 def settle(connection: Connection, job_id: str, batches: Collection[int] | None = None) -> State:
-    """Derive the states of a job's tasks, for some batches or all, then the job's own, and return that."""
+    """Derive the states of a job's tasks (of some batches, or all), then the state of the job; return it."""
     return settle_batches(connection, {job_id: batches})[job_id]
 
 
 def settle_batches(connection: Connection, touched: Mapping[str, Collection[int] | None]) -> dict[str, State]:
-    """Derive the states for some batches, or all (None), of many jobs at once; return the states of these jobs.
+    """Derive the states of some batches of many jobs (None: all); return the states of these jobs.
 
-    If the first batch finds no grasp in its scenes, the job's other batches are skipped: they end as if cancelled.
+    If the first batch finds no grasp in its scenes, the other batches of the job are skipped, as if cancelled.
     """
     states: dict[str, State] = {}
     for some in chunks(list(touched), _JOBS_AT_ONCE):
@@ -195,7 +194,7 @@ def _settle_tasks(connection: Connection, touched: Mapping[str, Collection[int] 
 
 
 def _hopeless() -> ColumnElement[bool]:
-    """Return whether the first batch of a job ended because of its scenes or of the weight."""
+    """Return whether the first batch of a job failed because of its scenes or of the weight."""
     last = (attempts.c.task_id == tasks.c.id) & (attempts.c.number == tasks.c.last_attempt)
     failed = (tasks.c.done.is_(False), tasks.c.exhausted.is_(True), tasks.c.last_attempt > tasks.c.retried_upto)
     first = (tasks.c.job_id == jobs.c.id, tasks.c.batch == 0)
@@ -209,7 +208,7 @@ def _hopeless() -> ColumnElement[bool]:
 
 
 def _changes(chain: Sequence[Any], *, cancelled: bool) -> list[tuple[str, str, bool]]:
-    """Return the tasks of a batch whose state or readiness differs from the facts, with the new values."""
+    """Return the tasks of a batch whose state or readiness changes, with the new values."""
     facts = [TaskFacts(running=row["state"] == State.RUNNING, **{name: row[name] for name in _FACTS}) for row in chain]
     states = batch_states(facts, job_cancelled=cancelled)
     return [
@@ -220,7 +219,7 @@ def _changes(chain: Sequence[Any], *, cancelled: bool) -> list[tuple[str, str, b
 
 
 def _settle_jobs(connection: Connection, ids: Sequence[str]) -> dict[str, State]:
-    # Six index look-ups; collecting the distinct states would read every task of the job.
+    # Six index look-ups; a query of distinct states would read every task of the job.
     of_job = tasks.c.job_id == jobs.c.id
     probes = [exists().where(of_job, tasks.c.state == state.value).label(state.value) for state in State]
     probes.append(exists().where(notes.c.name == literal(ENTERING) + jobs.c.id).label("entering"))
@@ -241,13 +240,13 @@ def _settle_jobs(connection: Connection, ids: Sequence[str]) -> dict[str, State]
         if State.FAILED in found:
             first = select(tasks.c.reason).where(tasks.c.job_id == job, tasks.c.state == State.FAILED.value)
             values["reason"] = connection.scalar(first.order_by(tasks.c.batch, tasks.c.position).limit(1))
-        # Most jobs stay unchanged: then the row is not written.
+        # Most jobs are unchanged; their rows are not written.
         if values != {"state": row["now"], "finished": row["finished"], "reason": row["reason"]}:
             connection.execute(update(jobs).where(jobs.c.id == job).values(**values))
             if state.is_final and state != row["now"]:
                 about = {"kind": "job", "subject": job, "state": state.value}
                 ended.append(about | {"project": row["project"], "owner": row["owner"]})
-    # A rebuild reports no earlier ends.
+    # A rebuild reports no past ends of jobs and datasets.
     if not connection.get_execution_options().get(QUIET):
         note_ends(connection, ended)
     return states

@@ -35,10 +35,7 @@ class Assets(IndexPart):
         return Page(items=[AssetView(**row) for row in rows], next=following)
 
     def get(self, kind: AssetKind, name_or_digest: str, *, scope: ProjectScope = EVERYTHING) -> AssetView:
-        """Return the hand or object of a digest or name; of several, an accepted one, the project's own, the newest.
-
-        NotFoundError: it does not exist; the message lists the existing names.
-        """
+        """Return an asset by digest or name: accepted ones first, then own, then newer ones; or NotFoundError."""
         named = and_(assets.c.kind == kind.value, assets.c.name == name_or_digest)
         by_digest = and_(assets.c.kind == kind.value, assets.c.digest == name_or_digest)
         refused_last = case((assets.c.verdict == "refuse", 1), else_=0)
@@ -64,13 +61,12 @@ class Assets(IndexPart):
 
 
 def _not_refused() -> ColumnElement[bool]:
-    """Return the condition of a usable asset, or one in its check."""
+    """Return the condition of an asset that is usable or in its check."""
     return or_(assets.c.verdict.is_(None), assets.c.verdict != "refuse")
 
 
 class ObjectSets(IndexPart):
     def newest(self, *, scope: ProjectScope = EVERYTHING) -> list[ObjectSetView]:
-        """Return the newest version of each set of objects, by name."""
         query = select(object_sets).where(*seen(scope, object_sets))
         query = query.order_by(object_sets.c.name, object_sets.c.created, object_sets.c.digest)
         return list({row["name"]: ObjectSetView(**row) for row in self.database.rows(query)}.values())

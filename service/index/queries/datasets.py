@@ -77,7 +77,7 @@ class Datasets(IndexPart):
         return Page(items=views, next=following)
 
     def shards(self, name: str) -> list[SnapshotShard]:
-        """Return all shards of a dataset: cell by cell, batch by batch, stage by stage."""
+        """Return all shards of a dataset, ordered by cell, batch and stage."""
         query = (
             select(*(shards.c[field] for field in SnapshotShard.model_fields))
             .join(tasks, tasks.c.shard_id == shards.c.id)
@@ -111,8 +111,8 @@ def _dataset_row(connection: Connection, name: str, scope: ProjectScope = EVERYT
 
 
 def _cell_state(cancelled: bool) -> ColumnElement[str]:
-    """Return the state of a cell: its job's, or the dataset's if it has none."""
-    # As a literal: PostgreSQL does not match an expression with a parameter to its GROUP BY.
+    """Return the state of a cell: its job's, or the dataset's if the cell has no job."""
+    # A literal, because PostgreSQL does not match an expression with a parameter to its GROUP BY.
     unplanned = literal((State.CANCELLED if cancelled else State.QUEUED).value, literal_execute=True)
     return func.coalesce(jobs.c.state, unplanned)
 
@@ -147,7 +147,7 @@ def _dataset_view(connection: Connection, row: Any) -> DatasetView:
 def _state(row: Any, states: dict[State, int]) -> State:
     state = job_state(state for state, count in states.items() if count)
     if row["cancelled"]:
-        # A cancelled dataset has no pending work, although its jobs stop later or continue for another dataset.
+        # A cancelled dataset has no pending work: its jobs stop, or continue for another dataset.
         return state if state.is_final else State.CANCELLED
     # The jobs have not received the dataset's last event, a retry.
     return State.QUEUED if state.is_final and row["applied"] < row["events"] else state
@@ -167,7 +167,7 @@ def _states(connection: Connection, row: Any) -> dict[State, int]:
 
 
 def _tasks_of_cell(options: JobOptions, span: int | None) -> int:
-    """Return the tasks of a cell by its job's batches per task; None: unplanned, assume one."""
+    """Return the number of tasks of a cell by its job's batches per task; None: unplanned, assume one."""
     return ranges_of(options.grasps, span or 1) * len(stages_of(options))
 
 

@@ -19,7 +19,7 @@ from graspd.service.model.states import AssetKind, Priority, Stage, State
 
 @dataclass(frozen=True)
 class ReadyTask:
-    """A task that may start now, with the content of its message."""
+    """Task that is ready to start, with the content of its message."""
 
     job: JobRecord
     task: PlannedTask
@@ -30,7 +30,7 @@ class ReadyTask:
 
 @dataclass(frozen=True)
 class ReadyCheck:
-    """An uploaded hand or object that waits for its check."""
+    """Uploaded hand or object with a pending check."""
 
     kind: AssetKind
     name: str
@@ -40,7 +40,6 @@ class ReadyCheck:
 
 class Feed(IndexPart):
     def waiting_jobs(self, priority: Priority, *, now: float) -> list[WaitingJob]:
-        """Return jobs with tasks that may be queued, oldest first."""
         due = _due(tasks.c.not_before, now)
         waiting = exists().where(tasks.c.job_id == jobs.c.id, *_WAITING, due)
         query = (
@@ -63,7 +62,7 @@ class Feed(IndexPart):
         return [task for _, task in chosen]
 
     def ready_of_job(self, job_id: str, *, limit: int, now: float | None = None) -> list[ReadyTask]:
-        """Return the first tasks of one job that may be queued now; without `now`, ignore back-offs."""
+        """Return the first tasks of one job that are ready to queue; without `now`, ignore back-offs."""
         due = () if now is None else (_due(tasks.c.not_before, now),)
         query = (
             select(tasks, *(jobs.c[name] for name in _OF_THE_JOB))
@@ -85,7 +84,7 @@ class Feed(IndexPart):
         ]
 
     def believed_queued(self) -> tuple[set[str], set[tuple[AssetKind, str]]]:
-        """Return unfinished tasks, and checks of assets, that are marked as queued."""
+        """Return unfinished tasks and checks of assets that the index marks as queued."""
         unfinished = tasks.c.state.in_((State.QUEUED.value, State.RUNNING.value))
         of_tasks = select(tasks.c.id).where(tasks.c.ready.is_(True), tasks.c.queued.is_(True), unfinished)
         of_checks = select(assets.c.kind, assets.c.digest).where(assets.c.queued.is_(True), assets.c.verdict.is_(None))
@@ -108,7 +107,7 @@ class Feed(IndexPart):
         return {row["id"]: row["last_attempt"] for row in self.database.rows(query)}
 
     def unfinished_tasks(self, job_id: str) -> list[str]:
-        """Return tasks of a job that are queued or with a worker."""
+        """Return tasks of a job that are queued or running."""
         return self.database.column(select(tasks.c.id).where(tasks.c.job_id == job_id, tasks.c.queued.is_(True)))
 
 
@@ -136,8 +135,6 @@ def _ready(row: Any, record: JobRecord) -> ReadyTask:
 
 @dataclass(frozen=True)
 class DatasetWork:
-    """A dataset with pending work of the planner."""
-
     name: str
     options: JobOptions
     revisions: dict[str, int]
@@ -187,7 +184,7 @@ class DatasetFeed(IndexPart):
     ) -> list[tuple[int, str]]:
         """Return positions and jobs of the next cells in some states, after a position.
 
-        `unshared` omits jobs that another, uncancelled dataset waits for too, and those that another key submitted.
+        `unshared` omits jobs that another key submitted, and jobs that an uncancelled dataset needs too.
         """
         query = (
             select(dataset_cells.c.position, dataset_cells.c.job_id)

@@ -1,13 +1,13 @@
 """Queries of grasps: filters, and pages sorted by a metric, among millions of rows.
 
-The index is chosen here, not by the database: SQLite has no statistics of the values, and scans an order's index to the
-end for a filter that almost nothing passes. There are three plans:
+This module chooses the database index: SQLite has no statistics of the values, and scans the index of an order to
+its end for a rare match. There are three plans:
 
 1. A condition leaves few rows: fetch them by its index, and sort them.
-2. Else a bounded number of rows is read in the wanted order until the page is full.
-3. A filter that hardly any row passes, though many pass each of its conditions: all rows are read once.
+2. Otherwise a bounded number of rows is read in the wanted order until the page is full.
+3. Each condition matches many rows, but the conjunction hardly any: all rows are read once.
 
-`truth` translates the language of grasp expressions (`service.model.where`) to SQL.
+`truth` translates grasp expressions (`service.model.where`) to SQL.
 """
 
 from __future__ import annotations
@@ -88,14 +88,14 @@ class Grasps(IndexPart):
         return [(found["shard_id"], found["row"]) for found in self.database.rows(query.where(*sql_conditions(where)))]
 
     def listed(self, wanted: Sequence[Grasp]) -> Iterator[GraspView]:
-        """Yield grasps by shard and row, in that order; missing ones are omitted."""
+        """Yield grasps by shard and row, in this order; missing grasps are omitted."""
         for some in chunks(sorted(wanted)):
             query = select(grasps).where(tuple_(grasps.c.shard_id, grasps.c.row).in_(some))
             for row in self.database.rows(query.order_by(grasps.c.shard_id, grasps.c.row)):
                 yield GraspView(**row)
 
 
-#: Most rows that are fetched by an index and sorted: faster than a scan of a million rows.
+#: Most rows to fetch by an index and sort: faster than a scan of a million rows.
 SORTED_AT_ONCE: Final = 40_000
 #: Rows read in the wanted order: few at first, since most filters fill a page from them.
 LOOKED_AT: Final = (1000, 20_000)
@@ -114,7 +114,7 @@ _FLAGS: Final[dict[str, Callable[[Columns], ColumnElement[bool]]]] = {
     "validated": lambda grasps: grasps.success.is_not(None),
     "valid": lambda grasps: grasps.valid.is_(True),
     "held": lambda grasps: grasps.success.is_(True),
-    # A grasp planned in a scene is validated by the lift.
+    # Grasps planned in a scene are validated by the lift.
     "lift": lambda grasps: and_(grasps.scene_kind != "free", grasps.success.is_(True)),
     "lift_hard": lambda grasps: grasps.lift_hard.is_(True),
 }
@@ -122,7 +122,7 @@ _FLAGS: Final[dict[str, Callable[[Columns], ColumnElement[bool]]]] = {
 
 @dataclass(frozen=True)
 class Condition:
-    """A test of one column. Conditions of one group share one index."""
+    """Test of one column. Conditions of one group share one index."""
 
     group: str
     column: ColumnElement[Any]
@@ -130,7 +130,7 @@ class Condition:
     value: Any
 
     def sql(self, groups: Sequence[str] | None) -> ColumnElement[bool]:
-        """Return the test; outside the listed groups, in a form that no index serves (None: all are listed)."""
+        """Return the test; outside the `listed` groups, in a form without index (None: all are listed)."""
         return self._of(self.column if groups is None or self.group in groups else _plain(self.column))
 
     def on(self, rows: Subquery) -> ColumnElement[bool]:
@@ -162,7 +162,7 @@ class Tagged:
 
 @dataclass(frozen=True)
 class ExpressionCondition:
-    """Grasps that satisfy an expression; no index serves it."""
+    """Grasps that satisfy an expression, tested without an index."""
 
     node: Node
     group: str = "flag"
@@ -178,7 +178,7 @@ Test = Condition | Tagged | ExpressionCondition
 
 
 def conditions(where: GraspFilter | None) -> list[Test]:
-    """Return a filter as a conjunction; InputError for an invalid expression, or values that the index lacks."""
+    """Return a filter as a conjunction; InputError for an invalid expression, or values missing in the index."""
     where = where or GraspFilter()
     found: list[Test] = []
     if where.job is not None:
@@ -216,14 +216,13 @@ def conditions(where: GraspFilter | None) -> list[Test]:
 
 
 def sql_conditions(where: GraspFilter | None) -> list[ColumnElement[bool]]:
-    """Return a filter in SQL; the database chooses the index."""
     return [condition.sql(None) for condition in conditions(where)]
 
 
 def search(
     connection: Connection, where: GraspFilter | None, sort: GraspSort, size: int, start: tuple[Any, ...] | None
 ) -> list[Any]:
-    """Return the first `size` rows after `start`, the metric, shard id and row of the previous grasp."""
+    """Return the first `size` rows after `start`: metric, shard id and row of the previous grasp."""
     wanted = conditions(where)
     few = _few(connection, where, wanted)
     rows: list[Any] = []
@@ -250,7 +249,7 @@ def _with_metric(
     by = grasps.c[sort.by]
     if few is not None and few != sort.by:
         return _sorted(connection, [c.sql([few]) for c in wanted], sort, size, start)
-    # The order's index may serve other conditions too: those of its metric, or of hand and object.
+    # The index of the order may serve other conditions too: of its metric, or of hand and object.
     served = [sort.by, "pair"] if sort.by == "epsilon" else [sort.by]
     inside = [c.sql(served) for c in wanted if c.group in served]
     outside = [c for c in wanted if c.group not in served]
@@ -265,7 +264,7 @@ def _with_metric(
         rows = list(connection.execute(_slice(query, same_key, sort, size, None)).mappings())
         if len(rows) >= size or _count(connection, looked) < number:
             return rows
-    # PostgreSQL can join indexes; SQLite would follow one of them row by row, which is slower than a full scan.
+    # PostgreSQL can join indexes; SQLite would follow one index row by row, which is slower than a full scan.
     groups: list[str] | None = None if connection.dialect.name == "postgresql" else []
     return _sorted(connection, [c.sql(groups) for c in wanted], sort, size, start)
 
@@ -277,14 +276,14 @@ def _sorted(
     size: int,
     start: tuple[Any, ...] | None,
 ) -> list[Any]:
-    """Return the rows that pass, sorted without the order's index."""
+    """Return the matching rows, sorted without the index of the order."""
     by = _plain(grasps.c[sort.by])
     query = select(grasps).where(by.is_not(None), *tests)
     return list(connection.execute(_slice(query, (by, grasps.c.shard_id, grasps.c.row), sort, size, start)).mappings())
 
 
 def _few(connection: Connection, where: GraspFilter | None, wanted: Sequence[Test]) -> str | None:
-    """Return the group of conditions that leaves the fewest rows, if these can be sorted at once."""
+    """Return the group of conditions that leaves the fewest rows, if they are few enough to sort."""
     numbers: dict[str, int] = {}
     for group in dict.fromkeys(condition.group for condition in wanted):
         if group != "flag":
@@ -294,7 +293,7 @@ def _few(connection: Connection, where: GraspFilter | None, wanted: Sequence[Tes
 
 
 def number_of(connection: Connection, where: GraspFilter, group: str, wanted: Sequence[Test] = ()) -> int:
-    """Return the number of rows that pass a group; for metrics, counting stops at the relevant limit."""
+    """Return the number of rows that match a group; for metrics, counting stops at the relevant limit."""
     query: Select[Any]
     if group == "job":
         query = select(func.sum(tasks.c.count)).where(
@@ -340,17 +339,13 @@ def _slice(
 
 
 def _plain(column: ColumnElement[Any]) -> ColumnElement[Any]:
-    """Return the same value in a form without an index."""
     if isinstance(column.type, Float):
         return column + 0.0
     return column.concat("") if isinstance(column.type, String) else column
 
 
 def truth(node: Node, grasps: Columns) -> ColumnElement[bool]:
-    """Return an expression in SQL: true or false for each row, never unknown, so `not` is a complement.
-
-    InputError: it uses values that the index lacks.
-    """
+    """Return an expression in SQL that is never unknown, so `not` is a complement; InputError for missing values."""
     if isinstance(node, Connective):
         return (or_ if node.word == "or" else and_)(*(truth(part, grasps) for part in node.parts))
     if isinstance(node, Negation):
@@ -358,7 +353,6 @@ def truth(node: Node, grasps: Columns) -> ColumnElement[bool]:
     if isinstance(node, Flag):
         if node.name not in _FLAGS:
             raise _unknown(node.name)
-        # A test for truth is false for NULL.
         return _FLAGS[node.name](grasps)
     if isinstance(node, MetricComparison):
         if node.name not in _METRICS:
@@ -378,7 +372,7 @@ def _unknown(name: str) -> InputError:
 
 
 class GraspFilter(Model):
-    """All conditions hold together. `at_least`, `at_most` bound metrics, inclusive; missing values fail."""
+    """Conjunction of filters. `at_least` and `at_most` are inclusive bounds of metrics; missing values fail."""
 
     hand: str | None = None
     object: str | None = None
@@ -394,7 +388,7 @@ class GraspFilter(Model):
     """False: validated, and not valid."""
     success: bool | None = None
     scene: str | None = None
-    """Kind of the scene in which it was planned; any: all but free."""
+    """Kind of the scene in which the grasp was planned; any: all except free."""
     neighbours: bool | None = None
     lift_hard: bool | None = None
     robust_weakest: str | None = None

@@ -143,7 +143,7 @@ def _task_view(row: Any) -> TaskView:
     return TaskView.model_validate({**row, **progress, "attempt": attempt})
 
 
-#: Most shards that are read: enough for the reasons, and the page stays fast.
+#: Most shards that are read: enough to show the reasons, and few enough for a fast page.
 MOST_SHARDS: Final = 1000
 
 
@@ -182,7 +182,7 @@ class Shards(IndexPart):
         return {row["id"]: (row["hand_digest"], row["object_digest"]) for row in self.database.rows(query)}
 
     def job_of(self, shard_id: str, *, scope: ProjectScope = EVERYTHING) -> str | None:
-        """Return a job in scope that requested this shard; None if a pruned index has none."""
+        """Return a job in scope that requested this shard; None if the index has none."""
         query = select(tasks.c.job_id).where(tasks.c.shard_id == shard_id, *seen_with_job(scope, tasks)).limit(1)
         found: str | None = self.database.value(query)
         return found

@@ -1,4 +1,4 @@
-"""Queries of workers, the whole service, usage and costs; those of a scrape have a constant bound."""
+"""Queries of workers, the whole service, usage and costs; the cost of a Prometheus scrape is constant."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Overview(IndexPart):
         )
 
     def valid_per_minute(self, *, since: str, scope: ProjectScope = EVERYTHING) -> dict[str, int]:
-        """Return the valid grasps of each minute (2026-11-22T08:30) since a time; minutes without shards are absent."""
+        """Return the valid grasps of each minute (2026-11-22T08:30) since a time, without empty minutes."""
         minute = func.substr(shards.c.created, 1, 16)
         query = select(minute, func.sum(shards.c.valid)).group_by(minute)
         query = query.where(shards.c.kind == "base", shards.c.created >= since, *seen_shards(scope, shards.c.id))
@@ -121,7 +121,6 @@ def _by_state(connection: Connection, table: Table, *tests: ColumnElement[bool])
     return {state: found.get(state, 0) for state in State}
 
 
-#: Unfinished jobs are counted up to here.
 MOST_JOBS: Final = 10_000
 RATE_WINDOW_S: Final = 60
 UNFINISHED: Final = (State.QUEUED, State.RUNNING)
@@ -164,7 +163,6 @@ def oldest_job(state: State) -> Select[Any]:
 
 
 def made_since(when: datetime) -> Select[Any]:
-    """Sum grasps and valid grasps."""
     text = when.isoformat(timespec="milliseconds").replace("+00:00", "Z")
     base = (shards.c.kind == "base", shards.c.created >= text)
     return select(func.sum(shards.c.count), func.sum(shards.c.valid)).where(*base)
@@ -172,7 +170,7 @@ def made_since(when: datetime) -> Select[Any]:
 
 class Usage(IndexPart):
     def days(self, since: str, until: str, *, scope: ProjectScope = EVERYTHING) -> list[UsageDay]:
-        """Return the usage of each project by day (2026-11-22), without empty days, the newest first."""
+        """Return the usage of each project by day (2026-11-22), without empty days, newest first."""
         day = func.substr(shards.c.created, 1, 10).label("day")
         sums = (_base(shards.c.count), _base(shards.c.valid), func.count(), func.sum(shards.c.seconds))
         made = select(shards.c.charged, day, shards.c.device, *sums)
@@ -196,7 +194,7 @@ class Usage(IndexPart):
         return views
 
     def gpu_seconds(self, project: str, day: str) -> float:
-        """Return the GPU workers' time for a project's requests on one day [s]."""
+        """Return the time of GPU workers for a project's requests on one day [s]."""
         return sum(one.gpu_seconds for one in self.days(day, day, scope=ProjectScope(project, everything=False)))
 
 
@@ -211,7 +209,7 @@ def _number(day: str) -> int:
 _USED: Final = ("grasps", "valid", "tasks", "gpu_seconds", "cpu_seconds")
 
 
-#: Most tasks read per stage, the newest first: old measurements of a machine matter less.
+#: Most tasks read per stage, newest first: old measurements of a machine count less.
 _NEWEST: Final = 2000
 
 
@@ -232,13 +230,12 @@ class BatchCost:
 
     @property
     def kept(self) -> int:
-        """Grasps that count towards the requested ones: valid ones, or all remaining ones without validation."""
+        """Grasps that count towards the request: valid ones, or without validation all stored ones."""
         return self.valid if self.request.counted == "valid" else self.count
 
 
 class Costs(IndexPart):
     def of_batches(self, stage: Stage, *, limit: int = _NEWEST, scope: ProjectScope = EVERYTHING) -> list[BatchCost]:
-        """Return the newest finished batches of a stage, from at most `limit` tasks."""
         columns = [shards.c[name] for name in BatchCost.__dataclass_fields__ if name != "request"]
         query = (
             select(*columns, shards.c.manifest["request"].label("request"))

@@ -1,11 +1,10 @@
 """Seconds and bytes of a batch: measured on this service's finished batches if possible, else stored.
 
-The nearest measurement counts: the same hand on the same object, else the same hand, else any hand; always with the
-same method, fidelity and validator on the same kind of device. Stored values are in `STORED` and `STORED_METHODS`, with
-their origin. After the first measurement, one factor (this machine's seconds over the stored seconds) scales all
-stored values, so that two fidelities are never compared by times of two machines.
-
-Every rate has an interval: for a measured one the scatter of its batches, for a stored one its observed error.
+The nearest measurement counts: of the same hand and object, else of the same hand, else of any hand; always with the
+same method, fidelity, validator and kind of device. `STORED` and `STORED_METHODS` have the stored values with their
+origin. After the first measurement, one factor (seconds of this machine over stored seconds) scales all stored
+values, so that comparisons of fidelities never mix two machines. Every rate has an interval: the scatter of measured
+batches, or the observed error of a stored value.
 """
 
 from __future__ import annotations
@@ -32,15 +31,15 @@ class Rate:
     batches: int
     """Finished batches of the measurement; 0: stored."""
     spread: tuple[float, float]
-    """Interval of the seconds, as factors of them."""
+    """Interval of the seconds, as factors."""
 
 
 @dataclass(frozen=True)
 class Machine:
-    """Speed of this machine relative to that of the stored numbers."""
+    """Speed of this machine relative to the stored numbers."""
 
     factor: float = 1.0
-    """Its seconds over the stored ones: the median of its batches of all fidelities and methods."""
+    """Median over all batches of the seconds here over the stored seconds."""
     spread: tuple[float, float] = (1.0, 1.0)
     """Interval of single batches, as factors of the median."""
     batches: int = 0
@@ -48,12 +47,11 @@ class Machine:
 
     @property
     def stored_spread(self) -> tuple[float, float]:
-        """Interval of a stored number on this machine, as factors of it."""
+        """Interval of a stored number on this machine, as factors."""
         low, high = SCALED_SPREAD if self.batches else STORED_SPREAD
         return low * self.spread[0], high * self.spread[1]
 
     def scaled(self, origin: str) -> str:
-        """Return the origin of a stored number with the applied factor."""
         if not self.batches:
             return origin
         return f"{origin}, x {self.factor:.2g}, measured here (batches: {self.batches})"
@@ -68,23 +66,23 @@ class StageRate:
     origin: str
     batches: int
     spread: tuple[float, float] = (1.0, 1.0)
-    """Interval of the seconds, as factors of them."""
+    """Interval of the seconds, as factors."""
 
 
-#: Least interval of a measured rate: the difference between runs of the same batches.
+#: Narrowest interval of a measured rate: the observed difference between two runs of the same batches.
 MEASURED_SPREAD: Final = (0.8, 1.25)
 #: Interval of a stored rate on a machine with a known factor: fidelities and methods scale differently.
 SCALED_SPREAD: Final = (0.5, 2.0)
-#: Interval of a stored rate on an unknown machine: a small shared one took ten times as long.
+#: Interval of a stored rate on an unknown machine: a small shared machine was ten times as slow.
 STORED_SPREAD: Final = (1 / 3, 10.0)
-#: Origin of the stored numbers: CPU times and sizes of graspd 0.1, for a worker with two cores that is busy nine tenths
-#: of its time, see docs/explanation/scaling.md.
+#: Origin of the stored numbers: CPU times and sizes of graspd 0.1, for a worker with two cores that is busy for nine
+#: tenths of the time; see docs/explanation/scaling.md.
 ORIGIN: Final = "stored default: 2 CPU cores, docs/explanation/scaling.md"
-#: Seconds per candidate, with postures, quality and verdict; valid yield of standard (its first matrix: 1,785 of 2,542
-#: candidates), also used for the others.
+#: Seconds per candidate, with postures, quality and verdict; valid yield of standard (1,785 of 2,542 candidates of the
+#: first matrix), also used for draft and fine.
 STORED: Final[dict[str, tuple[float, float]]] = {"draft": (0.13, 0.7), "standard": (0.16, 0.7), "fine": (0.24, 0.7)}
-#: The same for other methods at their source's budget: the planner's time and success in docs/results/chart.md, and the
-#: cost of postures, quality and verdict.
+#: Seconds per candidate and yield of other methods at their published budget: time and success of the planner from
+#: docs/results/chart.md, plus the cost of postures, quality and verdict.
 STORED_METHODS: Final[dict[str, tuple[float, float]]] = {
     "graspit": (1.5, 0.2),
     "graspd2022": (0.75, 0.4),
@@ -93,20 +91,20 @@ STORED_METHODS: Final[dict[str, tuple[float, float]]] = {
 }
 _BYTES_PER_GRASP: Final = 1338.0
 STORED_SCENE: Final = StageRate(0.5, 240.0, ORIGIN, 0)
-#: The same for a scene of later grasps.
+#: Seconds and bytes of a scene for existing grasps.
 STORED_PLACE: Final = StageRate(0.5, 2200.0, ORIGIN, 0)
-#: Cost of a candidate in a scene relative to a free object, and the valid share there: values of built-in hands and
-#: objects on tables, to within a factor of four.
+#: Cost of a candidate in a scene relative to a free object, and its valid share: values of built-in hands and objects
+#: on tables, to within a factor of four.
 STORED_IN_SCENE: Final = (1.6, 0.5)
 #: Seconds per valid grasp and perturbed model on two cores: 25 to 70 core-ms, for a lift 44 to 59
-#: (docs/results/robust.md). All models are counted, because few tests end early.
+#: (docs/results/robust.md). All models count, because few tests end early.
 STORED_MODEL_S: Final = 0.018
 STORED_PICTURE: Final = StageRate(2.1, 1.34e6, ORIGIN, 0)
 
 
 class Rates:
     def __init__(self, batches: Iterable[BatchCost], options: JobOptions, devices: Collection[str]) -> None:
-        """Group the batches of `synthesize` that were made with these options on these devices; empty: on all."""
+        """Group the batches of `synthesize` by these options and devices; empty: all devices."""
         self._options = options
         self._groups: dict[Hashable, list[BatchCost]] = defaultdict(list)
         recipe = recipe_of(options)
@@ -180,10 +178,7 @@ def _stored_of(options: JobOptions) -> tuple[float, float, str]:
 
 
 def machine_of(batches: Iterable[BatchCost]) -> Machine:
-    """Compare the machine of these batches of `synthesize` with the stored numbers.
-
-    Only batches with their own stored number count: as offered, without options.
-    """
+    """Compare the machine of these batches of `synthesize` with the stored numbers of the same recipes."""
     comparable = [batch for batch in batches if batch.candidates and _is_stored(batch.request)]
     ratios = [
         batch.seconds / batch.candidates / _stored_of(batch.request)[0]
@@ -210,7 +205,7 @@ def _spread(values: list[float], least: tuple[float, float]) -> tuple[float, flo
 
 
 def _whole(batches: list[BatchCost]) -> list[BatchCost]:
-    """Return the costs of at least half a full batch, if any: small ones are dominated by loading time."""
+    """Return the costs of batches that are at least half full, if any: loading dominates small batches."""
     return [batch for batch in batches if 2 * batch.candidates >= BATCH_SIZE] or batches
 
 
@@ -234,7 +229,7 @@ def _on(machine: Machine, stored: StageRate) -> StageRate:
 
 
 def scene_rate(batches: Iterable[BatchCost], options: JobOptions, machine: Machine) -> StageRate:
-    """Return seconds per batch and scene; bytes per grasp and scene, or per scene of grasps planned in it."""
+    """Return seconds per batch and scene, and bytes: per grasp and scene, or per scene for grasps planned in scenes."""
     found = [batch for batch in batches if batch.request.scenes and batch.request.in_scene == options.in_scene]
     rows = sum(batch.count for batch in found)
     if not rows:
@@ -246,7 +241,7 @@ def scene_rate(batches: Iterable[BatchCost], options: JobOptions, machine: Machi
 
 
 def picture_rate(batches: Iterable[BatchCost], options: JobOptions, machine: Machine) -> StageRate:
-    """Return seconds and bytes per million pixels, of pictures with the same channels if there are any."""
+    """Return seconds and bytes per million pixels, if possible of pictures with the same channels."""
     found = [batch for batch in batches if batch.count]
     found = [batch for batch in found if batch.request.channels == options.channels] or found
     pixels = sum(batch.count * batch.request.width * batch.request.height for batch in found) / 1e6

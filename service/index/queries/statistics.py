@@ -1,4 +1,4 @@
-"""Aggregates over many grasps: means, ranges and distributions of their metrics, in the database."""
+"""Aggregates over many grasps, computed in the database: means, ranges and distributions of metrics."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Distribution:
 
 @dataclass(frozen=True)
 class GraspKinds:
-    """Grasp types, and the cells of the sphere of approaches; grasps without either are omitted."""
+    """Counts of grasp types and of approach cells; grasps without either are omitted."""
 
     types: dict[int, int]
     """Number of grasps of each `GraspType`."""
@@ -66,7 +66,7 @@ class Statistics(IndexPart):
         with self.database.reading() as connection:
             place: ColumnElement[Any] = (value - low) / width if width > 0 else value * 0
             if connection.dialect.name == "postgresql":
-                # PostgreSQL's cast rounds, SQLite's truncates, and not every SQLite has floor().
+                # A cast to integer rounds in PostgreSQL and truncates in SQLite; some versions of SQLite lack floor().
                 place = func.floor(place)
             place = cast(place, Integer)
             query = select(place, func.count()).where(value.between(low, high), *sql_conditions(where)).group_by(place)
@@ -77,10 +77,11 @@ class Statistics(IndexPart):
     def side_by_side(
         self, filters: Sequence[GraspFilter], metrics: Sequence[Metric], *, bins: int = 20, at_most: int = 20_000
     ) -> dict[Metric, list[Distribution | None]]:
-        """Return one distribution per metric and filter in common bins, from at most about `at_most` grasps each.
+        """Return one distribution per metric and filter in common bins; None without grasps.
 
-        None without grasps. The id of a shard is a digest, so ids below a bound are a fair sample, and they are
-        adjacent in the index.
+        The grasps are a sample of about `at_most` per filter: ids of shards are digests, so the ids below a bound are a
+        fair
+        sample, and they are adjacent in the index.
         """
         samples = [self._values(where, metrics, at_most) for where in filters]
         found: dict[Metric, list[Distribution | None]] = {}
@@ -93,14 +94,13 @@ class Statistics(IndexPart):
         return found
 
     def _values(self, where: GraspFilter, metrics: Sequence[Metric], at_most: int) -> NDArray[np.float64]:
-        """Return the metrics (N, M) of the sampled grasps; nan: not measured."""
         with self.database.reading() as connection:
             query = select(*(grasps.c[metric] for metric in metrics)).where(*_sampled(connection, where, at_most))
             rows = [tuple(row) for row in connection.execute(query)]
         return np.array(rows, float).reshape(-1, len(metrics))
 
     def kinds(self, where: GraspFilter, *, at_most: int = 20_000) -> GraspKinds:
-        """Return types and directions, from about `at_most` grasps as sampled by `side_by_side`."""
+        """Return types and directions of about `at_most` grasps, sampled as in `side_by_side`."""
         columns = grasps.c.grasp_type, grasps.c.approach_cell
         with self.database.reading() as connection:
             query = select(*columns, func.count()).where(*_sampled(connection, where, at_most)).group_by(*columns)

@@ -1,4 +1,4 @@
-"""Actions of a user on datasets: create, cancel, retry, snapshot. The controller carries them out."""
+"""Actions of users on datasets: create, cancel, retry, snapshot. The controller carries them out."""
 
 from __future__ import annotations
 
@@ -39,12 +39,11 @@ def create(
 ) -> tuple[DatasetView, bool]:
     """Record a dataset; the controller plans its jobs. Equal hands, objects and options give one dataset.
 
-    Returns:
-        the dataset, and whether it is new. A failed or cancelled one is returned unchanged: see `retry`.
+    Return the dataset, and whether it is new. A failed or cancelled dataset is returned unchanged: see `retry`.
 
     Raises:
         NotFoundError: unknown hand, object, neighbour, network or set.
-        InputError: one of them failed its check; the network is of another hand; no chart meets the target.
+        InputError: a failed check; a network of another hand; no chart meets the target.
         ConflictError: a check is still running, or another dataset has the name.
         LimitError: more than `MAX_CELLS` cells.
     """
@@ -77,10 +76,11 @@ def create(
 
 
 def cancel(services: Services, name: str) -> DatasetView:
-    """Stop a dataset: plan no more jobs and cancel its unfinished ones. Finished shards stay.
+    """Stop a dataset: plan no more jobs and cancel unfinished ones; finished shards stay.
 
-    A job continues if another dataset waits for it or another key submitted it. NotFoundError for an unknown dataset,
-    ConflictError for one that is finished or cancelled already.
+    A job continues if another dataset needs it or another key submitted it. Raises NotFoundError for an unknown
+    dataset,
+    ConflictError for a finished or cancelled one.
     """
     with recording(services) as (connection, put):
         dataset = services.index.datasets.get(name)
@@ -101,10 +101,7 @@ def retry(services: Services, name: str) -> DatasetView:
 
 
 def snapshot(services: Services, name: str) -> tuple[Snapshot, bool]:
-    """Record the present shards of a dataset. Equal shards give the same snapshot.
-
-    Return the snapshot, and whether it is new; NotFoundError without the dataset, ConflictError without a shard.
-    """
+    """Record the present shards; return the snapshot, and whether it is new. ConflictError without a shard."""
     dataset = services.index.datasets.get(name)
     held = tuple(services.index.datasets.shards(name))
     if not held:
@@ -140,19 +137,16 @@ def add_object_set(
     scope: ProjectScope = EVERYTHING,
     may_follow: Callable[[str, str], None] = lambda owner, project: None,
 ) -> ObjectSetView:
-    """Give objects a common name. Equal objects change nothing; others make a new version, with the owner of the set.
+    """Give objects a common name. Equal objects change nothing; others make a new version with the same owner.
 
-    Args:
-        may_follow: called with owner and project of the set before a new version; raises if that is refused.
-
-    Raises:
-        NotFoundError, InputError, ConflictError: as in `usable`, or no object is given.
+    `may_follow` receives owner and project of the set before a new version, and may raise. Errors as in `usable`;
+    InputError without objects.
     """
     assets = [services.index.assets.get(AssetKind.OBJECT, one, scope=scope) for one in objects]
     wanted = tuple(asset.name for asset in assets)
     if not wanted:
-        raise InputError(f"the set {name!r} holds no object; name some")
-    # Of two concurrent requests for one name, the later must see the set of the earlier.
+        raise InputError(f"the set {name!r} holds no object; name at least one")
+    # Of two concurrent requests for one name, the later one must see the set of the earlier one.
     with recording(services) as (connection, put):
         after, project = "", scope.project
         if (present := services.index.object_sets.named(name)) is not None:

@@ -5,8 +5,8 @@
                          + pictures x seconds per picture
     time of W workers  = the larger of seconds / W and rounds of batches x seconds of a batch
 
-The rates and their intervals come from `service.index.queries.rates`. Intervals add, as if all errors were correlated.
-A worker is one process of `graspd worker` on a device like the measured ones.
+`service.index.queries.rates` provides rates and intervals. Intervals add, as if all errors were correlated. A worker is
+one process of `graspd worker` on a device like the measured ones.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from graspd.service.pipeline.datasets.estimate import Estimate, RateUsed, Worker
 from graspd.service.pipeline.datasets.spec import MAX_CELLS, Matrix
 
 WORKERS: Final = (1, 8, 64)
-#: A task in the queue and its events, both directions (docs/explanation/scaling.md) [bytes].
+#: Traffic of a task in the queue and its events, in both directions (docs/explanation/scaling.md) [bytes].
 _MESSAGE_BYTES: Final = 19_500
-#: An object of unknown size: a scan of 5000 faces as STL [bytes].
+#: Size of an unknown object: a scan of 5000 faces as STL [bytes].
 _ASSET_BYTES: Final = 250_000
 _SHOWN_RATES: Final = 20
 Batches = Callable[[Stage], list[BatchCost]]
@@ -62,10 +62,8 @@ def estimate(
 ) -> Estimate:
     """Estimate the cost of a matrix. Hands and objects need not exist yet.
 
-    Args:
-        resolve: replaces `auto` by a fidelity; InputError if no chart contains one that meets the target.
-        costs: returns the finished batches of a stage; None: read from the index.
-        scope: which sets of objects the matrix may name, and whose measurements count.
+    `resolve` replaces `auto` by a fidelity, or raises InputError if no chart meets the target. `costs` returns the
+    finished batches of a stage; None: read from the index. `scope` limits sets of objects and measurements.
     """
     objects = objects_of(index, matrix, scope)
     options = matrix.shared
@@ -169,7 +167,7 @@ def _plan(
     """Compute the plan; one worker runs all stages of a batch, so a round takes as long as a batch."""
     share = max(1 / workers, math.ceil(batches / workers) / batches)
     seconds, low, high = (total * share for total in totals)
-    # Each worker reads hand and object of a cell once, and caches them while it works on that cell.
+    # Each worker reads hand and object of a cell once, and caches them while it works on the cell.
     moved = network + assets * min(workers, max(1, batches // cells))
     return WorkersPlan(
         workers=workers,

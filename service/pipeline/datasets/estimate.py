@@ -11,7 +11,7 @@ from graspd.service.model.states import Stage
 
 
 class WorkersPlan(View):
-    """The same dataset on a number of workers."""
+    """Time and network traffic of the dataset with a number of workers."""
 
     workers: int
     seconds: float = Field(description="expected time until the dataset is done [s]")
@@ -34,11 +34,9 @@ class RateUsed(View):
 
 
 class Estimate(View):
-    """Estimated cost of a dataset. Seconds are of one worker."""
-
     cells: int
     asked: int = Field(description="grasps requested in all cells")
-    candidates: int = Field(description="candidates to plan for these")
+    candidates: int = Field(description="candidates to plan for the requested grasps")
     valid: int = Field(description="expected number of grasps of the kind in `counted`")
     counted: Literal["valid", "feasible"] = Field(
         "valid", description="kind of grasps that `valid` counts: feasible ones without validation"
@@ -55,6 +53,6 @@ class Estimate(View):
     storage_bytes: int
     storage_by_kind: dict[str, int]
     plans: list[WorkersPlan]
-    rates: list[RateUsed] = Field(description="rates of the estimate, those of most cells first; a long list is cut")
+    rates: list[RateUsed] = Field(description="rates of the estimate, sorted by number of cells; a long list is cut")
     measured_share: float = Field(description="share of the cells with a rate measured here")
     unknown: list[str] = Field(description="hands and objects unknown to the service")

@@ -11,7 +11,7 @@ from graspd.service.model.errors import InputError
 from graspd.service.model.records import Snapshot, SnapshotShard
 from graspd.service.store.integrity import check_digest
 
-#: Bytes of a shard, in chunks: from the API or from the store.
+#: Bytes of a shard, in chunks, from the API or from the store.
 Fetch = Callable[[SnapshotShard], Iterable[bytes]]
 #: Called after each file: files done, files in all, bytes fetched so far.
 Progress = Callable[[int, int, int], None]
@@ -19,10 +19,9 @@ _CHUNK: Final = 1 << 20
 
 
 def export_shards(snapshot: Snapshot, folder: Path, fetch: Fetch, progress: Progress | None = None) -> int:
-    """Export the HDF5 files as `HAND/OBJECT/KIND-BATCH.h5`, with `SHA256SUMS` and `snapshot.json`.
+    """Export the HDF5 files as `HAND/OBJECT/KIND-BATCH.h5`, with `SHA256SUMS` and, last, `snapshot.json`.
 
-    `snapshot.json` is written last: a folder that contains it is complete. Return the number of fetched files;
-    DamagedShard: the checksum of a file differs from the snapshot's.
+    Return the number of fetched files; DamagedShard if the checksum of a file differs from the snapshot's.
     """
     _make(folder)
     fetched = size = 0
@@ -59,7 +58,7 @@ def _is_there(path: Path, shard: SnapshotShard) -> bool:
 
 
 def _fetch(shard: SnapshotShard, path: Path, fetch: Fetch) -> None:
-    """Fetch a shard; the file gets its name once it is complete and its checksum is right."""
+    """Fetch a shard; the file gets its name after a check of its checksum."""
     draft = path.with_name(f".{path.name}.part")
     digest = hashlib.sha256()
     try:

@@ -1,7 +1,7 @@
 """Users' actions on datasets, a part in each round of the controller: plan, cancel and retry jobs.
 
-A killed controller's successor continues, because the index records which cells have a job. A job's event
-names the causing event of the dataset, so no event is applied twice.
+The index records which cells have a job, and a job's event names the causing event of the dataset, so another
+controller can continue without applying an event twice.
 """
 
 from __future__ import annotations
@@ -21,14 +21,12 @@ from graspd.service.pipeline.ranges import TaskRanges
 from graspd.service.store.records import job_events
 
 log = logging.getLogger(__name__)
-#: Time for datasets in one round of the controller [s]; queue and lost workers must not wait long.
+#: Most time for datasets in one round of the controller [s], because queue and lost workers must not wait long.
 BUDGET_S: Final = 0.5
 _CELLS_AT_ONCE: Final = 20
 
 
 class DatasetRounds:
-    """Process the datasets with pending work, the oldest first."""
-
     def __init__(self, services: Services, *, clock: Callable[[], float] = time.monotonic) -> None:
         self._services = services
         self._clock = clock
@@ -36,7 +34,7 @@ class DatasetRounds:
         self._positions: dict[tuple[str, int], int] = {}
 
     def advance(self, budget_s: float = BUDGET_S) -> bool:
-        """Work for at most `budget_s`. Return whether work is left."""
+        """Work for at most `budget_s`; return whether work is left."""
         deadline = self._clock() + budget_s
         for work in self._services.index.dataset_feed.in_work():
             if not self._pass_on(work, deadline) or not self._plan(work, deadline):
@@ -88,5 +86,5 @@ class DatasetRounds:
         try:
             act(self._services, job, cause=cause)
         except ConflictError as error:
-            # It ended or was restarted since the query of the index.
-            log.info("job %s of dataset %s is left as it is: %s", job, work.name, error)
+            # The job ended or was restarted since the query of the index.
+            log.info("job %s of dataset %s is unchanged: %s", job, work.name, error)

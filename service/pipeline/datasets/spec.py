@@ -16,11 +16,11 @@ from graspd.service.model.records import Choice, DatasetRecord, Member, request_
 from graspd.service.model.renamed import original
 from graspd.service.model.version import STAGE_REVISIONS
 
-#: Larger matrices must be split by the user: a record of this many cells has 4 MB.
+#: Most cells of a dataset: a record of this many cells has 4 MB.
 MAX_CELLS: Final = 100_000
 
 
-#: Names without repetitions: these are the same cell.
+#: Unique names, because repeated names would be one cell.
 Names = Annotated[tuple[Name, ...], AfterValidator(lambda given: tuple(dict.fromkeys(given)))]
 
 
@@ -36,7 +36,7 @@ class Matrix(JobOptions):
     @model_validator(mode="after")
     def _has_objects(self) -> Self:
         if not self.objects and not self.sets:
-            raise ValueError("a dataset needs objects: name some, or a set of them")
+            raise ValueError("a dataset needs objects: name objects, or a set of objects")
         return self
 
     @property
@@ -45,15 +45,13 @@ class Matrix(JobOptions):
 
 
 class DatasetRequest(Matrix):
-    """A matrix with a name."""
-
-    name: Name = Field(description="name of the dataset; `estimate` is taken by an address of the API")
+    name: Name = Field(description="name of the dataset; `estimate` is reserved")
 
     @field_validator("name")
     @classmethod
     def _is_free(cls, value: str) -> str:
         if value == "estimate":
-            raise ValueError("the API answers estimates at this name; take another one")
+            raise ValueError("this name is reserved for estimates; choose another one")
         return value
 
 
@@ -71,7 +69,6 @@ def describe(
     `choose` replaces `auto` by a fidelity, or raises InputError if none meets the target on one of the cells.
     """
     cells = [(hand, obj, *choose(request_of(options, hand.name, obj.name))) for hand in hands for obj in objects]
-    # A chosen fidelity has a name.
     fidelities = tuple(str(request.fidelity) for _, _, request, _ in cells) if options.fidelity == AUTO else ()
     found = [choice for *_, choice in cells if choice is not None]
     places = {choice: place for place, choice in enumerate(dict.fromkeys(found))}

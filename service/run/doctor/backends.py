@@ -37,7 +37,6 @@ from graspd.service.run.embedded import find_server
 from graspd.service.settings import Settings
 from graspd.service.store.store import Store, open_store
 
-#: Oldest tested version.
 _OLDEST: Final = (6, 2)
 
 _SLOW_REDIS_S: Final = 0.02
@@ -74,7 +73,7 @@ def redis(settings: Settings) -> Finding:
 def _check_redis(settings: Settings, client: Redis, info: Mapping[str, Any]) -> Finding:
     version = str(info.get("redis_version", "0"))
     if int(info.get("cluster_enabled", 0)):
-        return bad("it is a Redis Cluster: tasks move between keys of several nodes", "name a plain Redis")
+        return bad("it is a Redis Cluster: tasks move between keys of several nodes", "use Redis without cluster mode")
     if info.get("role") != "master":
         return bad(f"it is a {info.get('role')}: it cannot be written", "name the primary in GRASPD_REDIS_URL")
     most, policy = int(info.get("maxmemory", 0)), str(info.get("maxmemory_policy", "noeviction"))
@@ -84,7 +83,7 @@ def _check_redis(settings: Settings, client: Redis, info: Mapping[str, Any]) -> 
     used = int(info.get("used_memory", 0))
     if most and used > _FULL * most:
         return bad(
-            f"{used >> 20} of {most >> 20} MiB are used", "redis-cli config set maxmemory to more; see who else uses it"
+            f"{used >> 20} of {most >> 20} MiB are used", "increase maxmemory, or find other users of this Redis"
         )
     seconds = _write(client)
     line = f"Redis {version} at {_shown(settings)}, {1000 * seconds:.1f} ms, {used >> 20} MiB"
@@ -103,7 +102,7 @@ def _check_redis(settings: Settings, client: Redis, info: Mapping[str, Any]) -> 
 
 
 def _write(client: Redis) -> float:
-    """Return the duration of a write and a read [s]. Raises RedisError if writes are refused."""
+    """Return the duration of a write and a read [s]; RedisError if writes are refused."""
     key, value = f"graspd:doctor:{secrets.token_hex(8)}", secrets.token_bytes(8)
     start = time.perf_counter()
     client.set(key, value, ex=60)
@@ -111,7 +110,7 @@ def _write(client: Redis) -> float:
     seconds = (time.perf_counter() - start) / 2
     client.delete(key)
     if found != value:
-        raise RedisError("a written value is read differently")
+        raise RedisError("a value changed between write and read")
     return seconds
 
 
@@ -131,7 +130,7 @@ def persistence(settings: Settings) -> Finding:
                 return bad(f"the log of writes fails ({what}: {info[what]})", fix)
         return good("the log of writes is on: a killed Redis restarts with its tasks")
     if info.get("rdb_last_bgsave_status", "ok") != "ok":
-        return bad("its snapshots fail, and it may refuse writes", "make room on the disk of Redis and see its log")
+        return bad("snapshots of Redis fail; it may refuse writes", "make room on the disk of Redis and see its log")
     return warning(
         "the log of writes is off: after a crash nothing runs until the controller has queued everything again",
         "redis-cli config set appendonly yes, and `appendonly yes` in its configuration",
@@ -150,14 +149,14 @@ def _fix(error: Exception, settings: Settings) -> str:
     if "NOAUTH" in said or "WRONGPASS" in said or "AUTHENTICATION" in said:
         return "put the password into GRASPD_REDIS_URL: redis://:PASSWORD@HOST:6379/0"
     if "MISCONF" in said or "OOM" in said:
-        return "it cannot write: make room on its disk or in its memory, and see its log"
+        return "Redis cannot write: free disk space or memory, and see its log"
     if settings.redis_url is None:
         return "the service of this data folder crashed: start `graspd up` again"
     return _START
 
 
 _NONE_HERE: Final = (
-    "no index is here: GRASPD_INDEX_URL is unset and there is no index.sqlite; only api and controller need one"
+    "there is no index here: GRASPD_INDEX_URL is unset and there is no index.sqlite; only api and controller need one"
 )
 _REBUILD: Final = (
     "graspd admin index rebuild --check shows all of it; graspd admin index rebuild fixes it while the service runs"
@@ -170,16 +169,15 @@ _SETTLES_S: Final = 3.0
 
 
 def index(settings: Settings) -> Finding:
-    """Check connection, integrity and schema of the index; changes nothing."""
     try:
         found = look(settings.resolved_index_url)
     except IndexDamaged as error:
-        return bad(str(error), "graspd admin index rebuild: it is moved aside and made again from the store")
+        return bad(str(error), "graspd admin index rebuild: moves the index aside and fills a new one from the store")
     except InputError as error:
         return bad(str(error), "see the message, and GRASPD_INDEX_URL")
     except UnavailableError as error:
         fix = "start the database; see host, user, password and database in GRASPD_INDEX_URL"
-        return bad(str(error), fix if settings.index_url is not None else "see who may read the file")
+        return bad(str(error), fix if settings.index_url is not None else "check the permissions of the file")
     if found is not None:
         return _check_index(settings, found)
     if settings.index_url is None:
@@ -197,11 +195,11 @@ def _check_index(settings: Settings, found: IndexCondition) -> Finding:
     if found.revision and not found.is_ready and found.revision > found.newest:
         return bad(
             f"{line}: a newer graspd made it; this one knows {found.newest}",
-            "install the newer version here, or graspd admin index rebuild: it is made again from the store",
+            "install the newer version here, or graspd admin index rebuild: fills a new index from the store",
         )
     if found.revision and not found.is_ready:
         return bad(
-            f"{line}: this graspd has {found.newest}", "graspd admin index rebuild: it is made again from the store"
+            f"{line}: this graspd has {found.newest}", "graspd admin index rebuild: fills a new index from the store"
         )
     if not found.is_ready:
         return warning(line, "the next start makes its tables")
@@ -228,7 +226,6 @@ def _openable(settings: Settings) -> str:
 
 
 def index_identity(settings: Settings) -> Finding:
-    """Check whether store, index and Redis belong to one service; changes nothing."""
     folder = local_store(settings)
     if folder is not None and not folder.exists():
         return skipped("there is no store yet")
@@ -253,7 +250,7 @@ def index_identity(settings: Settings) -> Finding:
 
 
 def index_is_store(settings: Settings, *, full: bool = False, settles_s: float = _SETTLES_S) -> Finding:
-    """Compare the rows with the store. Differences in only one of two comparisons are still being indexed."""
+    """Compare the rows with the store. A difference in only one of two comparisons is an event in progress."""
     if why := _openable(settings):
         return skipped(why)
     store = open_store(settings.resolved_store_url)
@@ -310,7 +307,6 @@ def store_damage(settings: Settings) -> Finding:
 
 _FOLDER: Final = "health"
 
-#: Limit for a dozen requests.
 _SLOW_STORE_S: Final = 5.0
 #: Number of concurrent writers of one name; only one may succeed.
 _RIVALS: Final = 4
@@ -334,7 +330,7 @@ def store(settings: Settings) -> Finding:
 
 
 def check_store(opened: Store) -> Finding:
-    """Return the finding on an open store. Raises GraspdError if an operation fails."""
+    """Return the finding on an open store; GraspdError if an operation fails."""
     key = f"{_FOLDER}/doctor-{secrets.token_hex(8)}"
     start = time.perf_counter()
     try:

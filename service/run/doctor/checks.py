@@ -1,7 +1,4 @@
-"""Checks of an installation: findings with fixes.
-
-They run in parallel with timeouts, so that one hanging part does not hide the state of the others.
-"""
+"""Checks of an installation, with fixes; parallel, with timeouts, so that a hanging part does not hide the others."""
 
 from __future__ import annotations
 
@@ -14,13 +11,10 @@ from typing import Final
 
 from graspd.service.model.errors import GraspdError
 
-#: Prefix of the names of check threads.
 THREADS: Final = "doctor-"
 
 
 class Condition(StrEnum):
-    """Condition of a checked part."""
-
     GOOD = "good"
     WARNING = "warning"
     BAD = "bad"
@@ -38,7 +32,6 @@ class Finding:
 
     @property
     def ok(self) -> bool:
-        """Whether no fix is necessary."""
         return self.condition is not Condition.BAD
 
 

@@ -1,7 +1,7 @@
 """Checks of the fleet: controller, capable workers, the API, and clocks.
 
-Leases use each process's own monotonic clock, so work continues with wrong clocks. They affect displayed and sorted
-times, expiry of keys, the grace time of shards, and S3, which refuses requests off by fifteen minutes.
+Leases use each process's own monotonic clock, so work continues with wrong clocks. Wrong clocks affect times shown and
+sorted, expiry of keys, the grace time of shards, and S3, which refuses requests off by fifteen minutes.
 """
 
 from __future__ import annotations
@@ -47,11 +47,10 @@ def _asked(settings: Settings, look: Callable[[RqQueue], Finding]) -> Finding:
 
 
 def controller(settings: Settings) -> Finding:
-    """Check for a recent heartbeat of a controller."""
     dead = bad(
         "no heartbeat from a controller: finished tasks are not indexed, and nothing is queued", "graspd controller"
     )
-    return _asked(settings, lambda queue: good("a controller lives") if queue.announced(PART) else dead)
+    return _asked(settings, lambda queue: good("a controller is alive") if queue.announced(PART) else dead)
 
 
 def workers(settings: Settings) -> Finding:
@@ -79,7 +78,7 @@ def _check_workers(beats: list[WorkerBeat], waiting: Counter[Stage]) -> Finding:
     if alone := sorted(stage.value for stage in waiting if stage not in served):
         tasks = sum(number for stage, number in waiting.items() if stage not in served)
         return bad(
-            f"{tasks} tasks wait, and no worker takes {', '.join(alone)}", f"graspd worker --stages {','.join(alone)}"
+            f"{tasks} tasks wait, and no worker serves {', '.join(alone)}", f"graspd worker --stages {','.join(alone)}"
         )
     if not beats:
         return warning("there is no worker, and no task waits", "graspd worker, or graspd up --workers 1")
@@ -89,7 +88,6 @@ def _check_workers(beats: list[WorkerBeat], waiting: Counter[Stage]) -> Finding:
 
 
 def port(settings: Settings) -> Finding:
-    """Check whether this service's API answers and is ready."""
     url = recorded_address(settings.data_dir)
     if url is None and "api_url" in settings.model_fields_set:
         url = settings.api_url
@@ -138,7 +136,6 @@ _FIX: Final = "timedatectl set-ntp true, or chronyd, on the machine whose clock 
 
 
 def clocks(settings: Settings) -> Finding:
-    """Compare the clocks of the other machines with this one."""
     offsets = dict(_offsets(settings))
     if not offsets:
         return skipped("only this machine's clock can be read")

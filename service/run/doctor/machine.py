@@ -19,7 +19,7 @@ from graspd.service.settings import Settings
 from graspd.service.store.store import local_folder
 
 _GIB: Final = 2**30
-#: Below this, a worker's scratch files, a shard and the log of Redis may not fit together.
+#: Least free space: a worker's scratch files, a shard and the log of Redis must fit together.
 _DISK_BAD: Final = 1 * _GIB
 _DISK_LOW: Final = 5 * _GIB
 _FEW_INODES: Final = 10_000
@@ -37,7 +37,6 @@ def local_store(settings: Settings) -> Path | None:
 
 
 def disk(settings: Settings, *, usage: Callable[[Path], tuple[int, int, int]] = shutil.disk_usage) -> Finding:
-    """Check the disk space for data, results, caches and scratch files."""
     found = []
     for what, folder, variable in _folders(settings):
         there = existing(folder)
@@ -65,7 +64,6 @@ def _folders(settings: Settings) -> Iterable[tuple[str, Path, str]]:
 
 
 def existing(folder: Path) -> Path:
-    """Return the folder, or its nearest existing ancestor."""
     return next(one for one in (folder, *folder.parents) if one.exists())
 
 
@@ -95,7 +93,6 @@ def data_folder(settings: Settings, *, mounts: Path = Path("/proc/self/mounts"))
 
 
 def filesystem(folder: Path, mounts: Path = Path("/proc/self/mounts")) -> str:
-    """Return the file system type of a folder; "" if unknown."""
     try:
         lines = [line.split() for line in mounts.read_text().splitlines()]
     except OSError:

@@ -227,7 +227,7 @@ def test_an_api_that_cannot_start_says_why_in_one_line(graspd: Shell, tmp_path: 
     no_store = Shell(graspd.environment | {"GRASPD_STORE_URL": (tmp_path / "file" / "store").as_uri()})
     with socket.create_server(("127.0.0.1", 0)) as taken:
         for shell, arguments, code, words in (
-            (graspd, ("--port", str(taken.getsockname()[1])), 1, "taken"),
+            (graspd, ("--port", str(taken.getsockname()[1])), 1, "in use"),
             (graspd, ("--host", "0.0.0.0", "--port", "0"), 2, "graspd keys add"),
             (no_store, ("--port", "0"), 1, str(tmp_path / "file")),
         ):
@@ -256,7 +256,7 @@ def test_a_job_with_a_target_says_how_its_fidelity_was_chosen(graspd: Shell, ser
     assert told in done.stdout
     assert graspd.json(*asked, "lift>=0.9")["choice"]["reached"] == 0.95
     done = graspd(*asked, "gsr>=0.8")
-    assert done.returncode == 2 and "charts in scenes hold lift, lift_dexgraspbench, lift_hard, robust" in said(done)
+    assert done.returncode == 2 and "charts in scenes contain lift, lift_dexgraspbench, lift_hard, robust" in said(done)
 
 
 def until(service: Supervisor, name: str, state: State) -> None:

@@ -138,7 +138,7 @@ def test_a_dataset_and_a_job_have_the_same_options(http: TestClient, services: S
     for options in (services.index.datasets.get("heavy").options, job):
         assert (options.min_payload, options.shake, options.robust) == (0.5, True, 0.75)
     refused = http.post("/submit", data=pair | {"shake": "true"})
-    assert refused.status_code == 422 and "lifted out of a scene" in refused.text
+    assert refused.status_code == 422 and "a lift out of a scene" in refused.text
 
 
 @pytest.fixture

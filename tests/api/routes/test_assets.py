@@ -221,7 +221,7 @@ def test_an_upload_that_says_what_no_network_has_is_refused(http: TestClient) ->
 def test_a_file_larger_than_any_network_is_not_read(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(network_file, "MAX_BYTES", 10)
     file = io.BytesIO(b"x" * 11)
-    with pytest.raises(LimitError, match="no proposal network needs as much"):
+    with pytest.raises(LimitError, match="a proposal network is smaller"):
         files_of_upload(AssetKind.NETWORK, "net.npz", file, limit_bytes=100)
     assert file.tell() == 0
 

@@ -269,7 +269,7 @@ def test_every_kind_of_damage_to_the_index_is_seen_and_mended(services: Services
         connection.execute(insert(tables.object_sets).values(name="x", digest="x", objects=[], created="x"))
     found = differences(services.index, services.store)
     assert {line.split()[0] for line in found} >= {"grasps", "shards", "object_sets"}
-    for words in ("not in the index", "not in the store", "the store says"):
+    for words in ("not in the index", "not in the store", "in the store "):
         assert any(words in line for line in found)
     rebuild(services.index, services.store)
     assert differences(services.index, services.store) == []
@@ -377,7 +377,7 @@ def test_text_that_a_database_would_refuse_stops_nothing(services: Services) -> 
 @pytest.mark.postgres
 def test_what_a_database_cannot_hold_is_not_taken_for_an_outage(postgres_server: PostgresServer) -> None:
     index = Index(postgres_server.database())
-    with pytest.raises(InputError, match="cannot hold"), index.database.writing() as connection:
+    with pytest.raises(InputError, match="cannot store"), index.database.writing() as connection:
         connection.execute(tables.workers.insert().values(name="x" * 999))
     index.close()
 

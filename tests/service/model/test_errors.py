@@ -44,7 +44,7 @@ def test_controls_of_a_terminal_are_quoted_and_other_scripts_are_not() -> None:
         ({"stereo": "perhaps"}, "stereo: must be true or false"),
         (
             {"hand": "a/b"},
-            "hand: must begin with a letter or digit and hold at most 64 letters, digits, dots, dashes and underscores",
+            "hand: must begin with a letter or digit and have at most 64 letters, digits, dots, dashes and underscores",
         ),
         ({"want": "vaild"}, "want: must be one of valid, candidates; did you mean valid?"),  # codespell:ignore vaild
         ({"target": "x" * 41}, "target: must have at most 40 characters"),

@@ -97,8 +97,8 @@ def test_a_fidelity_that_lifted_nothing_promises_no_robust_lift() -> None:
 @pytest.mark.parametrize(
     ("target", "chart", "words"),
     [
-        ("gsr>=0.6", scene_chart(), r"charts in scenes hold lift, .*, robust; write lift>=0\.9"),
-        ("lift>=0.9", CHART, r"charts of free objects hold gsr, .*, pd_mm; write gsr"),
+        ("gsr>=0.6", scene_chart(), r"charts in scenes contain lift, .*, robust; write lift>=0\.9"),
+        ("lift>=0.9", CHART, r"charts of free objects contain gsr, .*, pd_mm; write gsr"),
         ("lift<=0.9", scene_chart(), r"write lift>=0\.9"),
         ("dexgraspbench>=0.6", CHART, "lacks dexgraspbench of fast_graspd"),
         ("lift>=0.99", scene_chart(), r"best measured lift is 0\.95"),

@@ -128,7 +128,7 @@ def test_up_on_a_taken_port_is_one_clear_line(tmp_path: Path) -> None:
         port = taken.getsockname()[1]
         shown = runner.invoke(app, ["up", "--port", str(port), "--data-dir", str(tmp_path / "data")])
     assert shown.exit_code == 1
-    assert shown.stderr.splitlines()[-1].startswith(f"graspd: port {port} on 127.0.0.1 is taken; ")
+    assert shown.stderr.splitlines()[-1].startswith(f"graspd: port {port} on 127.0.0.1 is in use; ")
     with Supervisor(Settings(data_dir=tmp_path / "data", port=0), workers=0, api=False):
         pass  # nothing was left locked
 

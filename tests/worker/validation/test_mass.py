@@ -111,7 +111,7 @@ def test_the_letter_has_the_mass_of_the_protocol() -> None:
 def test_what_is_said_with_a_job_goes_over_what_the_file_says() -> None:
     assert object_from_path("block").mass == pytest.approx(650 * object_from_path("block").volume)
     assert object_from_path("block", options={"mass": 0.4}).mass == 0.4
-    with pytest.raises(MeshError, match="give one of them"):
+    with pytest.raises(MeshError, match="exclude each other"):
         object_from_path("block", options={"mass": 0.4, "density": 3.0})
     with pytest.raises(MeshError, match="100 kg"):
         BOX.weighing(density=1e7)

@@ -80,7 +80,7 @@ def test_a_manifest_or_row_that_is_gone_is_bad(
 def test_a_row_that_differs_is_bad(kept: Services) -> None:
     change_row(kept)
     found = backends.index_is_store(kept.settings, settles_s=0.0)
-    assert not found.ok and shard_of(kept).stem in found.message and "the store says" in found.message
+    assert not found.ok and shard_of(kept).stem in found.message and "in the store " in found.message
 
 
 def test_what_is_on_its_way_in_is_no_difference(kept: Services, look: Look, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -152,7 +152,7 @@ def test_tasks_of_a_stage_that_nobody_serves_are_bad(settings: Settings, rq_queu
     present(rq_queue, stages=(Stage.INGEST, Stage.SCENE))
     rq_queue.enqueue([task("a", stage=Stage.RENDER), task("b", stage=Stage.SCENE)], Priority.BULK)
     found = workers(settings)
-    assert not found.ok and "1 tasks wait, and no worker takes render" in found.message
+    assert not found.ok and "1 tasks wait, and no worker serves render" in found.message
     assert found.fix == "graspd worker --stages render"
 
 
