@@ -272,9 +272,9 @@ def test_hands_are_drawn_to_an_object_at_their_first_start_alone(free, monkeypat
     pulls: list[tuple[float, float]] = []
     work = planner._work
 
-    def watched(launch, begun):
+    def watched(launch, begun, *rest):
         pulls.append((launch.coarse.options.pull, launch.fine.options.pull))
-        return work(launch, begun)
+        return work(launch, begun, *rest)
 
     monkeypatch.setattr(planner, "_work", watched)
     monkeypatch.setattr(planner, "FREE", (FAILED, FAILED))
