@@ -46,7 +46,7 @@ browser: $(STAMP) ## Chromium and Playwright for the dashboard's tests (Debian, 
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,browser]'
 
 screenshots: $(STAMP) ## the dashboard's pages of a real service, for docs/how-to/dashboard.md (needs make browser)
-	$(BIN)/python -m tests.browser.screenshots
+	$(BIN)/python -m benchmarks.screenshots
 
 docs: $(STAMP) ## rewrite the tables in the docs that follow from the code
 	$(BIN)/python -m graspd.service.docs
@@ -72,7 +72,7 @@ dist: $(STAMP) ## wheel and sdist in dist/, the same bytes from the same sources
 	$(BIN)/python docker/dist.py dist
 
 pins: $(STAMP) ## versions and hashes that the images install: those of .venv (asks the package index)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,postgres,otel,gpu]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,postgres,gpu]'
 	$(BIN)/python docker/pin.py
 
 licences: $(STAMP) ## licences of what graspd runs with, into docs/reference/licences.md

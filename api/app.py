@@ -52,8 +52,11 @@ def create_app(settings: Settings, services: Services | None = None) -> FastAPI:
     """Create the application with given services, or with its own, which it opens and closes."""
     proxy = Proxy(settings)
     keys = KeyFile(settings.resolved_keys_file, closed=proxy.is_on)
-    if not proxy.is_on:
-        check_exposure(settings.host, keys)
+    if not (proxy.is_on or keys.has_live_key or is_loopback(settings.host)):
+        raise InputError(
+            f"{settings.host} is reachable from other machines and there is no valid key; "
+            "make one with `graspd keys add NAME --scope admin`, or bind 127.0.0.1"
+        )
     opened = services or Services.open(settings)
     if services is None:
         identify_if_redis_answers(opened)
@@ -94,14 +97,6 @@ def create_app(settings: Settings, services: Services | None = None) -> FastAPI:
     _add_middleware(app, settings, keys, proxy, rates)
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
     return app
-
-
-def check_exposure(host: str, keys: KeyFile) -> None:
-    if not keys.has_live_key and not is_loopback(host):
-        raise InputError(
-            f"{host} is reachable from other machines and there is no valid key; "
-            "make one with `graspd keys add NAME --scope admin`, or bind 127.0.0.1"
-        )
 
 
 def _add_middleware(app: FastAPI, settings: Settings, keys: KeyFile, proxy: Proxy, rates: Rates) -> None:

@@ -186,7 +186,8 @@ def install(app: FastAPI, page: Callable[[Request, dict[str, Any]], Response]) -
     """Convert every exception to a problem document; a browser gets it as a `page` for dashboard addresses."""
 
     def answer_any(request: Request, error: Exception) -> Response:
-        if _is_page(request):
+        is_api = request.url.path.startswith(("/v1/", "/healthz", "/readyz", "/metrics", "/openapi.json"))
+        if not is_api and "text/html" in request.headers.get("accept", ""):
             slug, title, status, detail = describe(error)
             facts = {"type": slug, "title": title, "status": status, "detail": detail}
             return page(request, facts | {"request_id": request_id_of(request)})
@@ -204,11 +205,6 @@ def install(app: FastAPI, page: Callable[[Request, dict[str, Any]], Response]) -
     for kind in (GraspdError, ApiError, HTTPException):
         app.add_exception_handler(kind, any_error)
     app.add_exception_handler(RequestValidationError, bad_request)
-
-
-def _is_page(request: Request) -> bool:
-    is_api = request.url.path.startswith(("/v1/", "/healthz", "/readyz", "/metrics", "/openapi.json"))
-    return not is_api and "text/html" in request.headers.get("accept", "")
 
 
 def responses(*statuses: int, others: dict[int | str, dict[str, Any]] | None = None) -> dict[int | str, dict[str, Any]]:

@@ -8,7 +8,6 @@ the response. No code reads such a body, and each of its bytes restarts uvicorn'
 from __future__ import annotations
 
 import asyncio
-import errno
 import os
 import socket
 import sys
@@ -21,7 +20,7 @@ from starlette.types import ASGIApp
 from uvicorn.protocols.http.h11_impl import H11Protocol, RequestResponseCycle
 
 from graspd.api.app import create_app
-from graspd.service.model.errors import BusyError, InputError
+from graspd.service.run.address import bind
 from graspd.service.settings import Settings
 
 #: Longest wait of a stop for open event streams, which only clients end [s].
@@ -29,27 +28,11 @@ _GRACE_S = 3
 _TOO_SLOW: Final = b"HTTP/1.1 408 Request Timeout\r\nConnection: close\r\nContent-Length: 0\r\n\r\n"
 
 
-def bind(host: str, port: int) -> socket.socket:
-    """Return a listening socket; BusyError if the port is taken, InputError if it cannot be bound."""
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    # asyncio disables Nagle's algorithm only on sockets with an explicit protocol; otherwise each body is 40 ms late.
-    listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    try:
-        listener.bind((host, port))
-        listener.listen(socket.SOMAXCONN)
-    except OSError as error:
-        listener.close()
-        if error.errno == errno.EADDRINUSE:
-            raise BusyError(f"port {port} on {host} is taken; stop what uses it, or choose another: --port 0") from None
-        raise InputError(f"{host}:{port} cannot be bound: {error.strerror or error}") from None
-    return listener
-
-
 def serve(settings: Settings) -> None:
     """Answer requests until SIGINT or SIGTERM."""
     listener = bind(settings.host, settings.port)
     with listener:
+        listener.listen(socket.SOMAXCONN)
         # Spool uploads in this folder, because /tmp may be in memory.
         spool = settings.data_dir / "uploads"
         spool.mkdir(parents=True, exist_ok=True)

@@ -6,7 +6,6 @@ from typing import Annotated
 
 import typer
 
-from graspd.service import telemetry
 from graspd.service.cli import CommandGroup, keep_private, load_settings, log_to_stderr
 from graspd.service.model.libraries import imports
 
@@ -25,5 +24,4 @@ def api(
     settings = load_settings(host=host, port=port)
     log_to_stderr(settings, "api")
     keep_private(settings)
-    telemetry.set_up_tracing("api")
     serve(settings)

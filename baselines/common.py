@@ -18,10 +18,10 @@ from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from graspd.service.model.fidelity import Fidelity
-from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, quat_rotate
+from graspd.service.model.transforms import Floats
 from graspd.worker.control.postures import pregrasp, squeeze
 from graspd.worker.grasps import GraspSet
-from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.jaws import posed_points
 from graspd.worker.hands.model import HandModel, SurfacePoints
 from graspd.worker.hands.surface import farthest_points, sample_surface
 from graspd.worker.objects.model import ObjectModel
@@ -71,10 +71,6 @@ def frame_along(z: Floats) -> Floats:
     return np.column_stack([x, np.cross(z, x), z])
 
 
-def joined(states: list[HandState]) -> HandState:
-    return HandState(*(np.concatenate([getattr(s, name) for s in states]) for name in ("pivot", "rotation", "q")))
-
-
 def grasp_set(pair: Pair, state: HandState, began: float, info: dict[str, object]) -> GraspSet:
     """Return hands as grasps with all postures; `began` is the planner's start time by `time.perf_counter`."""
     hand, obj, device = pair.hand.model, pair.fine.obj.model, pair.hand.device
@@ -106,14 +102,9 @@ def inside_points(hand: HandModel, *, each: int, on_palm: int) -> SurfacePoints:
 
 
 def _inside(hand: HandModel, points: SurfacePoints) -> NDArray[np.bool_]:
-    before, after = (_posed(hand, points, hand.preshape + t * hand.closing) for t in (0.0, STEP))
+    before, after = (posed_points(hand, points, hand.preshape + t * hand.closing) for t in (0.0, STEP))
     motion = after[0] - before[0]
     speed = np.linalg.norm(motion, axis=1)
     along = np.einsum("ni,ni->n", motion, before[1]) / np.maximum(speed, 1e-12)
     ahead = before[1] @ hand.palm.approach
     return np.where(speed > 1e-3 * STEP, along > INSIDE_COS, (points.body == 0) & (ahead > INSIDE_COS))
-
-
-def _posed(hand: HandModel, points: SurfacePoints, q: Floats) -> tuple[Floats, Floats]:
-    pose = body_poses(hand, IDENTITY_POSE, hand.expand(q))[0][points.body]
-    return apply(pose, points.position), quat_rotate(pose[:, 3:], points.normal)

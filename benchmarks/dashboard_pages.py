@@ -25,9 +25,9 @@ import httpx
 import uvicorn
 
 from graspd.api.app import create_app
-from graspd.api.server import bind
 from graspd.service.index.index import Index
 from graspd.service.pipeline.backends import Services
+from graspd.service.run.address import bind
 from graspd.service.settings import Settings
 from graspd.service.store.store import open_store
 from tests.memory_queue import MemoryQueue

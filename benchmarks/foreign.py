@@ -24,14 +24,16 @@ from numpy.typing import NDArray
 
 from benchmarks.cells import cell_parser, planned
 from graspd.service.model.fidelity import FIDELITIES
+from graspd.service.model.transforms import Floats, apply, compose, invert
 from graspd.worker.grasps import GraspSet
+from graspd.worker.hands.collisions import resting_neighbours
 from graspd.worker.hands.load import hand_from_path
-from graspd.worker.hands.model import HandModel
+from graspd.worker.hands.model import ConvexPiece, HandModel
 from graspd.worker.hands.same_hand import SameHand, same_hand
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.quality.intervals import wilson
-from graspd.worker.validation.foreign import driven_as, in_other_model, with_our_shapes, with_their_shapes
+from graspd.worker.validation.foreign import driven_as, in_other_model
 from graspd.worker.validation.validator import validate
 
 HAND = "hands/shadow/shadow_hand_right.urdf"
@@ -59,6 +61,30 @@ TOUCH, LOOKS = "ours, shapes that touch", "ours, shapes as they look"
 TRACED = "tendons"
 
 Flags = NDArray[np.bool_]
+
+
+def with_our_shapes(same: SameHand) -> HandModel:
+    """Return the other model with the collision shapes of `same.ours`: isolates the effect of shapes on verdicts."""
+    there = np.zeros(same.ours.bodies, np.intp)
+    there[same.bodies] = np.arange(same.theirs.bodies)
+    frames = invert(same.frames)[there]
+    return _dressed(same.theirs, tuple(_moved(p, int(there[p.body]), frames[p.body]) for p in same.ours.pieces))
+
+
+def with_their_shapes(same: SameHand) -> HandModel:
+    """Return `same.ours` with the collision shapes of the other model."""
+    pieces = tuple(_moved(p, int(same.bodies[p.body]), same.frames[p.body]) for p in same.theirs.pieces)
+    return _dressed(same.ours, pieces)
+
+
+def _moved(piece: ConvexPiece, body: int, frame: Floats) -> ConvexPiece:
+    pose = piece.pose if piece.kind == "hull" else compose(frame, piece.pose)
+    return replace(piece, body=body, pose=pose, vertices=apply(frame, piece.vertices))
+
+
+def _dressed(hand: HandModel, pieces: tuple[ConvexPiece, ...]) -> HandModel:
+    dressed = replace(hand, pieces=pieces)
+    return replace(dressed, neighbours=resting_neighbours(dressed))
 
 
 def main() -> None:

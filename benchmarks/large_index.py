@@ -20,8 +20,8 @@ from typing import Any, Final
 import numpy as np
 from sqlalchemy import Connection, Table
 
-from graspd.service.index.bulk import upsert
 from graspd.service.index.changes.rows import fitted, job_row, settle, shard_row, task_rows
+from graspd.service.index.database import upsert
 from graspd.service.index.index import Index
 from graspd.service.index.tables import attempts, grasps, jobs, metadata, shards, tasks
 from graspd.service.model import names

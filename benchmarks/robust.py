@@ -11,7 +11,8 @@ from __future__ import annotations
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from graspd.worker.validation.decomposition import decompose
 from graspd.worker.validation.model import MujocoOptions
 from graspd.worker.validation.refit import fits_of
 from graspd.worker.validation.robust import reaches, robust
-from graspd.worker.validation.variant import SHAPES, Models, Variant, axes_of, couplings_of, draw, together
+from graspd.worker.validation.variant import NOMINAL, SHAPES, Models, Variant, axes_of, couplings_of, draw
 
 OBJECTS = ["003_cracker_box", "005_tomato_soup_can", "011_banana", "025_mug"]
 #: Seed of the random models; jobs with this seed have other models.
@@ -33,6 +34,14 @@ SEED = 9102
 SHARES = (0.75, 0.9)
 ALL = "all at once"
 WORDS = {"hull": "one hull per link", "primitive": "primitives", "capsule": "capsules", "own": ""}
+
+
+def together(variants: Iterable[Variant]) -> Variant:
+    """Combine variants along several axes; if two change the same value, the later one is used."""
+    own, changed = asdict(NOMINAL), dict[str, Any]()
+    for one in variants:
+        changed |= {name: value for name, value in asdict(one).items() if value != own[name]}
+    return replace(NOMINAL, **changed)
 
 
 def kinds(cell: Cell, draws: int) -> dict[str, list[Callable[[np.random.Generator], Variant]]]:

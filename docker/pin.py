@@ -19,7 +19,7 @@ from packaging.utils import canonicalize_name
 ROOT = Path(__file__).resolve().parent.parent
 FOLDER = ROOT / "docker"
 #: What the images are made of; `graspd up` and its embedded Redis do not run there.
-IMAGES = {"api": ("api", "postgres", "otel"), "worker": ("worker", "otel", "gpu")}
+IMAGES = {"api": ("api", "postgres"), "worker": ("worker", "gpu")}
 EXTRAS = tuple(dict.fromkeys(extra for extras in IMAGES.values() for extra in extras))
 #: Machines that images are built for, and their Python.
 MACHINES = ("x86_64", "aarch64")

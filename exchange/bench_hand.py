@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any, Final
 from xml.etree.ElementTree import Element, SubElement
 
-import mujoco
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
@@ -44,12 +43,6 @@ def write_hand(hand: HandModel, config: str, root: Path) -> Path:
     (root / "config" / "hand").mkdir(parents=True, exist_ok=True)
     (root / "config" / "hand" / f"{config}.yaml").write_text(_configuration(hand, folder / "hand.xml"))
     return folder / "hand.xml"
-
-
-def joint_order(file: Path) -> tuple[str, ...]:
-    """Return the joints of a model in MuJoCo's order, that of its `qpos`."""
-    model = mujoco.MjModel.from_xml_path(str(file))
-    return tuple(model.joint(number).name for number in range(model.njnt))
 
 
 def body_names(hand: HandModel) -> tuple[str, ...]:
@@ -95,9 +88,14 @@ def _model(hand: HandModel) -> Element:
             _add_joint(body, hand, b)
         bodies.append(body)
         _add_solids(body, assets, hand, b)
-    _add_exclusions(SubElement(top, "contact"), hand, names)
-    if hand.tendons:
-        _add_tendons(SubElement(top, "tendon"), hand)
+    contact = SubElement(top, "contact")
+    for a, b in sorted(hand.neighbours):
+        SubElement(contact, "exclude", body1=names[a], body2=names[b])
+    tendons = SubElement(top, "tendon") if hand.tendons else top
+    for tendon in hand.tendons:
+        fixed = SubElement(tendons, "fixed", name=tendon.name)
+        for d, pull in zip(tendon.dofs, tendon.coefficients, strict=True):
+            SubElement(fixed, "joint", joint=hand.dof_names[d], coef=_text([pull]))
     _add_drives(SubElement(top, "equality"), SubElement(top, "actuator"), hand)
     return top
 
@@ -146,13 +144,6 @@ def _shape(piece: ConvexPiece, number: int) -> dict[str, str]:
     return {"name": f"piece_{number:03}", "type": piece.kind, "size": _text(size), **place}
 
 
-def _add_exclusions(contact: Element, hand: HandModel, names: tuple[str, ...]) -> None:
-    """Exclude neighbouring bodies, and parents with children, which touch by design."""
-    pairs = set(hand.neighbours) | {(int(hand.parent[b]), b) for b in range(1, hand.bodies)}
-    for a, b in sorted(pairs):
-        SubElement(contact, "exclude", body1=names[a], body2=names[b])
-
-
 def _add_drives(equality: Element, actuators: Element, hand: HandModel) -> None:
     """Add position actuators on the first joint of each dof and on tendons; couple the other joints."""
     pulled = {d: tendon for tendon in hand.tendons for d in tendon.dofs}
@@ -176,13 +167,6 @@ def _add_drives(equality: Element, actuators: Element, hand: HandModel) -> None:
 def _add_actuator(actuators: Element, name: str, driven: dict[str, str], gain: float, limit: float) -> None:
     values = {"kp": _text([gain]), "forcerange": _text([-limit, limit])}
     SubElement(actuators, "position", {"name": name, **driven, **values})
-
-
-def _add_tendons(tendons: Element, hand: HandModel) -> None:
-    for tendon in hand.tendons:
-        fixed = SubElement(tendons, "fixed", name=tendon.name)
-        for d, pull in zip(tendon.dofs, tendon.coefficients, strict=True):
-            SubElement(fixed, "joint", joint=hand.dof_names[d], coef=_text([pull]))
 
 
 def _text(values: Any) -> str:

@@ -127,11 +127,6 @@ def tabletop_fields(mapping: HandMapping, hand: HandModel, grasps: GraspSet, row
     }
 
 
-def is_tabletop(row: Row) -> bool:
-    """Check whether a grasp's file has its object on a table."""
-    return any(part.startswith(TABLETOP) for part in str(row.get("scene_path", "")).split("/"))
-
-
 def placed_of(obj_pose: Floats) -> PlacedGrasps:
     """Return tables, which fingertips may touch, for object poses (N, 7); equal poses share one."""
     _, first, index = np.unique(np.round(obj_pose / SAME), axis=0, return_index=True, return_inverse=True)

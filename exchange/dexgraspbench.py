@@ -14,23 +14,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
+import mujoco
 import numpy as np
 
-from graspd.exchange.bench_hand import (
-    GRASPS,
-    HandMapping,
-    body_names,
-    joint_order,
-    mapping_of,
-    of_the_benchmark,
-    write_hand,
-)
+from graspd.exchange.bench_hand import GRASPS, HandMapping, body_names, mapping_of, of_the_benchmark, write_hand
 from graspd.exchange.bench_scene import (
     SCALE,
     TABLETOP,
     Row,
     check_table,
-    is_tabletop,
     object_of_scene,
     placed_of,
     save_record,
@@ -67,7 +59,8 @@ def read(path: Path, *, hand: str, obj: str) -> list[ImportedGrasps]:
     sets: dict[tuple[float, bool], list[Row]] = defaultdict(list)
     for file in files:
         for row in _rows(file):
-            sets[_scale(row), is_tabletop(row)].append(row)
+            on_table = any(part.startswith(TABLETOP) for part in str(row.get("scene_path", "")).split("/"))
+            sets[_scale(row), on_table].append(row)
     model, mapping = hand_from_path(hand), mappings.pop()
     return [
         _set(path, model, scaled_object(obj, scale), rows, scale, mapping, on_table=on_table)
@@ -124,7 +117,9 @@ def models_of(hand: HandModel, folder: Path) -> list[HandMapping]:
     """Return mappings for our hand model, written below `folder`, and the benchmark's if it has one."""
     config = f"{NAME}_{plain_name(hand.name)}"
     model = write_hand(hand, config, folder)
-    joints = tuple((name, name) for name in joint_order(folder / model))
+    built: Any = mujoco.MjModel.from_xml_path(str(folder / model))
+    # In MuJoCo's order, that of `qpos`.
+    joints = tuple((built.joint(number).name,) * 2 for number in range(built.njnt))
     links = tuple(zip(body_names(hand), hand.body_names, strict=True))
     ours = HandMapping(hand.name, hand.root_link, config, model.as_posix(), tuple(IDENTITY_POSE), joints, links)
     return [ours, *filter(None, [of_the_benchmark(hand)])]

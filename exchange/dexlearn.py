@@ -25,10 +25,11 @@ from numpy.typing import NDArray
 from graspd.exchange.bench_hand import COLLECTED, HandMapping
 from graspd.exchange.bench_scene import SET, TABLETOP, check_table, save_record, write_object, write_table
 from graspd.exchange.dexgraspbench import POSTURES, experiment, models_of, postures
-from graspd.exchange.plan import ExportPart, ExportSummary, PictureReference, looks, object_points
+from graspd.exchange.plan import ExportPart, ExportSummary, PictureReference, looks
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, invert
 from graspd.service.readers import DepthNoise, Pictures
+from graspd.service.readers.clouds import CloudView
 from graspd.worker.grasps import GraspSet
 
 #: Folder of each `quality/grasp_type`; the number before the underscore is a network's input.
@@ -117,7 +118,8 @@ def _clouds(
 
 def points_of(pictures: Pictures, look: PictureReference, noise: DepthNoise | None, *, on_table: bool) -> Floats:
     """Return (P, 3) object points of a picture, in the table's frame, or the object's without a table [m]."""
-    points = object_points(pictures[look.index], look.index, noise)
+    view = CloudView(pictures[look.index], noise, np.random.default_rng(look.index))
+    points = view.points(*view.pixels(whole=False))
     return points if on_table else apply(invert(look.object_pose), points)
 
 

@@ -28,10 +28,10 @@ from graspd.service.model.transforms import IDENTITY_POSE, Floats
 from graspd.service.readers import DepthNoise, Pictures
 from graspd.service.readers.clouds import CloudView
 from graspd.service.readers.trajectories import scene_spec_of
-from graspd.service.store.manifests import INDEX_THRESHOLD_M
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.rendering.export import PNG_STEP_M
+from graspd.worker.rendering.sheets import quoted
 
 POSTURES: Final = ("pregrasp", "grasp", "squeeze")
 #: Kinds of scenes of planned grasps, as in the rows.
@@ -120,8 +120,7 @@ def write(
 
 def _grasps(lot: ExportPart) -> list[dict[str, Any]]:
     said, arrays = lot.shard.attributes, lot.shard.arrays
-    thresholds = np.asarray(arrays["quality/thresholds_m"], float)
-    at = int(np.argmin(np.abs(thresholds - INDEX_THRESHOLD_M)))
+    epsilon = quoted(arrays, "quality/epsilon")
     spec = scene_spec_of(lot.shard)
     kind = FREE if lot.placed is None or spec is None else spec.kind
     types = np.asarray(arrays.get("quality/grasp_type", np.zeros(len(lot.grasps), int)))
@@ -136,7 +135,7 @@ def _grasps(lot: ExportPart) -> list[dict[str, Any]]:
             "joint_names": list(lot.hand.joint_names),
             "verdict": int(lot.verdict[row]),
             "verdict_level": str(said.get("verdict_level", "none")),
-            "epsilon": float(np.asarray(arrays["quality/epsilon"], float)[row, at]),
+            "epsilon": float(epsilon[row]),
             "penetration_depth_mm": float(arrays["quality/penetration_depth_mm"][row]),
             "grasp_type": int(types[row]),
             "scene_kind": kind,

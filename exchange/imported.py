@@ -9,7 +9,7 @@ import pickle
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -131,22 +131,15 @@ def load_npy(path: Path) -> Any:
     """Load a `.npy` file: an array, or the one object in it; InputError if it would run code."""
     try:
         with path.open("rb") as file:
-            if (array := _plain(file)) is not None:
-                return array
+            try:
+                return np.lib.format.read_array(file, allow_pickle=False)
+            except ValueError as error:
+                if "Object arrays" not in str(error):
+                    raise
+            # NumPy has read the header: the pickle follows.
             found = _Reader(file).load()
     except pickle.UnpicklingError as error:
         raise InputError(f"{path} cannot be read safely: {error}") from None
     except Exception as error:  # an untrusted pickle may raise anything
         raise InputError(f"{path} is no NumPy file: {why(error)}") from None
     return found.item() if isinstance(found, np.ndarray) and found.shape == () else found
-
-
-def _plain(file: BinaryIO) -> np.ndarray | None:
-    """Return the array if it contains no objects; else leave the file at the start of its pickle."""
-    version = np.lib.format.read_magic(file)
-    header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    _, _, dtype = header(file)
-    if dtype.hasobject:
-        return None
-    file.seek(0)
-    return np.lib.format.read_array(file, allow_pickle=False)

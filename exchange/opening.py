@@ -7,11 +7,13 @@ import json
 import tarfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
 from xml.etree import ElementTree
 
 import numpy as np
+import yaml
 
 from graspd.service.model.errors import GraspdError
 from graspd.service.parquet import arrow
@@ -44,12 +46,6 @@ def _open(path: Path, library: str, read: Callable[[Path], Any]) -> None:
         ) from error
 
 
-def _mjcf(path: Path) -> None:
-    import mujoco
-
-    mujoco.MjModel.from_xml_path(str(path))
-
-
 def _stage(path: Path) -> None:
     from pxr import Usd
 
@@ -63,12 +59,6 @@ def _mesh(path: Path) -> None:
 
     if trimesh.load_scene(path, process=False).is_empty:
         raise ValueError("it is empty")
-
-
-def _yaml(path: Path) -> None:
-    import yaml
-
-    yaml.load(path.read_bytes(), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
 
 
 def _rows(path: Path) -> None:
@@ -105,13 +95,13 @@ def _depth(path: Path) -> None:
 
 #: By the suffix of a file's name: the library, and a function that opens a file.
 READERS: Final[dict[str, tuple[str, Callable[[Path], Any]]]] = {
-    ".xml": ("mujoco", _mjcf),
+    ".xml": ("mujoco", lambda path: import_module("mujoco").MjModel.from_xml_path(str(path))),
     ".urdf": ("an XML parser", ElementTree.parse),
     ".usd": ("pxr", _stage),
     ".glb": ("trimesh", _mesh),
     ".obj": ("trimesh", _mesh),
     ".stl": ("trimesh", _mesh),
-    ".yaml": ("PyYAML", _yaml),
+    ".yaml": ("PyYAML", lambda path: yaml.load(path.read_bytes(), getattr(yaml, "CSafeLoader", yaml.SafeLoader))),
     ".json": ("json", lambda path: json.loads(path.read_bytes())),
     ".jsonl": ("json", lambda path: [json.loads(line) for line in path.read_text().splitlines()]),
     ".csv": ("csv", _rows),

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from graspd.service.model.names import fitted
 from graspd.service.model.transforms import Floats, compose, invert, pose_from_matrix
-from graspd.service.readers import DepthNoise, Pictures
-from graspd.service.readers.clouds import CloudView
+from graspd.service.readers import Pictures
 from graspd.service.store.shards import Shard
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
@@ -86,12 +85,6 @@ def looks(pictures: Pictures) -> Iterator[PictureReference]:
 
 #: Value of `camera/eye` for the right picture of a stereo pair.
 RIGHT: Final = 2
-
-
-def object_points(sample: Mapping[str, Any], index: int, noise: DepthNoise | None) -> Floats:
-    """Return (P, 3) object points of a picture in the table's frame [m]; its index seeds the noise."""
-    view = CloudView(sample, noise, np.random.default_rng(index))
-    return view.points(*view.pixels(whole=False))
 
 
 def by_scene(pictures: Pictures) -> list[list[PictureReference]]:

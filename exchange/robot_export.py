@@ -31,6 +31,7 @@ from graspd.service.store.shards import Shard, read_shard
 from graspd.worker.files.provenance import hand_files_of_shard
 from graspd.worker.files.subsets import choose
 from graspd.worker.rendering.sheets import best as best_of
+from graspd.worker.rendering.sheets import quoted
 from graspd.worker.validation.decomposition import decompose
 
 
@@ -133,9 +134,8 @@ def _found(
 def _quality(shard: Shard, rows: NDArray[np.intp]) -> dict[str, NDArray[Any]]:
     arrays = shard.arrays
     success = np.asarray(arrays.get("quality/success", np.full(len(arrays["quality/valid"]), -1)))
-    thresholds = np.asarray(arrays["quality/thresholds_m"], float)
-    epsilon = np.asarray(arrays["quality/epsilon"], float)[:, int(np.argmin(np.abs(thresholds - 0.005)))]
-    return {"valid": np.asarray(arrays["quality/valid"])[rows], "success": success[rows], "epsilon": epsilon[rows]}
+    epsilon = quoted(arrays, "quality/epsilon")[rows]
+    return {"valid": np.asarray(arrays["quality/valid"])[rows], "success": success[rows], "epsilon": epsilon}
 
 
 def _assumptions(limits: Limits) -> list[str]:

@@ -11,6 +11,7 @@ import json
 import tarfile
 import tempfile
 from collections.abc import Iterator
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -59,7 +60,7 @@ def _members(shards: Shards, sample: dict[str, Any]) -> Iterator[tuple[str, byte
 
 
 def _record(shards: Shards, sample: dict[str, Any]) -> dict[str, Any]:
-    views = _views(shards, sample["shard_id"])
+    views = _views(shards.path(shards.by_id(sample["shard_id"])))
     grasps = {
         "hand_pose": sample["grasp/hand_pose"],
         "joint_positions": sample["grasp/joint_positions"],
@@ -78,12 +79,7 @@ def _record(shards: Shards, sample: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-_SHOWN: dict[str, Shard] = {}
-
-
-def _views(shards: Shards, shard: str) -> Shard:
+@lru_cache(maxsize=1)
+def _views(path: Path) -> Shard:
     """Return the views shard without its depth, cached while its samples are written."""
-    if shard not in _SHOWN:
-        _SHOWN.clear()
-        _SHOWN[shard] = read_shard(shards.path(shards.by_id(shard)), kind="views", without=("image/depth",))
-    return _SHOWN[shard]
+    return read_shard(path, kind="views", without=("image/depth",))

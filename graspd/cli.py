@@ -61,7 +61,7 @@ COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
 
 #: Group, its command, module of the command, help.
 JOINED: Final[tuple[tuple[str, str, str, str], ...]] = (
-    ("admin", "kernels", "graspd.commands.admin", "Compile all kernels ahead of time."),
+    ("admin", "kernels", "graspd.commands.worker", "Compile all kernels ahead of time."),
     ("admin", "index", "graspd.service.run.commands", "Rebuild the index from the store or export its tables."),
     ("admin", "store", "graspd.service.run.store_commands", "Verify and repair the store."),
     ("hands", "check", "graspd.commands.hands", "Check whether a hand can be used, and report guesses."),

@@ -32,7 +32,7 @@ _COLOURS: Final = {
 @app.command(epilog="graspd doctor --only redis,store,clocks")
 def doctor(
     only: Annotated[str | None, typer.Option(help="Checks to run, separated by commas; default: all.")] = None,
-    full: Annotated[bool, typer.Option("--full", help="Compare the whole index with the store, not a sample.")] = False,
+    full: Annotated[bool, typer.Option("--full", help="Compare all rows of a large index, not only names.")] = False,
     data_dir: Annotated[Path | None, typer.Option(help="Data folder of graspd; default: GRASPD_DATA_DIR.")] = None,
     json: JsonFlag = False,
 ) -> None:

@@ -1,4 +1,4 @@
-"""Telemetry of every process: log lines, OpenTelemetry spans, heartbeat file for health checks."""
+"""Telemetry of every process: log lines, heartbeat file for health checks."""
 
 from __future__ import annotations
 
@@ -104,54 +104,6 @@ def _time(record: logging.LogRecord) -> str:
 
 
 log = logging.getLogger(__name__)
-_ASKED_BY: Final = ("OTEL_EXPORTER_OTLP_ENDPOINT", "OTEL_EXPORTER_OTLP_TRACES_ENDPOINT")
-_tracer: Any = None
-
-
-def set_up_tracing(process: str) -> None:
-    global _tracer
-    if not any(os.environ.get(name) for name in _ASKED_BY):
-        return
-    try:
-        from opentelemetry.exporter.otlp.proto.http.trace_exporter import OTLPSpanExporter
-        from opentelemetry.sdk.resources import Resource
-        from opentelemetry.sdk.trace import TracerProvider
-        from opentelemetry.sdk.trace.export import BatchSpanProcessor
-    except ImportError:
-        log.warning("no traces are sent: run `pip install 'graspd[otel]'`, or unset %s", _ASKED_BY[0])
-        return
-    resource = Resource.create({"service.name": os.environ.get("OTEL_SERVICE_NAME", f"graspd-{process}")})
-    provider = TracerProvider(resource=resource)
-    provider.add_span_processor(BatchSpanProcessor(OTLPSpanExporter()))
-    _tracer = provider.get_tracer("graspd")
-
-
-@contextmanager
-def span(name: str, *, parent: str = "", **attributes: Any) -> Iterator[dict[str, Any]]:
-    """Open a span around the work within; entries of the yielded dictionary become attributes at the end."""
-    later: dict[str, Any] = {}
-    if _tracer is None:
-        yield later
-        return
-    from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
-
-    context = TraceContextTextMapPropagator().extract({"traceparent": parent}) if parent else None
-    known = {f"graspd.{key}": value for key, value in attributes.items()}
-    with _tracer.start_as_current_span(name, context=context, attributes=known) as current:
-        yield later
-        current.set_attributes(later)
-
-
-def traceparent() -> str:
-    if _tracer is None:
-        return ""
-    from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
-
-    carrier: dict[str, str] = {}
-    TraceContextTextMapPropagator().inject(carrier)
-    return carrier.get("traceparent", "")
-
-
 #: Well below the minute after which a health check declares the process dead.
 _EVERY_S: Final = 5.0
 

@@ -1,7 +1,5 @@
 """Ways in which a store loses what it was given."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,13 +1,10 @@
 """The commands that README and docs print: found, checked against the command line, and run.
 
-usage: python -m tests.docs_commands [PAGE ...] [--list]    (make docs-commands; hours of two cores for all)
+usage: python -m tests.docs_commands [PAGE ...]    (make docs-commands; hours of two cores for all)
 
-Each page gets a folder with the files that a reader would have (`tests/docs_files.py`), and where a line asks one a
-service of its own; its lines run in their order, as they are printed, and what is shown below one is held against what
-came. What is not run is told with its reason. Ends with 1 if a line failed.
+Each page gets a folder with the files that a reader would have (`tests/docs_files.py`), and a service where a line
+needs one; its lines run in their order, as they are printed. Ends with 1 if a line failed.
 """
-
-from __future__ import annotations
 
 import argparse
 import os
@@ -26,7 +23,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import graspd.cli
-from graspd.service.model.states import State
 from tests.docs_files import files_for
 
 REPOSITORY: Final = Path(__file__).resolve().parent.parent
@@ -36,8 +32,6 @@ PAGES: Final = (
     *sorted(page for page in DOCS.rglob("*.md") if not {"results", "adr"} & set(page.relative_to(DOCS).parts)),
 )
 LIMIT_S: Final = 3600.0
-#: What came, a file for each page.
-KEPT: Final = REPOSITORY / "build" / "docs-commands"
 #: Where a page says that the service is; each run has a port of its own.
 _PRINTED_URL: Final = "http://127.0.0.1:8000"
 #: And where it is for a page of which no line asks one: nobody listens there.
@@ -50,11 +44,11 @@ _ASKS: Final = re.compile(
 _FENCED: Final = re.compile(r"^```(\w*)\n(.*?)^```\n?", re.DOTALL | re.MULTILINE)
 _INDENTED: Final = re.compile(r"(?:^\n)((?:^    .*\n)+)", re.MULTILINE)
 _TRIED: Final = re.compile(r"<!-- tried: [\w-]+ -->\s*$")
+#: The output that a page shows after a command that ends with an error.
+_REFUSAL: Final = re.compile(r"\s*```\ngraspd: ")
 _OURS: Final = {"graspd", "benchmarks", "examples", "tests"}
 #: What an indented block of commands begins with; any other is a file or a formula.
 _FIRST: Final = re.compile(r"(?:\w+=\S+ )*(?:\S*/)?(?:graspd|python|make|export|cp|curl|docker|kubectl) ")
-#: Words that differ between what has ended and what is shown on its way.
-_STATES: Final = {*(state.value for state in State), "min", "left"}
 _OPERATORS: Final = {"|", "||", "&&", ";", "&", ">", ">>", "<", "2>", "(", ")"}
 #: What a line has that is not run here, and why. A line with none of it is run.
 NOT_RUN: Final = (
@@ -92,8 +86,6 @@ class Line:
     text: str
     refused: bool = False
     """The page shows an error after it, or its comment says *refused*."""
-    shown: str = ""
-    """What the page shows as its output."""
     tried: bool = False
     """It is in a block that tests/deploy runs."""
 
@@ -121,44 +113,22 @@ class Line:
                 return found
         return ""
 
-    def misses(self, came: str) -> str:
-        """A line shown that did not come, empty if all did: numbers, names and states may differ, messages may not.
-        Of all words shown half at least came, and of those of each line a quarter."""
-        words = set(_words(came))
-        shares = {
-            line: [word in words for word in wanted] for line in self.shown.splitlines() if (wanted := _words(line))
-        }
-        least = min(shares, key=lambda line: sum(shares[line]) / len(shares[line]), default="")
-        found = [one for share in shares.values() for one in share]
-        strange = sum(found) * 2 < len(found) or sum(shares.get(least, [])) * 4 < len(shares.get(least, []))
-        return least if strange else ""
-
-
-def _words(text: str) -> list[str]:
-    """Without numbers, states and names like `005_tomato_soup_can`."""
-    found = re.findall(r"\w{3,}", text.lower())
-    return [word for word in found if word.isalpha() and word not in _STATES]
-
 
 def lines_of(page: Path) -> Iterator[Line]:
     text = page.read_text()
-    blocks = []
-    fenced = list(_FENCED.finditer(text))
-    for at, block in enumerate(fenced):
-        if block[1] in {"sh", "bash"}:
-            after = fenced[at + 1] if at + 1 < len(fenced) else None
-            follows = after is not None and not after[1] and not text[block.end() : after.start()].strip()
-            shown = after[2] if after is not None and follows else ""
-            blocks.append((block[2], shown, bool(_TRIED.search(text[: block.start()]))))
+    blocks = [
+        (block[2], bool(_REFUSAL.match(text[block.end() :])), bool(_TRIED.search(text[: block.start()])))
+        for block in _FENCED.finditer(text)
+        if block[1] in {"sh", "bash"}
+    ]
     indented = (re.sub(r"^    ", "", block, flags=re.MULTILINE) for block in _INDENTED.findall(_FENCED.sub("", text)))
-    blocks += [(block, "", False) for block in indented if _FIRST.match(block)]
-    for block, shown, tried in blocks:
-        whole = [line.partition(" #") for line in block.replace("\\\n", " ").splitlines()]
-        told = [(re.sub(r"\s+", " ", line).strip(), comment.strip()) for line, _, comment in whole]
-        commands = [(line, comment) for line, comment in told if line]
+    blocks += [(block, False, False) for block in indented if _FIRST.match(block)]
+    for block, shows_error, tried in blocks:
+        parts = [line.partition(" #") for line in block.replace("\\\n", " ").splitlines()]
+        commands = [(" ".join(line.split()), comment.strip()) for line, _, comment in parts if line.strip()]
         for at, (line, comment) in enumerate(commands, 1):
-            last = shown if at == len(commands) else ""
-            yield Line(page.name, line, last.startswith("graspd: ") or comment.startswith("refused"), last, tried)
+            refused = comment.startswith("refused") or (shows_error and at == len(commands))
+            yield Line(page.name, line, refused, tried)
 
 
 def _commands(text: str) -> Iterator[list[str]]:
@@ -212,42 +182,32 @@ def _resolved(command: Any, words: list[str]) -> tuple[Any, list[str]]:
 
 
 def run_page(page: Path) -> list[str]:
+    """Run the lines of a page; each that failed, with the end of its output."""
     from graspd.service.run.supervisor import Supervisor
     from graspd.service.settings import Settings
 
-    lines = list(lines_of(page))
+    lines = [line for line in lines_of(page) if not line.reason]
     failed = []
-    record = KEPT / f"{page.stem}.txt"
-    record.parent.mkdir(parents=True, exist_ok=True)
-    with record.open("w"), tempfile.TemporaryDirectory() as scratch:
+    with tempfile.TemporaryDirectory() as scratch, ExitStack() as stack:
         folder, data = Path(scratch) / "here", Path(scratch) / "data"
         folder.mkdir()
         kept = {name: value for name, value in os.environ.items() if not name.startswith("GRASPD_")}
         kept["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{kept.get('PATH', '')}"
         (folder / ".curlrc").write_text("fail-with-body\nsilent\n")
-        with ExitStack() as stack:
-            url = _NOBODY
-            if any(_ASKS.search(line.text) for line in lines if not line.reason):
-                supervisor = stack.enter_context(Supervisor(Settings(data_dir=data, port=0), workers=1))
-                supervisor.wait_ready(say=say)
-                url = supervisor.api_url
-            kept |= {"GRASPD_API_URL": url, "GRASPD_DATA_DIR": str(data), "CURL_HOME": str(folder)}
-            kept |= {"API": url, "GRASPD_API_KEY": "none"}
-            files_for(page, folder, data, kept)
-            for line in lines:
-                if line.reason:
-                    say(f"  -    {line.text}   ({line.reason})")
-                    continue
-                started = time.monotonic()
-                code, came = run_line(line.text.replace(_PRINTED_URL, url), folder, kept)
-                with record.open("a") as file:
-                    file.write(f"$ {line.text}\n{came}\n")
-                missed = line.misses(came)
-                wrong = bool(code) != line.refused or bool(missed)
-                say(f"  {'FAIL' if wrong else 'ok  '} {line.text}   ({time.monotonic() - started:.0f} s)")
-                if wrong:
-                    told = f"shown, and did not come: {missed}\n" if missed else ""
-                    failed.append(f"{page.name}: {line.text}\n{told}{came[-600:]}")
+        url = _NOBODY
+        if any(_ASKS.search(line.text) for line in lines):
+            supervisor = stack.enter_context(Supervisor(Settings(data_dir=data, port=0), workers=1))
+            supervisor.wait_ready(say=say)
+            url = supervisor.api_url
+        kept |= {"GRASPD_API_URL": url, "GRASPD_DATA_DIR": str(data), "CURL_HOME": str(folder)}
+        kept |= {"API": url, "GRASPD_API_KEY": "none"}
+        files_for(page, folder, data, kept)
+        for line in lines:
+            started = time.monotonic()
+            code, came = run_line(line.text.replace(_PRINTED_URL, url), folder, kept)
+            if wrong := bool(code) != line.refused:
+                failed.append(f"{page.name}: {line.text}\n{came[-600:]}")
+            say(f"  {'FAIL' if wrong else 'ok  '} {line.text}   ({time.monotonic() - started:.0f} s)")
     return failed
 
 
@@ -275,18 +235,12 @@ def say(text: str) -> None:
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("pages", nargs="*", help="names of pages; default: all")
-    parser.add_argument("--list", action="store_true", help="only say what would be run, and why something is not")
-    given = parser.parse_args(arguments)
+    given = parser.parse_args(arguments).pages
     failed = []
     for page in PAGES:
-        if (given.pages and page.name not in given.pages) or not (lines := list(lines_of(page))):
-            continue
-        say(page.name)
-        if given.list or all(line.reason for line in lines):
-            for line in lines:
-                say(f"  {'-  ' if line.reason else 'run'} {line.text}" + (f"   ({line.reason})" if line.reason else ""))
-            continue
-        failed += run_page(page)
+        if page.name in (given or [page.name]) and not all(line.reason for line in lines_of(page)):
+            say(page.name)
+            failed += run_page(page)
     say("\n".join(failed) or "all that was run ended well")
     return int(bool(failed))
 

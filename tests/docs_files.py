@@ -1,7 +1,5 @@
 """What the pages call the reader's own, for `tests/docs_commands.py`: hands, meshes, shards, scenes, small datasets."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -1,9 +1,8 @@
 """Stand-ins for the engine: stages that make true shards of random numbers in no time, and a job to run them on."""
 
-from __future__ import annotations
-
 import argparse
 import ctypes
+import math
 import os
 import sys
 import time
@@ -27,6 +26,7 @@ from graspd.service.model.records import AttemptRecord, JobRecord
 from graspd.service.model.states import AssetKind, Priority, Stage
 from graspd.service.model.workers import WorkerBeat
 from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.datasets.rounds import DatasetRounds
 from graspd.service.store.integrity import put_document
 from graspd.service.store.library import publish_asset
 from graspd.service.store.manifests import ShardManifest, load_shard, publish_shard
@@ -147,6 +147,17 @@ def finish(
     for task in plan(record := record_of(services, job)):
         if (batches is None or task.batch < batches) and stage in (None, task.stage):
             make_task(services, record, task, **info)
+
+
+def plan_all(services: Services) -> None:
+    """Plan all datasets in one round, however slow the machine: cells that are planned at once share the workers."""
+    assert not DatasetRounds(services).advance(math.inf)
+
+
+def tasks_of(job: JobRecord) -> list[TaskMessage]:
+    """The first attempts at a job's tasks of synthesis."""
+    tasks = [task for task in plan(job) if task.stage is Stage.SYNTHESIZE]
+    return [message_of(job, task, attempt=1, max_attempt=3) for task in tasks]
 
 
 def fail_task(services: Services, job: str, task: PlannedTask | TaskView, number: int = 1, **changes: Any) -> str:

@@ -1,7 +1,5 @@
 """Empty indexes in milliseconds: tables are made once a process, and copied or used again."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,12 +1,10 @@
 """The queue in one process: the twin that unit tests use, and what the contract test holds against Redis."""
 
-from __future__ import annotations
-
 import itertools
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from graspd.service.model.states import Priority, Stage
@@ -40,7 +38,7 @@ class MemoryQueue(RqQueue):
     _taken: Counter[str] = field(default_factory=Counter)
     _read: int = 0
     _acknowledged: set[str] = field(default_factory=set)
-    _numbers: itertools.count[int] = field(default_factory=itertools.count)
+    _numbers: Iterator[int] = field(default_factory=itertools.count)
     _changed: threading.Condition = field(default_factory=threading.Condition)
 
     def ping(self) -> float:

@@ -1,7 +1,5 @@
 """Proposal networks for tests: of the right shapes, and of no skill."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

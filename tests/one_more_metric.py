@@ -4,8 +4,6 @@ A process of its own: what follows from the table is made when the modules that 
 folder, and the URL of an index that was made without the metric. Prints the findings as JSON.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

@@ -4,8 +4,6 @@ A process of its own: what follows from the table is made when the modules that 
 findings as JSON.
 """
 
-from __future__ import annotations
-
 import inspect
 import json
 import sys
@@ -41,22 +39,16 @@ def main(folder: Path) -> None:
     from graspd.api.app import create_app
     from graspd.cli import build
     from graspd.service.docs import keywords_stub, options_table
-    from graspd.service.index.index import Index
-    from graspd.service.pipeline.backends import Services
     from graspd.service.settings import Settings
-    from graspd.service.store.store import open_store
     from tests.api.conftest import BASE_URL
-    from tests.memory_queue import MemoryQueue
+    from tests.indexes import open_services
 
     def command(*words: str) -> str:
         return CliRunner().invoke(build(), [*words], env={"COLUMNS": "200"}).output
 
     pair = ("--hand", "barrett", "--object", "block")
-    settings = Settings(data_dir=folder)
-    services = Services(
-        settings, open_store(settings.resolved_store_url), Index(settings.resolved_index_url), MemoryQueue()
-    )
-    with TestClient(create_app(settings, services), base_url=BASE_URL) as http:
+    services = open_services(Settings(data_dir=folder))
+    with TestClient(create_app(services.settings, services), base_url=BASE_URL) as http:
         schemas = http.get("/openapi.json").json()["components"]["schemas"]
         found = {
             "help": [command(*name.split(), "--help") for name in ("synth", "submit", "datasets create")],

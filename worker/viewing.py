@@ -24,6 +24,7 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.quality.probe import Probe, probe_of
 from graspd.worker.rendering.hands import drawn_parts, drawn_poses
 from graspd.worker.rendering.scenery import Supports, seen_share, slab_poses, slabs
+from graspd.worker.rendering.sheets import quoted
 from graspd.worker.scenes.neighbours import Neighbours
 
 #: Hand points whose distance from the object is shown, and the largest distance shown [m].
@@ -119,7 +120,6 @@ def _srgb(linear: float) -> float:
     return 12.92 * linear if linear <= 0.0031308 else 1.055 * linear ** (1 / 2.4) - 0.055
 
 
-_QUOTED_M: Final = 0.005  # contact threshold at which epsilon is quoted [m]
 #: Distance of the first view from the object [m], and the angle between candidate views [rad].
 _EYE_M: Final = 0.7
 _STEP: Final = np.pi / 8
@@ -300,8 +300,7 @@ def _choices(shard: Shard) -> dict[str, NDArray[np.intp]]:
 
 def _figures(shard: Shard, row: int) -> str:
     arrays = shard.arrays
-    column = int(np.argmin(np.abs(np.asarray(arrays["quality/thresholds_m"], float) - _QUOTED_M)))
-    rows = [("ε at 5 mm", f"{float(arrays['quality/epsilon'][row, column]):.3f}")]
+    rows = [("ε at 5 mm", f"{quoted(arrays, 'quality/epsilon')[row]:.3f}")]
     rows.append(("penetration", f"{float(arrays['quality/penetration_depth_mm'][row]):.2f} mm"))
     verdicts = {
         "success": "lift" if "quality/lift_outcome" in arrays else "verdict",

@@ -7,7 +7,7 @@ from datetime import UTC, datetime, timedelta
 from typing import Final
 
 from graspd.api.access.auth import Proxy
-from graspd.api.access.keys import Key, KeyFile, Scope
+from graspd.api.access.keys import KeyFile, Scope
 from graspd.service.model.errors import GraspdError
 from graspd.service.run.doctor.checks import Finding, bad, good, warning
 from graspd.service.settings import Settings
@@ -34,14 +34,12 @@ def keys(settings: Settings) -> Finding:
     live = [key for key in found if key.is_live]
     if not live:
         return bad(f"all {len(found)} keys are expired or revoked", _ADD)
-    if ending := sorted({key.name for key in live} - {key.name for key in live if not _ends_soon(key)}):
+    soon = datetime.now(UTC) + _SOON
+    kept = {key.name for key in live if key.expires is None or datetime.fromisoformat(key.expires) >= soon}
+    if ending := sorted({key.name for key in live} - kept):
         return warning(
             f"keys that expire within a week: {', '.join(ending[:3])}", f"graspd keys rotate {ending[0]} --grace 24h"
         )
     if not any(key.scope is Scope.ADMIN for key in live):
         return warning(f"{len(live)} valid keys, none with scope admin", _ADD)
     return good(f"{len(live)} valid keys")
-
-
-def _ends_soon(key: Key) -> bool:
-    return key.expires is not None and datetime.fromisoformat(key.expires) < datetime.now(UTC) + _SOON

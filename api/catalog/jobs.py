@@ -172,12 +172,13 @@ class Jobs:
     def _job(self, job: JobView, running: Sequence[TaskView]) -> Job:
         request = job.request
         stages = stage_statuses(job, running, self._paces)
+        tasks = sum(stage.tasks for stage in job.stages)
         return Job(
             **{name: getattr(job, name) for name in _SHARED},
             **{name: getattr(request, name) for name in ("hand", "object", "method", "standing")},
             fidelity=request.fidelity if isinstance(request.fidelity, str) else request.fidelity.name,
             requested=request.grasps,
-            progress=progress_of_job(job),
+            progress=min(1.0, sum(stage.done for stage in job.stages) / tasks) if tasks else 0.0,
             eta_s=eta_of_job(job, stages),
             reason=job.reason or job.note,
             stages=stages,
@@ -225,12 +226,6 @@ class TaskRates:
 def stage_statuses(job: JobView, tasks: Sequence[TaskView], paces: TaskRates) -> list[StageStatus]:
     """Return the stages of a job; `tasks` are its running tasks, and waiting ones that have a reason."""
     return [_status(stage, [task for task in tasks if task.stage is stage.stage], paces) for stage in job.stages]
-
-
-def progress_of_job(job: JobView) -> float:
-    """Return the share of a job's tasks that are done [0, 1]; running tasks count by their progress."""
-    tasks = sum(stage.tasks for stage in job.stages)
-    return min(1.0, sum(stage.done for stage in job.stages) / tasks) if tasks else 0.0
 
 
 def eta_of_job(job: JobView, stages: Sequence[StageStatus]) -> float | None:

@@ -94,14 +94,10 @@ class Overview:
 
     def valid_per_minute(self) -> list[int]:
         """Return the numbers of valid grasps made in each of the last `MINUTES`, oldest first."""
-        start = datetime.now(UTC).replace(second=0, microsecond=0) - timedelta(minutes=MINUTES - 1)
-        made = [0] * MINUTES
-        for bucket in self._services.index.overview.throughput(
-            since=start.isoformat().replace("+00:00", "Z"), bucket_s=60, scope=project_scope()
-        ):
-            minute = int((datetime.fromisoformat(bucket.start) - start).total_seconds() // 60)
-            made[min(max(minute, 0), MINUTES - 1)] += bucket.valid
-        return made
+        start = datetime.now(UTC) - timedelta(minutes=MINUTES - 1)
+        minutes = [f"{start + timedelta(minutes=minute):%Y-%m-%dT%H:%M}" for minute in range(MINUTES)]
+        made = self._services.index.overview.valid_per_minute(since=minutes[0], scope=project_scope())
+        return [made.get(minute, 0) for minute in minutes]
 
     def failures(self) -> list[FailureGroup]:
         return self._services.index.overview.failures(limit=_FAILURES_SHOWN, scope=project_scope())

@@ -17,7 +17,7 @@ from graspd.api.catalog.tags import Format, Tags
 from graspd.api.dashboard import rendering
 from graspd.api.dashboard.forms import fields_of, first_message
 from graspd.api.dashboard.rendering import base_url, render
-from graspd.api.models import GraspDetail, GraspName, GraspQuery, Selection
+from graspd.api.models import GraspName, GraspQuery, Selection
 from graspd.api.routes.dependencies import READ, SUBMIT, AssetsOf, ExportsOf, GraspsOf, ShardsOf, TagsOf, next_address
 from graspd.api.routes.grasps import exported
 from graspd.service.index.views import GraspView, TagView
@@ -108,7 +108,11 @@ def grasp_page(
         stops=[point.name for point in grasp.way if point.name],
         shard=shard,
         job=shards.job_of(shard_id),
-        metrics=_metrics(grasp),
+        metrics=[
+            (metric.title, getattr(grasp, metric.name), metric.unit)
+            for metric in indexed()
+            if metric.name not in _BESIDE_VERDICT
+        ],
         type=GraspType(int(grasp.grasp_type or 0)),
         weakest=_WEAKEST.get(grasp.robust_weakest or ""),
         swept=[metric for metric in GRASP_METRICS if metric.name in grasp.sweep],
@@ -124,14 +128,6 @@ def choice_of(
         "tags": known,
         "filter": urlencode(where),
     }
-
-
-def _metrics(grasp: GraspDetail) -> list[tuple[str, float | None, str]]:
-    return [
-        (metric.title, getattr(grasp, metric.name), metric.unit)
-        for metric in indexed()
-        if metric.name not in _BESIDE_VERDICT
-    ]
 
 
 def _names(assets: Assets, kind: AssetKind) -> list[tuple[str, str]]:

@@ -18,7 +18,6 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 from graspd.api.access.auth import SESSION_COOKIE
 from graspd.api.access.keys import SESSION_S, KeyFile
 from graspd.api.catalog import events
-from graspd.api.catalog.datasets import Datasets
 from graspd.api.catalog.overview import MINUTES, Overview
 from graspd.api.dashboard import dataset_pages, figures, forms, grasp_pages, hand_pages, job_pages, tradeoff
 from graspd.api.dashboard.forms import Expectations
@@ -37,7 +36,7 @@ from graspd.api.routes.dependencies import (
     UsageOf,
 )
 from graspd.api.routes.system import Since, Until
-from graspd.service.index.views import DatasetView, WorkerView
+from graspd.service.index.views import WorkerView
 from graspd.service.model.errors import ERRORS, InputError, UnavailableError
 from graspd.service.model.states import State
 from graspd.service.pipeline.backends import Services
@@ -78,7 +77,7 @@ def home(
         stages=stage_depths(overview),
         workers=[worker for worker in overview.workers() if is_recent(worker)],
         failures=overview.failures(),
-        datasets=_latest_datasets(datasets),
+        datasets=sorted(datasets.page(limit=_DATASETS).items, key=lambda dataset: dataset.state.is_final)[:4],
         damage=overview.damage(),
     )
 
@@ -159,11 +158,6 @@ def stage_depths(overview: Overview) -> list[tuple[str, int]]:
     for (_, stage), waiting in depths.items():
         totals[stage] += waiting
     return [(STAGE_LABELS[stage], waiting) for stage, waiting in totals.items()]
-
-
-def _latest_datasets(datasets: Datasets) -> list[DatasetView]:
-    newest = datasets.page(limit=_DATASETS).items
-    return sorted(newest, key=lambda dataset: dataset.state.is_final)[:4]
 
 
 _SUMMED = ("grasps", "valid", "tasks", "gpu_seconds", "cpu_seconds")

@@ -21,7 +21,6 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from graspd.api.formatting import host_name
 from graspd.api.metrics import Metrics
 from graspd.api.problems import ApiError, answer
-from graspd.service import telemetry
 from graspd.service.model.errors import GraspdError
 from graspd.service.telemetry import bind
 
@@ -68,15 +67,11 @@ class RequestContext(HttpMiddleware):
         self.metrics = metrics
 
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
-        headers = Headers(scope=scope)
-        given = headers.get("x-request-id", "")
+        given = Headers(scope=scope).get("x-request-id", "")
         request_id = given if _REQUEST_ID.fullmatch(given) else uuid.uuid4().hex[:16]
         scope.setdefault("state", {})["request_id"] = request_id
-        parent = headers.get("traceparent", "")
-        with telemetry.span(f"HTTP {_method(scope)}", parent=parent, request=request_id) as facts:
-            with bind(request=request_id, traceparent=telemetry.traceparent()):
-                await self._answer(scope, receive, send, request_id)
-            facts["http.route"] = _route(scope)
+        with bind(request=request_id):
+            await self._answer(scope, receive, send, request_id)
 
     async def _answer(self, scope: Scope, receive: Receive, send: Send, request_id: str) -> None:
         started = time.perf_counter()

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from graspd.baselines.autograsp import kernels
-from graspd.baselines.common import free_starts, grasp_set, ground_of, joined
+from graspd.baselines.common import free_starts, grasp_set, ground_of
 from graspd.service.model.transforms import Floats, quat_rotate
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet
@@ -57,7 +57,7 @@ class Autograsp:
             return state
 
         states = run_parts(cut(wanted.count, run), work)
-        return grasp_set(pair, joined(states), began, {})
+        return grasp_set(pair, HandState.joined(states), began, {})
 
 
 METHOD: Final = Method(

@@ -15,7 +15,7 @@ import warp as wp
 from numpy.typing import NDArray
 from pydantic import Field
 
-from graspd.baselines.common import frame_along, grasp_set, ground_of, inside_points, joined
+from graspd.baselines.common import frame_along, grasp_set, ground_of, inside_points
 from graspd.baselines.dfc import kernels
 from graspd.service.model.transforms import (
     IDENTITY_POSE,
@@ -73,7 +73,7 @@ class Dfc:
         found = run_parts(cut(wanted.count, run), work)
         energies = np.concatenate([part[1] for part in found])
         passed = (energies[:, :3] < np.array(PASSES)).all(axis=1)
-        return grasp_set(pair, joined([part[0] for part in found]), began, {"passed": passed.tolist()})
+        return grasp_set(pair, HandState.joined([part[0] for part in found]), began, {"passed": passed.tolist()})
 
 
 METHOD: Final = Method(

@@ -16,7 +16,7 @@ import warp as wp
 from numpy.typing import NDArray
 from pydantic import Field
 
-from graspd.baselines.common import free_starts, grasp_set, ground_of, joined, search_of
+from graspd.baselines.common import free_starts, grasp_set, ground_of, search_of
 from graspd.baselines.graspd2022 import kernels
 from graspd.service.model.cores import available_cores
 from graspd.service.model.transforms import Floats, quat_rotate
@@ -78,7 +78,9 @@ class Graspd2022:
 
         found = run_parts(cut(wanted.count, run), work)
         residual = np.concatenate([part[1] for part in found])
-        return grasp_set(pair, joined([part[0] for part in found]), began, {"residual": residual.round(4).tolist()})
+        return grasp_set(
+            pair, HandState.joined([part[0] for part in found]), began, {"residual": residual.round(4).tolist()}
+        )
 
 
 METHOD: Final = Method(

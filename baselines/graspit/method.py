@@ -21,7 +21,7 @@ from pydantic import Field
 
 from graspd.baselines.autograsp import kernels as closing_kernels
 from graspd.baselines.autograsp.method import HandCloser
-from graspd.baselines.common import frame_along, grasp_set, ground_of, inside_points, joined, search_of
+from graspd.baselines.common import frame_along, grasp_set, ground_of, inside_points, search_of
 from graspd.baselines.graspit import kernels
 from graspd.baselines.graspit.kernels import FIRST_STEP
 from graspd.service.model.errors import InputError
@@ -141,7 +141,7 @@ class Graspit:
             state = search.run(seeds, steps=self.options.steps, keep=keep, tell=steps)
             return HandCloser(pair, len(state.pivot)).close(state).state
 
-        states = joined(run_parts(cut(chains, run), work))
+        states = HandState.joined(run_parts(cut(chains, run), work))
         return grasp_set(pair, states[: wanted.count], began, {"chains": chains, "moves": moves})
 
 

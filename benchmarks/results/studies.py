@@ -683,8 +683,8 @@ STUDIES: Final = (
         "dashboard",
         "pictures of the dashboard",
         ("images/dashboard-*.png",),
-        ("python -m tests.browser.screenshots --out OUT/images",),
-        ("python -m tests.browser.screenshots --out OUT/images",),
+        ("python -m benchmarks.screenshots --out OUT/images",),
+        ("python -m benchmarks.screenshots --out OUT/images",),
         needs=(BROWSER,),
     ),
 )

@@ -30,7 +30,7 @@ from graspd.worker.hands.robot import FREE, MOVING, chain_to
 from graspd.worker.hands.tree import build_tree
 from graspd.worker.simulation.environment import Obstacle
 from graspd.worker.validation.decomposition import ConvexPieces
-from graspd.worker.validation.model import add_shape
+from graspd.worker.validation.model import add_mesh, add_shape, add_support
 
 
 @dataclass(frozen=True)
@@ -288,8 +288,9 @@ class ArmScene:
         _add_tree(self.spec, root, hand, "hand", _OTHER)
         thing = self.spec.worldbody.add_body(name="object", mocap=True)
         for k, corners in enumerate(pieces.vertices):
-            _hull(self.spec, thing.add_geom(**_OTHER), corners, f"object{k}")
-        self._add_supports(supports)
+            add_mesh(self.spec, thing.add_geom(**_OTHER), corners, f"object{k}")
+        for k, support in enumerate(supports):
+            add_support(self.spec, self.spec.worldbody.add_geom(name=f"support{k}", **_OTHER), support)
         self.spec.add_exclude(bodyname1=f"arm{arm.mount_body}", bodyname2="hand0")
         self._exclude_what_always_touches()
         self.model: Any = self.spec.compile()
@@ -318,16 +319,6 @@ class ArmScene:
     def _put(self, model: Any, data: Any, arm_joints: Floats, hand_joints: Floats) -> None:
         data.qpos[_addresses(model, self.arm.model, "arm")] = self.arm.model.expand(arm_joints)
         data.qpos[_addresses(model, self.hand, "hand")] = hand_joints
-
-    def _add_supports(self, supports: Sequence[Obstacle]) -> None:
-        for k, support in enumerate(supports):
-            geom = self.spec.worldbody.add_geom(name=f"support{k}", **_OTHER)
-            if len(support.corners):
-                _hull(self.spec, geom, support.corners, f"support{k}")
-                continue
-            normal, offset = support.planes[0, :3], support.planes[0, 3]
-            geom.type, geom.size, geom.pos = mujoco.mjtGeom.mjGEOM_PLANE, [0, 0, 0.1], offset * normal
-            mujoco.mju_quatZ2Vec(geom.quat, normal)
 
     def _exclude_what_always_touches(self) -> None:
         """Exclude body pairs in contact in nearly all random postures, as in MoveIt's setup."""
@@ -369,13 +360,6 @@ def _add_tree(spec: Any, root: Any, model: HandModel, prefix: str, contact: dict
     for k, piece in enumerate(model.pieces):
         add_shape(spec, bodies[piece.body].add_geom(**contact), piece, f"{prefix}_{k}")
     return bodies
-
-
-def _hull(spec: Any, geom: Any, corners: Floats, name: str) -> None:
-    mesh = spec.add_mesh(name=name)
-    mesh.uservert = np.ascontiguousarray(corners, np.float32).ravel()
-    mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
-    geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, name
 
 
 def _addresses(model: Any, tree: HandModel, prefix: str) -> NDArray[np.intp]:

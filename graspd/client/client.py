@@ -70,7 +70,6 @@ class Client(AbstractContextManager["Client"]):
         return self._document(JobDetail, "GET", path_of("jobs", job_id))
 
     def jobs(self, *, state: State | None = None, limit: int = 50) -> Page[Job]:
-        """Return jobs, newest first."""
         return self._document(Page[Job], "GET", "/v1/jobs", params={"state": state, "limit": limit})
 
     def cancel(self, job_id: str) -> JobDetail:
@@ -171,12 +170,10 @@ class Client(AbstractContextManager["Client"]):
         return self._document(DatasetView, "POST", "/v1/datasets", json=_matrix_body(request))
 
     def estimate(self, matrix: Matrix) -> Estimate:
-        """Estimate the cost of a matrix of datasets."""
         body = {name: value for name, value in _matrix_body(matrix).items() if name in Matrix.model_fields}
         return self._document(Estimate, "POST", "/v1/datasets/estimate", json=body)
 
     def datasets(self, *, limit: int = 50) -> Page[DatasetView]:
-        """Return datasets, newest first."""
         return self._document(Page[DatasetView], "GET", "/v1/datasets", params={"limit": limit})
 
     def dataset(self, name: str) -> DatasetView:
@@ -196,7 +193,6 @@ class Client(AbstractContextManager["Client"]):
         return self._document(SnapshotView, "POST", path_of("datasets", name, "snapshots"))
 
     def snapshot(self, name: str, digest: str) -> Snapshot:
-        """Return a snapshot with its list of shards."""
         return self._document(Snapshot, "GET", path_of("datasets", name, "snapshots", digest))
 
     def watch_dataset(self, name: str) -> Iterator[DatasetView]:
@@ -225,8 +221,8 @@ class Client(AbstractContextManager["Client"]):
     def _document(self, kind: type[View], method: str, path: str, **options: Any) -> View:
         return kind.model_validate_json(self.send(method, path, **options).content)
 
-    def _comes_back(self, timeout_s: float = 30.0) -> bool:
-        deadline = time.monotonic() + timeout_s
+    def _comes_back(self) -> bool:
+        deadline = time.monotonic() + 30.0
         while time.monotonic() < deadline:
             try:
                 self.send("GET", "/healthz")
@@ -247,7 +243,8 @@ class Client(AbstractContextManager["Client"]):
         for wait in (*_WAITS_S, None):
             with _translated(self.url):
                 answer = self._http.request(method, path, params=given or None, **options)
-            if wait is None or not _is_too_fast(answer):
+            # Only the rate of requests recovers within a retry, not the other quotas.
+            if wait is None or answer.status_code != 429 or RateError.slug not in answer.text:
                 break
             time.sleep(min(wait, float(answer.headers.get("retry-after", wait))))
         _raise_for(answer)
@@ -281,11 +278,6 @@ def _authorization(key: str) -> dict[str, str]:
     if not (key.isascii() and key.isprintable() and " " not in key):
         raise InputError("the API key (GRASPD_API_KEY) contains an invalid character; copy it again")
     return {"Authorization": f"Bearer {key}"}
-
-
-def _is_too_fast(answer: httpx.Response) -> bool:
-    """Check whether the rate of requests is exceeded; other quotas recover too slowly for a retry."""
-    return answer.status_code == 429 and RateError.slug in answer.text
 
 
 def events_of(answer: httpx.Response) -> Iterator[tuple[str, Any]]:

@@ -36,12 +36,12 @@ from graspd.service.command_options import pairs, parsed_options, with_options
 from graspd.service.index.views import DatasetView
 from graspd.service.model.base import Name, why
 from graspd.service.model.domain import JobOptions
-from graspd.service.model.errors import InputError, TaskError, did_you_mean, one_of
+from graspd.service.model.errors import InputError, TaskError, did_you_mean
 from graspd.service.model.options import accepted
 from graspd.service.model.scene_spec import known_name, scene_option
 from graspd.service.model.states import AssetKind, State
 from graspd.service.pipeline.datasets.estimate import Estimate
-from graspd.service.pipeline.datasets.export import FORMATS
+from graspd.service.pipeline.datasets.export import export_shards
 from graspd.service.pipeline.datasets.spec import DatasetRequest, Matrix
 from graspd.service.store.object_sets import Objects, files_of_set
 
@@ -322,13 +322,10 @@ def export(
     name: NameArgument,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write; an interrupted export is continued.")],
     snapshot: Annotated[str | None, typer.Option(help="Digest of a snapshot; default: all present shards.")] = None,
-    format: Annotated[str, typer.Option(help=f"Format: {', '.join(FORMATS)}.")] = "shards",
     url: UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
     """Write a snapshot's files into a folder; each is verified against its checksum."""
-    if format not in FORMATS:
-        raise InputError(f"there is no format {format!r}; there are: {one_of(format, FORMATS)}")
     label, counts = TextColumn("{task.description}", markup=False), TextColumn("{task.fields[files]}")
     columns = (label, BarColumn(), counts, DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
     with open_client(url) as client:
@@ -340,7 +337,7 @@ def export(
             def show(done: int, files: int, fetched: int) -> None:
                 progress.update(bar, completed=fetched, files=f"{done}/{files}")
 
-            fetched = FORMATS[format](taken, out, lambda shard: client.fetch(path_of("shards", shard.id, "file")), show)
+            fetched = export_shards(taken, out, lambda shard: client.fetch(path_of("shards", shard.id, "file")), show)
     told = {"dataset": name, "snapshot": taken.digest, "out": str(out), "files": len(taken.shards), "fetched": fetched}
     line = f"{out}: {count(len(taken.shards))} files, {size(taken.size_bytes)}, snapshot {taken.digest}"
     report({**told, "bytes": taken.size_bytes, "complete": taken.complete}, line, json=json)

@@ -66,7 +66,6 @@ def say_deleted(what: str, name: str, *, json: bool, undo: str = "") -> None:
 
 
 def restore(url: str | None, what: str, name: str, *, json: bool) -> None:
-    """Restore a deleted resource and report it."""
     with open_client(url) as client:
         found = client.send("POST", path_of(f"{what}s", name, "restore")).json()
     report({"restored": found["id"], "kind": what}, f"{what} {name} is restored", json=json)
@@ -131,7 +130,6 @@ def job_summary(job: JobDetail) -> dict[str, Any]:
 
 
 def show_asset(asset: dict[str, Any], *, json: bool) -> None:
-    """Print the facts of a hand or object."""
     if json:
         emit(asset)
         return
@@ -231,7 +229,6 @@ class JobDisplay:
         self._progress.stop()
 
     def update(self, job: Job) -> None:
-        """Show a new state of the job."""
         for stage in job.stages:
             if stage.state is not State.QUEUED:
                 self._started.setdefault(stage.stage, time.monotonic())

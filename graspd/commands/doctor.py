@@ -72,7 +72,7 @@ def gpu(settings: Settings, *, child: Child = run_child, has_driver: Callable[[]
     )
     if full := [one["name"] for one in gpus if one["free"] < _MEMORY_LOW]:
         return warning(
-            line, f"see nvidia-smi: other processes fill {',  '.join(full)}; launches are halved until they fit"
+            line, f"see nvidia-smi: other processes fill {', '.join(full)}; launches are halved until they fit"
         )
     return good(f"{line}; {needed}")
 

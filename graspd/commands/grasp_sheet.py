@@ -71,7 +71,6 @@ class GraspSheet:
         return "" if spec is None else spec.kind
 
     def png(self, *, subtitle: str) -> bytes:
-        """Draw the sheet as a PNG."""
         said = self.shard.attributes
         title = f"{said.get('hand', self.hand.name)} on {said.get('object', self.obj.name)}"
         title += f", {self.scene}" if self.scene else ""

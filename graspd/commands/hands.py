@@ -96,10 +96,9 @@ def _bar(what: str, first: str = "", *, quiet: bool) -> Iterator[ExecutionContex
 
 def _draw(hand: HandModel, picture: Path, *, collision: bool) -> None:
     from graspd.worker.rendering.hands import without_visuals
-    from graspd.worker.rendering.portraits import above, hand_portrait, hand_sides, write_png
+    from graspd.worker.rendering.portraits import hand_portrait, write_png
 
-    shown = without_visuals(hand) if collision else hand
-    write_png(above(hand_portrait(shown), hand_sides(hand)), picture)
+    write_png(hand_portrait(without_visuals(hand) if collision else hand), picture)
 
 
 def _write(file: str, options: dict[str, Any], report: dict[str, Any], target: Path) -> None:

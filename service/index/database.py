@@ -12,7 +12,7 @@ import logging
 import sqlite3
 import threading
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from datetime import UTC, datetime
 from pathlib import Path
@@ -26,13 +26,17 @@ from sqlalchemy import (
     MetaData,
     RowMapping,
     Select,
+    Table,
+    bindparam,
     create_engine,
     event,
     inspect,
     make_url,
     select,
     text,
+    update,
 )
+from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import ArgumentError, DataError, NoSuchModuleError, SQLAlchemyError
 
 from graspd.service.index.tables import grasps, metadata
@@ -124,9 +128,9 @@ class Database:
             raise NotFoundError(f"there is no {what}")
         return found[0]
 
-    def column(self, query: Select[Any], within: Connection | None = None) -> list[Any]:
+    def column(self, query: Select[Any]) -> list[Any]:
         """Return the first column of the rows."""
-        with self.reading(within) as connection:
+        with self.reading() as connection:
             return list(connection.scalars(query))
 
     def among(self, query: Select[Any], column: ColumnElement[Any], wanted: Iterable[Any]) -> list[Any]:
@@ -405,3 +409,33 @@ class SqliteFile:
 
     def _beside(self, name: str) -> Path:
         return self.path.with_name(f"{self.path.name}{name}")
+
+
+#: Rows are written with one statement that runs for each: it is faster to build than one with all of them.
+Row = Mapping[str, Any]
+
+
+def upsert(connection: Connection, table: Table, rows: Sequence[Row], *, keep: Sequence[str] = ()) -> None:
+    """Insert rows; for existing primary keys update all given columns except `keep`.
+
+    All rows have the same columns. Of two rows with one key the last one counts.
+    """
+    if not rows:
+        return
+    keys = [column.name for column in table.primary_key]
+    insert: Any = (postgresql if connection.dialect.name == "postgresql" else sqlite).insert(table)
+    changed = {name: insert.excluded[name] for name in rows[0] if name not in keys and name not in keep}
+    if changed:
+        statement = insert.on_conflict_do_update(index_elements=keys, set_=changed)
+    else:
+        statement = insert.on_conflict_do_nothing(index_elements=keys)
+    connection.execute(statement, list(rows))
+
+
+def update_rows(connection: Connection, table: Table, rows: Sequence[Row], *, state: str) -> None:
+    """Update rows by `id`, if their column `state` still has that value."""
+    if not rows:
+        return
+    values: dict[str, Any] = {name: bindparam(f"new_{name}") for name in rows[0] if name != "id"}
+    statement = update(table).where(table.c.id == bindparam("new_id"), table.c.state == state).values(**values)
+    connection.execute(statement, [{f"new_{name}": value for name, value in row.items()} for row in rows])

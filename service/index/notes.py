@@ -8,8 +8,7 @@ from typing import Any, Final
 
 from sqlalchemy import Connection, delete, func, select
 
-from graspd.service.index.bulk import upsert
-from graspd.service.index.database import IndexPart
+from graspd.service.index.database import IndexPart, upsert
 from graspd.service.index.tables import damage, notes
 from graspd.service.model.clock import timestamp
 
@@ -17,7 +16,7 @@ _REBUILT: Final = "rebuilt"
 _SCAN: Final = "integrity scan"
 _CHANGES: Final = "changes"
 _MARK: Final = "mark"
-_SCAN_TURN: Final = "integrity scan turn"
+_SCAN_PAUSE: Final = "integrity scan pause"
 _SERVICE: Final = "service"
 #: Stored names of records; the count includes all.
 _NAMED: Final = 50
@@ -100,25 +99,16 @@ class Notes(IndexPart):
     def set_scan_note(self, note: ScanNote) -> None:
         self._set(_SCAN, asdict(note))
 
-    def take_scan_turn(self, holder: str, *, is_controller: bool, lasts_s: float) -> bool:
-        """Take or renew the right to read through the whole store; return False if another holder has it.
-
-        A controller yields to other callers. The right lasts `lasts_s` after the last call [s].
-        """
+    def pause_scan(self, lasts_s: float, *, begin: bool = False) -> bool:
+        """Pause the controller's scan for `lasts_s` from now [s]; return False if `begin` and it is paused already."""
         with self.database.writing() as connection:
-            held = self._get(_SCAN_TURN, connection)
-            others = held and held["holder"] != holder and held["until"] > timestamp()
-            if others and (is_controller or not held["controller"]):
+            if begin and self.is_scan_paused(within=connection):
                 return False
-            value = {"holder": holder, "controller": is_controller, "until": timestamp(-lasts_s)}
-            self._set(_SCAN_TURN, value, connection)
+            self._set(_SCAN_PAUSE, timestamp(-lasts_s), connection)
         return True
 
-    def end_scan_turn(self, holder: str) -> None:
-        with self.database.writing() as connection:
-            held = self._get(_SCAN_TURN, connection)
-            if held and held["holder"] == holder:
-                connection.execute(delete(notes).where(notes.c.name == _SCAN_TURN))
+    def is_scan_paused(self, *, within: Connection | None = None) -> bool:
+        return (self._get(_SCAN_PAUSE, within) or "") > timestamp()
 
     def _get(self, name: str, within: Connection | None = None) -> Any:
         return self.database.value(select(notes.c.value).where(notes.c.name == name), within)

@@ -17,7 +17,7 @@ from graspd.service.index.changes.rows import QUIET
 from graspd.service.index.index import Index
 from graspd.service.index.notes import StoreMark
 from graspd.service.index.outbox import last_end
-from graspd.service.index.tables import LIVE_COLUMNS, LIVE_TABLES, datasets, metadata, webhooks
+from graspd.service.index.tables import LIVE_COLUMNS, LIVE_TABLES, datasets, jobs, metadata, shards, webhooks
 from graspd.service.model import names
 from graspd.service.model.errors import DamagedError, InputError, NotFoundError
 from graspd.service.model.records import (
@@ -205,6 +205,20 @@ def differences(index: Index, store: Store) -> list[str]:
         with index.database.reading() as live, fresh.database.reading() as derived:
             rows = [line for table in metadata.tables.values() for line in _compare(table, live, derived)]
         return [*damaged, *rows][:_SHOWN_DIFFERENCES]
+
+
+def missing_names(index: Index, store: Store) -> list[str]:
+    """Return shards and jobs that only the index or only the store has, one line each; reads no record of the store."""
+    gone = {f"jobs {name}" for what, name in pending(store) if what == "job"}
+    stored = {
+        f"shards {entry.key.rpartition('/')[2].removesuffix('.json')}"
+        for entry in store.list(names.SHARDS)
+        if entry.key.endswith(".json")
+    }
+    stored |= {f"jobs {entry.key.split('/')[1]}" for entry in store.list(names.JOBS) if entry.key.endswith("/job.json")}
+    with index.database.reading() as connection:
+        rows = {f"{table.name} {one}" for table in (shards, jobs) for one in connection.scalars(select(table.c.id))}
+    return [f"{name}: not in the {'index' if name in stored else 'store'}" for name in sorted((rows ^ stored) - gone)]
 
 
 def _compare(table: Table, live: Connection, derived: Connection) -> Iterator[str]:

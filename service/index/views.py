@@ -224,16 +224,6 @@ class Stats(Validated):
     workers: int
 
 
-class Throughput(View):
-    """Production of one interval."""
-
-    start: str
-    grasps: int
-    valid: int
-    tasks: int
-    seconds: float
-
-
 class EndView(View):
     """A job or a dataset that ended."""
 

@@ -13,8 +13,6 @@ from typing import Final
 ROOT: Final = Path("/")
 #: Cache lifetime of a quota [s].
 _LATELY_S: Final = 2.0
-#: Mount points of the CPU controller of cgroup v1.
-_V1: Final = ("cpu", "cpu,cpuacct")
 
 
 def available_cores(root: Path = ROOT) -> int:
@@ -30,40 +28,29 @@ def _lately(root: Path, moment: int) -> list[float]:
 
 
 def _quotas(root: Path) -> Iterator[float]:
-    """Yield the quotas [cores] of this process's control group and its ancestors."""
-    mount = root / "sys/fs/cgroup"
-    for controllers, group in _groups(root):
-        if not controllers:
-            yield from _ratio(_text(mount / group / "cpu.max"))
-        elif "cpu" in controllers.split(","):
-            for name in _V1:
-                files = (mount / name / group / f"cpu.cfs_{what}_us" for what in ("quota", "period"))
-                yield from _ratio(" ".join(map(_text, files)))
+    """Yield the quotas [cores] of this process's control group and its ancestors; unlimited ones are omitted."""
+    for text in _limits(root, "cpu.max"):
+        try:
+            quota, period = map(int, text.split())
+        except ValueError:  # "max 100000"
+            continue
+        if quota > 0 and period > 0:
+            yield quota / period
 
 
 def available_memory(root: Path = ROOT) -> int:
     """Return the memory for this process [bytes]: the machine's, or its control group's limit if less."""
-    return min([os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"), *_memory_limits(root)])
+    limits = (text.strip() for text in _limits(root, "memory.max"))
+    given = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    return min([given, *(int(text) for text in limits if text.isdigit() and int(text) > 0)])
 
 
-def _memory_limits(root: Path) -> Iterator[int]:
-    """Yield the memory limits [bytes] of this process's control group and its ancestors, where set."""
-    mount = root / "sys/fs/cgroup"
-    for controllers, group in _groups(root):
-        words = []
-        if not controllers:
-            words = _text(mount / group / "memory.max").split()
-        elif "memory" in controllers.split(","):
-            words = _text(mount / "memory" / group / "memory.limit_in_bytes").split()
-        yield from (int(word) for word in words if word.isdigit() and int(word) > 0)
-
-
-def _groups(root: Path) -> Iterator[tuple[str, str]]:
-    """Yield the process's control groups and their ancestors, each with its controllers; no controllers: cgroup v2."""
+def _limits(root: Path, name: str) -> Iterator[str]:
+    """Yield the texts of a limit's file in the process's control group (version 2) and its ancestors."""
     for line in _text(root / "proc/self/cgroup").splitlines():
-        _, controllers, path = [*line.split(":", 2), "", ""][:3]
-        for group in (PurePosixPath(path), *PurePosixPath(path).parents):
-            yield controllers, str(group).lstrip("/")
+        path = PurePosixPath(line.partition("::")[2])
+        for group in (path, *path.parents):
+            yield _text(root / "sys/fs/cgroup" / str(group).lstrip("/") / name)
 
 
 def _text(file: Path) -> str:
@@ -71,13 +58,3 @@ def _text(file: Path) -> str:
         return file.read_text()
     except OSError:
         return ""
-
-
-def _ratio(text: str) -> Iterator[float]:
-    """Yield quota over period; nothing if unlimited (`max`, -1)."""
-    try:
-        quota, period = map(int, text.split())
-    except ValueError:
-        return
-    if quota > 0 and period > 0:
-        yield quota / period

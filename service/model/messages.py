@@ -13,11 +13,10 @@ from graspd.service.model.states import AssetKind, Stage
 
 
 class Origin(Model):
-    """Origin of a job, for logs and traces of its tasks and for fair scheduling between keys."""
+    """Origin of a job, for logs of its tasks and for fair scheduling between keys."""
 
     request: str = Field("", max_length=64, description="id of the HTTP request")
     key: str = Field("", max_length=64, description="name of the API key")
-    traceparent: str = Field("", max_length=64, description="W3C trace context")
 
     # Ignore further fields of a newer API.
     model_config = ConfigDict(frozen=True, extra="ignore")

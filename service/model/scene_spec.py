@@ -249,10 +249,6 @@ class NamedNeighbour(NeighbourSpec):
     object: Name = Field(description="name of an object known to the service")
 
 
-def _beside_form(value: object) -> str:
-    return "name" if isinstance(value, str) else "neighbour"
-
-
 def _whole(value: str | NamedNeighbour) -> NamedNeighbour:
     return NamedNeighbour(object=value) if isinstance(value, str) else value
 
@@ -260,7 +256,7 @@ def _whole(value: str | NamedNeighbour) -> NamedNeighbour:
 #: A neighbour in a request: a name, or a name with a pose.
 BesideOption = Annotated[
     Annotated[Name, Tag("name")] | Annotated[NamedNeighbour, Tag("neighbour")],
-    Discriminator(_beside_form),
+    Discriminator(lambda value: "name" if isinstance(value, str) else "neighbour"),
     AfterValidator(_whole),
 ]
 

@@ -127,13 +127,10 @@ def examine(
         return None  # removed since it was listed
 
 
-def _model_of(key: str) -> type[Any] | None:
-    return next((model for pattern, model in _RECORDS if re.fullmatch(pattern, key)), None)
-
-
 def _sealed(store: Store, key: str, read: Read, unsealed: Unsealed) -> Damage | None:
     """Check an object with its own checksum; without one, check its content as far as possible."""
-    match, model = _UPLOAD.fullmatch(key), _model_of(key)
+    match = _UPLOAD.fullmatch(key)
+    model = next((model for pattern, model in _RECORDS if re.fullmatch(pattern, key)), None)
     try:
         if not is_sealed(key, _counted(store.stream(key), read), store.size(key)):
             unsealed(key)

@@ -7,10 +7,8 @@ import logging
 import threading
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import replace
 from typing import Final
-from uuid import uuid4
 
 from graspd.service.index.notes import Damage, ScanNote
 from graspd.service.model.clock import age_of, timestamp
@@ -30,36 +28,12 @@ _KEYS: Final = 10_000
 _LEAST: Final = 16 * 2**10
 #: Most backlog that is caught up at once after a pause [s].
 _BURST_S: Final = 0.25
-#: Interval at which a reader of the store renews its turn [s]; the turn expires after three times as long.
-_TURN_S: Final = 5.0
+#: Interval of queries whether `graspd admin store verify` pauses the scan [s].
 _PAUSE_S: Final = 5.0
 
 
 class Interrupted(Exception):
-    """The process shall stop, or another process reads the store."""
-
-
-class ReadPermit:
-    """Exclusive right to read through the store; `store verify` takes precedence over the controller."""
-
-    def __init__(self, services: Services, *, is_controller: bool, clock: Callable[[], float] = time.monotonic) -> None:
-        self._services, self._is_controller, self._clock = services, is_controller, clock
-        self._holder = uuid4().hex
-        self._said = -_TURN_S
-
-    def is_mine(self) -> bool:
-        """Take or renew the turn; queries the index every few seconds."""
-        now = self._clock()
-        if now - self._said >= _TURN_S:
-            take = self._services.index.notes.take_scan_turn
-            if not take(self._holder, is_controller=self._is_controller, lasts_s=3 * _TURN_S):
-                return False
-            self._said = now
-        return True
-
-    def end(self) -> None:
-        self._services.index.notes.end_scan_turn(self._holder)
-        self._said = -_TURN_S
+    """The process shall stop, or `graspd admin store verify` reads the store."""
 
 
 class IntegrityScan:
@@ -70,7 +44,7 @@ class IntegrityScan:
     ) -> None:
         self._services, self._stop, self._clock = services, stop, clock
         self._rate = services.settings.integrity_scan_mb_per_s * 2**20
-        self.turn = ReadPermit(services, is_controller=True, clock=clock)
+        self._asked = -_PAUSE_S
         self._paid = clock()
         self._looked = clock()
 
@@ -78,7 +52,7 @@ class IntegrityScan:
         """Run until `stop` is set. Wait for an unavailable backend."""
         while not self._stop.is_set():
             try:
-                if self.turn.is_mine() and self.advance():
+                if self._may_read() and self.advance():
                     continue
             except Interrupted:
                 pass
@@ -87,8 +61,15 @@ class IntegrityScan:
             except Exception:
                 log.exception("the integrity scan failed; it continues later")
             self._stop.wait(_PAUSE_S)
-        with suppress(GraspdError):
-            self.turn.end()
+
+    def _may_read(self) -> bool:
+        """Check that `store verify` does not pause the scan; queries the index every few seconds."""
+        now = self._clock()
+        if now - self._asked >= _PAUSE_S:
+            if self._services.index.notes.is_scan_paused():
+                return False
+            self._asked = now
+        return True
 
     def advance(self) -> bool:
         """Read some more objects; return whether more can be read now. Interrupted: `store verify` reads now."""
@@ -144,5 +125,5 @@ class IntegrityScan:
         """Wait until `size` more bytes are within the rate."""
         now = self._clock()
         self._paid = max(self._paid, now - _BURST_S) + size / self._rate
-        if self._stop.wait(max(0.0, self._paid - now)) or not self.turn.is_mine():
+        if self._stop.wait(max(0.0, self._paid - now)) or not self._may_read():
             raise Interrupted

@@ -71,6 +71,7 @@ def prepare(
     services.queue.ping()
     named = request.model_copy(update={"hand": hand.name, "object": obj.name})
     request, choice = Resolver(services.store).choose(named)
+    origin = Origin(request=bound("request"), key=bound("key"))
     record = JobRecord(
         id=job_id(request, hand.digest, obj.digest, scope.project),
         request=request,
@@ -78,7 +79,7 @@ def prepare(
         object_digest=obj.digest,
         priority=priority or priority_of(request),
         created=timestamp(),
-        origin=_present_origin(),
+        origin=origin if origin != Origin() else None,
         owner=owner,
         project=scope.project,
         choice=choice,
@@ -241,11 +242,6 @@ def _told(services: Services, job_id: str) -> JobView:
     except UnavailableError as error:
         log.warning("the state of job %s, %s, was not announced: %s", job_id, job.state, error)
     return job
-
-
-def _present_origin() -> Origin | None:
-    origin = Origin(request=bound("request"), key=bound("key"), traceparent=bound("traceparent"))
-    return origin if origin != Origin() else None
 
 
 def check_scene(options: JobOptions, obj: AssetView, beside: Sequence[AssetView] = ()) -> None:

@@ -13,12 +13,12 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from itertools import zip_longest
 from typing import Final
 
 from graspd.service.index.outbox import DueDelivery
 from graspd.service.index.views import EndView
 from graspd.service.model.errors import UnavailableError
+from graspd.service.model.planning import interleave
 from graspd.service.model.webhooks import SIGNATURE, secret_of, signature
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.http_client import Networks, Response, networks, post
@@ -94,7 +94,7 @@ class WebhookDispatcher:
         of_project: dict[str, list[DueDelivery]] = {}
         for due in sorted(found, key=lambda one: self._last.get(one.hook.id, (0.0, False))):
             of_project.setdefault(due.hook.project or f"key {due.hook.owner}", []).append(due)
-        return [due for turn in zip_longest(*of_project.values()) for due in turn if due is not None]
+        return interleave(list(of_project.values()))
 
     def _failed_last(self, due: DueDelivery) -> bool:
         return due.attempts > 0 or self._last.get(due.hook.id, (0.0, False))[1]

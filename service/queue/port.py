@@ -45,11 +45,7 @@ class EventKind(StrEnum):
     """The job's state changed; `message` is the new state."""
 
 
-def _cut(value: object) -> object:
-    return value[:_LONGEST_MESSAGE] if isinstance(value, str) else value
-
-
-_LONGEST_MESSAGE: Final = 2000
+_LONGEST: Final = 2000
 
 
 class Event(Model):
@@ -63,7 +59,7 @@ class Event(Model):
     batch: Count = 0
     attempt: Count = 0
     worker: HostWord = ""
-    message: Annotated[str, BeforeValidator(_cut)] = ""
+    message: Annotated[str, BeforeValidator(lambda text: text[:_LONGEST] if isinstance(text, str) else text)] = ""
     last: bool = False
     seconds: Amount = 0.0
     output: Annotated[str, Field(pattern=r"^([a-z]{1,10}/)?[A-Za-z0-9_-]{0,64}$")] = ""

@@ -12,10 +12,9 @@
 `service.readers.torch_data` wraps them for PyTorch; no other module here imports torch.
 """
 
-from graspd.service.readers.cache import ShardCache
 from graspd.service.readers.clouds import Clouds
 from graspd.service.readers.depth_noise import DepthNoise
-from graspd.service.readers.files import ShardFile, Shards, open_shards
+from graspd.service.readers.files import ShardCache, ShardFile, Shards, open_shards
 from graspd.service.readers.grasps import Grasps
 from graspd.service.readers.pictures import Pictures
 

@@ -10,6 +10,7 @@ atomically at every start, and removed with the service.
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import secrets
@@ -19,7 +20,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from graspd.service.model.errors import InputError, UnavailableError
+from graspd.service.model.errors import BusyError, InputError, UnavailableError
 from graspd.service.run.children import start_of
 from graspd.service.settings import Settings
 from graspd.service.user_cache import write_whole
@@ -37,6 +38,27 @@ def local_url(host: str, port: int) -> str:
     """Return the URL at which this machine reaches an API that binds to a host; for all addresses the loopback's."""
     shown = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(host, f"[{host}]" if ":" in host else host)
     return f"http://{shown}:{port}"
+
+
+def bind(host: str, port: int) -> socket.socket:
+    """Bind a socket to the port, or to a free one for 0; BusyError if it is taken, InputError if it cannot be bound.
+
+    While it is open, the API of a child process can listen there, and the system assigns the port to no other process.
+    """
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    # asyncio disables Nagle's algorithm only on sockets with an explicit protocol; otherwise each body is 40 ms late.
+    bound = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
+    bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        bound.bind((host, port))
+    except OSError as error:
+        bound.close()
+        if error.errno == errno.EADDRINUSE:
+            raise BusyError(
+                f"port {port} on {host} is taken; stop what uses it, or choose another with --port or GRASPD_PORT"
+            ) from None
+        raise InputError(f"the address {host}:{port} cannot be used: {error.strerror or error}") from None
+    return bound
 
 
 def forget_address(folder: Path) -> None:

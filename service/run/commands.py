@@ -59,7 +59,8 @@ def up(
     json: JsonFlag = False,
 ) -> None:
     """Run the whole service on this machine until Ctrl-C."""
-    _check_extras(workers)
+    if any(find_spec(library) is None for library in ("httpx", "fastapi", *(("warp",) if workers else ()))):
+        raise UnavailableError("`graspd up` is not part of this install; run pip install 'graspd[all]'")
     from graspd.service.run.address import joining
     from graspd.service.run.supervisor import Supervisor
 
@@ -95,7 +96,12 @@ def controller(
     log_to_stderr(settings, "controller")
     keep_private(settings)
     if check:
-        check_controller(settings)
+        from graspd.service.pipeline.leading import PART
+        from graspd.service.queue.rq_queue import open_queue
+
+        with closing(open_queue(settings, patience=0)) as queue:
+            if not queue.announced(PART):
+                raise UnavailableError("no controller sent a heartbeat lately; start `graspd controller`")
         return
     _run_controller(settings, stop_on_signals())
 
@@ -205,21 +211,6 @@ def path(data_dir: DataDir = None) -> None:
 
     url = make_url(load_settings(data_dir=data_dir).resolved_index_url)
     typer.echo(without_secrets(url.render_as_string(hide_password=True)))
-
-
-def _check_extras(workers: int) -> None:
-    needed = ("httpx", "fastapi", "warp") if workers else ("httpx", "fastapi")
-    if any(find_spec(library) is None for library in needed):
-        raise UnavailableError("`graspd up` is not part of this install; run pip install 'graspd[all]'")
-
-
-def check_controller(settings: Settings) -> None:
-    from graspd.service.pipeline.leading import PART
-    from graspd.service.queue.rq_queue import open_queue
-
-    with closing(open_queue(settings, patience=0)) as queue:
-        if not queue.announced(PART):
-            raise UnavailableError("no controller sent a heartbeat lately; start `graspd controller`")
 
 
 def stop_on_signals() -> threading.Event:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+import time
+from typing import Annotated, Final
 
 import typer
 
@@ -13,6 +14,9 @@ from graspd.service.model.errors import ConflictError
 app = CommandGroup(no_args_is_help=True)
 store_app = CommandGroup(no_args_is_help=True, help="Verify and repair the store.")
 app.add_typer(store_app, name="store")
+
+#: Time for which the integrity scan of the controller pauses after each renewal [s].
+_PAUSE_S: Final = 15.0
 
 
 @store_app.command(epilog="graspd admin store verify --repair")
@@ -30,25 +34,32 @@ def verify(
     from graspd.service.pipeline.backends import Services
     from graspd.service.pipeline.identity import identify_if_redis_answers
     from graspd.service.pipeline.integrity import MISSING, scan
-    from graspd.service.pipeline.integrity_scan import ReadPermit
     from graspd.service.pipeline.repair import repair as fix
 
     services = Services.open(load_settings(data_dir=data_dir), make=False)
     if repair:
         identify_if_redis_answers(services)
-    turn = ReadPermit(services, is_controller=False)
+    pause_scan, renewed = services.index.notes.pause_scan, time.monotonic()
+
+    def renew(size: int = 0) -> None:
+        nonlocal renewed
+        if time.monotonic() - renewed >= _PAUSE_S / 3:
+            pause_scan(_PAUSE_S)
+            renewed = time.monotonic()
+
+    if not pause_scan(_PAUSE_S, begin=True):
+        services.close()
+        raise ConflictError("another `graspd admin store verify` reads this store; wait until it is done")
     try:
-        if not turn.is_mine():
-            raise ConflictError("another `graspd admin store verify` reads this store; wait until it is done")
         shards, found, unsealed = 0, [], list[str]()
-        for key, wrong in scan(services.store, read=lambda size: turn.is_mine(), unsealed=unsealed.append):
-            turn.is_mine()
+        for key, wrong in scan(services.store, read=renew, unsealed=unsealed.append):
+            renew()
             shards += key.startswith(f"{names.SHARDS}/") and key.endswith(".json")
             found += [wrong] if wrong is not None else []
         services.index.damage.replace(found)
         repaired, left = fix(services, found) if repair else ([], found)
     finally:
-        turn.end()
+        pause_scan(0.0)
         services.close()
     if json:
         damaged = [{"shard": one.shard or one.key, "what": one.what, "key": one.key} for one in found]

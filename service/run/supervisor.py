@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import logging
-import os
 import secrets
 import socket
 import sys
@@ -19,13 +17,13 @@ from typing import IO, Final, Self
 import httpx
 from pydantic import SecretStr
 
-from graspd.service.model.errors import BusyError, GraspdError, InputError, UnavailableError
+from graspd.service.model.errors import GraspdError, InputError, UnavailableError
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.identity import identify_if_redis_answers, recorded
 from graspd.service.pipeline.leading import PART
 from graspd.service.queue.connection import redis_url
 from graspd.service.queue.rq_queue import RqQueue, open_queue
-from graspd.service.run.address import ListenAddress, forget_address, local_url, record_address
+from graspd.service.run.address import ListenAddress, bind, forget_address, local_url, record_address
 from graspd.service.run.children import Child, end_leftovers, keep_alive, stop_children
 from graspd.service.run.embedded import find_server, give_up_log, lock_file, own_redis, server_command, set_log_aside
 from graspd.service.settings import Settings
@@ -181,7 +179,7 @@ class Supervisor:
         folder = self._wanted.data_dir.resolve()
         update: dict[str, object] = {"data_dir": folder}
         if self._api:
-            reserved = _reserve(self._wanted.host, self._wanted.port)
+            reserved = bind(self._wanted.host, self._wanted.port)
             update["port"] = reserved.getsockname()[1]
             if sys.platform == "linux":
                 self._locks.append(reserved)
@@ -287,21 +285,3 @@ def _as_variable(value: object) -> str:
     if isinstance(value, SecretStr):
         return value.get_secret_value()
     return json.dumps(value) if isinstance(value, dict) else str(value)
-
-
-def _reserve(host: str, port: int) -> socket.socket:
-    """Bind a socket to the port, or to a free one for 0. While it is open, the API can listen there
-    and the system assigns the port to no other process.
-    """
-    reserved = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
-    reserved.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    try:
-        reserved.bind((host, port))
-    except OSError as error:
-        reserved.close()
-        if error.errno == errno.EADDRINUSE:
-            raise BusyError(
-                f"port {port} on {host} is taken; stop what uses it, or choose another with --port or GRASPD_PORT"
-            ) from None
-        raise InputError(f"the address {host}:{port} cannot be used: {os.strerror(error.errno or 0)}") from None
-    return reserved

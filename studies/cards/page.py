@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from bisect import bisect_right
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -174,10 +174,6 @@ def percent(value: float | None) -> str:
     return f"{100 * value:.{digits}f} %"
 
 
-def _interval(found: Row | None) -> str:
-    return f"{percent(found['share'])} ({percent(found['low'])} to {percent(found['high'])})" if found else "unknown"
-
-
 def _count(number: int, what: str = "") -> str:
     return f"{number:,} {what}{'' if number == 1 else 's'}" if what else f"{number:,}"
 
@@ -194,10 +190,6 @@ def _rejected(rejected: Mapping[str, int] | None) -> str:
     return ", ".join(parts) or ("-" if rejected is not None else "not recorded")
 
 
-def _millimetres(extents: Sequence[float] | None) -> str:
-    return "-" if extents is None else " x ".join(f"{1e3 * extent:.0f}" for extent in extents)
-
-
 def _template() -> Any:
     # The page is Markdown: nothing is escaped but the cells of tables.
     environment = Environment(
@@ -212,10 +204,12 @@ def _template() -> Any:
         "cell": cell_text,
         "count": _count,
         "fixed": fixed,
-        "interval": _interval,
+        "interval": lambda found: (
+            f"{percent(found['share'])} ({percent(found['low'])} to {percent(found['high'])})" if found else "unknown"
+        ),
         "json": lambda value, indent=None: json.dumps(value, ensure_ascii=False, indent=indent),
         "letters": lambda name: "".join(letter for letter in name if letter.isalnum()) or "dataset",
-        "millimetres": _millimetres,
+        "millimetres": lambda extents: " x ".join(f"{1e3 * extent:.0f}" for extent in extents or ()) or "-",
         "percent": percent,
         "rejected": _rejected,
         "size": _size,

@@ -40,11 +40,22 @@ MARKERS: Final = ("o", "s", "D", "^", "v", "P", "X", "<")
 INK: Final = "#1f2937"
 
 
-def draw(rows: Sequence[Row], files: Sequence[Path]) -> None:
-    """Plot accuracies over valid grasps per second, and success over seconds to the first valid grasp."""
+def new_figure(width: float, height: float) -> Any:
+    """Return an empty figure of this size [inch]."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(15.5, 8.6), layout="constrained")
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def plain_axes(axes: Any) -> None:
+    """Add a faint grid and remove the upper and the right line."""
+    axes.grid(alpha=0.25)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def draw(rows: Sequence[Row], files: Sequence[Path]) -> None:
+    """Plot accuracies over valid grasps per second, and success over seconds to the first valid grasp."""
+    figure = new_figure(15.5, 8.6)
     panels = figure.subplots(2, 3)
     styles, words = _styles(rows), "valid grasps per second, end to end"
     labels = []
@@ -68,11 +79,9 @@ def draw_hands(
     label: PointLabel | None = None,
 ) -> None:
     """Plot a panel per hand, accuracy over speed; `words` has the axis labels, `label` returns a point's label."""
-    from matplotlib.figure import Figure
-
     columns = min(3, len(by_hand))
     lines = -(-len(by_hand) // columns)
-    figure = Figure(figsize=(5.4 * max(columns, 2), 4.6 * lines), layout="constrained")
+    figure = new_figure(5.4 * max(columns, 2), 4.6 * lines)
     panels = figure.subplots(lines, columns, squeeze=False)
     styles = _styles([row for rows in by_hand.values() for row in rows])
     labels = []
@@ -115,9 +124,7 @@ def _over_speed(
 
 def draw_scenes(rows: Sequence[Row], files: Sequence[Path], *, second: str) -> None:
     """Plot shares of candidates over lifted grasps per `second`, and lifts over seconds to the first."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(15.5, 8.6), layout="constrained")
+    figure = new_figure(15.5, 8.6)
     panels = figure.subplots(2, 3)
     styles = _styles(rows)
     words = f"lifted grasps per {second}, end to end"
@@ -174,8 +181,7 @@ def _panel(
     _logarithmic(axes, [label.x * (0.5 if "0 of" in label.text else 1.0) for label in labels])
     top = max([row[f"{y}_high"] for row in rows] or [1.0])
     axes.set_ylim(-0.09 * top, 1.08 * top)
-    axes.grid(alpha=0.25)
-    axes.spines[["top", "right"]].set_visible(False)
+    plain_axes(axes)
     return labels
 
 
@@ -217,12 +223,10 @@ def one_of_several(row: Row, rows: Sequence[Row]) -> str:
 
 def draw_sweeps(rows: Sequence[Row], file: Path) -> None:
     """Plot a panel per setting: success over speed, a point per value."""
-    from matplotlib.figure import Figure
-
     knobs = list(dict.fromkeys(row["knob"] for row in rows))
     columns = 3
     lines = -(-len(knobs) // columns)
-    figure = Figure(figsize=(11, 3.1 * lines), layout="constrained")
+    figure = new_figure(11, 3.1 * lines)
     panels = figure.subplots(lines, columns, squeeze=False, sharex=True, sharey=True)
     labels = []
     for axes, knob in zip(panels.flat, knobs, strict=False):
@@ -235,8 +239,7 @@ def draw_sweeps(rows: Sequence[Row], file: Path) -> None:
             labels.append(Label(axes, row["speedup"], row["gsr"], str(row["value"]), INK, y_bar=_ends(row, "gsr")))
         axes.set_title(knob, loc="left", fontsize=10)
         axes.set_ylim(0, 1.05)
-        axes.grid(alpha=0.25)
-        axes.spines[["top", "right"]].set_visible(False)
+        plain_axes(axes)
     for axes in panels.flat[len(knobs) :]:
         axes.set_visible(False)
     # All panels share an axis from zero, so that differences are comparable.

@@ -155,7 +155,7 @@ class Rollout:
         table = measure(
             self.hand, self.true, found, friction=FRICTION, thresholds_m=[THRESHOLD_M], run=self.setting.run
         )
-        columns = {key: _flat(table[f"quality/{name}"]) for key, name in COLUMNS.items()}
+        columns = {key: np.asarray(table[f"quality/{name}"], float).reshape(-1) for key, name in COLUMNS.items()}
         return columns | {"feasible": np.asarray(passes(table), float)}
 
     def scrutinise(self, models: int) -> None:
@@ -194,7 +194,3 @@ class Rollout:
         names = ("ca_cm2", "iv_cm3", "epsilon", "wrench_volume")
         row = {name: float(np.nanmean(self.values(name)[order])) for name in names}
         return row | {"sd_cm": float(slip.mean()), "n": float(len(order))}
-
-
-def _flat(values: NDArray[Any]) -> Floats:
-    return np.asarray(values, float).reshape(len(values))

@@ -64,14 +64,6 @@ def cube(side_mm: float) -> Any:
     return trimesh.creation.box(3 * (side_mm * MILLIMETRES,))
 
 
-def _opened(faces: Any) -> Any:
-    return faces[2:]
-
-
-def _inverted(faces: Any) -> Any:
-    return faces[:, ::-1]
-
-
 def _half_inverted(faces: Any) -> Any:
     faces[::2] = faces[::2, ::-1]
     return faces
@@ -94,9 +86,9 @@ FAMILIES: Final[dict[str, tuple[str, Callable[[float], Any], tuple[float, ...]]]
 _ALLOW_OPEN: Final = "a side is missing, --allow-open"
 #: Defects of a box, as functions on its faces.
 DEFECTS: Final[dict[str, Callable[[Any], Any]]] = {
-    "a side is missing": _opened,
-    _ALLOW_OPEN: _opened,
-    "inside out": _inverted,
+    "a side is missing": lambda faces: faces[2:],
+    _ALLOW_OPEN: lambda faces: faces[2:],
+    "inside out": lambda faces: faces[:, ::-1],
     "every other face inside out": _half_inverted,
 }
 #: Defects that ingest refuses or closes.

@@ -100,12 +100,16 @@ def draw(one: StabilityMap, path: Path) -> None:
 
 
 def _panel(axes: Any, one: StabilityMap, panel: str) -> None:
+    from matplotlib.patches import Rectangle
+
     cells = one.of(panel)
     xs, ys = (list(dict.fromkeys(getattr(cell, axis) for cell in cells)) for axis in ("x", "y"))
     for cell in cells:
         at = xs.index(cell.x), ys.index(cell.y)
         fill, ink = COLOURS[cell.outcome]
-        axes.add_patch(_square(at, fill, framed=cell.reached and one.is_divided))
+        framed = cell.reached and one.is_divided
+        edge: dict[str, Any] = {"edgecolor": "#14191d", "linewidth": 1.4} if framed else {"linewidth": 0}
+        axes.add_patch(Rectangle((at[0] - 0.46, at[1] - 0.46), 0.92, 0.92, facecolor=fill, **edge))
         axes.text(*at, cell.text, ha="center", va="center", color=ink)
     axes.set_xlim(-0.5, len(xs) - 0.5)
     axes.set_ylim(-0.5, len(ys) - 0.5)
@@ -133,13 +137,6 @@ def _fit(axes: Any) -> None:
                 break
         else:
             text.set_visible(False)
-
-
-def _square(at: tuple[int, int], fill: str, *, framed: bool) -> Any:
-    from matplotlib.patches import Rectangle
-
-    edge: dict[str, Any] = {"edgecolor": "#14191d", "linewidth": 1.4} if framed else {"linewidth": 0}
-    return Rectangle((at[0] - 0.46, at[1] - 0.46), 0.92, 0.92, facecolor=fill, **edge)
 
 
 def _wrapped(value: float | str) -> str:

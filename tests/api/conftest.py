@@ -1,13 +1,11 @@
 """The application over a file store, an SQLite index and the queue's twin; no network, no Redis."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from datetime import datetime, tzinfo
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import pytest
 from fastapi import FastAPI
@@ -16,18 +14,14 @@ from starlette.testclient import TestClient
 
 from graspd.api.access.keys import KeyFile
 from graspd.api.app import create_app
-from graspd.service.index.index import Index
 from graspd.service.pipeline.backends import Services
 from graspd.service.queue.rq_queue import RqQueue
 from graspd.service.settings import Settings
-from graspd.service.store.store import open_store
 from tests.api.factories import add_builtins
-from tests.indexes import empty_index
-from tests.memory_queue import MemoryQueue
+from tests.indexes import open_services
 from tests.service.conftest import redis_server, redis_settings, rq_queue
 
 __all__ = ["redis_server", "redis_settings", "rq_queue"]
-
 TODAY = "2026-11-20"
 BASE_URL = "http://127.0.0.1:8000"
 
@@ -36,8 +30,7 @@ BASE_URL = "http://127.0.0.1:8000"
 def furnished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A data folder with the built-in hands and objects in store and index; each test gets a copy."""
     folder = tmp_path_factory.mktemp("furnished") / "data"
-    made = Settings(data_dir=folder)
-    opened = Services(made, open_store(made.resolved_store_url), empty_index(made.resolved_index_url), MemoryQueue())
+    opened = open_services(Settings(data_dir=folder))
     add_builtins(opened)
     opened.close()
     return folder
@@ -45,7 +38,7 @@ def furnished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 class _Noon(datetime):
     @classmethod
-    def now(cls, tz: tzinfo | None = None) -> _Noon:
+    def now(cls, tz: tzinfo | None = None) -> Self:
         return cls.fromisoformat(f"{TODAY}T12:00:00+00:00")
 
 
@@ -63,9 +56,7 @@ def settings(tmp_path: Path) -> Settings:
 @pytest.fixture
 def services(settings: Settings, furnished: Path) -> Iterator[Services]:
     shutil.copytree(furnished, settings.data_dir, dirs_exist_ok=True)
-    opened = Services(
-        settings, open_store(settings.resolved_store_url), Index(settings.resolved_index_url), MemoryQueue()
-    )
+    opened = open_services(settings)
     yield opened
     opened.close()
 

@@ -1,7 +1,5 @@
 """Jobs in any state, made as the pipeline and the workers make them: records in the store, rows in the index."""
 
-from __future__ import annotations
-
 import io
 import zipfile
 from pathlib import Path

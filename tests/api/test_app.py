@@ -1,33 +1,38 @@
 """The application as a whole: its socket, its imports, its OpenAPI document, its scrape."""
 
-from __future__ import annotations
-
 import asyncio
 import socket
 import subprocess
 import sys
 from functools import cache
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from fastapi import FastAPI
 from pydantic import TypeAdapter
 from starlette.testclient import TestClient
 
+from graspd.api.app import create_app
 from graspd.api.metrics import Metrics, Snapshot
-from graspd.api.server import bind
+from graspd.service.index.rebuild import rebuild
 from graspd.service.model.series import SERIES
+from graspd.service.pipeline.backends import Services
 from graspd.service.queue.port import QueueStatus
+from graspd.service.run.address import bind
+from graspd.service.settings import Settings
 from tests.api.conftest import BASE_URL
+from tests.api.factories import add_job
 from tests.conftest import REPOSITORY
+from tests.damage import overwrite
 from tests.fakes import beat_of
+from tests.indexes import empty_index
 
 
 def test_the_first_requests_build_no_route(app: FastAPI, monkeypatch: pytest.MonkeyPatch) -> None:
-    def built_late(self: TypeAdapter[Any], *arguments: Any, **named: Any) -> None:
-        raise AssertionError("a field of a route is built while a request waits")
-
-    monkeypatch.setattr(TypeAdapter, "__init__", built_late)
+    monkeypatch.setattr(
+        TypeAdapter, "__init__", Mock(side_effect=AssertionError("a field of a route is built while a request waits"))
+    )
     with TestClient(app, base_url=BASE_URL) as client:
         assert all(client.get(path).is_success for path in ("/v1/jobs", "/v1/datasets", "/", "/healthz"))
 
@@ -117,3 +122,32 @@ def test_the_page_of_the_api_lists_every_route(http: TestClient) -> None:
     assert [path for path in answer.json()["paths"] if f"`{path}`" not in page] == []
     wanted = {part.partition('"')[0] for part in answer.text.split("#/components/schemas/")[1:]}
     assert wanted <= set(answer.json()["components"]["schemas"])
+
+
+def asked_anew(app: FastAPI) -> dict[str, object]:
+    app.state.overview._probes._known = None
+    with TestClient(app, base_url="http://127.0.0.1:8000") as http:
+        answer = http.get("/readyz")
+        return {"status": answer.status_code, **answer.json()["parts"]["index"]}
+
+
+def test_an_index_that_lacks_what_the_store_has_is_not_ready(settings: Settings, services: Services) -> None:
+    record = add_job(services)
+    fresh = empty_index(f"sqlite:///{settings.data_dir / 'fresh.sqlite'}")
+    lost = Services(settings, services.store, fresh, services.queue)
+    app = create_app(settings, lost)
+    fresh.write.add_job(record)
+    assert (found := asked_anew(app))["status"] == 503
+    assert not found["ok"] and "controller" in str(found["detail"])
+    rebuild(fresh, services.store)
+    assert asked_anew(app)["status"] == 200
+    fresh.close()
+
+
+def test_an_index_without_damaged_records_names_them(settings: Settings, services: Services) -> None:
+    key = f"jobs/{add_job(services).id}/job.json"
+    app = create_app(settings, services)
+    overwrite(services.store, key, b'{"x": 1}')
+    rebuild(services.index, services.store)
+    found = asked_anew(app)
+    assert found["status"] == 200 and key in str(found["detail"])

@@ -1,7 +1,5 @@
 """Uploads: what a user says about one reaches its check, and files go past memory."""
 
-from __future__ import annotations
-
 import json
 import os
 import tracemalloc
@@ -73,12 +71,6 @@ def test_the_options_of_a_hand_decide_its_check(http: TestClient, services: Serv
     assert "palm" not in facts["guessed"] and "closing" in facts["guessed"]
 
 
-def test_options_stand_over_the_asset_json_of_the_upload() -> None:
-    for options, said in (("{}", {}), (json.dumps({"units": "mm"}), {"units": "mm"})):
-        files = files_of_upload(AssetKind.OBJECT, "b.stl", b"solid", limit_bytes=99, options=options)
-        assert json.loads(files["asset.json"]) == {"file": "b.stl", **said}
-
-
 def test_what_was_refused_gets_in_under_its_name_with_the_mend(http: TestClient, services: Services) -> None:
     file = ("open_shell.stl", shell())
     first = http.post("/v1/objects", files={"file": file}).json()
@@ -100,13 +92,13 @@ def folder_of(count: int, size: int) -> bytes:
 
 def test_a_zip_is_kept_without_ever_being_whole_in_memory(services: Services, tmp_path: Path) -> None:
     with (tmp_path / "upload.zip").open("w+b") as file:
-        file.write(folder_of(3, 8 * MIB))
+        file.write(folder_of(3, 4 * MIB))
         tracemalloc.start()
         files = files_of_upload(AssetKind.OBJECT, "thing.zip", file, limit_bytes=32 * MIB)
         asset = publish_asset(services.store, AssetKind.OBJECT, "thing", files)
         _, peak = tracemalloc.get_traced_memory()
         tracemalloc.stop()
-    # Two pieces of 1 MiB on their way into the store, of 24 MiB.
+    # Two pieces of 1 MiB on their way into the store, of 12 MiB.
     assert peak < 3 * MIB
     assert len(load_asset_files(services.store, AssetKind.OBJECT, asset.digest)) == 5
 

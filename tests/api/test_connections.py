@@ -1,7 +1,5 @@
 """Connections to a real server on loopback: half-sent headers, bodies, forwarded addresses, streams of events."""
 
-from __future__ import annotations
-
 import asyncio
 import socket
 import tempfile
@@ -17,8 +15,9 @@ from fastapi import FastAPI, Request
 from graspd.api.access.keys import KeyFile, Scope
 from graspd.api.app import create_app
 from graspd.api.catalog import events
-from graspd.api.server import TimedProtocol, bind, configuration
+from graspd.api.server import TimedProtocol, configuration
 from graspd.service.pipeline.backends import Services
+from graspd.service.run.address import bind
 from graspd.service.settings import Settings
 from tests.api.factories import add_job
 from tests.waiting import PATIENCE_S, until
@@ -56,6 +55,7 @@ def connect(settings: Settings) -> Iterator[Connect]:
         assert config.http is TimedProtocol
         config.http = _Quick
         listener = bind("127.0.0.1", 0)
+        listener.listen()
         connection = socket.create_connection(listener.getsockname(), timeout=PATIENCE_S)
         opened.append(connection)
         connection.sendall(sent)

@@ -3,8 +3,6 @@
 The long walk: `pytest -m slow tests/api/test_contract.py`.
 """
 
-from __future__ import annotations
-
 import base64
 import json
 from collections.abc import Iterator
@@ -25,13 +23,11 @@ from schemathesis.specs.openapi.checks import (
 )
 
 from graspd.api.app import create_app
-from graspd.service.pipeline.backends import Services
 from graspd.service.queue.connection import connect
 from graspd.service.queue.rq_queue import RqQueue
 from graspd.service.settings import Settings
-from graspd.service.store.store import open_store
 from tests.api.factories import add_builtins, add_job, add_worker, fail, finish_all
-from tests.indexes import empty_index
+from tests.indexes import open_services
 
 #: Examples of each operation; the many take hours.
 _EXAMPLES = (
@@ -61,9 +57,7 @@ def document(tmp_path_factory: pytest.TempPathFactory, redis_server: str) -> Ite
     )
     queue = RqQueue(connect(redis_server))
     queue.connection.flushdb()
-    services = Services(
-        settings, open_store(settings.resolved_store_url), empty_index(settings.resolved_index_url), queue
-    )
+    services = open_services(settings, queue=queue)
     add_builtins(services)
     done = add_job(services, scenes=1, views=1)
     finish_all(services, done)

@@ -1,7 +1,5 @@
 """`graspd demo` as a user runs it: a service of its own, one real job, files, and nothing left running."""
 
-from __future__ import annotations
-
 import json
 import os
 import sys

@@ -1,13 +1,13 @@
 """Requests made to break something: each gets an answer that says what is wrong with it."""
 
-from __future__ import annotations
-
 import base64
 import errno
 import json
 import os
 import tempfile
+from itertools import cycle, product
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from redis.exceptions import ConnectionError as RedisAway
@@ -21,7 +21,7 @@ from graspd.service.model.states import AssetKind
 from graspd.service.pipeline.backends import Services
 from graspd.service.settings import Settings
 from graspd.service.store.library import load_asset, load_check
-from tests.api.factories import zipped
+from tests.api.factories import add_job, finish_all, zipped
 
 STL = b"solid box\nendsolid box\n"
 LISTS: dict[str, tuple[Any, ...]] = {"/v1/grasps": (0.5, "s", 1), "/v1/datasets": ("t", "n")}
@@ -115,8 +115,7 @@ def test_long_findings_of_a_check_do_not_make_the_list_long(http: TestClient, se
     kind = AssetKind.OBJECT
     services.index.write.add_asset(load_asset(services.store, kind, digest), load_check(services.store, kind, digest))
     answer = http.get("/v1/objects/box")
-    assert len(answer.content) < 300_000
-    assert answer.json()["facts"] == {"faces": 7}
+    assert len(answer.content) < 300_000 and answer.json()["facts"] == {"faces": 7}
 
 
 def test_names_of_files_are_bounded(http: TestClient) -> None:
@@ -126,12 +125,8 @@ def test_names_of_files_are_bounded(http: TestClient) -> None:
 
 
 @pytest.mark.parametrize("where", ["the body", "the archive", "the store"])
-def test_a_full_disk_is_said_and_the_upload_may_come_again(
-    http: TestClient, where: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(*_: object, **__: object) -> Any:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
+def test_a_full_disk_is_told_and_a_retry_works(http: TestClient, where: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    full = Mock(side_effect=OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
     with monkeypatch.context() as patch:
         if where == "the body":
             patch.setattr(tempfile.SpooledTemporaryFile, "write", full)
@@ -141,8 +136,7 @@ def test_a_full_disk_is_said_and_the_upload_may_come_again(
             patch.setattr("graspd.service.store.store.os.link", full)
         answer = http.post("/v1/objects", files={"file": ("box.stl", STL)})
     assert answer.status_code == 503, answer.text
-    assert answer.json()["type"] == "/problems/store-unavailable"
-    assert "space" in answer.json()["detail"]
+    assert answer.json()["type"] == "/problems/store-unavailable" and "space" in answer.json()["detail"]
     assert http.post("/v1/objects", files={"file": ("box.stl", STL)}).status_code == 202
 
 
@@ -160,3 +154,39 @@ def test_redis_lost_in_the_middle_of_a_claim_forgets_no_job() -> None:
     key = Key(name="k", scope=Scope.SUBMIT, sha256="0" * 64, created="2026-01-01T00:00:00Z")
     with pytest.raises(QuotaError, match="has 7 grasps in unfinished jobs"), quotas.claim(key, "j", 5):
         pass
+
+
+#: What the service or its libraries read.
+NAMES = """
+    host origin cookie authorization range if-range if-none-match accept content-type content-length content-encoding
+    transfer-encoding forwarded x-forwarded-for x-forwarded-groups idempotency-key last-event-id x-request-id
+    traceparent sec-fetch-site
+"""
+#: With the id of a job and of a shard.
+PATHS = """
+    / /v1/jobs /v1/jobs/{0}/cancel /v1/shards/{1}/file /v1/hands/allegro/model /v1/hands /v1/datasets/estimate
+    /v1/events /v1/usage /healthz /metrics /login /submit /jobs/{0} /grasps /static/style.css /nowhere
+"""
+_VALUES = (
+    "| |*|null|http://[|http://[::1|//[|[|[::1]:x|http://\xe9|\xff\xfe|http://a:99999/|http://a:b|-1|0x10|1e400|NaN|"
+    'bytes=|bytes=-|bytes=9-1|bytes=a-b|bytes=0-0,1-1|W/"|W/*|Thu, 99 Foo 9999 99:99:99 GMT|Bearer|Bearer |Bearer \xa0|'
+    'Bearer gd_\xe9|Basic !!!|graspd_session=|graspd_session=\xff; a=b; ;;=|a="\\|=|application/json; charset=nonsense|'
+    "multipart/form-data|multipart/form-data; boundary=|multipart/form-data; boundary=b|text/html;q=\xb2|gzip, br|"
+    'for="[::1";by=|1.2.3.4, , \xe9|127.0.0.1:x|chunked|cross-site|%00|\x7f|../../x|<script>|{}'
+)
+_LONG = ("a" * 8000, "9" * 5000, '"' * 400, "bytes=0-" + "9" * 400, "Bearer " + "a" * 4000, "graspd_session=W10=." * 9)
+POSTED = (b"", b"[", b"\xff" * 50, b'{"hand": "\\ud800"}', b"a=b&" * 2000, b"--b\r\nContent-Disposition: x\r\n\r\n")
+
+
+def test_no_value_of_a_header_ends_in_a_5xx(http: TestClient, services: Services) -> None:
+    record = add_job(services)
+    shard = finish_all(services, record)[0].shard_id
+    methods = cycle(("GET", "POST", "POST"))
+    paths, bodies, found = cycle(PATHS.format(record.id, shard).split()), cycle(POSTED), set[int]()
+    for name, value in product(NAMES.split(), [*_VALUES.split("|"), *_LONG]):
+        path, method = next(paths), next(methods)
+        headers = {name.encode(): value.encode("latin-1")}
+        answer = http.request(method, path, content=next(bodies) if method == "POST" else None, headers=headers)
+        assert answer.status_code < 500, (method, path, name, value)
+        found.add(answer.status_code)
+    assert {200, 400, 403, 404, 405, 421, 422} <= found, "the requests reach what they are to reach"

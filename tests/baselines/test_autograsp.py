@@ -1,7 +1,5 @@
 """Autograsp: each joint stops when a link it moves touches, and only then."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh
@@ -31,8 +29,7 @@ def closed(box: tuple[float, float, float], shift: float = 0.0) -> tuple[ClosedH
 
 def test_each_finger_stops_at_its_own_first_contact() -> None:
     found, distance = closed((0.03, 0.05, 0.05), shift=0.005)
-    assert found.stopped.tolist() == [[1, 1]]
-    assert np.all(distance[0, 1:] < TOUCH_M)
+    assert found.stopped.tolist() == [[1, 1]] and np.all(distance[0, 1:] < TOUCH_M)
     assert np.all(distance[0, 1:] > -TOUCH_M)
     # The box is nearer to one finger: the other went on after that one had stopped.
     assert abs(found.state.q[0, 0] - found.state.q[0, 1]) > 0.1
@@ -40,15 +37,13 @@ def test_each_finger_stops_at_its_own_first_contact() -> None:
 
 def test_a_finger_that_meets_nothing_closes_to_its_limit() -> None:
     found, distance = closed((0.01, 0.01, 0.01), shift=0.2)
-    assert np.all(distance[0] > 0.02)
-    assert np.all(found.state.q[0] > 0.2)
+    assert np.all(distance[0] > 0.02) and np.all(found.state.q[0] > 0.2)
 
 
 @pytest.mark.parametrize("thickness", [1e-3, 1e-4])
 def test_nothing_is_passed_through_however_thin(thickness: float) -> None:
     found, distance = closed((thickness, 0.06, 0.06))
-    assert found.stopped.tolist() == [[1, 1]]
-    assert np.all(distance[0, 1:] > -SAMPLED)
+    assert found.stopped.tolist() == [[1, 1]] and np.all(distance[0, 1:] > -SAMPLED)
     # Symmetric: both fingers ended on their own side.
     assert np.allclose(found.state.q[0, 0], found.state.q[0, 1], atol=0.02)
 
@@ -57,5 +52,4 @@ def test_the_approach_ends_at_the_standoff() -> None:
     closer = closer_on(0.03, 0.03, 0.03)
     start = HandState(np.array([[0.0, 0.0, -0.15]]), np.array([[1.0, 0, 0, 0]]), np.zeros((1, 2)))
     there = closer.approach(start, 0.004)
-    assert closer.distances(there).min() == pytest.approx(0.004, abs=3e-4)
-    assert there.pivot[0, 2] > -0.1
+    assert closer.distances(there).min() == pytest.approx(0.004, abs=3e-4) and there.pivot[0, 2] > -0.1

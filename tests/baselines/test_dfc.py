@@ -1,7 +1,5 @@
 """DexGraspNet's energies and annealing, against values that follow from their formulas."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh
@@ -85,31 +83,23 @@ def test_the_gradient_is_the_difference_quotient_of_the_energy(q: tuple[float, f
 
 
 @wp.kernel(enable_backward=False)
-def _schedule(
-    iteration_in: wp.array[wp.int32],
-    rise_in: wp.array[wp.float32],
-    uniform_in: wp.array[wp.float32],
-    size_out: wp.array[wp.float32],
-    temperature_out: wp.array[wp.float32],
-    accepted_out: wp.array[wp.int32],
-):
+def _schedule(iteration_in: wp.array[wp.int32], rise_in: float, uniform_in: wp.array[float], out: wp.array[wp.vec3]):
     i = wp.tid()
-    size_out[i] = kernels.step_size(iteration_in[i])
-    temperature_out[i] = kernels.temperature(iteration_in[i])
-    accepted_out[i] = kernels.accepted(rise_in[i], temperature_out[i], uniform_in[i])
+    cold = kernels.temperature(iteration_in[i])
+    accepted = kernels.accepted(rise_in, cold, uniform_in[i])
+    out[i] = wp.vec3(kernels.step_size(iteration_in[i]), cold, float(accepted))
 
 
-def probed(iteration: np.ndarray, rise: np.ndarray, uniform: np.ndarray) -> tuple[np.ndarray, ...]:
-    n = len(iteration)
-    given = [wp.array(iteration, dtype=wp.int32, device="cpu")]
-    given += [wp.array(values, dtype=wp.float32, device="cpu") for values in (rise, uniform)]
-    found = [wp.zeros(n, dtype=kind, device="cpu") for kind in (wp.float32, wp.float32, wp.int32)]
-    wp.launch(_schedule, n, inputs=given, outputs=found, device="cpu")
-    return tuple(array.numpy() for array in found)
+def probed(iteration: list[int], uniform: np.ndarray, rise: float = 0.0) -> np.ndarray:
+    """(3, n) size of a step, temperature, and whether the rise is accepted."""
+    given = [wp.array(iteration, dtype=wp.int32, device="cpu"), rise, wp.array(uniform, dtype=float, device="cpu")]
+    found = wp.zeros(len(iteration), dtype=wp.vec3, device="cpu")
+    wp.launch(_schedule, len(iteration), inputs=given, outputs=[found], device="cpu")
+    return found.numpy().T
 
 
 def test_steps_and_temperature_decay_every_50_and_30_iterations() -> None:
-    size, cold, _ = probed(np.array([0, 29, 30, 49, 50, 5999]), np.zeros(6), np.zeros(6))
+    size, cold, _ = probed([0, 29, 30, 49, 50, 5999], np.zeros(6))
     np.testing.assert_allclose(size, [5e-3, 5e-3, 5e-3, 5e-3, 4.75e-3, 5e-3 * 0.95**119], rtol=1e-4)
     np.testing.assert_allclose(cold, [18, 18, 17.1, 17.1, 17.1, 18 * 0.95**199], rtol=1e-4)
 
@@ -118,10 +108,9 @@ def test_a_fall_is_accepted_and_a_rise_with_its_boltzmann_factor() -> None:
     """20,000 draws at a rise of T: a share of 1/e, standard error 0.3 points."""
     n = 20_000
     uniform = np.random.default_rng(5).random(n)
-    start = np.zeros(n, int)
-    assert probed(start, np.full(n, -1e-3), uniform)[2].all()
-    assert probed(start, np.full(n, 18.0), uniform)[2].mean() == pytest.approx(np.exp(-1), abs=0.015)
-    assert probed(np.full(n, 3000), np.full(n, 18.0), uniform)[2].mean() == 0
+    assert probed([0] * n, uniform, -1e-3)[2].all()
+    assert probed([0] * n, uniform, 18.0)[2].mean() == pytest.approx(np.exp(-1), abs=0.015)
+    assert probed([3000] * n, uniform, 18.0)[2].mean() == 0
 
 
 def test_annealing_ends_at_a_lower_energy_than_it_began() -> None:
@@ -130,8 +119,7 @@ def test_annealing_ends_at_a_lower_energy_than_it_began() -> None:
     found.run(1, tell)
     before = found.energies()[0] @ WEIGHTS
     found.run(1500, tell)
-    assert found.energies()[0] @ WEIGHTS < 0.3 * before
-    assert 0 < found.taken.numpy()[0] <= 1501
+    assert found.energies()[0] @ WEIGHTS < 0.3 * before and 0 < found.taken.numpy()[0] <= 1501
 
 
 def test_starts_look_at_the_hull_from_the_given_distance() -> None:

@@ -1,7 +1,5 @@
 """Grasp'D (2022): its distance grid, its contact forces, and what its relaxation relaxes."""
 
-from __future__ import annotations
-
 from functools import cache
 from typing import Any
 
@@ -11,18 +9,8 @@ import trimesh
 import warp as wp
 
 from graspd.baselines.common import ground_of
-from graspd.baselines.graspd2022 import kernels
-from graspd.baselines.graspd2022.method import (
-    FRICTION,
-    LEAK,
-    MISMATCH,
-    STIFFNESS,
-    VISCOUS,
-    Search,
-    _Batch,
-    distance_grid,
-    physics_of,
-)
+from graspd.baselines.graspd2022 import kernels, method
+from graspd.baselines.graspd2022.method import Search, _Batch, distance_grid, physics_of
 from graspd.worker.simulation.data import HandState
 from graspd.worker.simulation.kernels.surface import Surface, field_distance
 from tests.worker.models import object_from_mesh, two_finger_hand
@@ -42,32 +30,23 @@ def grid_of_sphere(cells: int) -> Any:
 
 @wp.kernel(enable_backward=False)
 def _probe(
-    physics: kernels.ForceModel,
-    surface: Surface,
-    point_in: wp.array[wp.vec3],
-    velocity_in: wp.vec3,
-    distance_out: wp.array[wp.float32],
-    force_out: wp.array[wp.vec3],
-    slope_out: wp.array[wp.vec3],
+    physics: kernels.ForceModel, surface: Surface, points: wp.array[wp.vec3], speed: wp.vec3, out: wp.array2d[wp.vec3]
 ):
     i = wp.tid()
-    sample = field_distance(surface, point_in[i])
-    distance_out[i] = sample.distance
-    force_out[i] = kernels.contact_force(physics, -sample.distance, sample.normal, velocity_in)
-    slope_out[i] = kernels.force_slope(physics, -sample.distance, sample.normal, velocity_in)
+    sample = field_distance(surface, points[i])
+    out[0, i] = wp.vec3(sample.distance)
+    out[1, i] = kernels.contact_force(physics, -sample.distance, sample.normal, speed)
+    out[2, i] = kernels.force_slope(physics, -sample.distance, sample.normal, speed)
 
 
-def probed(
-    points: np.ndarray, velocity: tuple[float, float, float] = (0, 0, 0), grid: Any = None
-) -> tuple[np.ndarray, ...]:
+def probed(points: np.ndarray, velocity: tuple[float, ...] = (0, 0, 0), grid: Any = None) -> tuple[np.ndarray, ...]:
     """Distance, force and slope at points by a grid, by default of the sphere."""
-    grid = grid or grid_of_sphere(CELLS)
-    n = len(points)
-    found: list[Any] = [wp.zeros(n, dtype=kind, device="cpu") for kind in (wp.float32, wp.vec3, wp.vec3)]
+    found = wp.zeros((3, len(points)), dtype=wp.vec3, device="cpu")
     at = wp.array(points, dtype=wp.vec3, device="cpu")
-    given = [physics_of(SPHERE.gyration_radius), grid, at, wp.vec3(*velocity)]
-    wp.launch(_probe, n, inputs=given, outputs=found, device="cpu")
-    return tuple(f.numpy() for f in found)
+    given = [physics_of(SPHERE.gyration_radius), grid or grid_of_sphere(CELLS), at, wp.vec3(*velocity)]
+    wp.launch(_probe, len(points), inputs=given, outputs=[found], device="cpu")
+    distance, force, slope = found.numpy()
+    return distance[:, 0], force, slope
 
 
 @pytest.mark.parametrize("cells", [16, 32, 48])
@@ -94,11 +73,11 @@ def test_points_inside_push_the_object_away_and_rub_against_it() -> None:
     depth = -distance
     np.testing.assert_allclose(depth, 0.001, rtol=1e-3)
     # At the two points whose normal is across the motion: k c inwards, and the lesser of kf v and mu k c against it.
-    rub = np.minimum(VISCOUS * 0.01, FRICTION * STIFFNESS * depth)
+    rub = np.minimum(method.VISCOUS * 0.01, method.FRICTION * method.STIFFNESS * depth)
     np.testing.assert_allclose(force[:2, 2], -rub[:2], rtol=1e-3)
-    np.testing.assert_allclose([-force[0, 0], -force[1, 1]], STIFFNESS * depth[:2], rtol=1e-3)
+    np.testing.assert_allclose([-force[0, 0], -force[1, 1]], method.STIFFNESS * depth[:2], rtol=1e-3)
     # Where the motion is along the normal there is no friction.
-    np.testing.assert_allclose(force[2], [0, 0, STIFFNESS * depth[2]], atol=0.1)
+    np.testing.assert_allclose(force[2], [0, 0, method.STIFFNESS * depth[2]], atol=0.1)
 
 
 @pytest.mark.parametrize("velocity", [(0.0, 0.0, 0.01), (0.005, 0.01, -0.01)])
@@ -107,13 +86,13 @@ def test_the_slope_of_the_force_is_its_difference_quotient(velocity: tuple[float
     step = 2e-5
     slope = probed(ring(0.001), velocity)[2]
     quotient = (probed(ring(0.001 + step), velocity)[1] - probed(ring(0.001 - step), velocity)[1]) / (2 * step)
-    np.testing.assert_allclose(slope, quotient, atol=0.05 * STIFFNESS)
+    np.testing.assert_allclose(slope, quotient, atol=0.05 * method.STIFFNESS)
 
 
 def test_points_outside_leak_a_share_of_the_slope() -> None:
     assert np.all(probed(ring(-0.002), (0.0, 0.0, 0.01))[1] == 0), "points outside press with nothing"
     outside, inside = (probed(ring(depth))[2] for depth in (-0.001, 0.001))
-    np.testing.assert_allclose(outside, LEAK * inside, atol=0.02 * STIFFNESS)
+    np.testing.assert_allclose(outside, method.LEAK * inside, atol=0.02 * method.STIFFNESS)
 
 
 def touching_batch() -> _Batch:
@@ -150,4 +129,4 @@ def test_relaxation_departs_from_hard_contact_as_its_weight_says() -> None:
     for pull in (0.01, 0.04):
         relaxed, hard = settled(pull)
         apart = (relaxed - hard)[..., 0]
-        np.testing.assert_allclose(apart, -pull / (2 * MISMATCH), atol=0.02)
+        np.testing.assert_allclose(apart, -pull / (2 * method.MISMATCH), atol=0.02)

@@ -1,7 +1,5 @@
 """Headless Chromium on the dashboard: of an application in this process, or of a whole service with the real engine."""
 
-from __future__ import annotations
-
 import shutil
 import sys
 import threading
@@ -13,14 +11,13 @@ import pytest
 import uvicorn
 from fastapi import FastAPI
 
-from graspd.api.server import bind
+from graspd.service.run.address import bind
 from graspd.service.run.supervisor import Supervisor
 from graspd.service.settings import Settings
 from tests.api.conftest import app, furnished, services, settings
 from tests.waiting import PATIENCE_S, until, until_a_worker_is_idle
 
 __all__ = ["app", "furnished", "services", "settings"]
-
 #: SwiftShader draws WebGL without a GPU; the rest keeps the browser from calling home.
 _ARGUMENTS = """
     --no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader --disable-quic --no-first-run

@@ -1,7 +1,5 @@
 """What users do, on a whole service with the real engine: from a file of their own to a grasp in 3D and its shard."""
 
-from __future__ import annotations
-
 import io
 import re
 from pathlib import Path
@@ -24,7 +22,6 @@ from graspd.worker.stages.models import SURFACE_POINTS
 from tests.waiting import until
 
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(900)]
-
 #: Eight draft grasps take about ten seconds on two cores; the rest is a busy machine.
 WORK_MS = 500_000
 

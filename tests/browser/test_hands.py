@@ -1,13 +1,15 @@
 """A hand in the browser: what was guessed of it is seen, corrected, kept as a hand of its own, and used."""
 
-from __future__ import annotations
-
 import json
+import re
+from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
+from typer.testing import CliRunner
 
+from graspd.commands.synth import app as synth
 from graspd.service.model.messages import IngestMessage
 from graspd.service.model.states import AssetKind
 from graspd.service.pipeline.backends import Services
@@ -15,11 +17,12 @@ from graspd.service.store import library
 from graspd.worker.hands.load import load_hand
 from graspd.worker.stages import ingest
 from graspd.worker.stages.context import TaskContext
+from tests.api.factories import finish_with
 from tests.browser.test_flows import colours
+from tests.waiting import until
 from tests.worker.hands.urdfs import joint, link, robot
 
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(300)]
-
 BAR = '<collision><origin xyz="0 0 0.03"/><geometry><box size="0.016 0.02 0.06"/></geometry></collision>'
 SEEN = (
     '<visual><origin xyz="0 0 0.03"/><geometry><cylinder radius="0.009" length="0.06"/></geometry>'
@@ -120,3 +123,50 @@ def test_a_wrong_guess_is_corrected_and_kept_as_a_hand(page: Any, services: Serv
     assert page.input_value("#hand") == "claw-right"
     job = httpx.post(f"{address}/v1/jobs", json={"hand": "claw-right", "object": "mug"}, trust_env=False, timeout=60)
     assert job.status_code == 202
+
+
+STOPS = ["standoff", "pregrasp", "grasp", "squeeze", "lift"]
+
+
+@pytest.fixture(scope="module")
+def bin_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two feasible grasps in a bin; the page shows them whether they lift or not."""
+    path = tmp_path_factory.mktemp("scene") / "bin.h5"
+    arguments = "--hand allegro --object mug --scene bin --scenes 1 -n 2 --want candidates --fidelity draft"
+    result = CliRunner().invoke(synth, [*arguments.split(), "--device", "cpu", "-o", str(path), "--json"])
+    assert result.exit_code == 0, result.output
+    return path
+
+
+def test_one_slider_leads_from_the_standoff_to_the_lift(page: Any, services: Services, bin_file: Path) -> None:
+    shard = finish_with(services, bin_file).shard_id
+    # A small canvas is drawn quickly without a GPU.
+    page.set_viewport_size({"width": 700, "height": 700})
+    page.goto(f"/grasps/{shard}/0")
+    page.wait_for_selector(".viewer[data-state=ready]")
+    assert page.locator("[data-posture]").all_inner_texts() == STOPS
+    assert page.inner_text("[data-stage]") == "grasp"
+    canvas = page.locator(".viewer canvas")
+    seen = {}
+    for place, stop in enumerate(STOPS):
+        page.click(f"[data-posture='{place}']")
+        assert page.get_attribute("input[type=range]", "aria-valuetext") == stop
+        # What changed is drawn in the next frame.
+        page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+        seen[stop] = canvas.screenshot()
+    # Pregrasp and grasp may differ by less than a pixel.
+    assert len({seen[stop] for stop in ("standoff", "grasp", "lift")}) == 3
+    page.click("[data-posture='0']")
+    assert re.match("0 surface points within 1 mm", page.inner_text("[data-say]"))
+    page.locator("input[type=range]").fill("3.5")
+    assert "50 % of the way from squeeze to lift" in page.inner_text("[data-stage]")
+    # The object goes along: what touches it while it is lifted is what touched it when it was squeezed.
+    lifting = page.inner_text("[data-say]")
+    page.click("[data-posture='3']")
+    assert page.inner_text("[data-say]") == lifting
+
+    page.click("[data-posture='0']")
+    page.uncheck("[data-toggle=scenery]")
+    until(lambda: canvas.screenshot() != seen["standoff"], "the scenery goes")
+    page.click("[data-play]")
+    page.wait_for_selector("[data-posture='4'][aria-current=true]")

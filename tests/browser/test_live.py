@@ -1,7 +1,5 @@
 """The pages in a real browser: they move by themselves, fit every screen, read without scripts, are accessible."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any
@@ -18,12 +16,10 @@ from graspd.service.store.records import publish
 from tests.api.dashboard.test_stability_page import a_record
 from tests.api.dashboard.test_tradeoff import RUNS
 from tests.api.factories import add_job, add_worker, fail, finish, finish_all
-from tests.fakes import record_of
-from tests.planning import plan_all
+from tests.fakes import plan_all, record_of
 from tests.waiting import until
 
 pytestmark = pytest.mark.browser
-
 AXE = Path(__file__).parent / "vendor" / "axe.min.js"
 #: Rules of axe that look at colours; what is serious of the others is so in every scheme.
 COLOURS = ["color-contrast", "link-in-text-block"]

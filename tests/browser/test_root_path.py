@@ -1,7 +1,5 @@
 """The dashboard below a path, in a real browser: pages, live updates, forms, models in 3D."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 
@@ -17,7 +15,6 @@ from tests.api.factories import add_job, finish_all
 from tests.browser.conftest import serving
 
 pytestmark = pytest.mark.browser
-
 PREFIX = "/graspd"
 
 

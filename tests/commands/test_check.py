@@ -1,7 +1,5 @@
 """`graspd hands check` and `graspd objects check` through the entry point: the JSON contract and the exit codes."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any
@@ -59,9 +57,7 @@ def test_a_folder_gets_a_verdict_each_and_code_2_if_refused(shared_data: Path, t
         ("two_components.stl", ("--keep-largest",), "repair"),
     ],
 )
-def test_a_file_gets_its_verdict_and_exit_code(
-    shared_data: Path, file: str, options: tuple[str, ...], verdict: str
-) -> None:
+def test_files_get_verdict_and_exit_code(shared_data: Path, file: str, options: tuple[str, ...], verdict: str) -> None:
     kind = "hands" if file.endswith(".urdf") else "objects"
     code, report = check(kind, "check", str(shared_data / "bad" / file), *options)
     assert report["verdict"] == verdict, report["message"]
@@ -99,8 +95,7 @@ def test_options_go_over_guesses_drop_fingers_and_weigh() -> None:
 )
 def test_an_option_that_cannot_be_read_is_the_callers_mistake(options: tuple[str, ...]) -> None:
     result = CliRunner().invoke(build(), ["hands", "check", "allegro", *options])
-    assert result.exit_code == 2
-    assert options[0] in result.stderr
+    assert result.exit_code == 2 and options[0] in result.stderr
 
 
 @pytest.mark.parametrize(("kind", "name"), [("hands", "barrett"), ("objects", "mug")])

@@ -1,7 +1,5 @@
 """`graspd scene`, `graspd render` and `graspd pictures` on files, without queue or server."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -91,8 +89,7 @@ def test_pictures_of_grasps_in_scenes_show_walls_and_whole_way(in_bin):
         output = in_bin.with_name("bin.png")
         graspd(f"pictures -n 1 {PICTURES} {more} -o", output, in_bin)
         with Image.open(output) as image:
-            assert image.width > columns * 48
-            assert (image.mode == "P") == ("--palette" in more)
+            assert image.width > columns * 48 and (image.mode == "P") == ("--palette" in more)
 
 
 def test_pictures_draw_the_best_first_and_each_posture_of_a_way(base):

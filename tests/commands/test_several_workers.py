@@ -1,7 +1,5 @@
 """Several workers by one command: numbered, started again, ended together."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import threading

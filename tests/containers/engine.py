@@ -1,7 +1,5 @@
 """Docker and its compose as a test uses them: whether they can be had here, and one project that is gone afterwards."""
 
-from __future__ import annotations
-
 import json
 import re
 import secrets

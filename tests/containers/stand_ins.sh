@@ -19,7 +19,7 @@ test -e "$folder/root/.complete" || {
         bookworm "$folder/root"
     touch "$folder/root/.complete"
 }
-"$python" -m pip download -q -d "$folder/wheels" -c docker/constraints.txt '.[api,postgres,otel,worker,gpu]' \
+"$python" -m pip download -q -d "$folder/wheels" -c docker/constraints.txt '.[api,postgres,worker,gpu]' \
     'setuptools>=77,<90' wheel async-timeout # Debian's Python is older than that of the image, and asks for the last one
 
 tar -C "$folder/root" --exclude=./proc --exclude=./sys --exclude=./dev --exclude=./var/cache/apt --exclude=./var/lib/apt -cf - . \

@@ -4,8 +4,6 @@ Takes minutes, and most of them go to the build. Where no engine is, or the base
 so.
 """
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -21,7 +19,6 @@ from tests.servers import free_ports
 from tests.shell import completed
 
 pytestmark = [pytest.mark.slow, pytest.mark.containers, pytest.mark.timeout(5400)]
-
 BATCHES = 16
 #: Generous: on two cores that have other work the kernels' first use alone takes a minute.
 PATIENCE_S = 1800.0

@@ -1,7 +1,5 @@
 """Files of a store behind a network: handed out by the store itself where users reach it, else through the API."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """The compose file as Docker would read it, and its services as plain processes of this machine."""
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Mapping, Sequence

@@ -3,8 +3,6 @@
 It knows the options that our scripts use and refuses all others, so that a misspelt one is found.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import signal

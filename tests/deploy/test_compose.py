@@ -1,7 +1,5 @@
 """The compose file: valid, pinned, in step with the settings, and its services end in time."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys
@@ -19,8 +17,7 @@ FILLED = {"REDIS_PASSWORD": "secret"}
 SERVICES = composition.SERVICES
 OURS = sorted(name for name, service in SERVICES.items() if "build" in service)
 SETTINGS = {f"GRASPD_{name.upper()}" for name in Settings.model_fields}
-
-PREFIXES = ("AWS_", "REDIS_", "REDISCLI_", "POSTGRES_", "FORWARDED_", "OTEL_")
+PREFIXES = ("AWS_", "REDIS_", "REDISCLI_", "POSTGRES_", "FORWARDED_")
 
 
 def test_it_is_what_the_compose_specification_says() -> None:
@@ -42,8 +39,7 @@ def test_gpu_workers_see_every_gpu_and_share_a_folder() -> None:
 def test_every_service_has_a_version_limits_and_bounded_logs(name: str) -> None:
     service = SERVICES[name]
     assert re.match(r"v?\d", service["image"].partition(":")[2]), f"{service['image']} floats"
-    assert "memory" in service["deploy"]["resources"]["limits"]
-    assert service["restart"] == "unless-stopped"
+    assert "memory" in service["deploy"]["resources"]["limits"] and service["restart"] == "unless-stopped"
     assert {"max-size", "max-file"} <= service["logging"]["options"].keys()
 
 

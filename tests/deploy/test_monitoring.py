@@ -1,7 +1,5 @@
 """Alerts and dashboard: every series, label and command in them exists; promtool tries when alerts fire."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

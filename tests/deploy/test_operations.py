@@ -1,7 +1,5 @@
 """The steps of docs/how-to/operations.md, run as they stand there."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

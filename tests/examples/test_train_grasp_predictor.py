@@ -1,7 +1,5 @@
 """The example that trains a grasp predictor: its rows, what it compares networks with, and how proposals are lifted."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,13 +14,21 @@ from examples.train_grasp_predictor.without_network import SQUEEZE, across
 from graspd.baselines.learned.network import Proposals, decode
 from graspd.service.model.transforms import apply, compose, invert, quat_from_axis_angle, quat_rotate, quat_to_matrix
 from graspd.service.readers import open_shards
+from graspd.worker.engines import backend
 from graspd.worker.grasps import GraspSet, Posture
+from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.prepare import object_from_path
 from tests.service.readers import box_scenes
 
 JOINTS = 3
 Floats = np.ndarray[Any, np.dtype[np.float64]]
+
+
+@pytest.fixture(scope="module")
+def hand() -> HandModel:
+    backend.start()
+    return hand_from_path("barrett")
 
 
 def poses(count: int, seed: int) -> Floats:

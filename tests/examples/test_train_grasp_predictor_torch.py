@@ -1,7 +1,5 @@
 """The network of the example in PyTorch; skipped where that is not installed."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

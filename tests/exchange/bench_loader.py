@@ -1,8 +1,6 @@
 """DexGraspBench's loader, rebuilt: what it does was read in its source (evaluation, base class of the tests, hand and
 object specs) and is written anew here; MuJoCo then loads what it would load."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from pathlib import Path

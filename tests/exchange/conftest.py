@@ -1,7 +1,5 @@
 """A few real grasps for the formats to carry."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -48,12 +46,9 @@ def on_tables(tmp_path_factory: pytest.TempPathFactory) -> Path:
     graspd("render --views 2 --width 96 --height 72 -o", views, block)
     base, seen = read_shard(block, kind="base"), read_shard(views, kind="views")
     mug = {"object": "mug", "object_digest": object_from_path("mug").digest}
-    base_id, seen_id = "a" * 64, "b" * 64
-    again = write_shard("base", base.arrays, {**base.attributes, **mug, "shard_id": base_id})
-    (folder / "mug.h5").write_bytes(again)
-    (folder / "mug-views.h5").write_bytes(
-        write_shard("views", seen.arrays, {**seen.attributes, **mug, "shard_id": seen_id, "base_shard": base_id})
-    )
+    as_base, as_views = {**mug, "shard_id": "a" * 64}, {**mug, "shard_id": "b" * 64, "base_shard": "a" * 64}
+    (folder / "mug.h5").write_bytes(write_shard("base", base.arrays, base.attributes | as_base))
+    (folder / "mug-views.h5").write_bytes(write_shard("views", seen.arrays, seen.attributes | as_views))
     return folder
 
 

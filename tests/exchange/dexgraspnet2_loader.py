@@ -7,8 +7,6 @@ src/utils/pc.py, how graspness is made src/preprocess/dex_graspness.py, both as 
 7824d859a8da1d942bc38709a9d217dfb548db5d.
 """
 
-from __future__ import annotations
-
 import random
 from dataclasses import dataclass
 from pathlib import Path

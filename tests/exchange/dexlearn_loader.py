@@ -5,8 +5,6 @@ Mingrui-Yu/DexLearn, dexlearn/dataset/base_dex.py at 2ae1aea3ab5b7360c6e39acd39d
 twin in hugs-dex/HUGS-DexLearn at 95a3c2aa2808ab2e6db0f03d59ceb15cc3c7bebf (`load_scene_cfg` in dexlearn/utils/util.py).
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from glob import glob
@@ -41,9 +39,8 @@ class Data:
     def __init__(self, root: Path, name: str) -> None:
         said = yaml.safe_load((root / "dexlearn" / "config" / "data" / f"{name}.yaml").read_text())
         self.root, self.config = root, said
-        self.grasps, self.objects = (
-            root / said[key].replace("${data_folder}", "assets") for key in ("grasp_path", "object_path")
-        )
+        self.grasps = root / said["grasp_path"].replace("${data_folder}", "assets")
+        self.objects = root / said["object_path"].replace("${data_folder}", "assets")
         self.types = said["grasp_type_lst"]
 
     def split(self, name: str) -> list[str]:

@@ -1,8 +1,6 @@
 """A folder that DexGraspBench's evaluator takes, of free grasps and of grasps on tables, read by `bench_loader`;
 its tabletop test says what ours says, and grasps come back as they were."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any
@@ -66,9 +64,7 @@ def test_the_object_weighs_what_the_evaluator_wants(bench: Path, block: ObjectMo
     assert info["mass"] == pytest.approx(info["density"] * block.volume, rel=0.05)  # the pieces' against the mesh's
 
 
-def test_every_file_beside_the_pieces_is_a_piece_also_later(
-    bench: Path, hand: HandModel, block: ObjectModel, grasps: GraspSet
-) -> None:
+def test_every_file_beside_the_pieces_is_a_piece_also_later(bench, hand, block: ObjectModel, grasps: GraspSet) -> None:
     pieces = bench / np.load(files_of(bench, "graspd_barrett")[0], allow_pickle=True).item()["obj_path"] / "urdf/meshes"
     (pieces / "convex_piece_099.obj").write_text("of another decomposition")
     dexgraspbench.write(hand, block, grasps, [0], bench)
@@ -96,10 +92,9 @@ def test_evaluators_bodies_and_actuators_are_those_of_the_hand(bench: Path, hand
     found.at(qpos)
     targets = found.controls(qpos)
     assert found.model.nu == hand.dofs
-    for number, target in enumerate(targets):
-        joint = found.model.joint(int(found.model.actuator_trnid[number, 0]))
-        assert target == pytest.approx(qpos[int(joint.qposadr[0])], abs=1e-12)
-        assert found.model.actuator_gainprm[number, 0] == pytest.approx(5.0)
+    driven = found.model.jnt_qposadr[found.model.actuator_trnid[:, 0]]
+    assert targets == pytest.approx(qpos[driven], abs=1e-12)
+    assert found.model.actuator_gainprm[:, 0] == pytest.approx(5.0)
     assert found.model.neq == 1 + len(hand.joint_names) - hand.dofs  # the weld, and what follows another joint
     known = {found.model.body(number).name for number in range(found.model.nbody)}
     said = found.hand
@@ -110,9 +105,7 @@ def test_evaluators_bodies_and_actuators_are_those_of_the_hand(bench: Path, hand
         assert any(name.startswith(prefix) for name in said["valid_body_name"])
 
 
-def test_a_hand_of_meshes_is_loaded_with_them(
-    shared_data: Path, block: ObjectModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_hand_of_meshes_is_loaded_with_them(shared_data: Path, block: ObjectModel, tmp_path, monkeypatch) -> None:
     hand = hand_from_path(shared_data / "hands" / "allegro" / "allegro_hand_right.urdf")
     (file,) = dexgraspbench.write(hand, block, random_postures(hand), [0], tmp_path)
     monkeypatch.chdir(tmp_path)  # nothing may depend on where the export was written
@@ -145,26 +138,16 @@ _SHADOW_THUMB = [
 
 
 @pytest.mark.parametrize(
-    ("file", "config", "root", "chain", "first", "tip"),
+    ("config", "root", "chain", "first", "tip"),
     [
-        ("allegro/allegro_hand_right.urdf", "allegro", [0, 0, 0, 0, 1, 0, 1], _ALLEGRO_INDEX, 0, "joint_3.0"),
-        ("allegro/allegro_hand_right.urdf", "allegro", [0, 0, 0, 0, 1, 0, 1], _ALLEGRO_THUMB, 12, "joint_15.0"),
-        ("shadow/shadow_hand_right.urdf", "shadow", [0, 0, 0.034, 1, 0, 0, 0], _SHADOW_INDEX, 0, "FFJ1"),
-        ("shadow/shadow_hand_right.urdf", "shadow", [0, 0, 0.034, 1, 0, 0, 0], _SHADOW_THUMB, 17, "THJ1"),
+        ("allegro", [0, 0, 0, 0, 1, 0, 1], _ALLEGRO_INDEX, 0, "joint_3.0"),
+        ("allegro", [0, 0, 0, 0, 1, 0, 1], _ALLEGRO_THUMB, 12, "joint_15.0"),
+        ("shadow", [0, 0, 0.034, 1, 0, 0, 0], _SHADOW_INDEX, 0, "FFJ1"),
+        ("shadow", [0, 0, 0.034, 1, 0, 0, 0], _SHADOW_THUMB, 17, "THJ1"),
     ],
 )
-def test_hand_that_benchmark_has_is_mapped_onto_its_own_model(
-    shared_data: Path,
-    block: ObjectModel,
-    tmp_path: Path,
-    file: str,
-    config: str,
-    root: list[float],
-    chain: list[Any],
-    first: int,
-    tip: str,
-) -> None:
-    hand = hand_from_path(shared_data / "hands" / file)
+def test_benchmarks_hand_is_mapped_to_its_model(shared_data, block, tmp_path, config, root, chain, first, tip) -> None:
+    hand = hand_from_path(shared_data / "hands" / config / f"{config}_hand_right.urdf")
     grasps = random_postures(hand)
     dexgraspbench.write(hand, block, grasps, [0], tmp_path)
     (npy,) = files_of(tmp_path, config)
@@ -196,12 +179,13 @@ def test_grasps_for_benchmarks_own_model_come_back_as_they_were(block: ObjectMod
 
 def random_postures(hand: HandModel) -> GraspSet:
     rng = np.random.default_rng(7)
-    parts = []
-    for _ in range(3):
+
+    def drawn() -> Posture:
         pose = np.concatenate([rng.uniform(-0.2, 0.2, (2, 3)), rng.normal(size=(2, 4))], axis=1)
         pose[:, 3:] /= np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
-        parts.append(Posture(pose, hand.expand(rng.uniform(hand.lower, hand.upper, (2, hand.dofs)))))
-    return GraspSet(parts[0], parts[1], parts[2], np.full(2, np.nan))
+        return Posture(pose, hand.expand(rng.uniform(hand.lower, hand.upper, (2, hand.dofs))))
+
+    return GraspSet(drawn(), drawn(), drawn(), np.full(2, np.nan))
 
 
 def assert_at(body: Any, pose: np.ndarray) -> None:
@@ -214,11 +198,10 @@ def _chain(root: list[float], chain: list[Any]) -> str:
         return " ".join(map(str, values))
 
     geom = '<geom size="0.01" mass="0.01"/>'
-    lines = [f'<body name="world_of_hand"><freejoint/>{geom}', f'<body pos="{text(root[:3])}" quat="{text(root[3:])}">']
-    lines += [
-        f'<body pos="{text(pos)}" quat="{text(quat)}"><joint axis="{text(axis)}"/>{geom}' for pos, quat, axis in chain
-    ]
-    inside = "".join([*lines, *["</body>"] * (len(chain) + 2)])
+    inside = f'<body name="world_of_hand"><freejoint/>{geom}<body pos="{text(root[:3])}" quat="{text(root[3:])}">'
+    for pos, quat, axis in chain:
+        inside += f'<body pos="{text(pos)}" quat="{text(quat)}"><joint axis="{text(axis)}"/>{geom}'
+    inside += "</body>" * (len(chain) + 2)
     return f'<mujoco><compiler angle="radian"/><worldbody>{inside}</worldbody></mujoco>'
 
 
@@ -331,15 +314,12 @@ def test_its_tabletop_test_says_what_our_letter_says(tabletop: Path, shard: Path
 def test_grasps_on_a_table_come_back_with_scenes_and_verdicts(tabletop: Path, shard: Path, candidates: Shard) -> None:
     folder = tabletop / "output" / f"{EXPERIMENT}_{CONFIG}"
     (back,) = dexgraspbench.read(folder, hand="barrett", obj="block")
-    assert back.placed is not None
     rows = [int(file.stem) for file in sorted(folder.rglob("*.npy"))]
     given = GraspSet.from_columns(candidates.arrays).take(np.array(rows))
-    assert given.approach is not None and back.grasps.approach is not None
     np.testing.assert_allclose(back.grasps.approach[..., :3], given.approach[..., :3], atol=ROUNDING_M)
     np.testing.assert_array_equal(back.grasps.coming, given.coming)
-    np.testing.assert_allclose(
-        back.placed.object_pose[back.placed.index], candidates["scene/object_pose"][given.scene], atol=ROUNDING_M
-    )
+    rest = candidates["scene/object_pose"][given.scene]
+    np.testing.assert_allclose(back.placed.object_pose[back.placed.index], rest, atol=ROUNDING_M)
     again = graspd("evaluate --protocol lift --level dexgraspbench --hand barrett --object block", folder)
     first = graspd("evaluate --protocol lift --level dexgraspbench", shard)
     there = {one["row"]: one["held"] for one in first["verdicts"]}
@@ -348,19 +328,15 @@ def test_grasps_on_a_table_come_back_with_scenes_and_verdicts(tabletop: Path, sh
 
 def test_an_import_is_validated_by_its_lift(tabletop: Path, candidates: Shard, tmp_path: Path) -> None:
     folder = tabletop / "output" / f"{EXPERIMENT}_{CONFIG}"
-    out = tmp_path / "imported"
     given = "import --format dexgraspbench --hand barrett --object block --source test --licence CC0-1.0 -o"
-    graspd(given, out, folder)
-    (file,) = out.glob("*.h5")
-    found = read_shard(file, kind="base")
+    graspd(given, tmp_path, folder)
+    found = read_shard(next(tmp_path.glob("*.h5")), kind="base")
     assert json.loads(str(found.attributes["scene"]))["kind"] == "table"
     assert int(found["quality/success"].sum()) == pytest.approx(int(candidates["quality/success"].sum()), abs=1)
     assert {"grasp/approach", "grasp/lift", "quality/lift_hard", "scene/object_pose"} <= set(found.arrays)
 
 
-def test_free_grasps_and_grasps_on_tables_do_not_mix(
-    tabletop: Path, hand: HandModel, block: ObjectModel, grasps: GraspSet
-) -> None:
+def test_free_grasps_and_grasps_on_tables_do_not_mix(tabletop, hand, block: ObjectModel, grasps: GraspSet) -> None:
     dexgraspbench.write(hand, block, grasps, [0], tabletop)
     assert len(files_of(tabletop, CONFIG)) == 1 and len(files_of(tabletop, CONFIG, EXPERIMENT)) == COUNT
     sets = dexgraspbench.read(tabletop, hand="barrett", obj="block")

@@ -1,7 +1,5 @@
 """A folder that DexGraspNet 2.0 trains on: each field as its loader reads it, and the grasps as they were."""
 
-from __future__ import annotations
-
 import shutil
 import tracemalloc
 import zipfile
@@ -60,35 +58,24 @@ def test_every_view_that_may_be_drawn_can_be_read(root: Path, hand: HandModel) -
             np.testing.assert_allclose(np.linalg.det(found.rot), 1, atol=1e-12)
 
 
-def test_a_fingertip_stands_where_ours_does_in_the_camera(
-    root: Path, split: range, hand: HandModel, stored: Shard, on_tables: Path
-) -> None:
+def test_a_fingertip_stands_where_ours_does_in_the_camera(root, split, hand, stored: Shard, on_tables: Path) -> None:
     pictures = Pictures(open_shards(on_tables))
-    tip, met = hand.fingertips[0], 0
+    tip = hand.fingertips[0]
     for scene, view in some_views(root, split, 6, seed=4):
         found = sample(root, scene, view, "barrett", list(hand.joint_names))
         rows = np.load(root / "data" / "dex_grasps_new" / scene / "barrett" / "block.npz")["row"]
         in_root = body_poses(hand, np.tile(IDENTITY_POSE, (len(rows), 1)), found.qpos)[:, tip, :3]
         there = np.einsum("nij,nj->ni", found.rot, in_root) + found.trans
+        (number,) = set(stored["grasp/scene_index"][rows].tolist())
         # The picture of the same scene and view, two a scene; others are these again.
-        seen = [one for one in pictures if one["object"] == "block" and one["scene"] == scene_of(stored, rows)][
-            view % 2
-        ]
+        seen = [one for one in pictures if one["object"] == "block" and one["scene"] == number][view % 2]
         poses = compose(seen["object/pose"], stored["grasp/hand_pose"][rows])
         ours = body_poses(hand, poses, stored["grasp/joint_positions"][rows])[:, tip, :3]
         np.testing.assert_allclose(there, ours, atol=ROUNDING_M)
-        met += len(rows)
-    assert met
+        assert len(rows)
 
 
-def scene_of(stored: Shard, rows: np.ndarray) -> int:
-    (scene,) = set(stored["grasp/scene_index"][rows].tolist())
-    return int(scene)
-
-
-def test_the_object_of_the_cloud_is_where_grasps_mean_it(
-    root: Path, split: range, hand: HandModel, block: ObjectModel
-) -> None:
+def test_the_object_of_the_cloud_is_where_grasps_mean_it(root, split, hand: HandModel, block: ObjectModel) -> None:
     mesh = trimesh.Trimesh(block.vertices, block.faces, process=False)
     for scene, view in some_views(root, split, 4, seed=5):
         found = sample(root, scene, view, "barrett", list(hand.joint_names))
@@ -111,9 +98,7 @@ def placed(root: Path, scene: str, view: int, points: np.ndarray) -> np.ndarray:
     return np.asarray(points @ pose[:, :3].T + pose[:, 3])
 
 
-def test_a_grasp_points_where_its_script_says(
-    root: Path, split: range, hand: HandModel, stored: Shard, block: ObjectModel
-) -> None:
+def test_a_grasp_points_where_its_script_says(root, split, hand: HandModel, stored: Shard, block: ObjectModel) -> None:
     surface, names = surface_samples(block), list(hand.joint_names)
     pads = [fingertip_pad(hand, tip).centre for tip in hand.fingertips]
     (scene, view), *_ = some_views(root, split, 1, seed=6)
@@ -210,9 +195,7 @@ def test_archives_are_neither_unpickled_nor_believed(tmp_path: Path, monkeypatch
         load_npz(tmp_path / "x.npz")
 
 
-def test_what_shows_no_scene_or_no_clear_grasp_is_told(
-    on_tables: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_shows_no_scene_or_no_clear_grasp_is_told(on_tables: Path, tmp_path: Path, monkeypatch) -> None:
     said = refused("export --format dexgraspnet2 -o", tmp_path / "out", on_tables / "block.h5")
     assert "no picture shows" in said
     none = PictureReference(0, "base", "views", 0, np.eye(4), IDENTITY_POSE, np.zeros(0, np.intp))

@@ -1,7 +1,5 @@
 """A folder that DexLearn trains on: each field as its loader reads it, and the grasps as they were."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -23,7 +21,7 @@ from graspd.service.store.shards import Shard
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from tests.exchange.dexlearn_loader import Data
+from tests.exchange.dexlearn_loader import Data, Sample
 from tests.worker.commands_run import graspd
 
 NAME = "graspd_tabletop_graspd_barrett"
@@ -52,6 +50,11 @@ def test_all_that_may_be_drawn_is_there(checkout: Path) -> None:
     assert data.types and len(data.test_scenes()) == 2
 
 
+def every(checkout: Path, name: str) -> list[Sample]:
+    data = Data(checkout, NAME)
+    return [one for split in ("train", "test") for one in data.samples(split) if name in one.file.parts]
+
+
 def test_a_fingertip_stands_where_ours_does(checkout: Path, hand: HandModel, stored: Shard) -> None:
     model = mujoco.MjModel.from_xml_path(str(checkout / "assets" / "hand" / "graspd_barrett" / "hand.xml"))
     state = mujoco.MjData(model)
@@ -66,10 +69,9 @@ def test_a_fingertip_stands_where_ours_does(checkout: Path, hand: HandModel, sto
                 state.qpos[:] = sample.hand_joint[k, when]
                 mujoco.mj_kinematics(model, state)
                 there = sample.hand_rot[k, when] @ state.body(body_names(hand)[tip]).xpos + sample.hand_trans[k, when]
-                ours = body_poses(
-                    hand, *(stored[f"{name}/{what}"][row][None] for what in ("hand_pose", "joint_positions"))
-                )
-                np.testing.assert_allclose(apply(away, there), ours[0, tip, :3], atol=ROUNDING_M)
+                posture = (stored[f"{name}/{what}"][row][None] for what in ("hand_pose", "joint_positions"))
+                ours = body_poses(hand, *posture)[0, tip, :3]
+                np.testing.assert_allclose(apply(away, there), ours, atol=ROUNDING_M)
     assert len(rows) == len(set(rows)) > 0
 
 
@@ -97,9 +99,7 @@ def test_a_cloud_of_a_free_object_lies_on_it_where_it_is_itself(on_tables: Path,
         assert 1e-4 < np.abs(trimesh.proximity.closest_point(mesh, noisy)[1]).max() < 0.05
 
 
-def test_a_file_that_names_only_its_scene_is_read_with_it_and_none_that_lies_elsewhere(
-    checkout: Path, tmp_path: Path
-) -> None:
+def test_a_file_is_read_with_its_scene_and_none_from_elsewhere(checkout, tmp_path) -> None:
     copy = tmp_path / "checkout"
     shutil.copytree(checkout, copy)
     (file, *_) = sorted((copy / "assets" / "grasp" / NAME / "succ_collect").rglob("*.npy"))
@@ -129,9 +129,3 @@ def test_objects_of_the_same_files_are_held_out_together() -> None:
         out = held_out(digests, share)
         assert out and out < set(digests) and ("mug" in out) == ("cup" in out)
     assert held_out({"mug": "1", "cup": "1"}, 0.5) == frozenset()
-
-
-def every(checkout: Path, name: str) -> list:  # type: ignore[type-arg]
-    data = Data(checkout, NAME)
-    split = next(split for split in ("train", "test") if name in data.split(split))
-    return [sample for sample in data.samples(split) if name in sample.file.parts]

@@ -6,8 +6,6 @@ webdataset_utils.py at 07773f7d1307ed0d454b60e7ea1ef38c5a108c0f, copies of NVlab
 docs/GRASP_DATASET_FORMAT.md and docs/GRIPPER_DESCRIPTION.md say what the frames are.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import re
@@ -58,6 +56,11 @@ def record_of(data: Path, uuid: str) -> dict[str, Any]:
     return dict(found[0])
 
 
+def read_back(record: dict[str, Any], folder: Path) -> Any:
+    (folder / "block.json").write_text(json.dumps(record))
+    return graspgen.read(folder / "block.json", hand="barrett", obj="block")
+
+
 def test_every_object_of_a_split_has_a_record_and_a_mesh(data: Path) -> None:
     splits = [(data / "splits" / "barrett" / f"{name}.txt").read_text().split() for name in ("train", "valid")]
     assert all(splits) and sorted([*splits[0], *splits[1]]) == ["block", "mug"]
@@ -67,9 +70,7 @@ def test_every_object_of_a_split_has_a_record_and_a_mesh(data: Path) -> None:
         assert (data / "objects" / paths[uuid]).is_file()
 
 
-def test_its_grasps_are_ours_with_their_verdicts(
-    data: Path, hand: HandModel, block: ObjectModel, stored: Shard
-) -> None:
+def test_its_grasps_are_ours_with_their_verdicts(data, hand: HandModel, block: ObjectModel, stored: Shard) -> None:
     record = record_of(data, "block")
     poses, mask = np.array(record["grasps"]["transforms"]), np.array(record["grasps"]["object_in_gripper"])
     assert poses.shape == (8, 4, 4) and mask.dtype == bool
@@ -102,9 +103,7 @@ def test_hands_are_turned_into_its_convention_and_jaws_close_along_x(data: Path,
 def test_of_grasps_without_joints_fingers_close_until_they_touch(data: Path, hand: HandModel, tmp_path: Path) -> None:
     record = record_of(data, "block")
     del record["gripper"]
-    path = tmp_path / "block.json"
-    path.write_text(json.dumps(record))
-    (back,) = graspgen.read(path, hand="barrett", obj="block")
+    (back,) = read_back(record, tmp_path)
     opened = np.abs(back.grasps.pregrasp.joint_positions - back.grasps.grasp.joint_positions).max(axis=1)
     assert (opened > 0.01).all() and len(back.grasps) == 8
     assert (np.abs(hand.reduce(back.grasps.grasp.joint_positions) - hand.preshape).max(axis=1) > 0.05).all()
@@ -133,15 +132,11 @@ def test_what_nobody_validated_has_no_label(on_tables: Path, tmp_path: Path) -> 
 def test_a_record_that_is_wrong_is_told(data: Path, tmp_path: Path, change: dict[str, Any], said: str) -> None:
     record = record_of(data, "block")
     record["grasps"] |= change
-    path = tmp_path / "block.json"
-    path.write_text(json.dumps(record))
     with pytest.raises(InputError, match=said):
-        graspgen.read(path, hand="barrett", obj="block")
+        read_back(record, tmp_path)
 
 
-def test_links_compressed_and_large_files_are_not_followed(
-    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_links_compressed_and_large_files_are_not_followed(data: Path, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(graspgen, "LARGEST", 1000)
     with pytest.raises(InputError, match="larger than"):
         graspgen.read(data / "grasps" / "barrett", hand="barrett", obj="block", object_name="block")

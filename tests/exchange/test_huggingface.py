@@ -1,7 +1,5 @@
 """Tables that Hugging Face's `datasets` reads: by pyarrow as it reads them, by itself where it is installed."""
 
-from __future__ import annotations
-
 import io
 import json
 from collections.abc import Callable
@@ -55,12 +53,10 @@ def picture(cell: dict[str, Any]) -> np.ndarray:
 
 def test_its_card_names_all_files_and_columns_of_pictures(folder: Path) -> None:
     found = configs(folder)
-    assert {table: sorted(splits) for table, splits in found.items()} == {
-        table: ["test", "train"] for table in ("grasps", "pictures")
-    }
-    assert sorted(file for splits in found.values() for files in splits.values() for file in files) == sorted(
-        folder.rglob("*.parquet")
-    )
+    splits = ["test", "train"]
+    assert {table: sorted(parts) for table, parts in found.items()} == {"grasps": splits, "pictures": splits}
+    files = [file for parts in found.values() for part in parts.values() for file in part]
+    assert sorted(files) == sorted(folder.rglob("*.parquet"))
     for file in (folder / "pictures").iterdir():
         told = json.loads(pq.read_schema(file).metadata[b"huggingface"])["info"]["features"]
         assert told == {name: {"_type": "Image"} for name in ("rgb", "depth", "segmentation")}
@@ -78,9 +74,7 @@ def test_a_row_is_a_grasp_of_ours(folder: Path, stored: Shard, hand: HandModel) 
             assert row[f"{name}_joints"] == stored[f"{name}/joint_positions"][row["row"]].tolist()
 
 
-def test_picture_has_what_was_seen_and_fingertips_where_they_are(
-    folder: Path, on_tables: Path, hand: HandModel, stored: Shard
-) -> None:
+def test_picture_has_what_was_seen_and_fingertips_where_they_are(folder, on_tables, hand, stored: Shard) -> None:
     pictures = Pictures(open_shards(on_tables), valid=False)
     ours = {(one["object"], one["row"]): one for one in pictures}
     tip = hand.fingertips[0]

@@ -5,8 +5,6 @@ dataset_reader.py at 0201803db23ee42ed1952e84f8ed9d6ab1eb3b92 and io_utils.py at
 073c4dbda9a9827b01abbd71ffbdc42580b23b72.
 """
 
-from __future__ import annotations
-
 import io
 import itertools
 import json

@@ -1,7 +1,5 @@
 """What an export writes: names that its libraries take, and files that they open before it says it is done."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,11 +1,10 @@
 """What the system refuses, a wrong file among it, is one line on standard error, and never a trace."""
 
-from __future__ import annotations
-
 import errno
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from typer.testing import CliRunner
@@ -64,18 +63,13 @@ def test_a_file_does_not_take_the_place_of_a_closed_output(tmp_path: Path) -> No
         (MemoryError(), "there is not enough memory; provide more, or request less at once"),
     ],
 )
-def test_a_refusal_of_the_system_names_the_thing_and_the_fix(
-    error: BaseException, line: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def command() -> None:
-        raise error
-
+def test_a_system_error_names_the_fix(error: BaseException, line: str, capsys: pytest.CaptureFixture[str]) -> None:
     with capsys.disabled(), pytest.MonkeyPatch.context() as patch:
         patch.setattr("graspd.service.cli._silence", lambda stream: None)
         patch.setattr("typer.echo", lambda text, err: told.append(text))
         told: list[str] = []
         with pytest.raises(SystemExit) as ended:
-            at_the_door(command)
+            at_the_door(Mock(side_effect=error))
     assert ended.value.code == 1
     assert told == [f"graspd: {line}"]
 
@@ -87,7 +81,6 @@ def test_a_fault_of_graspd_keeps_its_trace() -> None:
 
 #: Words of the libraries that read files, and of pydantic and click.
 FOREIGN = ("Errno", "pydantic", "nable to open", "nput should", "Traceback", "Error:", "<unicode string>")
-
 #: FILE stands for what is not there, or is of no kind; the suffix is what a user would give.
 _TYPED = """
     synth --hand FILE.urdf --object mug -o OUT.h5
@@ -114,7 +107,6 @@ COMMANDS = (
         for name in IMPORTS
     ),
 )
-
 #: Sent to the service as they are: what they hold is its business.
 ABSENT = (
     "hands add FILE.urdf",

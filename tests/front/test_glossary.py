@@ -1,7 +1,5 @@
 """Names of the product are words of the glossary, or plain words that docs/reference/names.txt lists."""
 
-from __future__ import annotations
-
 import ast
 import re
 

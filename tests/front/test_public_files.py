@@ -1,7 +1,5 @@
 """Files that a public project keeps beside its sources are valid; `import graspd` is light and complete."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys
@@ -22,9 +20,7 @@ from tests.docs_commands import Line
 from tests.shell import completed
 
 FORGE = REPOSITORY / ".github"
-
 WORKFLOWS = sorted((FORGE / "workflows").glob("*"))
-
 #: Name of a schema that check-jsonschema brings, and the files that it describes.
 SCHEMAS = {
     "citation-file-format": [REPOSITORY / "CITATION.cff"],
@@ -32,7 +28,6 @@ SCHEMAS = {
     "github-issue-forms": sorted((FORGE / "ISSUE_TEMPLATE").glob("*")),
     "github-workflows": WORKFLOWS,
 }
-
 PROSE = [
     *(REPOSITORY / name for name in ("CONTRIBUTING.md", "SECURITY.md", "CODE_OF_CONDUCT.md")),
     FORGE / "pull_request_template.md",
@@ -110,7 +105,6 @@ def test_a_commit_is_checked_by_the_tools_of_make_check() -> None:
 
 
 HEAVY = ("numpy", "pydantic", "warp", "newton", "trimesh", "mujoco", "h5py", "httpx")
-
 #: All that it imports of its own: `libraries` imports the others without the garbage collector.
 OWN = {"graspd", "graspd.service", "graspd.service.model", "graspd.service.model.libraries"}
 

@@ -1,7 +1,5 @@
 """Figures and pictures of the docs: each is held by the manifest, each command of the list is one that there is."""
 
-from __future__ import annotations
-
 import json
 import shlex
 from importlib.util import find_spec
@@ -53,8 +51,7 @@ def test_git_keeps_what_readers_see_and_no_raw_results() -> None:
 
 def test_each_file_belongs_to_one_study() -> None:
     held = [path for study in STUDIES for path in digests(study, DOCS)]
-    assert len(held) == len(set(held))
-    assert set(held) == there(DOCS)
+    assert len(held) == len(set(held)) and set(held) == there(DOCS)
     assert (DOCS / INDEX).read_text() == page.index(load(DOCS)), "run: make docs"
 
 

@@ -1,7 +1,5 @@
 """A private Redis, and the parts of a service with and without it."""
 
-from __future__ import annotations
-
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path

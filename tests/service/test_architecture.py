@@ -1,7 +1,5 @@
 """ARCHITECTURE.md and docs say what the code does: tests, layers, files, light imports."""
 
-from __future__ import annotations
-
 import importlib
 import inspect
 import re
@@ -106,8 +104,6 @@ MODULES = sorted(
     # The readers' module for torch is for those who have it.
     if path.name not in ("__init__.py", "torch_data.py")
 )
-
-
 HEAVY = {"warp", "trimesh", "mujoco", "scipy", "newton", "torch", "graspd.worker", "graspd.api"}
 
 

@@ -1,7 +1,5 @@
 """What a task and a grasp cost in Redis and in the index: the figures of docs/results/service.md, as limits."""
 
-from __future__ import annotations
-
 from graspd.service.model.clock import timestamp
 from graspd.service.model.states import Priority
 from graspd.service.queue.port import Event, EventKind

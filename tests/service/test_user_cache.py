@@ -1,7 +1,5 @@
 """The user's cache: entries whole, intact and the user's own, wherever it can be written."""
 
-from __future__ import annotations
-
 import logging
 import os
 import subprocess
@@ -95,7 +93,7 @@ def test_a_folder_that_others_can_write_is_not_used(tmp_path: Path, monkeypatch:
 
 def test_processes_that_keep_one_entry_leave_a_whole_one(tmp_path: Path) -> None:
     write = (
-        "import sys, pathlib; from service import user_cache\n"
+        "import sys, pathlib; from graspd.service import user_cache\n"
         "for _ in range(200):\n"
         "    user_cache.keep(pathlib.Path(sys.argv[1]), sys.argv[2].encode() * 50_000)\n"
         "    assert user_cache.load(pathlib.Path(sys.argv[1])) is not None, 'torn'\n"

@@ -1,6 +1,4 @@
-"""The chart's contract, its statistics, and that a sweep changes only what it names."""
-
-from __future__ import annotations
+"""The chart: its contract and statistics, of free grasps and in scenes, and that a sweep changes only what it names."""
 
 import csv
 import itertools
@@ -12,33 +10,36 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from matplotlib.text import Text
-from typer.testing import CliRunner
 
-from graspd.commands.studies import app
 from graspd.service.model.fidelity import FIDELITIES
+from graspd.service.model.studies import FILTERED, IN_SCENE
+from graspd.service.pipeline.fidelity_choice import cheapest
 from graspd.service.store.records import latest
 from graspd.service.store.store import open_store
 from graspd.studies.chart.chart import settings_of
 from graspd.studies.chart.figure import Label, place
 from graspd.studies.chart.report import markdown
+from graspd.studies.chart.scenes import figures
+from graspd.studies.chart.scenes import summed as summed_in_scenes
 from graspd.studies.chart.statistics import METRICS, first_valid, pareto, summed
 from graspd.studies.chart.sweeps import KnobValue, _make, asking_each, turns
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
+from graspd.worker.quality.intervals import wilson
+from tests.worker.commands_run import graspd, refused
 
 RUN_KEYS = {"method", "fidelity", "hand", "object", "valid_per_second", "seconds_to_first_valid", "gsr", "epsilon"}
 RUN_KEYS |= {"pd_mm", "end_to_end_per_second", "dexgraspbench", "hard", "robust"}
 
 
+QUICK = "chart --quick --methods fast_graspd,autograsp --hands barrett --objects block"
+
+
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path]:
     folder = tmp_path_factory.mktemp("chart")
-    arguments = ["--quick", "--methods", "fast_graspd,autograsp", "--hands", "barrett", "--objects", "block"]
-    arguments += ["--publish", "--data-dir", str(folder / "data"), "--out", str(folder), "--json"]
-    done = CliRunner().invoke(app, ["chart", *arguments])
-    assert done.exit_code == 0, done.output
-    return json.loads(done.stdout.strip().splitlines()[-1]), folder
+    return graspd(f"{QUICK} --publish --data-dir", folder / "data", "--out", folder), folder
 
 
 def test_runs_have_the_rates_that_their_counts_and_seconds_give(made: tuple[dict[str, Any], Path]) -> None:
@@ -50,8 +51,7 @@ def test_runs_have_the_rates_that_their_counts_and_seconds_give(made: tuple[dict
         # Seconds are printed to the microsecond, the rate is not rounded so.
         rounded = 0.5e-6 * len(run["seconds"]) / used
         assert run["valid_per_second"] == pytest.approx(run["valid"] / used, rel=1e-5 + rounded)
-        assert run["gsr"] == pytest.approx(run["valid"] / run["grasps"])
-        assert run["kept"] <= run["valid"]
+        assert run["gsr"] == pytest.approx(run["valid"] / run["grasps"]) and run["kept"] <= run["valid"]
         assert all(whole > planned for whole, planned in zip(run["end_seconds"], run["seconds"], strict=True))
         assert run["end_to_end_per_second"] == pytest.approx(run["kept"] / sum(run["end_seconds"]), rel=1e-4)
         for key in ("gsr", "dexgraspbench", "hard", "end_to_end_per_second", *(["robust"] if run["valid"] else [])):
@@ -61,45 +61,45 @@ def test_runs_have_the_rates_that_their_counts_and_seconds_give(made: tuple[dict
     assert made[0]["by_hand"]["barrett"] == made[0]["summary"]
 
 
-def test_all_files_are_written_and_agree(made: tuple[dict[str, Any], Path]) -> None:
-    found, folder = made
+def assert_written(folder: Path, found: dict[str, Any], column: str) -> None:
+    """All files of a chart, with the runs that the command printed."""
     assert json.loads((folder / "chart.json").read_text())["runs"] == found["runs"]
     rows = list(csv.DictReader((folder / "chart.csv").read_text().splitlines()))
-    assert [float(row["gsr"]) for row in rows] == [run["gsr"] for run in found["runs"]]
-    assert "The best ten by epsilon" in (folder / "chart.md").read_text()
-    assert (folder / "chart.hands.png").read_bytes().startswith(b"\x89PNG")
-    assert (folder / "chart.png").read_bytes().startswith(b"\x89PNG")
+    assert [row[column] for row in rows] == [str(run[column]) for run in found["runs"]]
+    assert all((folder / name).read_bytes().startswith(b"\x89PNG") for name in ("chart.png", "chart.hands.png"))
     assert "<svg" in (folder / "chart.svg").read_text()
+
+
+def test_all_files_are_written_and_agree(made: tuple[dict[str, Any], Path]) -> None:
+    found, folder = made
+    assert_written(folder, found, "gsr")
+    assert "The best ten by epsilon" in (folder / "chart.md").read_text()
     stored = latest(open_store((folder / "data" / "store").as_uri()), "charts")
     assert stored is not None and stored["runs"] == found["runs"]
 
 
 @pytest.mark.parametrize(
-    "arguments",
+    ("words", "says"),
     [
-        ["--methods", "magic"],
-        ["--fidelities", "superb"],
-        ["--batch", "many"],
-        ["--hands", ","],
-        ["--option", "steps=3"],
-        ["--methods", "graspit", "--option", "graspit:steps=1"],
-        ["--objects", "nowhere.stl"],
-        ["--sweep", "--knob", "volume"],
+        ("--methods magic", "magic"),
+        ("--fidelities superb", "superb"),
+        ("--batch many", "many"),
+        ("--hands ,", "an option is empty"),
+        ("--option steps=3", "steps"),
+        ("--methods graspit --option graspit:steps=1", "steps"),
+        ("--objects nowhere.stl", "nowhere.stl"),
+        ("--sweep --knob volume", "volume"),
+        ("--hands barrett --objects block --scene table --sweep", "omit --scene"),
     ],
 )
-def test_a_wrong_option_is_the_callers_mistake(arguments: list[str]) -> None:
-    done = CliRunner().invoke(app, ["chart", "--quick", *arguments])
-    assert done.exit_code == 2
+def test_a_wrong_option_is_the_callers_mistake(words: str, says: str) -> None:
+    assert says in refused(f"chart --quick {words}")
 
 
 def test_method_can_be_charted_with_options_and_batch_of_its_own() -> None:
-    given = {
-        "baseline_batch": 4,
-        "options": ["graspit:steps=40000"],
-        "quick": False,
-        "run": ExecutionContext(threads=1),
-    }
-    plain, kept = settings_of(["graspit", "graspit:keep=5@10"], ["draft"], batches=[32], **given)
+    given = {"batches": [32], "baseline_batch": 4, "options": ["graspit:steps=40000"], "quick": False}
+    methods, run = ["graspit", "graspit:keep=5@10"], ExecutionContext(threads=1)
+    plain, kept = settings_of(methods, ["draft"], **given, run=run)
     assert (plain.fidelity, plain.batch, plain.options) == ("as published", 4, {"steps": "40000"})
     assert (kept.fidelity, kept.batch, kept.options) == ("keep=5", 10, {"steps": "40000", "keep": "5"})
 
@@ -136,12 +136,10 @@ def test_sums_divide_all_valid_by_all_seconds() -> None:
     (row,) = summed([run_of("a", 8, 1.0, 0.1), run_of("a", 2, 4.0, 0.3)])
     assert row["valid_per_second"] == pytest.approx(10 / 5.0)
     assert row["end_to_end_per_second"] == pytest.approx(10 / 10.0)
-    assert row["gsr"] == row["dexgraspbench"] == pytest.approx(0.5)
-    assert row["pd_mm"] == pytest.approx(0.2)
+    assert row["gsr"] == row["dexgraspbench"] == pytest.approx(0.5) and row["pd_mm"] == pytest.approx(0.2)
     able, unable = summed([run_of("a", 5, 1.0, 0.5), run_of("b", 0, 0.1, 0.0)])
     assert able["front"] == ["dexgraspbench", "hard", "robust", "gsr", "epsilon", "pd_mm"]
-    assert unable["front"] == [] and unable["robust"] is None
-    assert unable["seconds_to_first_valid"] is None
+    assert unable["front"] == [] and unable["robust"] is None and unable["seconds_to_first_valid"] is None
     fast, gentle = summed([run_of("a", 5, 1.0, 0.5), run_of("b", 5, 2.0, 0.1)])
     assert "pd_mm" in fast["front"] and gentle["front"] == ["pd_mm"]
 
@@ -207,8 +205,7 @@ def test_no_word_lies_on_another_or_on_a_point_or_outside(crowd: str) -> None:
 def test_a_word_stands_close_to_its_point_and_on_no_other() -> None:
     axes, (word,) = drawn([(10.0, 0.5)])
     box, point = word.get_window_extent(), axes.transData.transform((10.0, 0.5))
-    assert word.arrow_patch is None
-    assert 0 < box.x0 - point[0] < 15 and 0 < box.y0 - point[1] < 15
+    assert word.arrow_patch is None and 0 < box.x0 - point[0] < 15 and 0 < box.y0 - point[1] < 15
     figure = Figure(figsize=(5.0, 4.0))
     axes = figure.subplots()
     # The second point lies where the first one's word would stand.
@@ -216,3 +213,98 @@ def test_a_word_stands_close_to_its_point_and_on_no_other() -> None:
     axes.set_ylim(0, 10)
     (word,) = place(figure, [Label(axes, 5.0, 5.0, "here", "black"), Label(axes, 5.4, 5.4, "", "black")])
     assert not Text.get_window_extent(word).contains(*axes.transData.transform((5.4, 5.4)))
+
+
+ON_TABLE = f"{QUICK} --scene table"
+
+
+@pytest.fixture(scope="module")
+def in_scenes(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path]:
+    folder = tmp_path_factory.mktemp("chart")
+    return graspd(f"{ON_TABLE} --work", folder / "work", "--out", folder), folder
+
+
+def test_rates_and_files_are_those_of_the_runs(in_scenes: tuple[dict[str, Any], Path]) -> None:
+    # Who plans in scenes does both, others are filtered.
+    ways = [(run["method"], run["way"]) for run in in_scenes[0]["runs"]]
+    assert ways == [("fast_graspd", IN_SCENE), ("fast_graspd", FILTERED), ("autograsp", FILTERED)]
+    for run in in_scenes[0]["runs"]:
+        assert 0 <= run["lift_hard_count"] <= run["lift_count"] <= run["clear_count"] <= run["grasps"]
+        assert run["valid_per_second"] == pytest.approx(run["lift_count"] / run["seconds"], rel=1e-4)
+        assert run["lift_low"] <= run["lift"] <= run["lift_high"]
+        assert run["end_seconds"] > run["seconds"] and run["lift_dexgraspbench_count"] <= run["clear_count"]
+        assert run["end_to_end_per_second"] == pytest.approx(run["lift_count"] / run["end_seconds"], rel=1e-4)
+        assert (run["robust"] is None) == (run["seconds_to_first"] is None) == (run["lift_count"] == 0)
+        assert run["robust"] is None or 0 <= run["robust_low"] <= run["robust"] <= run["robust_high"] <= 1
+    found, folder = in_scenes
+    assert_written(folder, found, "method")
+    assert f"| {IN_SCENE} | fast_graspd | draft |" in (folder / "chart.md").read_text()
+
+
+def test_a_run_that_was_stopped_plans_only_what_is_missing(in_scenes: tuple[dict[str, Any], Path], monkeypatch) -> None:
+    found, folder = in_scenes
+    kept = sorted((folder / "work").glob("*.json"))
+    assert len(kept) == 3
+    kept[0].unlink()
+    planned = []
+    runs = {(run["method"], run["way"]): run for run in found["runs"]}
+
+    def tried(setting: Any, way: str, *_: object) -> dict[str, Any]:
+        planned.append((setting.method, way))
+        return runs[setting.method, way]
+
+    monkeypatch.setattr("graspd.studies.chart.scenes._tried", tried)
+    assert graspd(f"{ON_TABLE} --work", folder / "work")["runs"] == found["runs"] and len(planned) == 1
+
+
+def test_a_chart_of_earlier_is_published_apart_and_drawn(
+    in_scenes: tuple[dict[str, Any], Path], tmp_path: Path
+) -> None:
+    found, folder = in_scenes
+    graspd("chart --publish --from", folder / "chart.json", "--data-dir", tmp_path, "--out", tmp_path)
+    store = open_store((tmp_path / "store").as_uri())
+    stored = latest(store, "scene_charts/table")
+    assert stored is not None and stored["runs"] == found["runs"] and latest(store, "charts") is None
+    assert (tmp_path / "chart.json").read_bytes() == (folder / "chart.json").read_bytes()
+    assert (tmp_path / "chart.md").read_text() == (folder / "chart.md").read_text()
+    # What it promises is what a job in such a scene is given.
+    draft = next(run for run in found["runs"] if run["way"] == IN_SCENE)
+    chosen = cheapest(stored, f"lift>={draft['lift']}", method="fast_graspd", hand="barrett", object_="block")
+    assert chosen == ("draft", "hand and object", draft["lift"])
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [("{}", "is no chart.json"), ("no json", "is no chart.json"), ('{"created": "c", "runs": []}', "has no summary")],
+)
+def test_a_file_that_is_no_chart_is_refused_in_a_line(tmp_path: Path, content: str, words: str) -> None:
+    (tmp_path / "chart.json").write_text(content)
+    assert words in refused("chart --from", tmp_path / "chart.json")
+
+
+def run_in_scenes(way: str, pair: str, lifted: int, seconds: float, grasps: int = 10) -> dict[str, Any]:
+    counts = {"grasps": grasps, "seconds": seconds, "end_seconds": 2 * seconds, "robust_sum": 0.5 * lifted}
+    counts |= dict.fromkeys(("clear_count", "lift_count", "lift_dexgraspbench_count"), lifted) | {"lift_hard_count": 0}
+    said = {"way": way, "method": "m", "fidelity": "f", "batch": grasps, "hand": "h", "object": pair, "note": ""}
+    return {**said, **counts, **figures([counts]), "scenes": 1, "seconds_to_first": seconds if lifted else None}
+
+
+def test_gain_is_median_of_pairs_in_which_filtering_found_any() -> None:
+    runs = [run_in_scenes(IN_SCENE, pair, 8, 2.0) for pair in "abc"]
+    runs += [run_in_scenes(FILTERED, pair, lifted, 1.0) for pair, lifted in (("a", 1), ("b", 2), ("c", 0))]
+    inside, outside = summed_in_scenes(runs)
+    assert inside["gain"] == pytest.approx((4 / 1 + 4 / 2) / 2)
+    assert (inside["pairs_with_one"], outside["pairs_with_one"]) == (3, 2)
+    assert inside["robust"] == 0.5 and (inside["robust_low"], inside["robust_high"]) == pytest.approx(wilson(12, 24))
+    assert outside["seconds_to_first"] is None and inside["seconds_to_first"] == 2.0
+    assert inside["lift"] == 0.8 and outside["valid_per_second"] == pytest.approx(1.0)
+
+
+def test_a_pair_that_is_refused_counts_as_tries_without_a_lift() -> None:
+    refused = run_in_scenes(IN_SCENE, "a", 0, 0.0) | {"note": "nothing can reach it"}
+    (row,) = summed_in_scenes([refused, run_in_scenes(IN_SCENE, "b", 5, 1.0)])
+    assert row["lift"] == 0.25 and row["grasps_per_second"] == pytest.approx(10.0)
+    assert row["valid_per_second"] == pytest.approx(5.0)
+    chart = {"runs": [refused], "summary": [row], "by_hand": {}, "models": 2, "versions": {"graspd": "0"}}
+    said = markdown(chart | {"device": "d", "created": "c", "scene": {"kind": "table", "faces": "all"}})
+    assert "## Refused" in said and "nothing can reach it" in said

@@ -1,7 +1,5 @@
 """The maps of failure say what physics says of integrators, hands, models and scenes, and the guards they name hold."""
 
-from __future__ import annotations
-
 import json
 import math
 import time
@@ -13,10 +11,9 @@ import numpy as np
 import pytest
 import trimesh
 from matplotlib.figure import Figure
-from typer.testing import CliRunner
 
-from graspd.cli import build
-from graspd.commands.studies import STUDIES, app
+from graspd.commands.studies import STUDIES
+from graspd.commands.synth import _said
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.errors import InputError
 from graspd.service.model.fidelity import FIDELITIES
@@ -42,6 +39,7 @@ from graspd.worker.scenes.trajectory import MARGIN_M
 from graspd.worker.simulation.data import HandState
 from graspd.worker.simulation.model import LossOptions
 from graspd.worker.validation.variant import Variant, draw
+from tests.worker.commands_run import graspd, refused
 from tests.worker.simulation.test_surroundings import mujoco_room
 
 FEW = MapOptions(4)
@@ -62,8 +60,7 @@ def pair(hand: HandModel) -> Pair:
 def test_planners_own_step_lies_where_its_integrators_are_good(name: str) -> None:
     way = LossOptions().step  # time step x speed [m]
     energy, sunk = integrators.position_based(integrators.SOLVERS[name], dt=1e-3, speed=way / 1e-3)
-    assert graded(energy, *integrators.ENERGY) == "good"
-    assert graded(sunk, *integrators.SINK_M) == "good"
+    assert graded(energy, *integrators.ENERGY) == graded(sunk, *integrators.SINK_M) == "good"
 
 
 @pytest.mark.parametrize(("share", "holds"), [(0.3, True), (2.5, False)])
@@ -77,8 +74,7 @@ def test_a_penalty_force_blows_up_above_the_bound_of_theory(share: float, holds:
 def test_summed_jacobi_overshoots_with_the_number_of_contacts() -> None:
     found = integrators.contact_count_map(counts=(1, 64))
     outcome = {(cell.panel, cell.x): cell.outcome for cell in found.cells if cell.y == 0.0}
-    assert outcome["Jacobi, summed", 1] == "good"
-    assert outcome["Jacobi, summed", 64] == "broken"
+    assert (outcome["Jacobi, summed", 1], outcome["Jacobi, summed", 64]) == ("good", "broken")
     assert outcome["Jacobi, averaged", 64] == outcome["direct (default)", 64] == "good"
 
 
@@ -119,19 +115,15 @@ def test_a_long_run_does_not_drift(pair: Pair) -> None:
 @pytest.mark.slow
 def test_a_quick_run_takes_less_than_the_minute_that_it_promises() -> None:
     started = time.process_time()
-    found = studies.run(
-        STUDIES, "allegro", "block", quick=True, long=False, work=DEFAULT_CONTEXT, say=lambda line: None
-    )
+    options = {"quick": True, "long": False, "work": DEFAULT_CONTEXT, "say": lambda line: None}
+    found = studies.run(STUDIES, "allegro", "block", **options)
     assert time.process_time() - started < 60  # CPU seconds: others may keep the machine busy
     assert [one.name for one in found] == list(STUDIES) and all(one.cells for one in found)
 
 
 def a_map(**changes: object) -> StabilityMap:
-    cells = [
-        MapCell("a", 1.0, 10.0, 0.1, "good", reached=True),
-        MapCell("a", 2.0, 10.0, math.inf, "broken", "why", "", True),
-    ]
-    cells.append(MapCell("a", 3.0, 10.0, 5.0, "broken"))
+    cells = [MapCell("a", 1.0, 10.0, 0.1, "good", reached=True), MapCell("a", 3.0, 10.0, 5.0, "broken")]
+    cells.insert(1, MapCell("a", 2.0, 10.0, math.inf, "broken", "why", "", True))
     one = StabilityMap("demo", "A demo", "x", "y", "m", "weak: 1", cells, "it flies", "g", "t", {"a": [(1.0, 10.0)]})
     return replace(one, **changes)
 
@@ -147,8 +139,7 @@ def test_a_report_has_pictures_tables_and_says_what_still_breaks(tmp_path: Path)
     assert json.loads(data.read_text())["maps"][0]["cells"][1]["value"] is None
     assert picture.name == "stability-demo.png" and picture.read_bytes().startswith(b"\x89PNG")
     said = page.read_text()
-    assert "| a | 1 | 0 | 2 | 0 |" in said
-    assert "| A demo | 1 | 0 | 1 | 0 | a 2 (10) | it flies |" in said
+    assert "| a | 1 | 0 | 2 | 0 |" in said and "| A demo | 1 | 0 | 1 | 0 | a 2 (10) | it flies |" in said
     whole = [replace(cell, outcome="good") for cell in a_map().cells]
     assert "| A demo | 2 | 0 | 0 | 0 | nothing | – |" in markdown(a_record(a_map(cells=whole)))
 
@@ -165,19 +156,12 @@ def test_numbers_on_a_picture_stay_within_their_cells(letters: str) -> None:
     assert axes.texts[0].get_visible() is (len(letters) < 20)
 
 
-def command(*arguments: str) -> tuple[int, str]:
-    done = CliRunner().invoke(app, ["stability", *arguments])
-    return done.exit_code, done.output
-
-
-@pytest.mark.parametrize("words", ["no json", "{}", '{"maps": 3}', "--only magic", "--from nowhere.json"])
-def test_wrong_files_and_options_are_the_callers_mistake(tmp_path: Path, words: str) -> None:
-    if words.startswith("--"):
-        assert command(*words.split())[0] == 2
-        return
-    (tmp_path / "wrong.json").write_text(words)
-    code, said = command("--from", str(tmp_path / "wrong.json"))
-    assert code == 2 and "no stability.json" in said
+@pytest.mark.parametrize("content", ["no json", "{}", '{"maps": 3}'])
+def test_wrong_files_and_options_are_the_callers_mistake(tmp_path: Path, content: str) -> None:
+    (tmp_path / "wrong.json").write_text(content)
+    assert "no stability.json" in refused("stability --from", tmp_path / "wrong.json")
+    assert "magic" in refused("stability --only magic")
+    assert "nowhere.json" in refused("stability --from nowhere.json")
 
 
 def tips(hand: HandModel, joints: np.ndarray) -> np.ndarray:
@@ -195,16 +179,13 @@ def test_a_ring_has_as_many_dofs_as_its_drives(coupling: Coupling, dofs: int) ->
 
 def test_fingers_open_outward_scale_and_follow_by_ratio() -> None:
     hand = ring_hand(3)
-    wide, closed = (
-        np.linalg.norm(tips(hand, hand.expand(posture))[:, :2], axis=1) for posture in (hand.lower, 0.5 * hand.upper)
-    )
-    assert (wide > 0.06).all()
-    assert (closed < 0.03).all()
+    postures = (hand.expand(q) for q in (hand.lower, 0.5 * hand.upper))
+    wide, closed = (np.linalg.norm(tips(hand, posture)[:, :2], axis=1) for posture in postures)
+    assert (wide > 0.06).all() and (closed < 0.03).all()
     small, large = (ring_hand(3, size=size) for size in (1.0, 2.0))
     # The URDF has six decimals of a metre.
-    np.testing.assert_allclose(
-        tips(large, large.expand(large.lower)), 2 * tips(small, small.expand(small.lower)), atol=3e-6
-    )
+    doubled = 2 * tips(small, small.expand(small.lower))
+    np.testing.assert_allclose(tips(large, large.expand(large.lower)), doubled, atol=3e-6)
     hand = ring_hand(2, coupling="distal follows", ratio=0.5)
     joints = hand.expand(np.full(hand.dofs, 0.6))
     by_name = dict(zip(hand.joint_names, joints, strict=True))
@@ -215,9 +196,8 @@ def test_palm_without_fingers_is_refused_and_three_of_them_hold() -> None:
     backend.start()
     none, three = assets.hand_map(FEW, fingers=(0, 3), couplings=("distal follows",)).cells
     assert none.outcome == "refused" and three.value > 0
-    assert [cell.outcome for cell in assets.hand_map(FEW, fingers=(3, 5), couplings=("one drive",)).cells] == 2 * [
-        "good"
-    ]
+    driven = assets.hand_map(FEW, fingers=(3, 5), couplings=("one drive",)).cells
+    assert [cell.outcome for cell in driven] == ["good", "good"]
 
 
 FRICTION, MASS = "friction, relative to the model", "mass, relative to the model"
@@ -270,8 +250,7 @@ def test_amounts_within_reach_are_those_that_robust_draws(name: str) -> None:
 def assert_valid_ones_are_clear(hand: HandModel, found: ValidatedBatch, spec: SceneSpec) -> None:
     """By MuJoCo's distances at the grasp, whatever the planner thinks of its clearance."""
     rows = np.flatnonzero(found.columns["quality/valid"] == 1)
-    assert (found.columns["quality/clearance_m"][rows] >= MARGIN_M).all()
-    assert spec.target is not None
+    assert (found.columns["quality/clearance_m"][rows] >= MARGIN_M).all() and spec.target is not None
     for support in supports_of(spec) if len(rows) else ():
         seen = support.seen_from(np.asarray(spec.target, float))
         assert mujoco_room(hand, found.grasps.grasp.take(rows), seen).min() >= MARGIN_M - 1e-6
@@ -281,10 +260,9 @@ def test_a_plate_flat_on_a_table_ends_with_fewer_and_says_so(tmp_path: Path) -> 
     plate = tmp_path / "plate.stl"
     trimesh.creation.box((0.15, 0.15, 0.003)).export(plate)
     words = "synth --hand barrett --units m --scene table --faces all --scenes 1 -n 2 --budget 2 --fidelity draft"
-    result = CliRunner().invoke(build(), [*words.split(" "), "--object", str(plate), "-o", str(tmp_path / "g.h5")])
-    assert result.exit_code == 3, result.output
-    assert "the budget of 2 candidates" in result.output
-    assert "of the candidates are clear" in result.output
+    told = graspd(f"{words} --object", plate, "-o", tmp_path / "g.h5", code=3)
+    assert "the budget of 2 candidates" in told["reason"]
+    assert "of the candidates are clear" in _said({"file": "g.h5", **told})
 
 
 @pytest.mark.parametrize("gap", [5, 30])
@@ -336,9 +314,8 @@ def test_maps_of_several_runs_are_drawn_and_published_as_one(tmp_path: Path) -> 
         own = StabilityMap(name, name, "x", "y", "m", "b", cells, "s", "g")
         run = Stability(f"2026-01-0{value:.0f}T00:00:00Z", f"graspd stability {name}", {"graspd": "0"}, [one, own])
         (tmp_path / f"{name}.json").write_text(json.dumps(run.as_json()))
-    words = [part for name in ("first", "second") for part in ("--from", str(tmp_path / f"{name}.json"))]
-    code, said = command(*words, "--out", str(tmp_path / "out"), "--json", "--publish", "--data-dir", str(tmp_path))
-    assert code == 0, said
+    given = [part for name in ("first", "second") for part in ("--from", tmp_path / f"{name}.json")]
+    graspd("stability --publish", *given, "--out", tmp_path / "out", "--data-dir", tmp_path)
     written = json.loads((tmp_path / "out" / "stability.json").read_text())
     assert latest(open_store((tmp_path / "store").as_uri()), "stability") == written
     found = from_json(written)

@@ -1,7 +1,5 @@
 """A whole service of real processes on a free port, with the workers' engine replaced by `tests.fakes`."""
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

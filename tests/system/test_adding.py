@@ -1,7 +1,5 @@
 """A user's own files through the whole service: command line, API, controller, worker with the real engine."""
 
-from __future__ import annotations
-
 import json
 import os
 import sys
@@ -90,12 +88,6 @@ def graspd(service: Supervisor, files: Path) -> Shell:
     return Shell(kept | names | {"PYTHONPATH": path}, files)
 
 
-def test_a_hand_is_added_with_its_guesses(graspd: Shell) -> None:
-    code, hand, _ = graspd("hands", "add", "pincer.urdf", "--no-self-test")
-    assert (code, hand["name"], hand["verdict"]) == (0, "pincer", "accept")
-    assert hand["facts"]["palm_approach"] == [0.0, 0.0, 1.0]
-
-
 def test_a_refused_object_gets_in_with_the_named_fix(graspd: Shell) -> None:
     code, _, said = graspd("objects", "add", "brick.stl")
     assert code == 2 and "--units mm" in said
@@ -104,10 +96,10 @@ def test_a_refused_object_gets_in_with_the_named_fix(graspd: Shell) -> None:
     assert brick["facts"]["mass_kg"] == pytest.approx(60e-3 * 40e-3 * 30e-3 * 500, rel=1e-3)
 
 
-def test_a_folder_of_objects_becomes_a_dataset_and_its_files(
-    graspd: Shell, service: Supervisor, tmp_path: Path
-) -> None:
-    graspd("hands", "add", "pincer.urdf", "--no-self-test")
+def test_a_folder_of_objects_becomes_a_dataset_and_files(graspd: Shell, service: Supervisor, tmp_path: Path) -> None:
+    code, hand, _ = graspd("hands", "add", "pincer.urdf", "--no-self-test")
+    assert (code, hand["name"], hand["verdict"]) == (0, "pincer", "accept")
+    assert hand["facts"]["palm_approach"] == [0.0, 0.0, 1.0]
     wanted = ("datasets", "create", "play", "--hands", "pincer", "--objects", "toys", "--grasps", "4")
     cheap = ("--fidelity", "draft", "--want", "candidates", "--validation", "none")
     code, seen, _ = graspd(*wanted, *cheap, "--dry-run")

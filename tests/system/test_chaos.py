@@ -1,7 +1,5 @@
 """Kills real processes and looks at what is left: every job ends, every result is there once, nothing stays behind."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os
@@ -28,17 +26,15 @@ from graspd.service.run.supervisor import Supervisor
 from graspd.service.settings import Settings
 from graspd.service.store.manifests import ShardManifest, load_shard
 from graspd.service.store.records import read_record
-from tests.dataset_status import status
 from tests.fakes import record_of
 from tests.fakes import request as wanted
-from tests.service.pipeline.datasets.makers import add_asset
+from tests.service.pipeline.datasets.makers import add_asset, cells_of
 from tests.service.pipeline.datasets.makers import wanted as wanted_dataset
 from tests.system.conftest import System, alive
 from tests.waiting import PATIENCE_S, until
 
 pytestmark = pytest.mark.chaos
 Start = Callable[..., System]
-
 #: Promised time from the death of a worker to the next attempt of its task [s].
 RECOVERY_S = 10.0
 
@@ -257,7 +253,7 @@ def test_a_dataset_goes_on_after_everything_was_killed(start: Start) -> None:
     after = made(system)
     assert {key: after[key] for key in before} == before
     assert len(after) == 2 * len(OBJECTS)
-    assert {cell.state for cell in status(system.services.index, "kitchen").cells} == {State.SUCCEEDED}
+    assert {cell.state for cell in cells_of(system.services, "kitchen")} == {State.SUCCEEDED}
     assert differences(system.services.index, system.services.store) == []
     taken, _ = actions.snapshot(system.services, "kitchen")
     assert taken.complete and len(taken.shards) == len(after)

@@ -1,7 +1,5 @@
 """The real engine in real workers: killed in the middle of its work, and given a network."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The batch scripts on a cluster that kills: nothing is lost, nothing is done twice."""
 
-from __future__ import annotations
-
 import os
 import stat
 import sys

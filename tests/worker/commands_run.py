@@ -1,7 +1,5 @@
 """Commands of graspd as a test runs them."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

@@ -1,6 +1,4 @@
-"""Small hands and objects made by hand, for tests of the parts that only read them."""
-
-from __future__ import annotations
+"""Small hands and objects for tests of the parts that only read them; comparison of grasps bit for bit."""
 
 from dataclasses import replace
 
@@ -8,6 +6,8 @@ import numpy as np
 import trimesh
 
 from graspd.service.store.shards import json_attribute
+from graspd.worker.generation import ValidatedBatch
+from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import ConvexPiece, HandModel, PalmFrame
 from graspd.worker.objects.mesh_geometry import corner_normals
 from graspd.worker.objects.model import ObjectModel
@@ -107,3 +107,20 @@ def attributes_of(hand: HandModel, obj: ObjectModel, **more: object) -> dict[str
     said = {"hand": hand.name, "hand_digest": hand.digest, "object": obj.name, "object_digest": obj.digest}
     said |= {"method": "none", "fidelity": json_attribute({"face_error_m": 3e-4}), "seed": 5, "batch": 0}
     return {**said, "joint_names": list(hand.joint_names), **more}
+
+
+def assert_same_grasps(one: GraspSet | Exception, other: GraspSet) -> None:
+    assert isinstance(one, GraspSet)
+    columns, others = one.to_columns(), other.to_columns()
+    assert columns.keys() == others.keys()
+    for name, values in others.items():
+        np.testing.assert_array_equal(columns[name], values, err_msg=name)
+    np.testing.assert_array_equal(one.stability_loss, other.stability_loss)
+
+
+def assert_same_batch(one: ValidatedBatch, other: ValidatedBatch) -> None:
+    assert_same_grasps(one.grasps, other.grasps)
+    assert (one.candidates, one.rejected, one.verdict_key) == (other.candidates, other.rejected, other.verdict_key)
+    assert one.columns.keys() == other.columns.keys()
+    for name, values in other.columns.items():
+        np.testing.assert_array_equal(one.columns[name], values, err_msg=name)

@@ -1,8 +1,8 @@
-"""CoreSharing of a batch and parts of its rounds: faster, and the same grasps, verdicts and metrics to the last bit."""
-
-from __future__ import annotations
+"""Batches on shared cores and batches made together: faster, with the same grasps, verdicts and metrics bit for bit."""
 
 import threading
+from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any
 
@@ -10,22 +10,28 @@ import numpy as np
 import pytest
 
 from graspd.service.model.domain import JobOptions
-from graspd.service.model.errors import TaskCancelled
+from graspd.service.model.errors import MeshError, TaskCancelled
 from graspd.service.model.fidelity import resolve_fidelity
 from graspd.service.model.scene_spec import SceneSpec
-from graspd.worker import generation
+from graspd.worker import generation, together
+from graspd.worker.engines.joins import batches_at_once, fitting
 from graspd.worker.execution_context import CoreSharing, ExecutionContext, parallel_map
-from graspd.worker.generation import validated_grasps
+from graspd.worker.files.synthesis import synthesized
+from graspd.worker.generation import ValidatedBatch, validated_grasps
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
-from graspd.worker.planners import NoStartFound, PlanRequest
+from graspd.worker.planners import BatchRequest, NoStartFound, PlanRequest
+from graspd.worker.pool.pool import MODULES, Pool
 from graspd.worker.rounds import SMALLEST_PART, parts_of
 from graspd.worker.scenes.kinds import rest_poses, supports_of
 from graspd.worker.simulation.environment import Scenes
-from tests.worker.batches import assert_same_batch
+from graspd.worker.together import validated_batches
+from tests.worker.models import assert_same_batch
 
 REQUEST = JobOptions(fidelity=resolve_fidelity("draft"), rechecks=2, seed=3)
+ASKED = REQUEST.model_copy(update={"rechecks": 0, "grasps": 6, "seed": 0})
+TABLE = SceneSpec(kind="table")
 COUNT = 2 * SMALLEST_PART
 
 
@@ -36,8 +42,7 @@ def pair():
 
 @pytest.fixture(scope="module")
 def scenes(pair) -> Scenes:
-    table = SceneSpec(kind="table")
-    return Scenes(supports_of(table), rest_poses(table, pair[1], count=3, seed=1)["scene/object_pose"])
+    return Scenes(supports_of(TABLE), rest_poses(TABLE, pair[1], count=3, seed=1)["scene/object_pose"])
 
 
 def noted(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int, int]]:
@@ -54,14 +59,11 @@ def noted(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int, int]]:
 
 
 @pytest.mark.parametrize("in_scenes", [False, True])
-def test_grasps_of_several_lanes_are_those_of_one(
-    pair, scenes, monkeypatch: pytest.MonkeyPatch, in_scenes: bool
-) -> None:
+def test_grasps_of_several_lanes_are_those_of_one(pair, scenes, monkeypatch, in_scenes: bool) -> None:
     wish = REQUEST.model_copy(update={"budget": 1.5, "rechecks": 0}) if in_scenes else REQUEST
     calls, around = noted(monkeypatch), scenes if in_scenes else None
-    two, one = (
-        validated_grasps(*pair, wish, count=COUNT, scenes=around, run=ExecutionContext(threads=n)) for n in (2, 1)
-    )
+    runs = (ExecutionContext(threads=2), ExecutionContext(threads=1))
+    two, one = (validated_grasps(*pair, wish, count=COUNT, scenes=around, run=run) for run in runs)
     assert {(0, 0, SMALLEST_PART), (0, SMALLEST_PART, SMALLEST_PART)} <= set(calls)
     assert_same_batch(two, one)
 
@@ -113,9 +115,8 @@ def test_lane_without_a_place_ends_blocked_where_another_has_one(pair, scenes, m
 def test_the_first_valid_grasps_are_audited_whoever_finds_them(pair, monkeypatch: pytest.MonkeyPatch) -> None:
     rechecked: list[GraspSet] = []
     recheck = generation.Batch._rechecked
-    monkeypatch.setattr(
-        generation.Batch, "_rechecked", lambda work, some: (rechecked.append(some), recheck(work, some))[1]
-    )
+    told = lambda work, some: (rechecked.append(some), recheck(work, some))[1]  # noqa: E731
+    monkeypatch.setattr(generation.Batch, "_rechecked", told)
     found = validated_grasps(*pair, REQUEST, count=COUNT, run=ExecutionContext(threads=2))
     (first,) = (some.moved(pair[1].centre) for some in rechecked)  # the engine works about the middle of the object
     np.testing.assert_array_equal(first.grasp.hand_pose, found.grasps.grasp.hand_pose[:2])
@@ -128,8 +129,7 @@ def test_the_first_valid_grasps_are_audited_whoever_finds_them(pair, monkeypatch
 )
 def test_parts_are_as_many_as_cores_and_none_is_small(rows: range, cores: int, sizes: list[int]) -> None:
     parts = parts_of(rows, cores)
-    assert [len(part) for part in parts] == sizes
-    assert [row for part in parts for row in part] == list(rows)
+    assert [len(part) for part in parts] == sizes and [row for part in parts for row in part] == list(rows)
 
 
 def test_a_lane_that_ends_leaves_its_cores_to_the_others() -> None:
@@ -175,9 +175,115 @@ def test_parts_report_progress_and_are_cancelled_as_one() -> None:
         run.progress(1.0, 1.0, "done")
         run.check("a priority")
 
-    parallel_map(
-        [0, 1, 2], work, ExecutionContext(progress=lambda done, total, _: told.append(done / total)), size=lambda _: 2
-    )
+    run = ExecutionContext(progress=lambda done, total, _: told.append(done / total))
+    parallel_map([0, 1, 2], work, run, size=lambda _: 2)
     assert told[-1] == max(told) == pytest.approx(1.0) and len(told) == 3
     with pytest.raises(TaskCancelled):
         parallel_map([0, 1], work, ExecutionContext(cancelled=lambda: True), size=lambda _: 1)
+
+
+@pytest.fixture(scope="module")
+def alone(pair):
+    """Batches done one after the other by this process."""
+    return validated_batches(*pair, ASKED, sizes=[2, 2, 2], run=ExecutionContext(threads=2))
+
+
+def assert_same(batches, others) -> None:
+    for one, other in zip(batches, others, strict=True):
+        assert one.planned == other.planned
+        assert_same_batch(one, other)
+
+
+def test_joined_batches_of_a_job_are_the_same_from_plan_to_verdict(pair, alone, monkeypatch) -> None:
+    launches, whole = list[list[int]](), together.synthesize_batches
+
+    def noted(hand: Any, obj: Any, asked: Sequence[BatchRequest], **named: Any) -> Any:
+        launches.append([one.wanted.batch for one in asked])
+        return whole(hand, obj, asked, **named)
+
+    monkeypatch.setattr(together, "synthesize_batches", noted)
+    told: list[tuple[float, float]] = []
+    run = ExecutionContext(threads=2, progress=lambda done, total, message: told.append((done, total)))
+    joined = validated_batches(*pair, ASKED, sizes=[2, 2, 2], join=3, run=run)
+    assert launches[0] == [0, 1, 2], "the first launch has all three"
+    assert_same(joined, alone)
+    assert told[-1] == (6, 6) and all(done <= total for done, total in told)
+
+
+def test_batches_that_other_processes_judge_and_measure_are_the_same(pair, alone) -> None:
+    told: list[tuple[float, float]] = []
+    with Pool(2, MODULES) as pool:
+        run = ExecutionContext(threads=2, pool=pool, progress=lambda done, total, message: told.append((done, total)))
+        assert_same(validated_batches(*pair, ASKED, sizes=[2, 2, 2], join=2, run=run), alone)
+        assert len(pool.pids) == 2
+    assert told[-1] == (6, 6)
+
+
+def test_a_run_in_this_process_makes_the_batches_of_a_job(pair) -> None:
+    """Near-duplicates are dropped from a batch, whoever makes it: at this distance two batches are full of them."""
+    quick = REQUEST.fidelity.model_copy(update={"coarse_iterations": 20, "fine_iterations": 6, "polish_iterations": 2})
+    request = JobOptions(grasps=33, validation="none", fidelity=quick, min_distance=0.03, budget=2, rechecks=0)
+    batches = validated_batches(*pair, request, sizes=[32, 1], run=ExecutionContext(threads=2))
+    made = synthesized("barrett", "block", request, device="cpu", threads=2)
+    assert_same(made.batches, batches)
+    assert len(made.arrays["grasp/hand_pose"]) == sum(len(one.grasps) for one in batches)
+
+
+@pytest.fixture(scope="module")
+def own_scenes(pair) -> list[Scenes]:
+    """Of each of three batches its own."""
+    poses = rest_poses(TABLE, pair[1], count=6, seed=1)["scene/object_pose"]
+    return [Scenes(supports_of(TABLE), poses[first : first + 2]) for first in (0, 2, 4)]
+
+
+@pytest.mark.parametrize("apart", [True, False])
+def test_waves_of_batches_in_scenes_are_the_same(pair, own_scenes: list[Scenes], apart: bool) -> None:
+    wish = ASKED.model_copy(update={"budget": 3.0, "rechecks": 1})
+    where, sizes = own_scenes if apart else own_scenes[0], [2, 2, 3]
+    given = {"sizes": sizes, "scenes": where, "run": ExecutionContext(threads=2)}
+    one_by_one, waves = (validated_batches(*pair, wish, **given, join=join) for join in (1, 2))
+    assert_same(waves, one_by_one)
+    assert [one.shares for one in waves] == [one.shares for one in one_by_one]
+    assert set(np.concatenate([one.grasps.scene for one in waves])) <= {0, 1}, "numbered as the batch has them"
+
+
+@pytest.mark.parametrize("refused", [0, 1])
+def test_a_batch_without_a_place_has_no_grasps_but_for_the_first(pair, own_scenes, monkeypatch, refused) -> None:
+    whole = together.synthesize_batches
+
+    def narrow(hand: Any, obj: Any, asked: Sequence[BatchRequest], **named: Any) -> Any:
+        made = whole(hand, obj, asked, **named)
+        return [NoStartFound("no way in") if k == refused else grasps for k, grasps in enumerate(made)]
+
+    monkeypatch.setattr(together, "synthesize_batches", narrow)
+    wish = ASKED.model_copy(update={"validation": "none", "want": "candidates"})
+    asked: dict[str, Any] = {"sizes": [2, 2], "scenes": own_scenes[:2], "join": 2, "empty_on": (NoStartFound,)}
+    with nullcontext() if refused else pytest.raises(NoStartFound, match="no way in"):
+        made = validated_batches(*pair, wish, **asked, run=ExecutionContext(threads=2))
+        assert [len(one.grasps) for one in made] == [2, 0]
+
+
+def test_what_was_validated_before_a_stop_is_kept(pair, alone) -> None:
+    stopped: list[bool] = []
+
+    def one_is_made(number: int, made: ValidatedBatch) -> None:
+        stopped.append(True)
+
+    run = ExecutionContext(threads=2, cancelled=lambda: bool(stopped))
+    found = validated_batches(*pair, ASKED, sizes=[2, 32, 32], join=2, run=run, partial=True, checked=one_is_made)
+    assert_same(found[:1], alone[:1])
+    assert sum(len(one.grasps) for one in found) < 66
+
+
+def test_what_becomes_of_one_batch_ends_the_job(pair) -> None:
+    def torn(obj: object) -> object:
+        raise MeshError("no pieces")
+
+    with pytest.raises(MeshError, match="no pieces"):
+        validated_batches(*pair, ASKED, sizes=[2, 2], join=2, pieces=torn, run=ExecutionContext(threads=1))  # type: ignore[arg-type]
+
+
+def test_how_many_are_joined_where_nobody_says() -> None:
+    assert batches_at_once("cpu", None) == 1 and batches_at_once("cpu", 4) == 4
+    # Of an H100 and an H200 (132 multiprocessors), of a GPU with 20, and of one whose memory is nearly full.
+    assert [fitting(132, 80 << 30), fitting(20, 8 << 30), fitting(132, 1 << 30), fitting(132, 0)] == [32, 4, 4, 1]

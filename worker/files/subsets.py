@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from itertools import groupby
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any
@@ -35,12 +35,6 @@ def shards_of(source: str) -> Shards:
     return open_shards(store, dataset=source)
 
 
-def base_shards(shards: Shards) -> Iterator[list[Shard]]:
-    """Group base shards by hand and object."""
-    for _, files in groupby(shards.of("base"), key=lambda file: (file.hand, file.object)):
-        yield [read_shard(shards.path(file), kind="base") for file in files]
-
-
 def require_empty(folder: Path) -> None:
     """Raise ConflictError unless a folder to write is new or empty."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
@@ -55,17 +49,17 @@ def write_subset(shards: Shards, choose: Chooser, out: Path, *, said: Mapping[st
     require_empty(out)
     looked_at = kept = 0
     ready: list[tuple[PurePosixPath, bytes]] = []
-    for together in base_shards(shards):
+    for _, files in groupby(shards.of("base"), key=lambda file: (file.hand, file.object)):
+        together = [read_shard(shards.path(file), kind="base") for file in files]
         for shard, mask in zip(together, choose(together), strict=True):
             looked_at, kept = looked_at + len(mask), kept + int(mask.sum())
             if mask.any():
                 ready.append((place_of(shard, {one for one, _ in ready}), part_of_shard(shard, mask)))
     if not ready:
         raise InputError(f"none of {looked_at} grasps is selected")
-    files = [out / path for path, _ in ready]
-    for path, (_, data) in zip(files, ready, strict=True):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(data)
+    for path, data in ready:
+        (out / path).parent.mkdir(parents=True, exist_ok=True)
+        (out / path).write_bytes(data)
     told = {**said, "looked_at": looked_at, "kept": kept, "shards": [str(path) for path, _ in ready]}
     (out / "subset.json").write_text(json.dumps(told, indent=1) + "\n")
     passed_over = len(shards) - len(shards.of("base"))

@@ -19,6 +19,7 @@ from graspd.service.model.planning import shortfall, totals
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.transforms import Floats
 from graspd.service.store.columns import Attribute
+from graspd.service.store.manifests import INDEX_THRESHOLD_M
 from graspd.service.store.shards import json_attribute
 from graspd.worker.engines.devices import Device
 from graspd.worker.engines.joins import batches_at_once, processes_at_once
@@ -46,8 +47,6 @@ from graspd.worker.together import validated_batches
 from graspd.worker.validation.payload import Limit
 
 Arrays = dict[str, NDArray[Any]]
-#: Threshold of the metrics in a summary [m].
-_TOLD_M: Final = 0.005
 FREE: Final = SceneSpec()
 #: Scene columns that a shard contains.
 _KEPT: Final = ("scene/object_pose", "scene/rest_probability", "scene/neighbour_pose")
@@ -157,7 +156,7 @@ class SynthesisResult:
     def _mean(self, name: str, digits: int) -> float | None:
         values = self.arrays[f"quality/{name}"]
         if values.ndim == 2:
-            values = values[:, int(np.argmin(np.abs(self.arrays["quality/thresholds_m"] - _TOLD_M)))]
+            values = values[:, int(np.argmin(np.abs(self.arrays["quality/thresholds_m"] - INDEX_THRESHOLD_M)))]
         known = values[np.isfinite(values)]
         return round(float(known.mean()), digits) if len(known) else None
 

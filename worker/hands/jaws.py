@@ -102,7 +102,7 @@ def closing_by_geometry(hand: HandModel) -> Floats:
     balance, total = np.zeros(hand.dofs), np.zeros(hand.dofs)
     for share in np.linspace(0.05, 0.95, 5):
         q = hand.lower + share * hand.span
-        place, normal = _posed(hand, points, q)
+        place, normal = posed_points(hand, points, q)
         motions = [_motion(hand, points, q, dof) for dof in range(hand.dofs)]
         moved = np.max([_ahead(motion, normal) for motion in motions], axis=0) > _LEADING
         first, second, _ = _facing(place, normal, points, np.flatnonzero(moved))
@@ -137,7 +137,7 @@ def find_jaws(hand: HandModel, approach: Floats | None = None) -> Jaws | None:
     if met is None:
         return None
     closed, first, second, faced = met
-    place, normal = _posed(hand, points, closed)
+    place, normal = posed_points(hand, points, closed)
     sides = _sides(place, normal, points, np.unique(np.concatenate([first, second])), faced)
     if sides is None:
         return None
@@ -151,7 +151,8 @@ def _points(hand: HandModel) -> SurfacePoints:
     return seen[int(np.argmax([points.area.sum() for points in seen]))]
 
 
-def _posed(hand: HandModel, points: SurfacePoints, q: Floats) -> tuple[Floats, Floats]:
+def posed_points(hand: HandModel, points: SurfacePoints, q: Floats) -> tuple[Floats, Floats]:
+    """Return points (P, 3) and normals (P, 3) of the hand at a posture q (D,), root frame [m]."""
     pose = body_poses(hand, IDENTITY_POSE, hand.expand(q))[0][points.body]
     return apply(pose, points.position), quat_rotate(pose[:, 3:], points.normal)
 
@@ -160,7 +161,7 @@ def _motion(hand: HandModel, points: SurfacePoints, q: Floats, dof: int) -> Floa
     """Return the derivative (N, 3) of the points by a dof [m/rad or 1]."""
     step = np.zeros(hand.dofs)
     step[dof] = 1e-4 * max(float(hand.span[dof]), 1e-3)
-    return (_posed(hand, points, q + step)[0] - _posed(hand, points, q - step)[0]) / (2 * step[dof])
+    return (posed_points(hand, points, q + step)[0] - posed_points(hand, points, q - step)[0]) / (2 * step[dof])
 
 
 def _ahead(motion: Floats, normal: Floats) -> Floats:
@@ -205,7 +206,7 @@ def _meeting(hand: HandModel, points: SurfacePoints, path: Floats) -> tuple[Floa
     best: tuple[Floats, Ints, Ints, Floats] | None = None
     step, faced = path[-1] - path[0], np.zeros(hand.bodies)
     for k in range(len(path)):
-        place, normal = _posed(hand, points, path[k])
+        place, normal = posed_points(hand, points, path[k])
         motion = sum((_motion(hand, points, path[k], d) * step[d] for d in range(hand.dofs)), np.zeros((1, 3)))
         leading = np.einsum("ni,ni->n", motion, normal) > _LEADING * np.abs(motion).max(initial=1e-12)
         first, second, gap = _facing(place, normal, points, np.flatnonzero(leading))
@@ -264,7 +265,7 @@ def _measured(
     width, middle, axes = np.zeros(len(path)), np.zeros((len(path), 3)), np.zeros((len(path), 3))
     speed, facing = np.zeros((len(path), hand.dofs, 2)), np.zeros(len(path), bool)
     for k, q in enumerate(path):
-        place, normal = _posed(hand, points, q)
+        place, normal = posed_points(hand, points, q)
         axis = normal[one].mean(axis=0) - normal[two].mean(axis=0)
         # Pads that do not face each other hold nothing: jaws are not opened that far.
         facing[k] = float(np.linalg.norm(axis)) > _TOWARDS
@@ -280,7 +281,7 @@ def _measured(
     if not facing[-1]:
         return None
     kept = slice(int(np.flatnonzero(~facing)[-1]) + 1 if not facing.all() else 0, None)
-    place, _ = _posed(hand, points, path[kept][len(path[kept]) // 2])
+    place, _ = posed_points(hand, points, path[kept][len(path[kept]) // 2])
     along = place[both] @ (approach if approach is not None else np.zeros(3))
     bodies = tuple(tuple(sorted(set(points.body[side].tolist()))) for side in sides)
     return Jaws(

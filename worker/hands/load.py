@@ -17,7 +17,6 @@ from graspd.service.model.transforms import Floats, compose
 from graspd.service.store.assets import builtin_files, builtin_names, unpack_file, without_common_folder
 from graspd.service.store.hand_files import files_of_hand, hand_name, main_of
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
-from graspd.worker.hands import collisions, guess, primitives, shapes
 from graspd.worker.hands.collisions import resting_neighbours
 from graspd.worker.hands.guess import complete
 from graspd.worker.hands.jaws import jaws_of, slides
@@ -38,7 +37,6 @@ from graspd.worker.hands.tendons import tendons_of
 from graspd.worker.hands.tree import Tree, build_tree
 from graspd.worker.hands.visuals import PlacedShape, Visuals
 from graspd.worker.hands.xacro import read_robot
-from graspd.worker.objects.disk_cache import recalling
 
 log = logging.getLogger(__name__)
 
@@ -62,8 +60,7 @@ def load_hand(
         HandError: the files describe no usable hand; the message names the fault and the fix.
     """
     source = HandSource.read(files, options, name=name, digest=digest)
-    with recalling("hand_shapes", (digest_files(AssetKind.HAND, files),), (collisions, guess, primitives, shapes)):
-        hand = assemble(source)
+    hand = assemble(source)
     return replace(hand, drag=_drag(source.robot, hand)) if drag else hand
 
 
@@ -142,6 +139,11 @@ def body_model(source: HandSource, tree: Tree) -> HandModel:
     joints = [body.joint for body in tree.bodies]
     drives = [tree.drives[joint.name] if joint else Mimic("", 0.0, 0.0) for joint in joints]
     number = {joint.name: body for body, joint in enumerate(joints) if joint}
+    visuals = tuple(
+        PlacedShape(shape, body, compose(pose, shape.pose), link)
+        for link, (body, pose) in tree.links.items()
+        for shape in robot.links[link].visuals
+    )
     dofs = len(tree.dof_names)
     return HandModel(
         name=source.name,
@@ -171,7 +173,7 @@ def body_model(source: HandSource, tree: Tree) -> HandModel:
         masses=_masses(robot, tree, pieces),
         velocity=tree.velocity,
         arm=chain_to(robot, tree.bodies[0].name),
-        visuals=Visuals(_placed_visuals(robot, tree), source.files, base),
+        visuals=Visuals(visuals, source.files, base),
         frames=dict(tree.links),
         tendons=tendons_of(robot, source.options.tendons, tree.dof_names),
     )
@@ -196,14 +198,6 @@ def _pieces(source: HandSource, tree: Tree, base: str) -> tuple[ConvexPiece, ...
             placed = compose(pose, shape.pose)
             pieces += make_pieces(shape, body=body, pose=placed, link=name, files=source.files, base=base, hulls=hulls)
     return tuple(pieces)
-
-
-def _placed_visuals(robot: Robot, tree: Tree) -> tuple[PlacedShape, ...]:
-    return tuple(
-        PlacedShape(shape, body, compose(pose, shape.pose), link)
-        for link, (body, pose) in tree.links.items()
-        for shape in robot.links[link].visuals
-    )
 
 
 def _joint_type(joint: Joint | None) -> JointType:

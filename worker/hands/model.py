@@ -176,7 +176,7 @@ class HandModel:
 
     def reduce(self, joints: Floats) -> Floats:
         """Compute dof values (..., D) from joint positions (..., J): each dof from the first joint it drives."""
-        first = self._first_joint
+        first = self.first_joint
         body = self.joint_body[first]
         return (np.asarray(joints)[..., first] - self.offset[body]) / self.multiplier[body]
 
@@ -189,6 +189,7 @@ class HandModel:
         return found
 
     @cached_property
-    def _first_joint(self) -> NDArray[np.intp]:
+    def first_joint(self) -> NDArray[np.intp]:
+        """(D,) first joint that each dof drives; it carries the dof's actuator in simulations."""
         drives = self.dof[self.joint_body]
         return np.array([int(np.flatnonzero(drives == d)[0]) for d in range(self.dofs)], np.intp)

@@ -47,10 +47,6 @@ class Coupling(_Options):
     offset: Finite = 0.0
 
 
-def _palm(value: Any) -> Any:
-    return {"link": value} if isinstance(value, str) else value
-
-
 class HandOptions(_Options):
     """Keys of a hand's `asset.json`. Joints and links have their URDF names; units are SI."""
 
@@ -70,7 +66,7 @@ class HandOptions(_Options):
     shapes: Literal["collision", "visual"] = Field(
         "collision", description="geometry in contact: collision or visual elements"
     )
-    palm: Annotated[PalmOptions | None, BeforeValidator(_palm)] = None
+    palm: Annotated[PalmOptions | None, BeforeValidator(lambda v: {"link": v} if isinstance(v, str) else v)] = None
     approach: Vector | None = Field(None, description="direction out of the palm, palm link frame")
     preshape: dict[str, Finite] = Field(default_factory=dict, description="joint values in which the hand approaches")
     closing: dict[str, int] = Field(default_factory=dict, description="-1, 0, +1: how a joint closes the hand")

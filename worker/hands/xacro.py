@@ -12,7 +12,6 @@ import signal
 import subprocess
 import sys
 from collections.abc import Mapping
-from importlib.util import find_spec
 from pathlib import PurePosixPath
 from typing import Final
 
@@ -39,8 +38,6 @@ def expand(files: Mapping[str, bytes], main: str, arguments: Mapping[str, str]) 
         HandError: it cannot be expanded, or refers to files outside the hand's folder; the message states the reason.
         OSError: the machine killed the child, or it neither computed nor ended: the file is not at fault.
     """
-    if find_spec("xacro") is None:
-        raise HandError(f"{main}: the package xacro is not installed: pip install 'graspd[worker]', or expand it first")
     given = {
         "main": main,
         "arguments": dict(arguments),

@@ -16,6 +16,7 @@ import posixpath
 import re
 import resource
 import sys
+from pathlib import PurePosixPath
 from types import SimpleNamespace
 from typing import Any, Final
 from xml.dom import minidom
@@ -159,18 +160,13 @@ def _package(package: str, names: list[str], texts: dict[str, str]) -> str | Non
     for name, text in texts.items():
         if posixpath.basename(name) == "package.xml" and f"<name>{package}</name>" in "".join(text.split()):
             return posixpath.dirname(name)
-    folders = {folder for name in names for folder in _parents(name)}
+    folders = {str(folder) for name in names for folder in PurePosixPath(name).parents}
     below = sorted((folder for folder in folders if posixpath.basename(folder) == package), key=len)
     if below:
         return below[0]
     manifests = [name for name in names if posixpath.basename(name) == "package.xml"]
     # A package may have been packed without the folder of its name.
     return "" if not manifests else None
-
-
-def _parents(name: str) -> list[str]:
-    parts = name.split("/")[:-1]
-    return ["/".join(parts[: end + 1]) for end in range(len(parts))]
 
 
 def _close_doors(cpu_s: int, memory_bytes: int) -> None:

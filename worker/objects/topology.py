@@ -89,7 +89,8 @@ def repeated(faces: Indices) -> Mask:
     parity = np.where((x < y).astype(int) + (y < z) + (z < x) == 2, 1, -1)
     order = np.argsort(group, kind="stable")
     single = size[group] == 1
-    edges_left = _edge_counts(faces[single])
+    keys, counts = np.unique(_edge_keys(faces[single]), return_counts=True)
+    edges_left = {(int(key) >> 32, int(key) & 0xFFFFFFFF): int(n) for key, n in zip(keys, counts, strict=True)}
     for members in np.split(order, np.cumsum(size)[:-1]):
         if len(members) == 1:
             continue
@@ -101,11 +102,6 @@ def repeated(faces: Indices) -> Mask:
             majority = 1 if parity[members].sum() >= 0 else -1
             drop[members[np.argmax(parity[members] == majority)]] = False
     return drop
-
-
-def _edge_counts(faces: Indices) -> dict[tuple[int, int], int]:
-    keys, counts = np.unique(_edge_keys(faces), return_counts=True)
-    return {(int(key) >> 32, int(key) & 0xFFFFFFFF): int(n) for key, n in zip(keys, counts, strict=True)}
 
 
 def _edge_keys(faces: Indices, *, directed: bool = False) -> Indices:

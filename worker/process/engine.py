@@ -239,7 +239,6 @@ def main(table: Mapping[Stage, StageFunction] | None = None, check: Check | None
     connection = Connection(int(sys.argv[-1]))
     setup: Setup = connection.recv()
     telemetry.set_up_logs(setup.settings, "worker")
-    telemetry.set_up_tracing("worker")
     Engine(connection, setup, table, check).serve()
     end()
 

@@ -12,7 +12,6 @@ from typing import Any, Final
 
 from pydantic import ValidationError
 
-from graspd.service import telemetry
 from graspd.service.model import names
 from graspd.service.model.clock import timestamp
 from graspd.service.model.errors import (
@@ -32,6 +31,7 @@ from graspd.service.model.workers import need_of, own_ability
 from graspd.service.queue.port import Event, EventKind, Message
 from graspd.service.store.manifests import ShardManifest, load_manifest, publish_shard, shard_exists
 from graspd.service.store.records import put_record
+from graspd.service.telemetry import bind
 from graspd.worker.engines.devices import DeviceLost, check_device
 from graspd.worker.pool.pool import ProcessLost
 from graspd.worker.process.fitness import Fitness, first_loss
@@ -66,12 +66,8 @@ class Runner:
         """Run a task; return the event for the controller, None if the task no longer belongs to this worker.
         Raises TaskRefused: the message cannot be read, so there is no task to fail."""
         message = parse_message(raw)
-        subjects = _subjects(message)
-        parent = message.origin.traceparent if isinstance(message, TaskMessage) and message.origin else ""
-        with telemetry.bind(**subjects), telemetry.span(f"task {message.stage}", parent=parent, **subjects) as facts:
-            event = self._run(message, raw, context)
-            facts["graspd.outcome"] = event.kind.value if event is not None else "lost"
-            return event
+        with bind(**_subjects(message)):
+            return self._run(message, raw, context)
 
     def _run(self, message: Message, raw: Mapping[str, Any], context: TaskContext) -> Event | None:
         started, clock = timestamp(), time.monotonic()

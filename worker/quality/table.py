@@ -239,16 +239,12 @@ def _touching_with_sides(
     probe: Probe, found: Distances, finger: NDArray[np.int32], digits: NDArray[np.int32]
 ) -> NDArray[np.bool_]:
     """Check (B, digits) whether more than half of a digit's near points are on its sides."""
-    points = probe.points
+    hand, points = probe.hand, probe.points
     near = np.where(np.abs(found.distance) < LINK_CONTACT_M, points.area, 0.0)
-    side = np.abs(np.einsum("ni,ni->n", points.normal, _flexion(probe.hand)[points.body])) > SIDE_COS
-    mine = finger[points.body][:, None] == digits
-    return np.asarray(near @ (mine & side[:, None]) > 0.5 * (near @ mine))
-
-
-def _flexion(hand: HandModel) -> Floats:
-    """Return the axis (L, 3) about which each body closes, in its own frame; 0: not closing, or not revolute."""
-    # A body turns about its joint's axis, which is therefore constant in its frame.
+    # Axes about which bodies close, 0 for others. A body turns about its joint's axis, constant in its frame.
     bends = (hand.joint_type == JointType.REVOLUTE) & (hand.dof >= 0)
     bends &= np.where(hand.dof >= 0, hand.closing[hand.dof], 0.0) != 0
-    return np.where(bends[:, None], hand.axis, 0.0)
+    axes = np.where(bends[:, None], hand.axis, 0.0)
+    side = np.abs(np.einsum("ni,ni->n", points.normal, axes[points.body])) > SIDE_COS
+    mine = finger[points.body][:, None] == digits
+    return np.asarray(near @ (mine & side[:, None]) > 0.5 * (near @ mine))

@@ -10,9 +10,7 @@ from numpy.typing import NDArray
 
 from graspd.service.model.domain import EXTRA_CHANNELS
 from graspd.service.model.errors import InputError, did_you_mean
-from graspd.service.model.pinhole import pixel_rays
 from graspd.service.model.transforms import Floats
-from graspd.worker.rendering.cameras import Cameras
 
 BACKGROUND, TABLE, OBJECT = 0, 1, 2
 
@@ -28,22 +26,10 @@ def tight_boxes(segmentation: NDArray[np.uint8]) -> NDArray[np.float32]:
     return boxes
 
 
-def loose_boxes(cameras: Cameras, points: Floats) -> NDArray[np.float32]:
-    """Return boxes (V, 4) around the projections of the object's vertices (V, P, 3).
-    Occluded vertices and those outside the picture count too."""
-    pixels, _ = cameras.project(points)
-    return np.concatenate([pixels.min(axis=1), pixels.max(axis=1)], axis=1).astype(np.float32)
-
-
 def box_corners(vertices: Floats) -> Floats:
     """Return the corners (8, 3) of the object-aligned box; bits 0, 1, 2 of k select maximum x, y, z."""
     bits = (np.arange(8)[:, None] >> np.arange(3)) & 1
     return np.where(bits, vertices.max(axis=0), vertices.min(axis=0))
-
-
-def in_camera(cameras: Cameras, points: Floats) -> Floats:
-    """Transform table-frame points (V, P, 3) to their camera frames (V, P, 3)."""
-    return np.einsum("vij,vpj->vpi", cameras.extrinsics[:, :3, :3], points) + cameras.extrinsics[:, None, :3, 3]
 
 
 ALL: Final = "all"
@@ -57,12 +43,6 @@ def parse_channels(words: Iterable[str]) -> tuple[str, ...]:
         meant = did_you_mean(unknown[0], EXTRA_CHANNELS)
         raise InputError(f"unknown channel {unknown[0]!r}; choose of {', '.join(EXTRA_CHANNELS)}, or {ALL}{meant}")
     return tuple(name for name in EXTRA_CHANNELS if name in wanted or ALL in wanted)
-
-
-def ray_distance(depth: NDArray[np.float32], k: Floats) -> NDArray[np.float32]:
-    """Return distances (V, H, W) from the optical centre along each pixel's ray [m]; inf: nothing."""
-    stretch = np.linalg.norm(pixel_rays(k, depth.shape[2], depth.shape[1]), axis=-1)
-    return (depth * stretch).astype(np.float32)
 
 
 def occlusion_ratio(segmentation: NDArray[np.uint8], alone: NDArray[np.bool_]) -> NDArray[np.float32]:

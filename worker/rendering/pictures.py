@@ -27,7 +27,7 @@ ELEVATION: Final = np.radians(20.0)
 FIELD_OF_VIEW: Final = np.radians(24.0)
 SAMPLES: Final = 12
 #: Hand parts farther than this from the object's hull are not framed: a forearm may leave the picture [m].
-_NEAR_M: Final = 0.14
+NEAR_M: Final = 0.14
 _TOGETHER: Final = 16  # grasps traced together: bounds the memory
 
 _FILL: Final = 0.86  # share of the picture's width or height that hand and object take up
@@ -146,7 +146,7 @@ def side_of(hand: HandModel, bodies: Floats) -> float:
 def _camera(obj: ObjectModel, points: Floats, angle: float, k: Floats, size: tuple[int, int]) -> Floats:
     middle = 0.5 * (obj.hull_vertices.min(axis=0) + obj.hull_vertices.max(axis=0))
     reach = np.linalg.norm(obj.hull_vertices - middle, axis=1).max()
-    return fit_camera(points[np.linalg.norm(points - middle, axis=1) < reach + _NEAR_M], angle, k, size)
+    return fit_camera(points[np.linalg.norm(points - middle, axis=1) < reach + NEAR_M], angle, k, size)
 
 
 def fit_camera(near: Floats, angle: float, k: Floats, size: tuple[int, int], *, elevation: float = ELEVATION) -> Floats:

@@ -124,6 +124,8 @@ class Setting:
         self.object_pose = np.asarray(poses, float)[:, 0]
         self._poses = np.stack([scene.poses for scene in scenes])
         self.looks = [scene.looks for scene in scenes]
+        # One height of the lamp for all scenes of a call; each scene turns under it, so azimuths differ.
+        elevation = np.radians(np.random.default_rng([seed, 2**31]).uniform(40.0, 65.0))
         self.shot = CameraShot(
             world=np.repeat(np.arange(len(poses), dtype=np.int32), plan.placements * plan.eyes),
             extrinsics=np.concatenate([scene.extrinsics for scene in scenes]),
@@ -131,7 +133,7 @@ class Setting:
             width=plan.width,
             height=plan.height,
             samples=samples,
-            toward_lamp=_toward_lamp(np.random.default_rng([seed, 2**31])),
+            toward_lamp=np.array([np.cos(elevation), 0.0, np.sin(elevation)]),
             turn=np.array([scene.turn for scene in scenes]),
             lamps=[scene.lamp for scene in scenes],
         )
@@ -216,12 +218,6 @@ def _unhidden(draw: Callable[[], Sequence[Floats]], supports: Supports, points: 
             if share[k] < _SEEN and (found := seen(camera)) > share[k]:
                 drawn[k], share[k] = camera, found
     return drawn
-
-
-def _toward_lamp(rng: np.random.Generator) -> Floats:
-    # One height for all scenes of a call; each scene turns under the lamp, so azimuths differ.
-    elevation = np.radians(rng.uniform(40.0, 65.0))
-    return np.array([np.cos(elevation), 0.0, np.sin(elevation)])
 
 
 def _kept(key: tuple[object, ...], solids: Callable[[], Sequence[Solid | Box]], device: str) -> Tracer:

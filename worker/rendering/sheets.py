@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from graspd.service.model.transforms import Floats
+from graspd.service.store.manifests import INDEX_THRESHOLD_M
 from graspd.worker.rendering.annotate import OBJECT, TABLE
 
 MARGIN: Final = 40
@@ -19,8 +20,6 @@ GAP: Final = 18
 _HEAD: Final = 74
 _CAPTION: Final = 44
 _NAME: Final = 22
-#: Contact threshold at which a sheet quotes epsilon and contact area [m].
-_QUOTED_THRESHOLD_M: Final = 0.005
 _SEGMENT: Final = np.array(
     [[214, 216, 219], [150, 168, 178], [224, 129, 63], [96, 122, 158], [122, 158, 112], [168, 118, 150]], np.uint8
 )
@@ -35,18 +34,18 @@ Arrays = Mapping[str, NDArray[np.generic]]
 def best(quality: Arrays, count: int, among: NDArray[np.bool_]) -> NDArray[np.intp]:
     """Return the `count` best rows by epsilon among those of a mask (N,)."""
     rows = np.flatnonzero(among)
-    return rows[np.argsort(-_quoted(quality, "quality/epsilon")[rows], kind="stable")][:count]
+    return rows[np.argsort(-quoted(quality, "quality/epsilon")[rows], kind="stable")][:count]
 
 
 def best_kept(scene: Arrays, base: Arrays) -> NDArray[np.int32]:
     """Return the row (S,) of each scene's valid grasp with the largest epsilon; -1: none."""
-    epsilon = _quoted(base, "quality/epsilon")[np.asarray(scene["grasp/base_index"])]
+    epsilon = quoted(base, "quality/epsilon")[np.asarray(scene["grasp/base_index"])]
     return _best_of_scenes(scene, np.where(np.asarray(scene["grasp/valid"], bool), epsilon, -np.inf))
 
 
 def best_in_scenes(base: Arrays, among: NDArray[np.bool_]) -> NDArray[np.int32]:
     """Return the row (S,) with the largest epsilon planned in each scene, among a mask (N,); -1: none."""
-    return _best_of_scenes(base, np.where(among, np.nan_to_num(_quoted(base, "quality/epsilon"), nan=-1.0), -np.inf))
+    return _best_of_scenes(base, np.where(among, np.nan_to_num(quoted(base, "quality/epsilon"), nan=-1.0), -np.inf))
 
 
 def _best_of_scenes(columns: Arrays, score: Floats) -> NDArray[np.int32]:
@@ -60,7 +59,7 @@ def _best_of_scenes(columns: Arrays, score: Floats) -> NDArray[np.int32]:
 
 def figures(quality: Arrays, rows: NDArray[np.intp]) -> list[list[tuple[str, str]]]:
     """Return caption entries, label and value, for each row of a base shard."""
-    epsilon, area = _quoted(quality, "quality/epsilon"), _quoted(quality, "quality/contact_area_cm2")
+    epsilon, area = quoted(quality, "quality/epsilon"), quoted(quality, "quality/contact_area_cm2")
     depth = np.asarray(quality["quality/penetration_depth_mm"], float)
     return [
         [("epsilon", f"{epsilon[r]:.3f}"), ("contact", f"{area[r]:.1f} cm^2"), ("depth", f"{depth[r]:.2f} mm")]
@@ -68,10 +67,10 @@ def figures(quality: Arrays, rows: NDArray[np.intp]) -> list[list[tuple[str, str
     ]
 
 
-def _quoted(quality: Arrays, path: str) -> Floats:
+def quoted(quality: Arrays, path: str) -> Floats:
+    """Return a metric (N,) at the contact threshold of the index."""
     thresholds = np.asarray(quality["quality/thresholds_m"], float)
-    column = int(np.argmin(np.abs(thresholds - _QUOTED_THRESHOLD_M)))
-    return np.asarray(quality[path], float)[:, column]
+    return np.asarray(quality[path], float)[:, int(np.argmin(np.abs(thresholds - INDEX_THRESHOLD_M)))]
 
 
 def contact_sheet(

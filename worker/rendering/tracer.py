@@ -53,11 +53,14 @@ class Tracer:
         backend.start()
         self.device = device
         shapes: NDArray[Any] = np.zeros(len(solids), _PLACED.numpy_dtype())
+        corners = list[Floats]()
         self._meshes, normals, first = list[Any](), [np.zeros((0, 3))], 0  # the meshes keep the shapes' trees alive
         for k, solid in enumerate(solids):
             if isinstance(solid, Box):
-                shapes["half"][k] = 0.5 * np.asarray(solid.size)
+                shapes["half"][k] = half = 0.5 * np.asarray(solid.size)
+                corners.append(box_corners(np.stack([-half, half])))
             else:
+                corners.append(box_corners(solid.vertices))
                 points = wp.array(np.asarray(solid.vertices, np.float32), dtype=wp.vec3f, device=device)
                 faces = wp.array(np.ravel(solid.faces).astype(np.int32), dtype=wp.int32, device=device)
                 self._meshes.append(wp.Mesh(points, faces))
@@ -66,7 +69,7 @@ class Tracer:
                 first += len(normals[-1])
         self._shapes = shapes
         self._corner_normals: Any = wp.array(np.concatenate(normals), dtype=wp.vec3f, device=device)
-        self._corners = np.stack([_corners(solid) for solid in solids])
+        self._corners = np.stack(corners)
 
     def place(self, poses: Floats, looks: Sequence[Sequence[Appearance]]) -> None:
         """Place the solids in their worlds: poses (worlds, P, 7), and for each world the P materials."""
@@ -142,13 +145,6 @@ class _Film:
 
         list(pool.map(rows, range(threads)))
         return tuple(array.numpy() for array in outputs)
-
-
-def _corners(solid: Solid | Box) -> Floats:
-    if isinstance(solid, Box):
-        half = 0.5 * np.asarray(solid.size)
-        return box_corners(np.stack([-half, half]))
-    return box_corners(solid.vertices)
 
 
 def _structs(things: Sequence[Any], struct: Any, device: str) -> Any:

@@ -28,6 +28,7 @@ from graspd.worker.rendering.pictures import (
     FIELD_OF_VIEW,
     FLOOR,
     FLOOR_SIZE,
+    NEAR_M,
     OBJECT_LOOK,
     SAMPLES,
     TOWARD_LAMP,
@@ -51,8 +52,6 @@ _APART: Final = np.radians(50.0)  # least angle between two sides of one grasp, 
 _GLANCE: Final = 48  # edge of the pictures that rate the sides [px]
 #: Direction of the lamp under a board: from the front, as high as a window.
 _UNDER_A_BOARD: Final = np.array([0.85, -0.42, 0.32]) / np.linalg.norm([0.85, -0.42, 0.32])
-#: Hand parts farther than this from the object are not framed [m].
-_NEAR_M: Final = 0.14
 _HIGH_M: Final = 3.0
 _TABLE: Final = Appearance(hexadecimal("#b9bfc2"), roughness=0.85)
 _WALL: Final = Appearance(hexadecimal("#7f97a5"), roughness=0.8)
@@ -99,7 +98,7 @@ def way_pictures(
     Raises TaskCancelled: `run.cancelled()` returned True."""
     if not frames:
         return np.zeros((0, sides, 0, size[1], size[0], 3), np.uint8)
-    stage = _Stage(hand, obj, around, len(frames[0]), run, np.inf if whole else _NEAR_M)
+    stage = _Stage(hand, obj, around, len(frames[0]), run, np.inf if whole else NEAR_M)
     return np.stack([stage.shoot(number, way, size, sides, samples) for number, way in enumerate(frames)])
 
 

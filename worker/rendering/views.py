@@ -10,18 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspd.service.model.errors import InputError
+from graspd.service.model.pinhole import pixel_rays
 from graspd.service.model.transforms import Floats, apply
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.objects.mesh_geometry import to_centre
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.rendering.annotate import (
-    box_corners,
-    in_camera,
-    loose_boxes,
-    occlusion_ratio,
-    ray_distance,
-    tight_boxes,
-)
+from graspd.worker.rendering.annotate import box_corners, occlusion_ratio, tight_boxes
 from graspd.worker.rendering.cameras import BASELINE_M, SAMPLED, Cameras, GivenCameras
 from graspd.worker.rendering.hands import DrawnHand
 from graspd.worker.rendering.scene_setup import CameraPlan, Setting
@@ -113,6 +107,10 @@ def annotate(setting: Setting, pictures: Pictures, obj: ObjectModel, channels: S
     cameras = Cameras(plan.width, plan.height, shot.intrinsics, shot.extrinsics)
     count, poses = len(shot.world), setting.object_pose[shot.world][:, None]
     segmentation = (pictures.shape + 1).astype(np.uint8)
+    # Occluded vertices and those outside the picture count too.
+    pixels, _ = cameras.project(apply(poses, obj.vertices))
+    rotation, shift = shot.extrinsics[:, :3, :3], shot.extrinsics[:, None, :3, 3]
+    corners = np.einsum("vij,vpj->vpi", rotation, apply(poses, box_corners(obj.vertices))) + shift
     result: Arrays = {
         "camera/intrinsics": np.repeat(shot.intrinsics[None], count, axis=0),
         "camera/extrinsics": shot.extrinsics,
@@ -123,11 +121,12 @@ def annotate(setting: Setting, pictures: Pictures, obj: ObjectModel, channels: S
         "image/depth": pictures.depth,
         "image/segmentation": segmentation,
         "box/bounding_box_2d_tight": tight_boxes(segmentation),
-        "box/bounding_box_2d_loose": loose_boxes(cameras, apply(poses, obj.vertices)),
-        "box/bounding_box_3d": in_camera(cameras, apply(poses, box_corners(obj.vertices))).astype(np.float32),
+        "box/bounding_box_2d_loose": np.concatenate([pixels.min(axis=1), pixels.max(axis=1)], axis=1, dtype=np.float32),
+        "box/bounding_box_3d": corners.astype(np.float32),
     }
     if "distance" in channels:
-        result["image/distance"] = ray_distance(pictures.depth, shot.intrinsics)
+        stretch = np.linalg.norm(pixel_rays(shot.intrinsics, plan.width, plan.height), axis=-1)
+        result["image/distance"] = (pictures.depth * stretch).astype(np.float32)
     if pictures.normal is not None:
         result["image/normals"] = pictures.normal.astype(np.float16)
     return result

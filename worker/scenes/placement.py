@@ -19,10 +19,12 @@ from graspd.worker.objects.convex import union_volume
 from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.objects.mesh_geometry import to_centre, to_file
 from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.topology import outward_hull
 from graspd.worker.scenes.kinds import SUNK, check_free, inside, rest_poses, room_in, supports_of
 from graspd.worker.scenes.neighbours import drop_together, lay_beside
 from graspd.worker.simulation.environment import Neighbour, Obstacle, Scenes
 from graspd.worker.validation.decomposition import decompose
+from graspd.worker.validation.model import add_mesh
 
 #: Most convex pieces of a neighbour. Hollows may be filled, since no hand reaches into a neighbour's hollow.
 MOST_PIECES: Final = 8
@@ -181,9 +183,7 @@ def gaps_between(things: Sequence[Neighbour], poses: Floats, farthest: float = 0
     for number, thing in enumerate(things):
         body = spec.worldbody.add_body(mocap=True)
         for k, corners in enumerate(thing.pieces):
-            mesh = spec.add_mesh(name=f"{number}-{k}", inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX)
-            mesh.uservert = np.ascontiguousarray(corners, np.float32).ravel()
-            body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"{number}-{k}")
+            add_mesh(spec, body.add_geom(), corners, f"{number}-{k}")
         first.append(first[-1] + len(thing.pieces))
     model = spec.compile()
     data = mujoco.MjData(model)
@@ -247,19 +247,8 @@ def _corners_and_edges(points: Floats) -> tuple[Floats, NDArray[np.intp]]:
 
     _, first = np.unique(np.round(points / _SAME_M).astype(np.int64), axis=0, return_index=True)
     hull = ConvexHull(points[np.sort(first)])
-    kept = hull.vertices
-    number = np.full(len(hull.points), -1)
-    number[kept] = np.arange(len(kept))
-    triangles = number[hull.simplices]
-    corners = hull.points[kept]
-    return corners, convex_edges(corners, _outward(corners, triangles, hull.equations[:, :3]))
-
-
-def _outward(corners: Floats, triangles: NDArray[Any], normals: Floats) -> NDArray[Any]:
-    a, b, c = (corners[triangles[:, k]] for k in range(3))
-    inward = (np.cross(b - a, c - a) * normals).sum(axis=1) < 0
-    triangles[inward] = triangles[inward][:, ::-1]
-    return triangles
+    corners, triangles = outward_hull(hull.points, hull.simplices, hull.equations[:, :3])
+    return corners, convex_edges(corners, triangles)
 
 
 def _stands_out(points: Floats, corners: Floats, hull: Any) -> float:

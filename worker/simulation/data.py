@@ -6,6 +6,7 @@ iteration is the same list of launches each time.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -167,6 +168,11 @@ class HandState:
 
     def __getitem__(self, index: Any) -> HandState:
         return HandState(self.pivot[index], self.rotation[index], self.q[index])
+
+    @classmethod
+    def joined(cls, states: Sequence[HandState]) -> HandState:
+        """Return the hands of several states, one state after the other."""
+        return cls(*(np.concatenate([getattr(one, name) for one in states]) for name in ("pivot", "rotation", "q")))
 
 
 @dataclass(frozen=True)

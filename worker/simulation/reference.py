@@ -43,10 +43,6 @@ def row(normal: Floats, point: Floats) -> Floats:
     return np.concatenate([normal, np.cross(point, normal)], axis=-1)
 
 
-def motion_at(s: Floats, point: Floats) -> Floats:
-    return s[..., :3] + np.cross(s[..., 3:], point)
-
-
 def loss(s: Floats, world: World) -> Floats:
     """Return the loss (...) of motions (..., 6)."""
     lengths = [np.sqrt(np.sum(v * v, axis=-1) + SMOOTH**2) for v in (s[..., :3], world.gyration * s[..., 3:])]
@@ -109,7 +105,7 @@ def _pushed(p: Floats, n: Floats, rho: Floats, s: Floats, world: World) -> tuple
 
 def _slipped(p: Floats, n: Floats, impulse: Floats, s: Floats, world: World) -> tuple[Floats, Floats]:
     """Return tangential impulses (...) within the friction cone, and the motion they cause (..., 6)."""
-    u = motion_at(s, p)
+    u = s[..., :3] + np.cross(s[..., 3:], p)
     tangent = u - np.sum(n * u, axis=-1, keepdims=True) * n
     length = np.linalg.norm(tangent, axis=-1)
     jt = row(tangent / np.maximum(length, 1e-9)[..., None], p)

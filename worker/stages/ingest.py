@@ -12,6 +12,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -44,7 +45,12 @@ def run(message: IngestMessage, context: TaskContext) -> None:
     files = _files(message, context)
     found, model = check_in_child(message.kind, message.name, files, context)
     if found["verdict"] != "refuse" and load_asset(context.store, message.kind, message.digest).self_test:
-        found["facts"]["self_test"] = _self_test(message, files, context)
+        from graspd.worker.hands.load import load_hand
+        from graspd.worker.stages.hand_self_test import tried_softly
+
+        # A hand that holds no grasp of a plain object is a result, not an error.
+        load = partial(load_hand, files, name=message.name, digest=message.digest)
+        found["facts"]["self_test"] = tried_softly(load, context.run)
     if model:
         put_sealed(context.store, names.asset_model(message.kind, message.digest), model)
     put_document(context.store, names.asset_check(message.kind, message.digest), found)
@@ -58,14 +64,6 @@ def _files(message: IngestMessage, context: TaskContext) -> dict[str, bytes]:
         with contextlib.suppress(HandError):
             return load_hand_files(context.store, message.digest)
     return load_asset_files(context.store, message.kind, message.digest)
-
-
-def _self_test(message: IngestMessage, files: dict[str, bytes], context: TaskContext) -> dict[str, Any]:
-    """Test how many grasps of plain objects hold. A hand without any is a result, not an error."""
-    from graspd.worker.hands.load import load_hand
-    from graspd.worker.stages.hand_self_test import tried_softly
-
-    return tried_softly(lambda: load_hand(files, name=message.name, digest=message.digest), context.run)
 
 
 def check_in_child(

@@ -51,7 +51,9 @@ def joined(message: TaskMessage, made: Sequence[Output], *, base_rows: Sequence[
         if schema[path].shape.split()[0] not in _ROWS:
             columns[path] = parts[0][path]
             continue
-        rows: list[NDArray[Any]] = [part[path] if path in part else _without(path, part) for part in parts]
+        rows: list[NDArray[Any]] = [
+            part[path] if path in part else np.full(len(part["grasp/hand_pose"]), _OF_SOME[path]) for part in parts
+        ]
         if first := firsts.get(path):
             rows = [numbers + start for numbers, start in zip(rows, first, strict=True)]
         columns[path] = np.concatenate(rows)
@@ -68,10 +70,6 @@ def base_rows(base: Shard, message: TaskMessage) -> list[range]:
     if len(counts) != len(sizes_of(message)):
         raise DamagedShard(f"shard {message.inputs[0]} has {len(counts)} batches, not {len(sizes_of(message))}")
     return [range(start, start + count) for start, count in zip(_starts(counts), counts, strict=True)]
-
-
-def _without(path: str, part: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
-    return np.full(len(part["grasp/hand_pose"]), _OF_SOME[path])
 
 
 def _summed(told: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

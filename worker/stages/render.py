@@ -31,7 +31,9 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
     said: dict[str, Attribute] = {"scene_shard": message.inputs[0]}
     extras = Extras(channels=request.channels)
     if request.in_scene:
-        drawn, beside = _drawn(shard, message, context), _beside(shard, message, context)
+        others = neighbours_of(context.store, message)
+        beside = Neighbours(others, np.asarray(shard["scene/neighbour_pose"], float)) if others else None
+        drawn = _drawn(shard, message, context)
         extras = replace(extras, supports=supports_in(request.place), drawn=drawn, neighbours=beside)
         said = {"base_shard": message.inputs[0], "scene": json_attribute(request.place.told())}
         said |= beside_attributes(message)
@@ -48,11 +50,6 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
         extras=extras,
     )
     return Output(pictures, said)
-
-
-def _beside(base: Shard, message: TaskMessage, context: TaskContext) -> Neighbours | None:
-    others = neighbours_of(context.store, message)
-    return Neighbours(others, np.asarray(base["scene/neighbour_pose"], float)) if others else None
 
 
 def _drawn(base: Shard, message: TaskMessage, context: TaskContext) -> DrawnHand | None:

@@ -12,11 +12,10 @@ from typing import Any, cast
 
 import numpy as np
 
-from graspd.service.model.transforms import Floats, apply, compose, invert
+from graspd.service.model.transforms import compose
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.grasps import GraspSet, Posture
-from graspd.worker.hands.collisions import resting_neighbours
-from graspd.worker.hands.model import ConvexPiece, HandModel
+from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.same_hand import SameHand
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.validation.decomposition import ConvexPieces
@@ -91,19 +90,15 @@ def driven_as(same: SameHand) -> HandModel:
     are sum(m_i^2 k_i) and sum(|m_i| e_i) of its joints. So the drive along the joints' common motion is the same,
     whether a model couples them or connects them by a tendon."""
     ours, theirs = same.ours, same.theirs
-    gain, limit = _of_joints(ours)
-    gain, limit = gain[same.joints], limit[same.joints]
+    dof, rate = ours.dof[ours.joint_body], ours.multiplier[ours.joint_body]
+    joints = np.bincount(dof, minlength=ours.dofs)[dof]
+    gain = (ours.stiffness[dof] / (joints * rate**2))[same.joints]
+    limit = (ours.effort[dof] / (joints * np.abs(rate)))[same.joints]
     dof, rate = theirs.dof[theirs.joint_body], theirs.multiplier[theirs.joint_body]
     stiffness, effort = np.zeros(theirs.dofs), np.zeros(theirs.dofs)
     np.add.at(stiffness, dof, rate**2 * gain)
     np.add.at(effort, dof, np.abs(rate) * limit)
     return replace(theirs, stiffness=stiffness, effort=effort)
-
-
-def _of_joints(hand: HandModel) -> tuple[Floats, Floats]:
-    dof, rate = hand.dof[hand.joint_body], hand.multiplier[hand.joint_body]
-    joints = np.bincount(dof, minlength=hand.dofs)[dof]
-    return hand.stiffness[dof] / (joints * rate**2), hand.effort[dof] / (joints * np.abs(rate))
 
 
 def in_other_model(same: SameHand, grasps: GraspSet) -> GraspSet:
@@ -117,27 +112,3 @@ def in_other_model(same: SameHand, grasps: GraspSet) -> GraspSet:
 
     loss = np.asarray(grasps.stability_loss, float)
     return GraspSet(posture(grasps.grasp), posture(grasps.pregrasp), posture(grasps.squeeze), loss)
-
-
-def with_our_shapes(same: SameHand) -> HandModel:
-    """Return the other model with the collision shapes of `same.ours`: isolates the effect of shapes on verdicts."""
-    there = np.zeros(same.ours.bodies, np.intp)
-    there[same.bodies] = np.arange(same.theirs.bodies)
-    frames = invert(same.frames)[there]
-    return _dressed(same.theirs, tuple(_moved(p, int(there[p.body]), frames[p.body]) for p in same.ours.pieces))
-
-
-def with_their_shapes(same: SameHand) -> HandModel:
-    """Return `same.ours` with the collision shapes of the other model."""
-    pieces = tuple(_moved(p, int(same.bodies[p.body]), same.frames[p.body]) for p in same.theirs.pieces)
-    return _dressed(same.ours, pieces)
-
-
-def _moved(piece: ConvexPiece, body: int, frame: Floats) -> ConvexPiece:
-    pose = piece.pose if piece.kind == "hull" else compose(frame, piece.pose)
-    return replace(piece, body=body, pose=pose, vertices=apply(frame, piece.vertices))
-
-
-def _dressed(hand: HandModel, pieces: tuple[ConvexPiece, ...]) -> HandModel:
-    dressed = replace(hand, pieces=pieces)
-    return replace(dressed, neighbours=resting_neighbours(dressed))

@@ -147,10 +147,13 @@ def build(
     model = scene_spec(hand, obj, pieces, physics, supports, neighbours).compile()
     if model.nv >= SPARSE:
         model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
-    lead = leading_bodies(hand)
+    lead = hand.joint_body[hand.first_joint]
     body_of_geom = model.geom_bodyid
     object_body = model.body("object").id
-    beside = tuple(_free_body(model, f"neighbour{k}", one.obj) for k, one in enumerate(neighbours))
+    beside = []
+    for k, one in enumerate(neighbours):
+        at, qpos = model.body(f"neighbour{k}").id, int(model.joint(f"neighbour{k}").qposadr[0])
+        beside.append(FreeBody(at, qpos, one.obj.centre_of_mass, float(model.body_mass[at])))
     stand = [one.body for one in beside] + ([model.body("supports").id] if supports else [])
     support = np.isin(body_of_geom, stand)
     return Scene(
@@ -168,7 +171,7 @@ def build(
         centre=obj.centre_of_mass,
         mass=obj.mass,
         support_geoms=np.asarray(support),
-        neighbours=beside,
+        neighbours=tuple(beside),
         tip_geoms=np.isin(body_of_geom, [model.body(f"body{b}").id for b in hand.fingertips]),
         pressing=_pressing(model, supports),
     )
@@ -184,11 +187,6 @@ def _pressing(model: Any, supports: Sequence[Obstacle]) -> Floats:
         if support.tips_m is not None and support.tips_m < CLEAR_M:
             out[model.geom(f"support{i}").id] = max(0.0, -support.tips_m) + TOUCH_ROUNDING_M
     return out
-
-
-def _free_body(model: Any, name: str, obj: ObjectModel) -> FreeBody:
-    body = model.body(name).id
-    return FreeBody(body, int(model.joint(name).qposadr[0]), obj.centre_of_mass, float(model.body_mass[body]))
 
 
 def scene_spec(
@@ -248,7 +246,7 @@ def _add_hand(spec: Any, hand: HandModel, friction: list[float], root: str) -> N
     for b, body in enumerate(bodies):
         _add_mass_and_geoms(spec, body, hand, b, friction)
     _add_actuators(spec, hand)
-    for a, b in sorted(_excluded(hand)):
+    for a, b in sorted(hand.neighbours):
         spec.add_exclude(bodyname1=f"body{a}", bodyname2=f"body{b}")
 
 
@@ -308,7 +306,7 @@ def add_shape(spec: Any, geom: Any, piece: ConvexPiece, name: str) -> None:
         "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
     }
     if piece.kind == "hull":
-        _mesh(spec, geom, piece.vertices, name)
+        add_mesh(spec, geom, piece.vertices, name)
         return
     geom.type = kinds[piece.kind]
     geom.pos, geom.quat = piece.pose[:3], piece.pose[3:]
@@ -320,7 +318,8 @@ def add_shape(spec: Any, geom: Any, piece: ConvexPiece, name: str) -> None:
         geom.size = [piece.size[0], piece.size[1] / 2, 0]
 
 
-def _mesh(spec: Any, geom: Any, vertices: Floats, name: str) -> None:
+def add_mesh(spec: Any, geom: Any, vertices: Floats, name: str) -> None:
+    """Set a geom to the convex hull of points (V, 3)."""
     mesh = spec.add_mesh(name=name)
     mesh.uservert = np.ascontiguousarray(vertices, np.float32).ravel()
     mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
@@ -329,7 +328,7 @@ def _mesh(spec: Any, geom: Any, vertices: Floats, name: str) -> None:
 
 
 def _add_actuators(spec: Any, hand: HandModel) -> None:
-    leading = leading_bodies(hand)
+    leading = hand.joint_body[hand.first_joint]
     pulled = {d: tendon for tendon in hand.tendons for d in tendon.dofs}
     for d, lead in enumerate(leading):
         if (tendon := pulled.get(d)) is not None:
@@ -357,17 +356,6 @@ def _add_actuators(spec: Any, hand: HandModel) -> None:
             )
 
 
-def _excluded(hand: HandModel) -> set[tuple[int, int]]:
-    """Return pairs of bodies without contact: adjacent ones, parents and grandparents."""
-    pairs = set(hand.neighbours)
-    for b in range(1, hand.bodies):
-        parent = int(hand.parent[b])
-        pairs.add((parent, b))
-        if parent > 0:
-            pairs.add((int(hand.parent[parent]), b))
-    return {(min(a, b), max(a, b)) for a, b in pairs}
-
-
 def add_object(
     spec: Any, obj: ObjectModel, pieces: Sequence[Floats], friction: list[float], mass: float, name: str = "object"
 ) -> None:
@@ -380,22 +368,24 @@ def add_object(
     body.explicitinertial = True
     for i, corners in enumerate(pieces):
         geom = body.add_geom(condim=4, friction=friction, name=f"{name}-{i}")
-        _mesh(spec, geom, corners - obj.centre_of_mass, f"{name}-{i}")
+        add_mesh(spec, geom, corners - obj.centre_of_mass, f"{name}-{i}")
 
 
 def _add_supports(spec: Any, supports: Sequence[Obstacle], friction: list[float]) -> None:
     """Add planes and convex solids to a mocap body, placed at the scene's pose in the object frame."""
     body = spec.worldbody.add_body(name="supports", mocap=True)
     for i, support in enumerate(supports):
-        geom = body.add_geom(condim=4, friction=friction, name=f"support{i}")
-        if len(support.corners):
-            _mesh(spec, geom, support.corners, f"support{i}")
-            continue
-        normal, offset = support.planes[0, :3], support.planes[0, 3]
-        geom.type = mujoco.mjtGeom.mjGEOM_PLANE
-        geom.size = [0, 0, 0.1]
-        geom.pos = offset * normal
-        mujoco.mju_quatZ2Vec(geom.quat, normal)
+        add_support(spec, body.add_geom(condim=4, friction=friction, name=f"support{i}"), support)
+
+
+def add_support(spec: Any, geom: Any, support: Obstacle) -> None:
+    """Set a geom to the plane or convex solid of a support, in the frame of the support."""
+    if len(support.corners):
+        add_mesh(spec, geom, support.corners, geom.name)
+        return
+    normal, offset = support.planes[0, :3], support.planes[0, 3]
+    geom.type, geom.size, geom.pos = mujoco.mjtGeom.mjGEOM_PLANE, [0, 0, 0.1], offset * normal
+    mujoco.mju_quatZ2Vec(geom.quat, normal)
 
 
 def blend(a: Posture, b: Posture, row: int, share: float) -> tuple[Floats, Floats]:
@@ -405,13 +395,7 @@ def blend(a: Posture, b: Posture, row: int, share: float) -> tuple[Floats, Float
     return pose, (1 - share) * a.joint_positions[row] + share * b.joint_positions[row]
 
 
-def leading_bodies(hand: HandModel) -> NDArray[np.intp]:
-    """Return the body (D,) whose joint carries each dof's actuator: the dof's first joint, as in `HandModel.reduce`."""
-    drives = hand.dof[hand.joint_body]
-    return np.array([hand.joint_body[int(np.flatnonzero(drives == d)[0])] for d in range(hand.dofs)], np.intp)
-
-
-def _add_tendon(spec: Any, hand: HandModel, tendon: Tendon, name: str, leading: NDArray[np.intp]) -> None:
+def _add_tendon(spec: Any, hand: HandModel, tendon: Tendon, name: str, leading: NDArray[np.int32]) -> None:
     """Add one actuator on the sum of joints; the joints are not coupled in any other way."""
     cord = spec.add_tendon(name=name)
     for d, pull in zip(tendon.dofs, tendon.coefficients, strict=True):

@@ -325,20 +325,16 @@ def capacities(hand: HandModel, obj: ObjectModel, grasp: Posture, against: Float
         forces = cone_edges(-found.normal[row, chosen], obj.friction / math.cos(math.pi / EDGES))
         torques = generalized_forces(hand, found.bodies[row], probe.points.body[chosen], points, -forces)
         moments = cross((points - obj.centre_of_mass)[:, None] / obj.radius, forces)
-        efforts = _limits(hand, q[row])
+        # Limits of contacts' effort on each dof, up then down; unlimited at a stop.
+        near, rest = AT_STOP * hand.span, q[row]
+        bounds = (np.where(stop, np.inf, hand.effort) for stop in (rest > hand.upper - near, rest < hand.lower + near))
+        efforts = np.concatenate([*bounds])
         loads = [
             _load(forces.reshape(-1, 3), moments.reshape(-1, 3), torques.reshape(-1, hand.dofs), efforts, along)
             for along in against[row]
         ]
         out[row] = min(loads) / ACCELERATION
     return out
-
-
-def _limits(hand: HandModel, q: Floats) -> Floats:
-    """Return limits (2 D,) of contacts' effort on each dof, up then down [N m or N]; unlimited at a stop."""
-    near = AT_STOP * hand.span
-    up = np.where(q > hand.upper - near, np.inf, hand.effort)
-    return np.concatenate([up, np.where(q < hand.lower + near, np.inf, hand.effort)])
 
 
 def _load(forces: Floats, moments: Floats, torques: Floats, efforts: Floats, along: Floats) -> float:

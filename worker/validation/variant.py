@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import copy
 import threading
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any, Final, Literal
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Final, Literal
 
 import mujoco
 import numpy as np
@@ -137,14 +137,6 @@ def draw(axis: Axis, hand: HandModel, rng: np.random.Generator) -> Variant:
             return Variant(lags=tuple((LATEST * rng.permutation(fingers) / (fingers - 1)).tolist()))
         case _:
             raise ValueError("nothing varies along no axis")
-
-
-def together(variants: Iterable[Variant]) -> Variant:
-    """Combine variants along several axes; if two change the same value, the later one is used."""
-    own, changed = asdict(NOMINAL), dict[str, Any]()
-    for one in variants:
-        changed |= {name: value for name, value in asdict(one).items() if value != own[name]}
-    return replace(NOMINAL, **changed)
 
 
 #: Variants of collision shapes.

@@ -7,9 +7,8 @@ from typing import Any
 
 from sqlalchemy import Connection, delete, select, update
 
-from graspd.service.index.bulk import update_rows, upsert
 from graspd.service.index.changes.rows import NO_PROGRESS, clean, fitted, settle
-from graspd.service.index.database import IndexPart, chunks, rows_among
+from graspd.service.index.database import IndexPart, chunks, rows_among, update_rows, upsert
 from graspd.service.index.tables import assets, jobs, tasks, workers
 from graspd.service.model.states import State
 from graspd.service.model.workers import WorkerBeat

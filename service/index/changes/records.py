@@ -8,7 +8,6 @@ from typing import Any, Final
 
 from sqlalchemy import Connection, delete, select, update
 
-from graspd.service.index.bulk import upsert
 from graspd.service.index.changes.rows import (
     ENTERING,
     NO_PROGRESS,
@@ -24,7 +23,7 @@ from graspd.service.index.changes.rows import (
     shard_row,
     task_rows,
 )
-from graspd.service.index.database import IndexPart, chunks, rows_among
+from graspd.service.index.database import IndexPart, chunks, rows_among, upsert
 from graspd.service.index.tables import (
     assets,
     attempts,

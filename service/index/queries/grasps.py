@@ -181,8 +181,6 @@ def conditions(where: GraspFilter | None) -> list[Test]:
     """Return a filter as a conjunction; InputError for an invalid expression, or values that the index lacks."""
     where = where or GraspFilter()
     found: list[Test] = []
-    if where.shard is not None:
-        found.append(Condition("shard", grasps.c.shard_id, operator.eq, where.shard))
     if where.job is not None:
         of_job = (tasks.c.job_id == where.job, tasks.c.stage == Stage.SYNTHESIZE.value)
         found.append(Condition("job", grasps.c.shard_id, in_op, select(tasks.c.shard_id).where(*of_job)))
@@ -289,8 +287,6 @@ def _few(connection: Connection, where: GraspFilter | None, wanted: Sequence[Tes
     """Return the group of conditions that leaves the fewest rows, if these can be sorted at once."""
     numbers: dict[str, int] = {}
     for group in dict.fromkeys(condition.group for condition in wanted):
-        if group == "shard":
-            return group
         if group != "flag":
             numbers[group] = number_of(connection, where or GraspFilter(), group, wanted)
     few = min(numbers, key=lambda name: numbers[name], default=None)
@@ -387,7 +383,6 @@ class GraspFilter(Model):
     hand: str | None = None
     object: str | None = None
     job: str | None = None
-    shard: str | None = None
     dataset: str | None = None
     tag: str | None = None
     where: str | None = None

@@ -53,19 +53,11 @@ class Jobs(IndexPart):
         query = select(jobs.c.id).where(jobs.c.finished.is_(None))
         return {row.id for row in self.database.among(query, jobs.c.id, ids)}
 
-    def tasks(
-        self,
-        *,
-        job: str | None = None,
-        stage: Stage | None = None,
-        state: State | None = None,
-        limit: int = 50,
-        cursor: str | None = None,
-    ) -> Page[TaskView]:
-        query = select(tasks).where(*_equal({tasks.c.job_id: job, tasks.c.stage: stage, tasks.c.state: state}))
+    def tasks(self, *, job: str, state: State | None = None, limit: int = 50) -> Page[TaskView]:
+        query = select(tasks).where(tasks.c.job_id == job, *_equal({tasks.c.state: state}))
         key = (tasks.c.job_id, tasks.c.batch, tasks.c.position)
         with self.database.reading() as connection:
-            rows, following = page_rows(connection, query, *key, limit=limit, cursor=cursor, descending=False)
+            rows, following = page_rows(connection, query, *key, limit=limit, cursor=None, descending=False)
         return Page(items=[_task_view(row) for row in rows], next=following)
 
     def task(self, task_id: str, *, scope: ProjectScope = EVERYTHING) -> TaskView:
@@ -172,15 +164,12 @@ class Shards(IndexPart):
         *,
         job: str | None = None,
         kind: Literal["base", "scene", "views"] | None = None,
-        hand: str | None = None,
-        object: str | None = None,
         limit: int = 50,
         cursor: str | None = None,
         scope: ProjectScope = EVERYTHING,
     ) -> Page[ShardView]:
         """Return a page of shards, newest first, without their manifests."""
-        same = _equal({shards.c.kind: kind, shards.c.hand: hand, shards.c.object: object})
-        query = select(shards).where(*seen_shards(scope, shards.c.id), *same)
+        query = select(shards).where(*seen_shards(scope, shards.c.id), *_equal({shards.c.kind: kind}))
         if job is not None:
             query = query.where(shards.c.id.in_(select(tasks.c.shard_id).where(tasks.c.job_id == job)))
         with self.database.reading() as connection:

@@ -13,7 +13,7 @@ from sqlalchemy import ColumnElement, Connection, Select, Table, case, func, sel
 from graspd.service.index.database import Database, IndexPart
 from graspd.service.index.project_scope import page_size, seen, seen_shards, seen_with_job
 from graspd.service.index.tables import attempts, damage, jobs, shards, spent, tasks, workers
-from graspd.service.index.views import FailureGroup, MatrixCell, Stats, Throughput, UsageDay, WorkerView
+from graspd.service.index.views import FailureGroup, MatrixCell, Stats, UsageDay, WorkerView
 from graspd.service.model.clock import age_of
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.names import SHARD_KINDS
@@ -48,23 +48,13 @@ class Overview(IndexPart):
             workers=int(living or 0),
         )
 
-    def throughput(self, *, since: str, bucket_s: int = 60, scope: ProjectScope = EVERYTHING) -> list[Throughput]:
-        """Return the production since a time, in intervals of `bucket_s`; empty intervals are omitted."""
-        # The database sums by the largest unit of time that divides the interval; few rows remain.
-        unit = func.substr(shards.c.created, 1, next(n for s, n in _UNITS if bucket_s % s == 0)).label("unit")
-        sums = (func.count(), func.sum(shards.c.count), func.sum(shards.c.valid), func.sum(shards.c.seconds))
-        query = select(unit, shards.c.kind, *sums).where(shards.c.created >= since, *seen_shards(scope, shards.c.id))
-        query = query.group_by(unit, shards.c.kind)
-        made: dict[str, dict[str, float]] = defaultdict(lambda: {"grasps": 0, "valid": 0, "tasks": 0, "seconds": 0.0})
+    def valid_per_minute(self, *, since: str, scope: ProjectScope = EVERYTHING) -> dict[str, int]:
+        """Return the valid grasps of each minute (2026-11-22T08:30) since a time; minutes without shards are absent."""
+        minute = func.substr(shards.c.created, 1, 16)
+        query = select(minute, func.sum(shards.c.valid)).group_by(minute)
+        query = query.where(shards.c.kind == "base", shards.c.created >= since, *seen_shards(scope, shards.c.id))
         with self.database.reading() as connection:
-            for start, kind, number, count, valid, seconds in connection.execute(query):
-                bucket = made[_bucket(start + _REST_OF_TIME[len(start) :], bucket_s)]
-                bucket["tasks"] += int(number)
-                bucket["seconds"] += float(seconds)
-                if kind == "base":
-                    bucket["grasps"] += int(count)
-                    bucket["valid"] += int(valid)
-        return [Throughput.model_validate({"start": start, **made[start]}) for start in sorted(made)]
+            return {start: int(valid) for start, valid in connection.execute(query)}
 
     def failures(self, *, limit: int = 20, scope: ProjectScope = EVERYTHING) -> list[FailureGroup]:
         """Return failed attempts by stage and error, the most frequent first."""
@@ -117,9 +107,6 @@ class Overview(IndexPart):
 
 
 _CELL: Final = ("jobs", "queued", "running", "failed", "grasps", "valid", "candidates", "validated")
-#: Seconds of an interval, and the number of leading characters of a time that identify it.
-_UNITS: Final = ((3600, 13), (60, 16), (1, 19))
-_REST_OF_TIME: Final = "0000-00-00T00:00:00Z"
 _MADE = (
     func.sum(shards.c.count),
     func.sum(shards.c.valid),
@@ -132,12 +119,6 @@ def _by_state(connection: Connection, table: Table, *tests: ColumnElement[bool])
     query = select(table.c.state, func.count()).where(*tests).group_by(table.c.state)
     found = {State(state): int(count) for state, count in connection.execute(query)}
     return {state: found.get(state, 0) for state in State}
-
-
-def _bucket(created: str, bucket_s: int) -> str:
-    seconds = datetime.fromisoformat(created).timestamp()
-    start = datetime.fromtimestamp(seconds - seconds % bucket_s, UTC)
-    return start.isoformat(timespec="seconds").replace("+00:00", "Z")
 
 
 #: Unfinished jobs are counted up to here.

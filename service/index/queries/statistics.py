@@ -116,10 +116,8 @@ class Statistics(IndexPart):
 def _sampled(connection: Connection, where: GraspFilter, at_most: int) -> list[ColumnElement[bool]]:
     """Return the filter restricted to a share of shards with about `at_most` grasps."""
     group = "job" if where.job is not None else "dataset" if where.dataset is not None else "pair"
-    # A shard is never larger than a sample.
-    size = number_of(connection, where, group) if where.shard is None else 0
-    share = min(1.0, at_most / max(1, size))
-    tests = [c.sql(["shard", "job", "dataset"]) for c in conditions(where)]
+    share = min(1.0, at_most / max(1, number_of(connection, where, group)))
+    tests = [c.sql(["job", "dataset"]) for c in conditions(where)]
     return [*tests, grasps.c.shard_id < f"{round(share * 16**8):08x}"] if share < 1.0 else tests
 
 

@@ -40,10 +40,6 @@ def export_shards(snapshot: Snapshot, folder: Path, fetch: Fetch, progress: Prog
     return fetched
 
 
-#: Formats of `graspd datasets export`; a new format is a new entry here.
-FORMATS: Final[dict[str, Callable[[Snapshot, Path, Fetch, Progress | None], int]]] = {"shards": export_shards}
-
-
 def path_of(shard: SnapshotShard) -> str:
     return f"{shard.hand}/{shard.object}/{shard.kind}-{shard.batch:05}.h5"
 

@@ -20,12 +20,8 @@ from graspd.service.model.version import STAGE_REVISIONS
 MAX_CELLS: Final = 100_000
 
 
-def _once(given: tuple[str, ...]) -> tuple[str, ...]:
-    """Remove repeated names: they are the same cell."""
-    return tuple(dict.fromkeys(given))
-
-
-Names = Annotated[tuple[Name, ...], AfterValidator(_once)]
+#: Names without repetitions: these are the same cell.
+Names = Annotated[tuple[Name, ...], AfterValidator(lambda given: tuple(dict.fromkeys(given)))]
 
 
 class Matrix(JobOptions):
@@ -79,10 +75,12 @@ def describe(
     fidelities = tuple(str(request.fidelity) for _, _, request, _ in cells) if options.fidelity == AUTO else ()
     found = [choice for *_, choice in cells if choice is not None]
     places = {choice: place for place, choice in enumerate(dict.fromkeys(found))}
+    # Digests do not depend on newer options that are unused.
+    unused = {name for name in ("options", "target") if not getattr(options, name)}
     content = {
         "hands": [[hand.name, hand.digest] for hand in hands],
         "objects": [[obj.name, obj.digest] for obj in objects],
-        "options": original(options.model_dump(mode="json", exclude=_unused(options))),
+        "options": original(options.model_dump(mode="json", exclude=unused)),
         **({"fidelities": fidelities} if fidelities else {}),
     }
     return DatasetRecord(
@@ -100,8 +98,3 @@ def describe(
         owner=owner,
         project=project,
     )
-
-
-def _unused(options: JobOptions) -> set[str]:
-    """Return newer options that are unused: without them, digests stay unchanged."""
-    return {name for name in ("options", "target") if not getattr(options, name)}

@@ -7,7 +7,6 @@ import time
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, closing
-from functools import partial
 from pathlib import Path
 from typing import Any, Final
 from urllib.parse import unquote, urlsplit
@@ -16,9 +15,9 @@ from redis import Redis
 from redis.exceptions import RedisError
 from sqlalchemy import func, make_url, select
 
+from graspd.service.index.condition import IndexCondition, look
 from graspd.service.index.index import Index
-from graspd.service.index.rebuild import differences
-from graspd.service.index.sample import IndexCondition, compare, draw, look
+from graspd.service.index.rebuild import differences, missing_names
 from graspd.service.index.tables import shards
 from graspd.service.model.base import first_line
 from graspd.service.model.errors import (
@@ -91,7 +90,8 @@ def _check_redis(settings: Settings, client: Redis, info: Mapping[str, Any]) -> 
     line = f"Redis {version} at {_shown(settings)}, {1000 * seconds:.1f} ms, {used >> 20} MiB"
     if tuple(int(part) for part in version.split(".")[:2]) < _OLDEST:
         return warning(f"{line}: older than 6.2, the oldest tested version", "install Redis 6.2 or newer, or Valkey")
-    if _is_open(settings):
+    parts = urlsplit(redis_url(settings))
+    if parts.scheme != "unix" and parts.hostname not in _LOCAL and not parts.password:
         fix = "requirepass in its configuration, or an ACL, and the password in GRASPD_REDIS_URL"
         return warning(f"{line}: it requires no password, so any client can start tasks", fix)
     if seconds > _SLOW_REDIS_S:
@@ -145,12 +145,6 @@ def _shown(settings: Settings) -> str:
     return f"{parts.scheme}://{parts.hostname}{f':{parts.port}' if parts.port else ''}{parts.path}"
 
 
-def _is_open(settings: Settings) -> bool:
-    """Check whether Redis accepts network connections without a password."""
-    parts = urlsplit(redis_url(settings))
-    return parts.scheme != "unix" and parts.hostname not in _LOCAL and not parts.password
-
-
 def _fix(error: Exception, settings: Settings) -> str:
     said = str(error).upper()
     if "NOAUTH" in said or "WRONGPASS" in said or "AUTHENTICATION" in said:
@@ -169,7 +163,7 @@ _REBUILD: Final = (
     "graspd admin index rebuild --check shows all of it; graspd admin index rebuild fixes it while the service runs"
 )
 _CROWDED: Final = 0.8
-#: Above this number of shards only a sample is compared.
+#: Above this number of shards only names are compared.
 _ALL_SHARDS: Final = 2000
 #: Time for the controller to process events between two comparisons [s].
 _SETTLES_S: Final = 3.0
@@ -272,19 +266,17 @@ def index_is_store(settings: Settings, *, full: bool = False, settles_s: float =
         with opened.database.reading() as connection:
             count = int(connection.scalar(select(func.count()).select_from(shards)) or 0)
         whole = full or count <= _ALL_SHARDS
-        compared = (
-            partial(differences, opened, store) if whole else partial(compare, opened, store, draw(opened, store))
-        )
-        if found := compared():
+        compared = differences if whole else missing_names
+        if found := compared(opened, store):
             time.sleep(settles_s)
-            again = set(compared())
+            again = set(compared(opened, store))
             found = [line for line in found if line in again]
     if found:
         # A missing shard changes rows of tasks and jobs: list the cause first.
         found.sort(key=lambda line: not line.startswith("shards "))
         more = f", and {len(found) - 3} more" if len(found) > 3 else ""
         return bad(f"{'; '.join(found[:3])}{more}", _REBUILD)
-    what = f"all rows of {count} shards" if whole else f"a sample of {count} shards (--full compares all)"
+    what = f"all rows of {count} shards" if whole else f"names of jobs and {count} shards (--full compares all rows)"
     return good(f"{what} match the store")
 
 

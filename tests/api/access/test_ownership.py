@@ -1,7 +1,5 @@
 """Who may cancel, retry and delete what: the key that submitted it, or an admin's."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import closing, nullcontext
 from typing import Any
@@ -20,14 +18,12 @@ from graspd.service.pipeline.backends import Services
 from graspd.service.settings import Settings
 from graspd.service.store.network_file import to_bytes
 from tests.api.factories import bearer, people_of
+from tests.fakes import plan_all
 from tests.networks import random_network
-from tests.planning import plan_all
 
 JOB = {"hand": "allegro", "object": "mug", "grasps": 32}
 MATRIX = {"name": "d", "hands": ["allegro"], "objects": ["mug"], "grasps": 32}
 Ask = Callable[..., Response]
-
-
 #: Who may change what ann submitted.
 WHO = pytest.mark.parametrize(("who", "may"), [("ann", True), ("bob", False), ("eve", False), ("root", True)])
 
@@ -112,8 +108,7 @@ def test_a_rotated_key_keeps_its_jobs_and_a_later_one_has_none(ask: Ask, keys: K
 def test_keys_of_before_there_were_ids_have_one_through_rotation(keys: KeyFile) -> None:
     old = {"name": "ann", "scope": "submit", "sha256": "a" * 64, "created": "2026-01-01T00:00:00Z"}
     key, again = Key.model_validate(old), Key.model_validate(old | {"sha256": "b" * 64, "created": "2026-02-01"})
-    assert key.id and key.id == again.id
-    assert key.id != Key.model_validate(old | {"name": "bob"}).id
+    assert key.id and key.id == again.id and key.id != Key.model_validate(old | {"name": "bob"}).id
 
 
 def test_owners_are_in_the_store_and_survive_a_lost_index(ask: Ask, services: Services, keys: KeyFile) -> None:

@@ -1,7 +1,5 @@
 """What the keys of a project may use together: grasps in work, grasps of a day, and GPU seconds of a day."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 
@@ -93,9 +91,7 @@ def test_a_project_without_gpu_seconds_left_submits_no_more(ask: Ask, settings: 
     assert not services.index.jobs.get(waiting).state.is_final, "what was submitted before goes on"
 
 
-def test_usage_is_told_of_the_own_project_alone(
-    ask: Ask, service: TestClient, settings: Settings, services: Services
-) -> None:
+def test_usage_is_of_the_own_project(ask: Ask, service: TestClient, settings: Settings, services: Services) -> None:
     for name, seed in (("ann", 1), ("bob", 2)):
         done(services, ask(name, seed).json()["id"], seconds=2.5)
     keys = KeyFile(settings.resolved_keys_file)

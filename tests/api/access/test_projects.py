@@ -1,8 +1,6 @@
 """What a key of one project sees of another's: nothing, by any route. Each route of the application is walked, so one
 that is added later and forgets to ask fails here."""
 
-from __future__ import annotations
-
 import io
 import re
 import shutil
@@ -29,32 +27,14 @@ from graspd.service.model.states import AssetKind
 from graspd.service.pipeline.backends import Services
 from graspd.service.settings import Settings
 from graspd.service.store.network_file import to_bytes
-from graspd.service.store.store import open_store
 from tests.api.factories import add_worker, fail, finish_all, people_of
-from tests.fakes import record_of
-from tests.memory_queue import MemoryQueue
+from tests.fakes import plan_all, record_of
+from tests.indexes import open_services
 from tests.networks import random_network
-from tests.planning import plan_all
 
 Headers = dict[str, str]
 JOB = {"hand": "allegro", "object": "mug", "grasps": 32, "scenes": 1, "views": 1, "seed": 77}
 _BALL = b"solid ball\nendsolid ball\n"
-
-
-@pytest.fixture(scope="module")
-def world(tmp_path_factory: pytest.TempPathFactory, furnished: Path) -> Iterator[World]:
-    """A service with a job that is done, one that failed, a dataset, a hand, objects and a set of project `red`."""
-    settings = Settings(data_dir=tmp_path_factory.mktemp("projects") / "data", webhook_secret=SecretStr("s" * 16))
-    shutil.copytree(furnished, settings.data_dir)
-    store, index = open_store(settings.resolved_store_url), Index(settings.resolved_index_url)
-    services = Services(settings, store, index, MemoryQueue())
-    of_red = {"ann": (Scope.SUBMIT, "red"), "amy": (Scope.SUBMIT, "red")}
-    of_blue = {"bob": (Scope.SUBMIT, "blue"), "eve": (Scope.READ, "blue")}
-    people = people_of(settings, **of_red, **of_blue, old=(Scope.SUBMIT, ""), root=(Scope.ADMIN, ""))
-    app = create_app(settings, services)
-    with TestClient(app, base_url="https://graspd.example", follow_redirects=False) as client:
-        yield World(client, services, people)
-    services.close()
 
 
 @dataclass
@@ -109,9 +89,23 @@ class World:
         return [*named, "red-secret broke", *self.said.values()]
 
 
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory, furnished: Path) -> Iterator[World]:
+    """A service with a job that is done, one that failed, a dataset, a hand, objects and a set of project `red`."""
+    settings = Settings(data_dir=tmp_path_factory.mktemp("projects") / "data", webhook_secret=SecretStr("s" * 16))
+    shutil.copytree(furnished, settings.data_dir)
+    services = open_services(settings)
+    of_red = {"ann": (Scope.SUBMIT, "red"), "amy": (Scope.SUBMIT, "red")}
+    of_blue = {"bob": (Scope.SUBMIT, "blue"), "eve": (Scope.READ, "blue")}
+    people = people_of(settings, **of_red, **of_blue, old=(Scope.SUBMIT, ""), root=(Scope.ADMIN, ""))
+    app = create_app(settings, services)
+    with TestClient(app, base_url="https://graspd.example", follow_redirects=False) as client:
+        yield World(client, services, people)
+    services.close()
+
+
 _URDF = b"""<robot name="two"><link name="base"/><link name="tip"/><joint name="j" type="revolute"><parent link="base"/>
 <child link="tip"/><axis xyz="0 0 1"/><limit lower="0" upper="1" effort="1" velocity="1"/></joint></robot>"""
-
 #: For each parameter of a path: what of the project it may name.
 _VALUES: dict[str, tuple[str, ...]] = (
     {"job_id": ("job_id", "failed", "waiting"), "shard_id": ("shard_id", "views"), "kind": ("object", "hand")}

@@ -1,7 +1,5 @@
 """Requests that come at once, to one API process or to two: what one of them may have, two do not get."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -110,9 +108,7 @@ def test_a_retry_of_fewer_grasps_leaves_the_sum_true(quotas: MakeQuotas, rq_queu
     assert held(rq_queue) == 5
 
 
-def test_a_claim_of_a_process_that_died_ends(
-    quotas: MakeQuotas, rq_queue: RqQueue, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_claim_of_a_dead_process_ends(quotas: MakeQuotas, rq_queue: RqQueue, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("graspd.api.access.quotas._PENDING_S", 0)
     one = quotas(lambda ids: set())
     died = one.claim(KEY, "a", 20)
@@ -123,9 +119,7 @@ def test_a_claim_of_a_process_that_died_ends(
 
 
 @pytest.mark.parametrize("refused", [{"object": "unheard-of"}, {"grasps": 21}])
-def test_a_refused_request_leaves_its_idempotency_key_free(
-    twins: list[TestClient], keys: KeyFile, refused: dict[str, Any]
-) -> None:
+def test_a_refusal_frees_the_idempotency_key(twins: list[TestClient], keys: KeyFile, refused: dict[str, Any]) -> None:
     keyed = {"Idempotency-Key": "one"}
     assert twins[0].post("/v1/jobs", json=JOB | refused, headers=keyed).status_code in (404, 429)
     assert twins[1].post("/v1/jobs", json=JOB, headers=keyed).status_code == 202

@@ -1,7 +1,5 @@
 """Hands and folders of meshes on the command line: what is sent, and that one bad mesh stops nothing."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -44,9 +42,7 @@ def add(monkeypatch: pytest.MonkeyPatch, http: TestClient, *arguments: str) -> t
     return result.exit_code, json.loads(result.stdout.splitlines()[-1])
 
 
-def test_a_folder_is_uploaded_and_a_bad_object_stops_nothing(
-    monkeypatch: pytest.MonkeyPatch, http: TestClient, folder: Path
-) -> None:
+def test_a_bad_object_stops_no_folder(monkeypatch: pytest.MonkeyPatch, http: TestClient, folder: Path) -> None:
     code, told = add(monkeypatch, http, str(folder), "--units", "mm")
     assert (code, told["refused"]) == (2, ["broken"])
     known = {asset["name"] for asset in http.get(f"/v1/{AssetKind.OBJECT.value}s").json()["items"]}
@@ -57,9 +53,7 @@ def test_a_folder_is_uploaded_and_a_bad_object_stops_nothing(
     assert add(monkeypatch, http, str(folder), "--name", "ycb")[1]["refused"] == ["ycb-broken"]
 
 
-def test_a_sweep_makes_an_object_of_each_size_and_a_set_of_them(
-    monkeypatch: pytest.MonkeyPatch, http: TestClient, folder: Path
-) -> None:
+def test_a_sweep_makes_a_set_of_all_sizes(monkeypatch: pytest.MonkeyPatch, http: TestClient, folder: Path) -> None:
     mesh = folder / "025_mug" / "google_16k" / "nontextured.stl"
     code, told = add(monkeypatch, http, str(mesh), "--name", "mug", "--scale-to", "0.06,0.08,0.125")
     assert (code, told["set"]) == (0, "mug")

@@ -1,7 +1,5 @@
 """The commands against the real service: embedded Redis, file store, SQLite, controller, API. No worker: jobs wait."""
 
-from __future__ import annotations
-
 import json
 import os
 import socket
@@ -12,16 +10,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Self
 
 import pytest
 from typer.testing import CliRunner
 
-from graspd.api.models import JobDetail, MeanMetrics
 from graspd.cli import build
 from graspd.client.client import Client
-from graspd.client.reports import job_summary
-from graspd.service.model.domain import JobRequest
 from graspd.service.model.states import AssetKind, State
 from graspd.service.run.supervisor import Supervisor
 from graspd.service.settings import Settings
@@ -46,7 +41,7 @@ class Shell:
     in_process: bool = True
 
     @property
-    def apart(self) -> Shell:
+    def apart(self) -> Self:
         return replace(self, in_process=False)
 
     def __call__(self, *arguments: str, typed: str = "") -> subprocess.CompletedProcess[str]:
@@ -212,7 +207,6 @@ _PAIR = "submit --hand allegro --object mug"
         (f"{' '.join(CREATE)} --yes --views 2", "views need scenes"),
         (f"{' '.join(CREATE)} --yes --fidelity auto --target gsr>=0.5", "graspd chart --publish"),
         (f"{' '.join(CREATE)} --yes --option keep", "write it as name=value"),
-        ("datasets export none -o x --format zip", "there is no format 'zip'"),
     ],
 )
 def test_a_mistake_is_one_line_and_exit_2(graspd: Shell, arguments: str, words: str) -> None:
@@ -249,17 +243,6 @@ def test_keys_are_made_listed_and_revoked(graspd: Shell, tmp_path: Path) -> None
     assert [(key["name"], key["revoked"]) for key in shell.json("keys", "list")["keys"]] == [("lab", None)]
     shell.json("keys", "revoke", "lab")
     assert shell.json("keys", "list")["keys"][0]["revoked"] is not None
-
-
-def test_the_keys_that_scripts_rely_on_are_there() -> None:
-    asked = {"hand": "allegro", "object": "mug", "method": "fast_graspd", "fidelity": "standard", "requested": 32}
-    found = {"grasps": 32, "valid": 20, "progress": 1.0, "created": "2026-01-01T00:00:00Z", "stages": []}
-    more = {"request": JobRequest(hand="allegro", object="mug"), "attempts": [], "shards": []}
-    digests = {"hand_digest": "b" * 32, "object_digest": "c" * 32}
-    mean = MeanMetrics(epsilon=0.1)
-    summary = job_summary(JobDetail(id="a" * 32, state=State.SUCCEEDED, mean=mean, **asked, **found, **more, **digests))
-    assert {"job", "state", "grasps", "valid", "stages", "mean", "shards"} <= set(summary)
-    assert set(summary["mean"]) == {"epsilon", "contact_area_cm2", "intersection_volume_cm3"}
 
 
 def test_a_job_with_a_target_says_how_its_fidelity_was_chosen(graspd: Shell, service: Supervisor) -> None:
@@ -301,12 +284,6 @@ def test_the_matrix_is_a_table_of_objects_and_hands(graspd: Shell) -> None:
     lines = [line.split() for line in graspd("datasets", "status", "table").stdout.splitlines()]
     head = lines.index(["allegro", "barrett"])
     assert lines[head + 1 : head + 3] == [["mug", "queued", "queued"], ["block", "queued", "queued"]]
-
-
-def test_a_dataset_takes_options_of_its_method(graspd: Shell) -> None:
-    method = ("--method", "graspit", "--option", "keep=20", "--option", "steps=40000")
-    made = graspd.json("datasets", "create", "annealed", *CREATE[3:], *method, "--yes")
-    assert made["dataset"]["options"]["options"] == {"keep": 20, "steps": 40000}
 
 
 def test_nobody_at_the_terminal_means_nothing_starts(graspd: Shell) -> None:

@@ -1,7 +1,5 @@
 """Specs of datasets in files, and options over them: what they say, and what is wrong with them."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

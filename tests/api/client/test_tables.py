@@ -1,7 +1,5 @@
 """Tables of jobs, datasets and their estimates on a terminal."""
 
-from __future__ import annotations
-
 import io
 import re
 from collections.abc import Callable, Iterator
@@ -24,36 +22,20 @@ from graspd.service.pipeline.datasets import actions
 from graspd.service.pipeline.datasets.cost import estimate
 from graspd.service.pipeline.datasets.spec import DatasetRequest
 from tests.api.factories import add_job, finish_all
-from tests.planning import plan_all
+from tests.fakes import plan_all
 
 NAME = "[red]mug[/] :mug: " + "a-very-long-name-of-an-object-that-somebody-gave-to-it"[:46]
-
 ID = "0123456789ab"
-
 CREATED = "2026-11-26T03:14:11.123456Z"
-
 _DONE = {"state": State.SUCCEEDED, "progress": 1.0, "created": CREATED, "model_dump": dict}
 _JOB = {"id": ID + "0" * 20, "hand": NAME, "object": NAME, "standing": "valid"}
 JOB = SimpleNamespace(**dict.fromkeys(("valid", "grasps", "requested"), 100_000), **_JOB, **_DONE)
-
 _DATASET = {"name": NAME, "cells": 1000, "counted": 10**6, "asked": 10**6, "size_bytes": 10**9 + 1}
 DATASET = SimpleNamespace(**_DATASET, **_DONE, options=JobOptions())
-
-ASSET = SimpleNamespace(
-    name=NAME,
-    filename=NAME,
-    size_bytes=10**6,
-    builtin=False,
-    verdict="ok",
-    facts={},
-    digest=ID + "0" * 52,
-    model_dump=dict,
-)
-
+_UPLOAD = {"name": NAME, "filename": NAME, "size_bytes": 10**6, "builtin": False, "verdict": "ok", "facts": {}}
+ASSET = SimpleNamespace(**_UPLOAD, digest=ID + "0" * 52, model_dump=dict)
 TAG = {"name": NAME, "grasps": 10**6, "changed": CREATED}
-
 WEBHOOK = {"id": ID, "url": "https://example.org/" + NAME, "states": ["failed", "succeeded"], "created": CREATED}
-
 _ENDED = {"kind": "job", "subject": ID, "ended": "succeeded", "state": "delivered"}
 DELIVERY = _ENDED | {"attempts": 3, "tried": CREATED, "detail": NAME}
 

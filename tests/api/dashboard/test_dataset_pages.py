@@ -1,18 +1,18 @@
 """The matrix: cells with their yield, actions on chosen ones, datasets made and steered by forms."""
 
-from __future__ import annotations
-
 import pytest
 from starlette.testclient import TestClient
 
+from graspd.api.catalog.datasets import Datasets, Pair
 from graspd.api.dashboard.figures import of_service
+from graspd.service.index.queries.grasps import GraspFilter
 from graspd.service.index.views import MatrixCell
 from graspd.service.model.states import State
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.datasets import actions
 from graspd.service.pipeline.datasets.spec import DatasetRequest
 from tests.api.factories import add_job, fail, finish_all
-from tests.planning import plan_all
+from tests.fakes import plan_all
 
 
 def cell(**fields: object) -> MatrixCell:
@@ -37,8 +37,7 @@ def create(services: Services, **changes: object) -> None:
 )
 def test_a_cell_tells_its_state_and_yield(counts: dict[str, int], state: str, shade: str) -> None:
     shown = of_service([cell(**counts)], ["h"], ["o"]).rows[0][1][0]
-    assert shown is not None
-    assert (shown.state, shown.shade) == (state, shade)
+    assert shown is not None and (shown.state, shown.shade) == (state, shade)
 
 
 def test_pairs_without_work_have_a_cell_to_choose() -> None:
@@ -140,3 +139,89 @@ def test_a_dataset_and_a_job_have_the_same_options(http: TestClient, services: S
         assert (options.min_payload, options.shake, options.robust) == (0.5, True, 0.75)
     refused = http.post("/submit", data=pair | {"shake": "true"})
     assert refused.status_code == 422 and "lifted out of a scene" in refused.text
+
+
+@pytest.fixture
+def jobs(http: TestClient, services: Services) -> dict[str, str]:
+    """One job that was validated, and a larger one on the same pair that was not."""
+    validated, unvalidated = (
+        add_job(services, want="candidates"),
+        add_job(services, grasps=320, validation="none", want="candidates"),
+    )
+    for record in (validated, unvalidated):
+        finish_all(services, record)
+    return {"validated": validated.id, "unvalidated": unvalidated.id}
+
+
+def share(http: TestClient, job: str) -> float:
+    rows = http.get("/v1/grasps", params={"job": job, "limit": 200}).json()["items"]
+    return sum(row["valid"] for row in rows) / len(rows)
+
+
+def test_service_and_job_count_as_tries_only_what_was_validated(http: TestClient, jobs: dict[str, str]) -> None:
+    stats = http.get("/v1/stats").json()
+    assert (stats["candidates"], stats["validated"]) == (352, 32)
+    told = {name: http.get(f"/v1/jobs/{job}").json() for name, job in jobs.items()}
+    assert stats["valid_yield"] == told["validated"]["valid_yield"] == share(http, jobs["validated"])
+    assert (told["unvalidated"]["validated"], told["unvalidated"]["valid_yield"]) == (0, None)
+    words = f"{int(100 * share(http, jobs['validated']) + 1e-9)} %"
+    home = http.get("/").text
+    assert words in home and "320 candidates not validated" in home
+    assert words in http.get("/datasets").text
+
+
+def test_unjudged_grasps_are_not_among_the_rejected(http: TestClient, jobs: dict[str, str]) -> None:
+    def found(**query: str) -> set[str]:
+        rows = http.get("/v1/grasps", params={"limit": 200, **query}).json()["items"]
+        assert rows
+        return {str(row["success"]) for row in rows}
+
+    rejected = http.get("/v1/grasps", params={"limit": 200, "valid": "false"}).json()["items"]
+    assert rejected and all(row["success"] is False for row in rejected)
+    assert found(validated="false") == found(where="not validated") == {"None"}
+    assert "None" not in found(validated="true") | found(where="validated and not valid")
+
+
+def _two(services: Services) -> None:
+    """`rough` is done, one cell of draft grasps; `fine` has another object besides and no grasp yet."""
+    create(services, name="rough", fidelity="draft")
+    create(services, name="fine", objects=["mug", "block"])
+    plan_all(services)
+    finish_all(services, add_job(services, fidelity="draft"))
+
+
+def test_the_page_shows_what_differs_and_every_cell(http: TestClient, services: Services) -> None:
+    _two(services)
+    page = " ".join(http.get("/compare", params={"one": "rough", "other": "fine"}).text.split())
+    assert "Fidelity</th><td" in page and ">draft</td>" in page and ">standard</td>" in page
+    assert "Objects of its own</th>" in page and ">block</td>" in page
+    assert page.count("<td>allegro</td>") == 2
+    assert page.count('<figure class="card histo twin">') > 3
+    assert "options are the same" not in page
+
+
+def test_a_dataset_beside_itself_differs_in_nothing(http: TestClient, services: Services) -> None:
+    _two(services)
+    page = http.get("/compare", params={"one": "rough", "other": "rough"}).text
+    assert "options are the same" in page and "+0 points" in page
+    assert "No grasp yet" in http.get("/compare", params={"one": "fine", "other": "fine"}).text
+    assert http.get("/compare", params={"one": "rough", "other": "gone"}).status_code == 404
+    page = http.get("/compare").text
+    assert page.count("<option>rough</option>") == page.count("<option>fine</option>") == 2
+    assert "/compare?one=rough&amp;other=fine" in http.get("/datasets").text
+
+
+def test_distributions_of_two_share_their_bins_and_count_all(services: Services) -> None:
+    _two(services)
+    filters = [GraspFilter(dataset="rough", valid=valid) for valid in (True, False, None)]
+    one, other, both = services.index.statistics.side_by_side(filters, ["epsilon"], bins=7)["epsilon"]
+    assert one is not None and other is not None and both is not None
+    assert (one.low, one.high) == (other.low, other.high)
+    assert [a + b for a, b in zip(one.counts, other.counts, strict=True)] == both.counts
+
+
+def test_more_cells_than_anybody_reads_are_left_out(services: Services, monkeypatch: pytest.MonkeyPatch) -> None:
+    _two(services)
+    monkeypatch.setattr("graspd.api.catalog.datasets.MOST_CELLS", 1)
+    datasets = Datasets(services, None)  # type: ignore[arg-type]
+    assert datasets.compare("rough", "fine").pairs == [] and Pair("hand", "object", None, None).gain is None

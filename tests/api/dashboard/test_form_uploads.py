@@ -1,7 +1,5 @@
 """The form of a job runs the object that it shows: a refused file stays, and no known object takes its place."""
 
-from __future__ import annotations
-
 import json
 import re
 from html import unescape
@@ -71,8 +69,7 @@ def test_a_refused_file_is_what_the_form_goes_on_to_show(http: TestClient, servi
         assert page.status_code == 422 and "a thing of 60 m" in page.text
         assert jobs(services) == []
     assert fields_of(answer.text)["object"] == ""
-    assert "your file part (refused)" in answer.text
-    assert 'data-model="/v1/objects/mug/model"' not in answer.text
+    assert "your file part (refused)" in answer.text and 'data-model="/v1/objects/mug/model"' not in answer.text
     known = http.post("/submit", data=fields_of(answer.text) | {"object": "block"}, follow_redirects=False)
     assert known.status_code == 303 and jobs(services) == ["block"]
 

@@ -1,7 +1,5 @@
 """One grasp: its document, its page, the models it is shown with; and the list in both views."""
 
-from __future__ import annotations
-
 import struct
 
 import numpy as np

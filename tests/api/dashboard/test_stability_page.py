@@ -1,7 +1,5 @@
 """The maps of failure on their page: laid out as pictures are, told in words, and what stands there before any."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -68,9 +66,7 @@ def test_the_page_shows_the_latest_maps_and_what_they_mean(http: TestClient, ser
 
 
 @pytest.mark.parametrize("stored", [None, b"{}", b"no json"])
-def test_without_maps_the_page_says_which_command_makes_them(
-    http: TestClient, services: Services, stored: bytes | None
-) -> None:
+def test_without_maps_the_page_names_the_command(http: TestClient, services: Services, stored: bytes | None) -> None:
     if stored is not None:
         services.store.put("stability/20260101.json", stored)
     assert "graspd stability --quick --publish" in http.get("/stability").text

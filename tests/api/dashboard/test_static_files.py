@@ -1,7 +1,5 @@
 """Templates compile, vendored files are what their lists say, words on a cell of the matrix can be read."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import re

@@ -1,8 +1,6 @@
 """The charts of speed against accuracy: points, front, free ones apart from those in scenes, and what stands there
 before anything is measured."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import math
@@ -37,8 +35,7 @@ def test_the_front_is_what_nothing_beats(points: list[tuple[int, int]]) -> None:
 def test_a_point_is_the_mean_over_hands_and_objects() -> None:
     runs = [run("draft", 1.0, 0.4), run("draft", 4.0, 0.8, object="block")]
     (point,) = draw(Measured.model_validate({"runs": runs}), axis="gsr").points
-    assert point.pairs == 2
-    assert point.speed == pytest.approx(math.sqrt(1.0 * 4.0))
+    assert point.pairs == 2 and point.speed == pytest.approx(math.sqrt(1.0 * 4.0))
     assert point.accuracy == pytest.approx(60.0)
 
 
@@ -114,9 +111,7 @@ def test_the_page_shows_the_chart_that_was_published_last(http: TestClient, serv
 
 
 @pytest.mark.parametrize("stored", [None, b"{}", b"no json"])
-def test_without_a_chart_the_page_says_which_command_makes_one(
-    http: TestClient, services: Services, stored: bytes | None
-) -> None:
+def test_without_a_chart_the_page_names_the_command(http: TestClient, services: Services, stored: bytes | None) -> None:
     if stored is not None:
         services.store.put("charts/20260101.json", stored)
     assert "graspd chart" in http.get("/chart").text

@@ -1,7 +1,5 @@
 """Rates, requests at once and quotas, counted in a real Redis that two applications share."""
 
-from __future__ import annotations
-
 import asyncio
 import time
 from collections.abc import Callable
@@ -18,8 +16,7 @@ from graspd.service.pipeline.backends import Services
 from graspd.service.queue.rq_queue import RqQueue
 from graspd.service.settings import Settings
 from tests.api.factories import bearer, finish_all
-from tests.fakes import record_of
-from tests.planning import plan_all
+from tests.fakes import plan_all, record_of
 from tests.waiting import PATIENCE_S
 
 JOB = {"hand": "allegro", "object": "mug", "grasps": 32}
@@ -124,9 +121,7 @@ def test_grasps_in_flight_come_free_as_jobs_end(make_twins: Twins, keys: KeyFile
     assert client.post("/v1/jobs", json=JOB | {"seed": 1, "grasps": 33}, headers=headers).status_code == 202
 
 
-def test_a_dataset_counts_with_all_its_cells_until_it_ends(
-    make_twins: Twins, keys: KeyFile, services: Services
-) -> None:
+def test_a_dataset_counts_with_all_cells_until_it_ends(make_twins: Twins, keys: KeyFile, services: Services) -> None:
     headers = bearer(keys.add("me", Scope.SUBMIT, limits=KeyLimits(grasps_in_flight=64)))
     client, _ = make_twins()
     matrix = {"name": "d", "hands": ["allegro", "barrett"], "objects": ["mug"], "grasps": 32}

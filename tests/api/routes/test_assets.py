@@ -1,20 +1,33 @@
-"""Uploads of hands and objects."""
+"""Uploads of hands, objects and networks."""
 
-from __future__ import annotations
-
+import asyncio
+import io
+import json
+import threading
 from typing import Any
 
+import httpx
+import numpy as np
 import pytest
+from fastapi import FastAPI
 from starlette.testclient import TestClient
 
+from graspd.api.routes import assets
+from graspd.api.routes.dependencies import RequestLimiter
 from graspd.api.uploads import files_of_upload, name_of_upload
-from graspd.service.model.errors import InputError, LimitError
+from graspd.service.model import names
+from graspd.service.model.errors import InputError, LimitError, UnavailableError
 from graspd.service.model.states import AssetKind
 from graspd.service.pipeline.backends import Services
 from graspd.service.settings import Settings
+from graspd.service.store import network_file
 from graspd.service.store.asset_summary import summary
 from graspd.service.store.library import load_asset, load_asset_files
+from graspd.service.store.network_file import NETWORK_FILE, to_bytes
 from tests.api.factories import zipped
+from tests.networks import random_network
+from tests.service.store.test_asset_files import HOSTILE
+from tests.waiting import PATIENCE_S
 
 STL = b"solid box\nendsolid box\n"
 
@@ -98,3 +111,144 @@ def test_files_of_a_zip_are_its_folders_or_its_asset_jsons() -> None:
 )
 def test_a_file_name_becomes_a_plain_name(filename: str, name: str) -> None:
     assert name_of_upload(filename) == name
+
+
+def test_sixty_long_uploads_keep_no_other_request_waiting(app: FastAPI, monkeypatch: pytest.MonkeyPatch) -> None:
+    hold = threading.Event()
+    inside = threading.Semaphore(0)
+
+    def takes_long(*_: object, **__: object) -> dict[str, bytes]:
+        inside.release()
+        hold.wait(PATIENCE_S)
+        raise UnavailableError("it took too long")
+
+    monkeypatch.setattr(assets, "files_of_upload", takes_long)
+
+    async def use() -> tuple[list[int], list[httpx.Response]]:
+        transport = httpx.ASGITransport(app=app)
+        async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1:8000", timeout=60) as client:
+            files = {"file": ("bomb.zip", b"PK")}
+            uploads = [asyncio.create_task(client.post("/v1/objects", files=files)) for _ in range(60)]
+            await asyncio.to_thread(inside.acquire)
+            try:
+                async with asyncio.timeout(PATIENCE_S):
+                    # What is over the bound is refused at once; only then is everybody else where they wait.
+                    while sum(task.done() for task in uploads) < 24:
+                        await asyncio.sleep(0.01)
+                    others = [(await client.get(path)).status_code for path in ("/healthz", "/v1/objects")]
+            finally:
+                hold.set()
+            return others, list(await asyncio.gather(*uploads))
+
+    others, answers = asyncio.run(use())
+    assert others == [200, 200]
+    assert {(answer.status_code, "retry-after" in answer.headers) for answer in answers} == {(503, True)}
+
+
+def test_a_turn_that_does_not_come_in_time_is_refused() -> None:
+    async def use() -> None:
+        turns = RequestLimiter(1, patience_s=0.05)
+        hold = threading.Event()
+        first = asyncio.create_task(turns.run(hold.wait, PATIENCE_S))
+        await asyncio.sleep(0)
+        try:
+            with pytest.raises(UnavailableError):
+                await turns.run(int)
+        finally:
+            hold.set()
+        await first
+        assert await turns.run(int, "7") == 7
+
+    asyncio.run(use())
+
+
+JOB = {"hand": "barrett", "object": "mug", "scene": "table", "method": "learned", "options": {"network": "net"}}
+
+
+def of_hand(http: TestClient, hand: str = "barrett", seed: int = 0) -> bytes:
+    return to_bytes(random_network(hand=hand, digest=http.get(f"/v1/hands/{hand}").json()["digest"], seed=seed))
+
+
+def upload(http: TestClient, data: bytes, filename: str = "net.npz", **said: str) -> Any:
+    return http.post("/v1/networks", files={"file": (filename, data)}, data=said)
+
+
+def test_an_uploaded_network_can_be_used_at_once(http: TestClient, services: Services) -> None:
+    data = of_hand(http)
+    answer = upload(http, data)
+    assert answer.status_code == 201, answer.text
+    shown = http.get(answer.headers["location"]).json()
+    assert (shown["name"], shown["verdict"], shown["kind"]) == ("net", "accept", "network")
+    barrett = http.get("/v1/hands/barrett").json()["digest"]
+    assert (shown["facts"]["hand"], shown["facts"]["hand_digest"]) == ("barrett", barrett)
+    assert shown["facts"]["about"] == "drawn by chance" and shown["created"] and shown["size_bytes"] > len(data)
+    assert load_asset_files(services.store, AssetKind.NETWORK, shown["digest"])[NETWORK_FILE] == data
+    assert [one["name"] for one in http.get("/v1/networks").json()["items"]] == ["net"]
+    assert list(services.index.feed.ready_checks(now=1e12, limit=9)) == [], "no worker is asked"
+
+
+def test_the_same_file_is_the_same_network(http: TestClient) -> None:
+    data = of_hand(http)
+    first, second = (upload(http, data, filename, name="net").json() for filename in ("a.npz", "b.npz"))
+    assert first["digest"] == second["digest"]
+    assert upload(http, data, name="other").status_code == 409
+    assert upload(http, of_hand(http, seed=1)).status_code == 409, "the name stands for another one"
+
+
+def test_what_is_no_network_is_refused_in_a_line_and_not_kept(http: TestClient, services: Services) -> None:
+    with np.load(io.BytesIO(to_bytes(random_network()))) as stored:
+        arrays = {name: stored[name] for name in stored.files}
+    for what in ("no zip", "pickled text", "double"):
+        answer = upload(http, HOSTILE[what][0](arrays))
+        assert answer.status_code == 422 and "\n" not in answer.json()["detail"], (what, answer.text)
+    assert http.get("/v1/networks").json()["items"] == []
+    assert list(services.store.list(f"{names.ASSETS}/network")) == []
+
+
+def test_an_upload_that_says_what_no_network_has_is_refused(http: TestClient) -> None:
+    data = of_hand(http)
+    for filename, said, words in (
+        ("net.zip", {}, "net.zip is no network"),
+        ("net.npz", {"options": '{"units": "mm"}'}, "a network has no 'units'"),
+        ("net.npz", {"options": '{"file": "../up.npz"}'}, "not among its files"),
+        ("net.npz", {"self_test": "true"}, "only hands have a self-test"),
+        ("net.npz", {"name": "../up"}, "name"),
+    ):
+        answer = upload(http, data, filename, **said)
+        assert answer.status_code == 422 and words in answer.text
+
+
+def test_a_file_larger_than_any_network_is_not_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(network_file, "MAX_BYTES", 10)
+    file = io.BytesIO(b"x" * 11)
+    with pytest.raises(LimitError, match="no proposal network needs as much"):
+        files_of_upload(AssetKind.NETWORK, "net.npz", file, limit_bytes=100)
+    assert file.tell() == 0
+
+
+def test_a_job_that_the_network_does_not_fit_is_refused(http: TestClient) -> None:
+    upload(http, of_hand(http))
+    for changes, status, words in (
+        ({"hand": "allegro"}, 422, "proposes grasps of barrett"),
+        ({"scene": "free"}, 422, "objects on a table"),
+        ({"scene": {"supports": [{"kind": "half_space", "normal": [0, 0.1, 1]}]}}, 422, "objects on a table"),
+        ({"options": {"network": "none"}}, 404, "there is no network 'none'; there are: net"),
+        ({"options": {"network": "/etc/passwd"}}, 404, "there is no network"),
+    ):
+        job = JOB | changes
+        options = {name: value for name, value in job.items() if name not in ("hand", "object")}
+        dataset = {"name": "d", "hands": [job["hand"]], "objects": [job["object"]], **options}
+        for path, body in (("/v1/jobs", job), ("/v1/datasets", dataset)):
+            answer = http.post(path, json=body)
+            assert answer.status_code == status and words in json.dumps(answer.json(), ensure_ascii=False), answer.text
+
+
+def test_the_page_of_hands_shows_networks_while_there_are_any(http: TestClient) -> None:
+    assert "Networks" not in http.get("/hands").text
+    digest = upload(http, of_hand(http)).json()["digest"]
+    page = http.get("/hands").text
+    barrett = http.get("/v1/hands/barrett").json()["digest"]
+    assert digest[:12] in page and f"barrett ({barrett[:12]})" in page and "drawn by chance" in page
+    assert http.get("/v1/networks/net/model").status_code == 404
+    assert http.delete("/v1/networks/net").status_code == 204
+    assert http.get("/v1/networks/net").status_code == 404

@@ -1,7 +1,5 @@
 """`/v1/datasets` and `/v1/object-sets`: answers, places, pages, refusals."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest
@@ -10,8 +8,7 @@ from starlette.testclient import TestClient
 from graspd.service.pipeline.backends import Services
 from graspd.service.store.records import publish
 from tests.api.factories import finish_all
-from tests.fakes import record_of
-from tests.planning import plan_all
+from tests.fakes import plan_all, record_of
 from tests.service.pipeline.test_fidelity_choice import CHART
 
 WANTED = {"name": "kitchen", "hands": ["allegro", "barrett"], "objects": ["mug", "block"], "grasps": 64}
@@ -56,9 +53,7 @@ def test_with_auto_each_cell_says_which_fidelity_it_got(http: TestClient, servic
     assert "auto (gsr&gt;=0.6)" in http.get("/datasets/kitchen").text
 
 
-def test_cells_come_in_pages_with_a_link_to_the_next(
-    http: TestClient, services: Services, kitchen: dict[str, Any]
-) -> None:
+def test_cells_come_in_pages_with_a_next_link(http: TestClient, services: Services, kitchen: dict[str, Any]) -> None:
     finish_cells(services, http, 1)
     first = http.get("/v1/datasets/kitchen/cells", params={"limit": 3})
     address = first.headers["Link"].partition(">")[0].lstrip("<")
@@ -92,23 +87,7 @@ def test_an_estimate_records_nothing(http: TestClient) -> None:
     assert http.get("/v1/datasets").json()["items"] == []
 
 
-def test_cancel_and_retry_are_accepted_once(http: TestClient, services: Services, kitchen: dict[str, Any]) -> None:
-    answer = http.post("/v1/datasets", json=WANTED | {"grasps": 32})
-    assert answer.status_code == 409 and "another dataset named 'kitchen'" in answer.json()["detail"]
-    plan_all(services)
-    assert http.post("/v1/datasets/kitchen/retry").status_code == 409
-    assert http.post("/v1/datasets/kitchen/cancel").status_code == 202
-    assert http.post("/v1/datasets/kitchen/cancel").status_code == 409
-    plan_all(services)
-    assert http.get("/v1/datasets/kitchen").json()["state"] == "cancelled"
-    assert http.post("/v1/datasets/kitchen/retry").status_code == 202
-    plan_all(services)
-    assert http.get("/v1/datasets/kitchen").json()["state"] == "queued"
-
-
-def test_a_snapshot_is_made_once_and_names_checksums(
-    http: TestClient, services: Services, kitchen: dict[str, Any]
-) -> None:
+def test_a_snapshot_is_made_once_with_checksums(http: TestClient, services: Services, kitchen: dict[str, Any]) -> None:
     assert http.post("/v1/datasets/kitchen/snapshots").status_code == 409
     finish_cells(services, http, 2)
     taken = http.post("/v1/datasets/kitchen/snapshots")

@@ -1,7 +1,5 @@
 """Corrections of a hand: what was guessed is said instead, and is a hand of its own."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 
@@ -134,8 +132,7 @@ def test_the_page_has_a_field_for_each_guess_without_scripts(http: TestClient) -
 )
 def test_a_wrong_form_is_shown_again_with_what_is_wrong(http: TestClient, field: str, value: str, says: str) -> None:
     answer = http.post("/hands/barrett", data={"palm_link": "palm", "fingertip": "finger_1_distal_link", field: value})
-    assert answer.status_code == 422
-    assert says in answer.text and "cannot be saved" in answer.text
+    assert answer.status_code == 422 and says in answer.text and "cannot be saved" in answer.text
 
 
 def test_hands_are_listed_with_their_own_words_as_text(http: TestClient) -> None:

@@ -1,7 +1,5 @@
 """Tags: names for grasps, in the store and in the index; grasps chosen by an expression; what is taken home of them."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json
@@ -23,7 +21,7 @@ from graspd.service.readers.where import parse
 from graspd.service.store.manifests import ShardManifest
 from graspd.service.store.shards import Shard, read_shard
 from tests.api.factories import add_job, finish_all, people_of
-from tests.planning import plan_all
+from tests.fakes import plan_all
 
 Grasps = list[dict[str, Any]]
 
@@ -85,9 +83,7 @@ def test_all_that_pass_a_filter_are_tagged(http: TestClient, made: ShardManifest
         "lift or lift_hard or clearance_m > -1",
     ],
 )
-def test_the_index_chooses_what_the_shards_choose(
-    http: TestClient, made: ShardManifest, services: Services, expression: str
-) -> None:
+def test_index_and_shards_agree(http: TestClient, made: ShardManifest, services: Services, expression: str) -> None:
     shard = shard_of(services, made)
     rows = np.flatnonzero(parse(expression)(shard.arrays, shard.attributes)).tolist()
     assert rows_of(http, where=expression) == rows
@@ -104,9 +100,7 @@ def test_an_expression_that_cannot_be_used_is_said_so(http: TestClient) -> None:
         assert answer.status_code == 422 and words in answer.json()["detail"]
 
 
-def test_tags_survive_a_rebuild_and_are_what_the_store_says(
-    http: TestClient, made: ShardManifest, services: Services
-) -> None:
+def test_tags_survive_a_rebuild_as_in_the_store(http: TestClient, made: ShardManifest, services: Services) -> None:
     give(http, "good", grasps=named(made.shard_id, 1, 2, 3))
     give(http, "gone", grasps=named(made.shard_id, 4))
     http.post("/v1/tags/good/remove", json={"grasps": named(made.shard_id, 2)})
@@ -130,9 +124,7 @@ def test_a_tag_is_made_anew_after_its_end_even_if_that_broke_off(
     assert rows_of(http, tag="good") == [7]
 
 
-def test_what_is_not_there_or_too_much_gets_no_tag(
-    http: TestClient, made: ShardManifest, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_absent_or_too_much_gets_no_tag(http: TestClient, made: ShardManifest, monkeypatch: pytest.MonkeyPatch) -> None:
     def refused(status: int, **body: Any) -> str:
         answer = http.post("/v1/tags", json={"name": "good", **body})
         assert answer.status_code == status, answer.text

@@ -1,7 +1,5 @@
 """The feed of ends, and webhooks: who is told what, signed how, and tried how often."""
 
-from __future__ import annotations
-
 import hashlib
 import hmac
 import json
@@ -27,7 +25,7 @@ from graspd.service.pipeline.webhook_dispatcher import AT_ONCE, SLOW_AT_ONCE, We
 from graspd.service.settings import Settings
 from tests.api.conftest import BASE_URL
 from tests.api.factories import add_job, finish_all, people_of
-from tests.planning import plan_all
+from tests.fakes import plan_all
 from tests.waiting import PATIENCE_S, until
 
 ADDRESS = "https://ci.example.org/graspd"
@@ -134,9 +132,7 @@ def test_what_is_not_taken_is_retried_with_longer_waits(http: TestClient, servic
     assert len({headers["X-Graspd-Delivery"] for _, _, headers in ear.heard}) == 1
 
 
-def test_a_webhook_is_told_of_the_ends_it_asked_for_from_then_on(
-    http: TestClient, services: Services, ear: Ear
-) -> None:
+def test_a_webhook_is_told_of_later_ends_it_asked_for(http: TestClient, services: Services, ear: Ear) -> None:
     end_a_job(services, seed=1)
     add(http, states=["failed"])
     hook = add(http)
@@ -232,9 +228,7 @@ def test_silent_addresses_keep_no_other_waiting(services: Services, dead: int, t
         ear.let_go.set()
 
 
-def test_a_burst_of_ends_is_told_without_a_pause_between_them(
-    services: Services, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_burst_of_ends_is_told_without_a_pause(services: Services, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("graspd.service.pipeline.webhook_dispatcher._PAUSE_S", PATIENCE_S)
     ear, stop = Ear(services), threading.Event()
     ear.dispatcher = WebhookDispatcher(services, stop, send=ear.send)

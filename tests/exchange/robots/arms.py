@@ -1,7 +1,5 @@
 """A six-joint arm of cylinders and boxes, shaped like the common ones: reach 0.85 m, a spherical wrist."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 #: Joint: parent offset [m], axis, limits [rad], velocity [rad/s]; link: radius and length of its cylinder [m].

@@ -1,7 +1,5 @@
 """An arm that carries the hand: it is where the hand should be, within its limits, and runs into nothing."""
 
-from __future__ import annotations
-
 import csv
 import re
 import sys
@@ -11,6 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+import yaml
 import yourdfpy
 
 from graspd.exchange.robots.execution import ASSUMED_RAD_S
@@ -55,9 +54,7 @@ def test_the_share_of_grasps_that_the_arm_reaches_is_told(carried: tuple[dict[st
     assert sum(told["refused"].values()) == told["candidates"] - told["grasps"]
 
 
-def test_the_arm_holds_the_hand_where_the_grasp_has_it_all_along(
-    carried: tuple[dict[str, Any], Path], arm: Path
-) -> None:
+def test_the_arm_holds_the_hand_where_the_grasp_has_it_all_along(carried, arm: Path) -> None:
     """yourdfpy's forward kinematics is the oracle; poses are told in the frame of the arm's base."""
     robot = yourdfpy.URDF.load(str(arm), load_meshes=False, build_scene_graph=True)
     for row in rows(carried[1])[::5]:
@@ -98,12 +95,10 @@ def test_arms_scene_opens_in_mujoco_and_nothing_of_arm_touches(table_shard: Path
 
 
 def test_moveit_is_told_poses_in_the_arms_base_and_all_joints(table_shard: Path, arm: Path, tmp_path: Path) -> None:
-    import yaml
-
     export(table_shard, arm, tmp_path, "moveit")
     grasps = yaml.safe_load((tmp_path / "grasps.yaml").read_text())
     assert {grasp["grasp_pose"]["header"]["frame_id"] for grasp in grasps} == {"base"}
-    file = sorted((tmp_path / "trajectories").iterdir())[0]
+    file = min((tmp_path / "trajectories").iterdir())
     assert yaml.safe_load(file.read_text())["joint_trajectory"]["joint_names"][:6] == NAMES
 
 
@@ -117,21 +112,17 @@ def test_moveit_is_told_poses_in_the_arms_base_and_all_joints(table_shard: Path,
         (["--mount", "flange", "--base", "0 0 0"], "--base '0 0 0' is no pose"),
     ],
 )
-def test_an_arm_that_cannot_is_refused_in_a_line(
-    options: list[str], said: str, free_shard: Path, arm: Path, tmp_path: Path
-) -> None:
+def test_an_arm_that_cannot_is_refused_in_a_line(options, said: str, free_shard: Path, arm: Path, tmp_path) -> None:
     told = refused("export --format csv", free_shard, "--arm", arm, *options, "-o", tmp_path / "out")
     assert re.search(said, told) and not (tmp_path / "out").exists()
 
 
-def test_base_without_an_arm_and_an_arm_without_mink_are_refused(
-    free_shard: Path, arm: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_base_without_an_arm_and_an_arm_without_mink_are_refused(free_shard, arm: Path, tmp_path, monkeypatch) -> None:
     words = "export --format csv"
     assert "--arm ARM.urdf" in refused(words, free_shard, "--base", "0 0 0 1 0 0 0", "-o", tmp_path)
     monkeypatch.setitem(sys.modules, "mink", None)
-    arms = refused(words, free_shard, "--arm", arm, "--mount", "flange", "-o", tmp_path)
-    assert "pip install 'graspd[arm]'" in arms
+    said = refused(f"{words} --mount flange --arm", arm, free_shard, "-o", tmp_path)
+    assert "pip install 'graspd[arm]'" in said
 
 
 def test_speeds_that_the_arm_does_not_state_are_assumed_and_told(free_shard: Path, tmp_path: Path) -> None:

@@ -1,7 +1,5 @@
 """The way of a grasp: free of the object, in the frame that was asked for, within the limits of the joints."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,19 +9,8 @@ import pytest
 import trimesh
 
 from graspd.exchange.inputs import load_case
-from graspd.exchange.robots.execution import (
-    ASSUMED_RAD_S,
-    HAND_M_S,
-    POSTURES,
-    Executions,
-    Limits,
-    executions,
-    hand_limits,
-    parse_pose,
-    straight_paths,
-    timed,
-    tool_frame,
-)
+from graspd.exchange.robots import execution
+from graspd.exchange.robots.execution import POSTURES, Executions, executions, straight_paths, timed, tool_frame
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import IDENTITY_POSE, apply, compose, invert, slerp
 from graspd.service.store.shards import read_shard
@@ -39,16 +26,9 @@ TOOL = tool_frame(None, "palm", {})
 
 def of_shard(file: Path) -> Executions:
     case = load_case(file)
-    count = len(case.grasps)
-    return executions(
-        case.hand,
-        case.obj,
-        case.grasps,
-        rows=np.arange(count),
-        placed=case.placed,
-        tool=TOOL,
-        quality={"valid": read_shard(file, kind="base")["quality/valid"]},
-    )
+    given = {"rows": np.arange(len(case.grasps)), "placed": case.placed, "tool": TOOL}
+    quality = {"valid": read_shard(file, kind="base")["quality/valid"]}
+    return executions(case.hand, case.obj, case.grasps, **given, quality=quality)
 
 
 @pytest.fixture(scope="module")
@@ -116,7 +96,8 @@ def test_the_tool_frame_is_a_link_or_a_pose(free: Executions) -> None:
         found = replace(free, tool=tool_frame(text, "palm", links))
         np.testing.assert_allclose(found.tool_pose("grasp")[:, :3], apply(root, np.array([0, 0, 0.1])), atol=1e-12)
     assert tool_frame("palm", "palm", links).name == "palm"
-    assert np.linalg.norm(parse_pose("0 0 0 0.7071 0 0 0.7071", "--base")[3:]) == pytest.approx(1.0, abs=1e-12)
+    rounded = execution.parse_pose("0 0 0 0.7071 0 0 0.7071", "--base")
+    assert np.linalg.norm(rounded[3:]) == pytest.approx(1.0, abs=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -146,20 +127,18 @@ def test_trajectories_stay_within_limits_and_reach_every_posture(free: Execution
         # Secants of a motion are no steeper than its steepest tangent; 1e-9: rounding.
         assert (np.abs(np.diff(found.joints, axis=0)) / step[:, None] <= speed * velocity * (1 + 1e-9)).all()
         along = np.linalg.norm(np.diff(found.hand_pose[:, :3], axis=0), axis=1) / step
-        assert along.max() <= speed * HAND_M_S * (1 + 1e-9)
-        assert not found.velocity[[0, -1]].any()
+        assert along.max() <= speed * execution.HAND_M_S * (1 + 1e-9) and not found.velocity[[0, -1]].any()
         ends = [0] + [k for k in range(len(step)) if found.phase[k] != found.phase[k + 1]] + [len(step)]
         ends = sorted(set(ends) - {0}) if len(ends) > len(POSTURES) else ends
         for posture_name, k in zip(POSTURES, ends, strict=True):
-            np.testing.assert_allclose(
-                found.joints[k], free.postures[posture_name].joint_positions[row], atol=1e-9, err_msg=posture_name
-            )
+            joints = free.postures[posture_name].joint_positions[row]
+            np.testing.assert_allclose(found.joints[k], joints, atol=1e-9, err_msg=posture_name)
 
 
 def test_limits_are_those_of_the_hand_or_assumed(free: Executions) -> None:
     hand = replace(free.hand, velocity=np.concatenate([[3.0], np.zeros(free.hand.dofs - 1)]))
-    found: Limits = hand_limits(hand)
+    found = execution.hand_limits(hand)
     leads = hand.dof[hand.joint_body] == 0
     np.testing.assert_allclose(found.velocity[leads], 3.0 * np.abs(hand.multiplier[hand.joint_body][leads]))
-    assert (found.velocity[~leads] == ASSUMED_RAD_S).all()
+    assert (found.velocity[~leads] == execution.ASSUMED_RAD_S).all()
     assert set(found.assumed) == {name for name, led in zip(hand.joint_names, leads, strict=True) if not led}

@@ -1,7 +1,5 @@
 """Each format of robots, opened by what reads it; the page of robots works as it stands."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re
@@ -21,14 +19,14 @@ import yaml
 from graspd import service
 from graspd.commands.exchange import ROBOTS
 from graspd.exchange.inputs import load_case
-from graspd.service.model.transforms import compose, invert, pose_to_matrix, quat_to_matrix
+from graspd.service.model.transforms import IDENTITY_POSE, compose, invert, pose_to_matrix, quat_to_matrix
 from graspd.service.store.shards import read_shard, write_shard
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.rendering.hands import hand_parts
 from tests.conftest import REPOSITORY
 from tests.exchange.robots.arms import write_arm
-from tests.exchange.robots.shards import COMMON, make
+from tests.exchange.robots.conftest import COMMON
 from tests.worker.commands_run import graspd, refused
 
 BLOCK = next(Path(service.__file__).parent.glob("builtin/objects/block/*.stl"))
@@ -54,8 +52,8 @@ def export_of(hand: str, format_: str, folder: Path) -> Path:
     """Export grasps of a built-in hand on an object whose name no format takes as it is."""
     thing = folder / "003_mug.v2-final.stl"
     thing.write_bytes(BLOCK.read_bytes())
-    made = make(f"--hand {hand} -n 2 {COMMON}", folder / "grasps.h5", "--object", thing)
-    export(made, format_, folder / format_)
+    graspd(f"synth --hand {hand} -n 2 {COMMON} --object", thing, "-o", folder / "grasps.h5")
+    export(folder / "grasps.h5", format_, folder / format_)
     return folder / format_
 
 
@@ -84,9 +82,7 @@ def validated(shard: Path) -> list[bool]:
 
 
 @pytest.mark.parametrize("which", ["free_shard", "table_shard", "pressing_shard", "clutter_shard"])
-def test_a_mujoco_scene_replays_to_the_verdict_of_the_validator(
-    which: str, request: pytest.FixtureRequest, tmp_path: Path
-) -> None:
+def test_a_mujoco_scene_replays_to_the_verdict_of_the_validator(which: str, request, tmp_path) -> None:
     shard = limp(request.getfixturevalue(which), tmp_path / "limp.h5")
     told = export(shard, "mujoco", tmp_path)
     # A script that has only mujoco and numpy must do: -I keeps this checkout out of its reach.
@@ -94,9 +90,8 @@ def test_a_mujoco_scene_replays_to_the_verdict_of_the_validator(
     found = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
     verdicts = validated(shard)
     assert len(found) == told["grasps"] and set(verdicts) == {True, False}
-    assert {name: what == "held" for name, what in found.items()} == {
-        name: verdicts[int(name.removeprefix("grasp_"))] for name in found
-    }
+    for name, what in found.items():
+        assert (what == "held") == verdicts[int(name.removeprefix("grasp_"))], name
 
 
 def test_a_mujoco_scene_has_the_hands_names_and_key_frames(table_shard: Path, tmp_path: Path) -> None:
@@ -120,27 +115,25 @@ def test_a_mujoco_scene_has_the_hands_names_and_key_frames(table_shard: Path, tm
 
 
 def test_an_isaac_file_has_the_fields_of_its_documentation(free_shard: Path, tmp_path: Path) -> None:
-    told = export(free_shard, "isaac", tmp_path)
+    count = export(free_shard, "isaac", tmp_path)["grasps"]
     found = yaml.safe_load((tmp_path / "barrett_block.yaml").read_text())
     assert found["format"] == "isaac_grasp" and float(found["format_version"]) == 1.0
     assert found["object_frame_link"] == found["object_frame"] == "/World/block"
     assert found["gripper_frame_link"] == found["gripper_frame"] == "/World/barrett/palm"
-    assert len(found["grasps"]) == told["grasps"]
+    assert len(found["grasps"]) == count
     case = load_case(free_shard)
     valid = read_shard(free_shard, kind="base")["quality/valid"]
-    mimics = {"finger_1_spread"}
     for name, grasp in found["grasps"].items():
         row = int(name.removeprefix("grasp_"))
         pose = case.grasps.grasp.hand_pose[row]
-        np.testing.assert_allclose(
-            [*grasp["position"], grasp["orientation"]["w"], *grasp["orientation"]["xyz"]], pose, atol=1e-8
-        )
+        told = [*grasp["position"], grasp["orientation"]["w"], *grasp["orientation"]["xyz"]]
+        np.testing.assert_allclose(told, pose, atol=1e-8)
         assert grasp["confidence"] == float(valid[row])
         assert set(grasp["cspace_position"]) == set(grasp["pregrasp_cspace_position"])
         joints = dict(zip(case.hand.joint_names, case.grasps.grasp.joint_positions[row], strict=True))
         for joint, value in grasp["cspace_position"].items():
             assert value == pytest.approx(joints[joint], abs=1e-8)
-        assert mimics <= set(grasp["cspace_position"]) < set(joints), "driven joints, and no coupled ones"
+        assert {"finger_1_spread"} <= set(grasp["cspace_position"]) < set(joints), "driven joints, and no coupled ones"
 
 
 def test_moveit_grasps_have_the_fields_of_the_messages(table_shard: Path, tmp_path: Path) -> None:
@@ -148,8 +141,7 @@ def test_moveit_grasps_have_the_fields_of_the_messages(table_shard: Path, tmp_pa
     grasps = yaml.safe_load((tmp_path / "grasps.yaml").read_text())
     assert len(grasps) == told["grasps"]
     for grasp in grasps:
-        assert set(grasp) == GRASP
-        assert grasp["grasp_pose"]["header"]["frame_id"] == "scene"
+        assert set(grasp) == GRASP and grasp["grasp_pose"]["header"]["frame_id"] == "scene"
         x, y, z, w = (grasp["grasp_pose"]["pose"]["orientation"][k] for k in "xyzw")
         assert x * x + y * y + z * z + w * w == pytest.approx(1.0, abs=1e-6)
         for name, points in (("pre_grasp_posture", 1), ("grasp_posture", 2)):
@@ -184,8 +176,7 @@ def test_tables_name_their_columns_and_hold_what_the_shard_holds(free_shard: Pat
     with (tmp_path / "postures.csv").open() as file:
         rows = list(csv.DictReader(file))
     case = load_case(free_shard)
-    grasps = [row for row in rows if row["posture"] == "grasp"]
-    for row in grasps:
+    for row in (row for row in rows if row["posture"] == "grasp"):
         number = int(row["grasp"].removeprefix("grasp_"))
         tool = np.array([float(row[part]) for part in ("x", "y", "z", "qw", "qx", "qy", "qz")])
         root = compose(tool, invert(np.array([0, 0, 0.1, 1, 0, 0, 0])))
@@ -213,22 +204,16 @@ ROUNDING_M = 2e-6
 def expected(shard: Path, row: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Vertices of the hand's bodies in the frame of the scene or the object, and the object's matrix there."""
     case = load_case(shard)
-    at = np.array([0, 0, 0, 1, 0, 0, 0.0]) if case.placed is None else case.placed.object_pose[case.placed.index[row]]
-    grasp = case.grasps.grasp
-    bodies = pose_to_matrix(at) @ pose_to_matrix(
-        body_poses(case.hand, grasp.hand_pose[row], grasp.joint_positions[row])[0]
-    )
-    found = {
-        case.hand.body_names[part.body]: trimesh.transform_points(part.solid.vertices, bodies[part.body])
-        for part in hand_parts(case.hand)
-    }
-    return found, pose_to_matrix(at)
+    at = IDENTITY_POSE if case.placed is None else case.placed.object_pose[case.placed.index[row]]
+    grasp, names = case.grasps.grasp, case.hand.body_names
+    poses = body_poses(case.hand, grasp.hand_pose[row], grasp.joint_positions[row])[0]
+    bodies = pose_to_matrix(at) @ pose_to_matrix(poses)
+    parts = [(names[part.body], part.solid.vertices, bodies[part.body]) for part in hand_parts(case.hand)]
+    return {name: trimesh.transform_points(points, body) for name, points, body in parts}, pose_to_matrix(at)
 
 
 @pytest.mark.parametrize("which", ["free_shard", "table_shard"])
-def test_trimesh_reads_grasp_whose_parts_stand_where_they_should(
-    which: str, request: pytest.FixtureRequest, tmp_path: Path
-) -> None:
+def test_trimesh_reads_grasp_whose_parts_stand_where_they_should(which: str, request, tmp_path) -> None:
     shard = request.getfixturevalue(which)
     told = export(shard, "glb", tmp_path)
     files = sorted(tmp_path.glob("*.glb"))
@@ -254,7 +239,7 @@ def test_usd_opens_a_grasp_in_metres_that_moves_to_the_lift(table_shard: Path, t
     usd = pytest.importorskip("pxr.Usd")
     geometry = pytest.importorskip("pxr.UsdGeom")
     export(table_shard, "usd", tmp_path)
-    file = sorted(tmp_path.glob("*.usd"))[0]
+    file = min(tmp_path.glob("*.usd"))
     stage = usd.Stage.Open(str(file))
     assert geometry.GetStageMetersPerUnit(stage) == 1.0 and geometry.GetStageUpAxis(stage) == "Z"
     assert stage.GetDefaultPrim().GetPath() == "/World"
@@ -278,9 +263,7 @@ def test_usd_opens_a_grasp_in_metres_that_moves_to_the_lift(table_shard: Path, t
     assert stage.GetPrimAtPath("/World/scene/support_0/mesh").IsValid()
 
 
-def test_without_usd_core_a_line_says_what_to_install(
-    free_shard: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_usd_core_a_line_says_what_to_install(free_shard: Path, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "pxr", None)
     assert "pip install 'graspd[usd]'" in refused("export --format usd", free_shard, "-o", tmp_path)
 

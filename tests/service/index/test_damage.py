@@ -1,7 +1,5 @@
 """An index that is lost, removed under its readers, or damaged; and a store some of whose records are damaged."""
 
-from __future__ import annotations
-
 import json
 import os
 import sqlite3
@@ -102,17 +100,14 @@ RECORDS = [of_job, of_manifest, of_attempt, of_event, of_asset, of_check, of_dat
 
 
 @pytest.mark.parametrize("record", RECORDS)
-def test_a_damaged_record_is_left_out_of_a_lost_index_and_named(
-    services: Services, record: Callable[[Services], str]
-) -> None:
+def test_a_rebuild_leaves_out_damage_and_names_it(services: Services, record: Callable[[Services], str]) -> None:
     key = record(services)
     overwrite(services.store, key, DAMAGED)
     fresh = lost(services)
     Controller(fresh).round()
     assert shown(fresh.index) == GOOD - (record is of_job)
     made = fresh.index.notes.completeness()
-    assert made is not None
-    assert (made.left_out, made.names) == (1, (key,))
+    assert made is not None and (made.left_out, made.names) == (1, (key,))
     fresh.index.close()
 
 

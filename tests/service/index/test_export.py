@@ -1,7 +1,5 @@
 """Tables of the index as Parquet files, read by pyarrow itself."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -38,9 +36,7 @@ def test_no_table_holds_what_is_secret(services: Services, tmp_path: Path) -> No
     assert not {name for name in columns if "secret" in name or "token" in name or "url" in name}
 
 
-def test_without_pyarrow_the_error_says_what_to_install(
-    services: Services, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_pyarrow_the_fix_is_told(services: Services, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
     with pytest.raises(InputError, match=r"graspd\[parquet\]"):
         export(services.index.database, tmp_path)

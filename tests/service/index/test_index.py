@@ -1,19 +1,17 @@
 """The index: what the API asks of it, that it holds the same rows as a rebuild, and several that write it at once."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import threading
 import time
 from collections.abc import Callable, Iterator
-from datetime import datetime
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from pydantic import SecretStr
-from sqlalchemy import delete, insert, update
+from sqlalchemy import delete, insert, select, update
 
 from graspd.service.index import tables
 from graspd.service.index.index import Index
@@ -166,13 +164,11 @@ def test_the_service_in_numbers(services: Services) -> None:
     before = timestamp()
     finish(services, job.id, batches=1)
     stats = services.index.overview.stats()
-    assert (stats.grasps, stats.shards) == (32, 2)
-    assert stats.tasks[State.SUCCEEDED] == 2
+    assert (stats.grasps, stats.shards) == (32, 2) and stats.tasks[State.SUCCEEDED] == 2
     assert stats.jobs[State.RUNNING] == 1
     (cell,) = services.index.overview.matrix()
     assert (cell.hand, cell.object, cell.jobs, cell.grasps, cell.queued) == ("gripper", "ball", 1, 32, 2)
-    made = services.index.overview.throughput(since=before)
-    assert sum(bucket.grasps for bucket in made) == 32
+    assert sum(services.index.overview.valid_per_minute(since=before).values()) == stats.valid > 0
 
 
 def test_the_jobs_of_a_key_are_fed_in_turn_batch_by_batch(services: Services) -> None:
@@ -282,11 +278,7 @@ def test_every_kind_of_damage_to_the_index_is_seen_and_mended(services: Services
 def test_a_rebuild_that_breaks_off_leaves_the_old_rows(services: Services, monkeypatch: pytest.MonkeyPatch) -> None:
     build_a_history(services)
     jobs = len(services.index.jobs.page(limit=99).items)
-
-    def away(_store: Store, key: str) -> bytes:
-        raise StoreUnavailable("away")
-
-    monkeypatch.setattr(Store, "get", away)
+    monkeypatch.setattr(Store, "get", Mock(side_effect=StoreUnavailable("away")))
     with pytest.raises(StoreUnavailable):
         rebuild(services.index, services.store)
     assert len(services.index.jobs.page(limit=99).items) == jobs
@@ -305,9 +297,7 @@ WAYS: list[tuple[int, tuple[int, ...]]] = [(1000, (8, 16)), (0, (8, 16)), (0, (1
 
 
 @pytest.mark.parametrize("sort", [GraspSort(), GraspSort(by="penetration_depth_mm", descending=False)])
-def test_every_way_of_searching_finds_the_same(
-    services: Services, monkeypatch: pytest.MonkeyPatch, sort: GraspSort
-) -> None:
+def test_every_search_finds_the_same(services: Services, monkeypatch: pytest.MonkeyPatch, sort: GraspSort) -> None:
     job, _ = job_actions.submit(services, request(grasps=160))
     finish(services, job.id)
     everything = services.index.grasps.page(sort=sort, limit=200).items
@@ -325,21 +315,21 @@ def test_every_way_of_searching_finds_the_same(
         assert all_pages(services, where, sort=sort, limit=7) == passing, (where, sorted_at_once, looked_at)
 
 
-def test_what_was_made_adds_up_in_intervals_of_any_length(services: Services) -> None:
-    job, _ = job_actions.submit(services, request(grasps=96, scenes=1))
+def test_valid_grasps_add_up_minute_by_minute(services: Services) -> None:
+    job, _ = job_actions.submit(services, request(grasps=128, scenes=1))
     finish(services, job.id)
     hour = "2026-05-01T{:02}:{:02}:{:02}.123Z"
     times = [hour.format(7, 59, 59), hour.format(8, 0, 0), hour.format(8, 0, 44), hour.format(9, 30, 1)]
+    base = tables.shards.c.kind == "base"
     with services.index.database.writing() as connection:
-        for number, shard in enumerate(services.index.shards.page(job=job.id, limit=9).items):
-            change = update(tables.shards).where(tables.shards.c.id == shard.id)
-            connection.execute(change.values(created=times[number % 4]))
-    seconds = [int(datetime.fromisoformat(x).timestamp()) for x in times]
-    for bucket_s in (1, 45, 60, 3600, 5400, 86400):
-        buckets = services.index.overview.throughput(since="2026-05-01T00:00:00Z", bucket_s=bucket_s)
-        assert (sum(b.grasps for b in buckets), sum(b.tasks for b in buckets)) == (96, 6), bucket_s
-        starts = [datetime.fromisoformat(bucket.start).timestamp() for bucket in buckets]
-        assert starts == sorted({t - t % bucket_s for t in seconds}), bucket_s
+        made = connection.execute(select(tables.shards.c.id, tables.shards.c.valid).where(base)).all()
+        for (shard, _), created in zip(made, times, strict=True):
+            connection.execute(update(tables.shards).where(tables.shards.c.id == shard).values(created=created))
+    late, early, second, last = (valid for _, valid in made)
+    assert early and second
+    expected = {"2026-05-01T07:59": late, "2026-05-01T08:00": early + second, "2026-05-01T09:30": last}
+    assert services.index.overview.valid_per_minute(since="2026-05-01T00:00") == expected
+    assert services.index.overview.valid_per_minute(since="2026-05-01T09:30") == {"2026-05-01T09:30": last}
 
 
 def test_writers_at_once_leave_the_rows_of_the_store(services: Services, index_url: str) -> None:

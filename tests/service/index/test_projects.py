@@ -1,7 +1,5 @@
 """What projects used, day by day, and whose turn it is when they share the queue."""
 
-from __future__ import annotations
-
 from graspd.service.index.rebuild import rebuild
 from graspd.service.index.views import UsageDay
 from graspd.service.model import names

@@ -1,7 +1,5 @@
 """Means and distributions counted by the database, held against NumPy."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What every error keeps: one line, no secret, words of this project; and names that do not fit."""
 
-from __future__ import annotations
-
 import logging
 from pathlib import Path
 from typing import Any
@@ -11,8 +9,8 @@ from pydantic import ValidationError
 
 from graspd.api.uploads import name_of_upload
 from graspd.exchange.plan import plain_name
+from graspd.service.index.condition import look
 from graspd.service.index.index import Index
-from graspd.service.index.sample import look
 from graspd.service.model.base import refusal
 from graspd.service.model.errors import ERRORS, GraspdError, InputError, without_secrets
 from graspd.service.model.names import fitted
@@ -124,9 +122,7 @@ def test_settings_show_no_secret(monkeypatch: pytest.MonkeyPatch) -> None:
 LONG = "mujoco-Office_Depot_Canon_CL211XL_Remanufactured_Ink_Cartridge_TriColor"
 
 
-def test_a_long_name_of_an_upload_is_refused_and_one_of_others_is_cut_and_told(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_a_long_name_of_an_upload_is_refused_others_are_cut(caplog: pytest.LogCaptureFixture) -> None:
     with pytest.raises(
         InputError, match=f"the name {LONG} has 71 characters, and at most 64 are allowed; give a shorter"
     ):

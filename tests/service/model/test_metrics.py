@@ -1,7 +1,5 @@
 """One row more in the table of metrics is found everywhere: stored, indexed, filtered, shown and documented."""
 
-from __future__ import annotations
-
 import json
 import sys
 from typing import Any
@@ -10,8 +8,6 @@ import pytest
 
 from benchmarks.large_index import fill
 from graspd.service.index.index import Index
-from graspd.service.model.metrics import GRASP_METRICS
-from graspd.service.store.columns import SCHEMAS
 from graspd.service.store.store import open_store
 from tests.conftest import REPOSITORY
 from tests.one_more_metric import MEANING, NAME, TITLE
@@ -25,7 +21,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Found:
     folder = tmp_path_factory.mktemp("metric")
     older = f"sqlite:///{folder / 'older.sqlite'}"
     index = Index(older)
-    fill(index, open_store("memory://"), grasps=600, jobs=20)
+    fill(index, open_store("memory://"), grasps=64, jobs=2)
     index.close()
     command = [sys.executable, "-m", "tests.one_more_metric", str(folder / "new"), older]
     (folder / "new").mkdir()
@@ -34,14 +30,8 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Found:
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def test_the_metric_is_in_no_table_of_this_process() -> None:
-    assert NAME not in {metric.name for metric in GRASP_METRICS}
-    assert f"quality/{NAME}" not in SCHEMAS["base"]
-
-
 def test_shard_manifest_and_index_have_it_and_an_older_index_too(found: Found) -> None:
-    assert found["schema"] == MEANING
-    assert found["manifest"][0] == 0 and found["manifest"][-1] == 20
+    assert found["schema"] == MEANING and found["manifest"][0] == 0 and found["manifest"][-1] == 20
     assert NAME in found["index columns"] and f"grasps_{NAME}" in found["index indexes"]
     assert found["older index"] == [None] * 50
 

@@ -1,7 +1,5 @@
 """From pixels to points and normals, against closed forms."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

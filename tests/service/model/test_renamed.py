@@ -1,7 +1,5 @@
 """Stores, shards and tasks of graspd 0.2 are read under today's names, and their addresses stay."""
 
-from __future__ import annotations
-
 import io
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What users may say of a scene, and what they are told when it is nonsense."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

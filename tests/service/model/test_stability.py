@@ -1,7 +1,5 @@
 """The record of the maps of failure: what still breaks, and numbers short enough for a small square."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

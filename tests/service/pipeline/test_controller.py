@@ -1,10 +1,9 @@
 """The controller on in-memory services: lost workers, lost events, lost queue, lost index, parts that are away."""
 
-from __future__ import annotations
-
 import json
 import threading
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -117,12 +116,12 @@ def test_while_redis_takes_no_writes_nobody_is_called_silent(bench: Bench, monke
     job_actions.submit(bench.services, request())
     held = bench.take()
     bench.pass_time(2, beating=held)
-
-    def full(part: str, seconds: float) -> None:
-        raise QueueUnavailable("Redis does not answer (MISCONF: the disk is full)")
-
     with monkeypatch.context() as patch:
-        patch.setattr(bench.queue, "announce", full)
+        patch.setattr(
+            bench.queue,
+            "announce",
+            Mock(side_effect=QueueUnavailable("Redis does not answer (MISCONF: the disk is full)")),
+        )
         for _ in range(10 * round(bench.services.settings.lease_s)):
             bench.clock.now += 1.0
             with pytest.raises(QueueUnavailable):
@@ -373,12 +372,8 @@ def test_forged_events_are_left_out_and_stop_nothing(bench: Bench) -> None:
 def test_a_cancelled_task_that_still_runs_is_stopped(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     job, _ = job_actions.submit(bench.services, request())
     delivery = bench.take()
-
-    def away(task_ids: object) -> None:
-        raise QueueUnavailable("Redis does not answer")
-
     with monkeypatch.context() as patch:
-        patch.setattr(bench.queue, "discard", away)
+        patch.setattr(bench.queue, "discard", Mock(side_effect=QueueUnavailable("Redis does not answer")))
         assert job_actions.cancel(bench.services, job.id).state is State.CANCELLED
     assert bench.queue.beat(delivery) == (False, False)
     bench.pass_time(1)

@@ -1,9 +1,8 @@
 """What a user deletes is gone at once, from the index and from one made anew; its objects go with the controller."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -21,8 +20,7 @@ from graspd.service.pipeline.deletion import delete_asset, delete_dataset, delet
 from graspd.service.pipeline.garbage_collector import GarbageCollector
 from graspd.service.store.library import publish_asset
 from graspd.service.store.records import deletions, pending
-from tests.fakes import OBJECT_FILES, make_shard, request, with_settings
-from tests.planning import plan_all
+from tests.fakes import OBJECT_FILES, make_shard, plan_all, request, with_settings
 from tests.service.pipeline.datasets.makers import fail
 
 
@@ -277,8 +275,7 @@ def _jobs(services: Services) -> list[str]:
     return [job.id for job in services.index.jobs.page().items]
 
 
-def _break(*_: object, **__: object) -> None:
-    raise KeyboardInterrupt
+_break = Mock(side_effect=KeyboardInterrupt)
 
 
 def _after(count: int, real: Any) -> Any:

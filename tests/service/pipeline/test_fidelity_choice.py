@@ -1,7 +1,5 @@
 """Charts in the store, and the cheapest fidelity that a chart promises: of grasps around free objects and in scenes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +11,7 @@ from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.fidelity_choice import cheapest
-from graspd.service.store.records import charts_of, latest, publish, scene_kinds
+from graspd.service.store.records import charts_of, publish, scene_kinds
 from graspd.service.store.store import open_store
 from tests.fakes import record_of, request
 
@@ -72,17 +70,7 @@ def test_the_fastest_fidelity_that_meets_the_target_is_taken(
     """Around free objects and, by a chart of lifts, among what was planned in the scene."""
     chart = scene_chart() if target.startswith("lift") else CHART
     found = cheapest(chart, target, method="fast_graspd", hand=hand, object_=object_)
-    assert (found.fidelity, found.measured_on) == expected[:2]
-    assert found.reached == pytest.approx(expected[2])
-
-
-def test_the_chart_published_last_is_the_latest(tmp_path: Path) -> None:
-    store = open_store(tmp_path.as_uri())
-    assert latest(store, "charts") is None
-    publish(store, "charts", {**CHART, "created": "2026-11-21T11:00:00.000Z", "runs": []})
-    publish(store, "charts", CHART)
-    found = latest(store, "charts")
-    assert found is not None and found["created"] == "2026-11-21T11:00:00.000Z"
+    assert (found.fidelity, found.measured_on) == expected[:2] and found.reached == pytest.approx(expected[2])
 
 
 def test_a_job_with_fidelity_auto_is_stored_with_the_chosen_one(services: Services) -> None:

@@ -1,7 +1,5 @@
 """Many tasks through one controller: reports, events in bulk, stages between two sweeps, large jobs in pieces."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """One service on a store, an index and a Redis, and one of its controllers leads."""
 
-from __future__ import annotations
-
 import shutil
 import threading
 from pathlib import Path

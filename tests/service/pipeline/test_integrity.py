@@ -1,7 +1,5 @@
 """`graspd admin store verify`: five kinds of damage are five findings, on files and on S3; most is made again."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -129,9 +127,7 @@ def test_what_comes_out_otherwise_is_not_put(services: Services, shards: list[Sh
     assert differences(services.index, services.store) == []
 
 
-def test_a_foreign_object_is_moved_and_a_bad_record_needs_a_copy(
-    services: Services, shards: list[ShardManifest]
-) -> None:
+def test_a_foreign_object_is_moved_a_bad_record_needs_a_copy(services: Services, shards: list[ShardManifest]) -> None:
     services.store.put("shards/base/notes.txt", b"mine")
     found = findings(services)
     assert [one.what for one in found] == [FOREIGN]

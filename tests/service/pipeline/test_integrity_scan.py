@@ -1,7 +1,5 @@
 """A turned byte of anything in the store is found and named; the controller's integrity scan makes way for others."""
 
-from __future__ import annotations
-
 import io
 import random
 import re
@@ -27,7 +25,7 @@ from graspd.service.pipeline.datasets import actions
 from graspd.service.pipeline.datasets.spec import DatasetRequest
 from graspd.service.pipeline.identity import ServiceRecord
 from graspd.service.pipeline.integrity import FOLDERS, MISSING, NO_MANIFEST, examine, scan
-from graspd.service.pipeline.integrity_scan import IntegrityScan, Interrupted, ReadPermit
+from graspd.service.pipeline.integrity_scan import IntegrityScan, Interrupted
 from graspd.service.pipeline.repair import repair
 from graspd.service.run.store_commands import app
 from graspd.service.settings import Settings
@@ -46,9 +44,8 @@ from graspd.service.store.records import (
     removed_folder,
 )
 from tests.damage import flip, flipped, overwrite, remove
-from tests.fakes import HAND_FILES, OBJECT_FILES, make_shard, message_for, request, with_settings
+from tests.fakes import HAND_FILES, OBJECT_FILES, make_shard, message_for, request, tasks_of, with_settings
 from tests.indexes import open_services
-from tests.packs import tasks_of
 from tests.waiting import PATIENCE_S, Pauses, until
 
 #: Flips of each object: with some thirty objects more than the 265 that were once tried by hand.
@@ -205,7 +202,6 @@ def a_round(services: Services, stop: Pauses | None = None) -> None:
     scan = IntegrityScan(services, stop, clock=stop.clock)
     for _ in FOLDERS:
         scan.advance()
-    scan.turn.end()
     assert services.index.notes.scan_note().ended
 
 
@@ -221,8 +217,7 @@ def test_a_round_notes_what_is_damaged_and_nothing_else(services: Services, shar
     remove(services.store, shards[1].key)
     a_round(services)
     noted = found(services)
-    assert noted.keys() == {shards[0].shard_id, shards[1].shard_id}
-    assert "SHA-256" in noted[shards[0].shard_id]
+    assert noted.keys() == {shards[0].shard_id, shards[1].shard_id} and "SHA-256" in noted[shards[0].shard_id]
     assert noted[shards[1].shard_id] == MISSING
 
 
@@ -278,31 +273,25 @@ def test_a_small_store_is_not_read_over_and_over(services: Services, shards: lis
 def test_it_makes_way_for_a_verify_and_goes_on_afterwards(services: Services, shards: list[ShardManifest]) -> None:
     stop = Pauses()
     scan = IntegrityScan(services, stop, clock=stop.clock)
-    verify = ReadPermit(services, is_controller=False)
-    assert scan.turn.is_mine() and not ReadPermit(services, is_controller=True).is_mine()
-    assert verify.is_mine()
+    assert services.index.notes.pause_scan(15.0, begin=True)
     stop.now += 10.0
     with pytest.raises(Interrupted):
         scan.advance()
-    assert not ReadPermit(services, is_controller=False).is_mine()
-    assert not ReadPermit(services, is_controller=True).is_mine()
-    verify.end()
+    assert not services.index.notes.pause_scan(15.0, begin=True)
+    assert services.index.notes.pause_scan(0.0)
     assert scan.advance()
 
 
 def test_a_second_verify_is_refused(tmp_path: Path) -> None:
     other = open_services(Settings(data_dir=tmp_path))
-    assert ReadPermit(other, is_controller=False).is_mine()
+    assert other.index.notes.pause_scan(15.0, begin=True)
     refused = CliRunner().invoke(app, ["store", "verify", "--data-dir", str(tmp_path)])
     other.close()
-    assert refused.exit_code == 2
-    assert "another `graspd admin store verify`" in refused.output
+    assert refused.exit_code == 2 and "another `graspd admin store verify`" in refused.output
 
 
 @pytest.mark.parametrize("rate", [100.0, 0.0])
-def test_the_controller_scans_beside_its_rounds_unless_it_is_off(
-    services: Services, shards: list[ShardManifest], rate: float
-) -> None:
+def test_the_controller_scans_unless_it_is_off(services: Services, shards: list[ShardManifest], rate: float) -> None:
     flip(services.store, shards[0].key)
     set_so = with_settings(services, integrity_scan_mb_per_s=rate, controller_interval_s=0.05)
     stop = threading.Event()

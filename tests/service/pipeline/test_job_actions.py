@@ -1,8 +1,7 @@
 """Jobs of a user: submit, cancel and retry; those planned in scenes: what is refused, their stages, end and grasps."""
 
-from __future__ import annotations
-
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -46,10 +45,7 @@ def test_an_unknown_hand_or_object_leaves_nothing_behind(services: Services) -> 
 
 
 def test_without_redis_nothing_is_recorded_of_a_submit(services: Services, monkeypatch: pytest.MonkeyPatch) -> None:
-    def gone() -> float:
-        raise QueueUnavailable("Redis does not answer")
-
-    monkeypatch.setattr(services.queue, "ping", gone)
+    monkeypatch.setattr(services.queue, "ping", Mock(side_effect=QueueUnavailable("Redis does not answer")))
     with pytest.raises(QueueUnavailable):
         job_actions.submit(services, request())
     assert list(services.store.list(names.JOBS)) == []
@@ -59,8 +55,7 @@ def test_without_redis_nothing_is_recorded_of_a_submit(services: Services, monke
 def test_a_large_job_fills_the_window_and_no_more(services: Services) -> None:
     job, _ = job_actions.submit(with_settings(services, queue_window=10), request(grasps=3200))
     assert len(services.queue.waiting()) == 10
-    assert job.priority is Priority.BULK
-    assert job.stages[0].tasks == 100
+    assert job.priority is Priority.BULK and job.stages[0].tasks == 100
 
 
 def test_a_cancelled_job_leaves_the_queue(services: Services) -> None:
@@ -68,8 +63,7 @@ def test_a_cancelled_job_leaves_the_queue(services: Services) -> None:
     queue_of(services).take("w")
     finish(services, job.id, batches=1)
     after = job_actions.cancel(services, job.id)
-    assert after.state is State.CANCELLED
-    assert (after.stages[0].succeeded, after.stages[0].cancelled) == (1, 1)
+    assert after.state is State.CANCELLED and (after.stages[0].succeeded, after.stages[0].cancelled) == (1, 1)
     assert services.queue.waiting() == set()
     assert [event.what for event in job_events(services.store, job.id)] == ["cancelled"]
 
@@ -103,8 +97,7 @@ def test_a_retried_job_gets_fresh_attempts(services: Services) -> None:
     after = job_actions.retry(services, job.id)
     assert (after.state, after.reason) == (State.RUNNING, None)
     delivery = queue.take("w")
-    assert delivery is not None
-    assert (delivery.message.attempt, delivery.message.max_attempt) == (4, 6)
+    assert delivery is not None and (delivery.message.attempt, delivery.message.max_attempt) == (4, 6)
     assert len(services.index.jobs.attempts(job=job.id)) == 3, "the history stays"
 
 
@@ -171,8 +164,7 @@ def test_a_later_batch_or_another_fault_stops_no_other_batch(services: Services,
         make(services, job, Stage.SCENE, one)
     fail_batch(services, job, batch, kind)
     found = states(services, job)
-    assert found[batch, Stage.SYNTHESIZE] is State.FAILED
-    assert found[1 - batch, Stage.SYNTHESIZE] is State.QUEUED
+    assert found[batch, Stage.SYNTHESIZE] is State.FAILED and found[1 - batch, Stage.SYNTHESIZE] is State.QUEUED
     assert found[2, Stage.SCENE] is State.QUEUED
     assert services.index.jobs.get(job.id).state is State.RUNNING
 

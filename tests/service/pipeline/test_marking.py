@@ -1,7 +1,5 @@
 """Store and index stay in step: an older copy of either is not believed, and what was answered 503 is in neither."""
 
-from __future__ import annotations
-
 import shutil
 import sqlite3
 import threading
@@ -9,6 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from sqlalchemy import Connection, make_url
@@ -210,12 +209,12 @@ def locked(services: Services, monkeypatch: pytest.MonkeyPatch) -> Iterator[Serv
 @contextmanager
 def full(services: Services, monkeypatch: pytest.MonkeyPatch) -> Iterator[Services]:
     """No room on the disk when rows are to be kept."""
-
-    def refuse(self: Connection) -> None:
-        raise OperationalError("COMMIT", {}, Exception("database or disk is full"))
-
     with monkeypatch.context() as patch:
-        patch.setattr(Connection, "commit", refuse)
+        patch.setattr(
+            Connection,
+            "commit",
+            Mock(side_effect=OperationalError("COMMIT", {}, Exception("database or disk is full"))),
+        )
         yield services
 
 

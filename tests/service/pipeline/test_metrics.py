@@ -1,7 +1,5 @@
 """What is told to Prometheus: true numbers, at a cost that does not grow with queue or index."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import asdict
@@ -75,8 +73,7 @@ def test_depth_age_and_workers_are_told_from_redis(rq_queue: RqQueue) -> None:
     place = (Priority.BULK, Stage.SYNTHESIZE)
     assert found.depth[place] == 2
     assert 0 <= found.oldest_s[place] < 60
-    assert set(found.workers) == {"w1"}
-    assert found.workers["w1"][0].state == "busy"
+    assert set(found.workers) == {"w1"} and found.workers["w1"][0].state == "busy"
     assert 200.0 <= found.workers["w1"][1] < 400.0
 
 

@@ -1,7 +1,5 @@
 """How many batches a task has, by what was measured and who is there, and which workers it waits for."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import asdict, replace
@@ -32,8 +30,7 @@ from graspd.service.queue.rq_queue import RqQueue
 from graspd.service.store.library import publish_asset
 from graspd.service.store.manifests import ShardManifest, publish_shard
 from graspd.worker.stages.context import TaskContext, shard_of
-from tests.fakes import OBJECT_FILES, beat_of, fake_stages, message_for, request, with_settings
-from tests.planning import plan_all
+from tests.fakes import OBJECT_FILES, beat_of, fake_stages, message_for, plan_all, request, with_settings
 from tests.service.pipeline.test_controller import Bench
 
 OWN = own_ability()
@@ -62,9 +59,7 @@ NEXT = beat(revision=REVISION + 1)
         ([beat(schemas=(4, 9))], replace(NEED, schema=2, newest=5), Route()),
     ],
 )
-def test_a_task_goes_where_those_look_who_can_do_it(
-    present: list[WorkerBeat], need: Requirements, place: Route
-) -> None:
+def test_a_task_goes_where_able_workers_look(present: list[WorkerBeat], need: Requirements, place: Route) -> None:
     assert Routes(present).place(need) == place
 
 
@@ -81,9 +76,7 @@ def test_a_task_goes_where_those_look_who_can_do_it(
         ([beat(schemas=(5, 6))], replace(NEED, newest=4), "has at most schema 4"),
     ],
 )
-def test_what_nobody_can_do_is_held_back_with_the_reason(
-    present: list[WorkerBeat], need: Requirements, why: str
-) -> None:
+def test_what_nobody_can_do_is_held_with_the_reason(present: list[WorkerBeat], need: Requirements, why: str) -> None:
     assert why in Routes(present).place(need).held
 
 
@@ -264,9 +257,7 @@ def test_a_job_of_ranges_goes_through_its_stages(services: Services) -> None:
     assert differences(services.index, services.store) == []
 
 
-def test_shards_of_many_batches_enter_the_index_in_short_turns(
-    services: Services, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_large_shards_enter_the_index_in_short_turns(services: Services, monkeypatch: pytest.MonkeyPatch) -> None:
     bench = Bench(services)
     bench.controller.round()
     record = job_actions.prepare(services, request(grasps=32 * 64 * 5), priority=Priority.BULK)

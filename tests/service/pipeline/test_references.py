@@ -1,7 +1,5 @@
 """Neighbours and networks of jobs and datasets: which files they are, what is refused, and what may not be deleted."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -28,9 +26,8 @@ from graspd.service.pipeline.garbage_collector import GarbageCollector
 from graspd.service.store.library import publish_asset
 from graspd.service.store.network_file import check_network
 from tests.api.factories import fail
-from tests.fakes import make_task, record_of, request
+from tests.fakes import make_task, plan_all, record_of, request
 from tests.networks import network_files, random_network
-from tests.planning import plan_all
 
 FLOOR = {"kind": "half_space"}
 UPRIGHT = [1.0, 0, 0, 0]
@@ -170,9 +167,7 @@ NO_NEIGHBOURS = ({"object": "cup"}, {"object": "../x", "digest": "a" * 32}, {"ob
         *((NEIGHBOUR, {"neighbours": [one]}) for one in NO_NEIGHBOURS),
     ],
 )
-def test_a_forged_entry_names_nothing_without_its_digest(
-    services: Services, named: Reference, forged: dict[str, Any]
-) -> None:
+def test_a_forged_entry_needs_a_digest(services: Services, named: Reference, forged: dict[str, Any]) -> None:
     named.add(services)
     job = named.submit(services)
     said = message_of(job, next(plan(job)), attempt=1, max_attempt=3).model_dump(mode="json", by_alias=True)

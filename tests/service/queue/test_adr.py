@@ -1,7 +1,5 @@
 """What RQ's defaults lose that are switched off: docs/adr has the decisions."""
 
-from __future__ import annotations
-
 import os
 import re
 import time

@@ -1,7 +1,5 @@
 """Whoever writes to Redis can forge entries and jobs: nothing of theirs runs, feeding and reaping go on, pages show."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

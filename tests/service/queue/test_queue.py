@@ -1,7 +1,5 @@
 """The queue's contract, held against Redis and against its twin in memory."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any

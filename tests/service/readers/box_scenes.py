@@ -1,7 +1,5 @@
 """A box on a table as shards whose pictures are closed forms: what clouds of them are held against."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +10,6 @@ from graspd.service.model.pinhole import pixel_rays
 from graspd.service.store.shards import write_shard
 
 Floats = NDArray[np.float64]
-
 SIZE = np.array([0.09, 0.06, 0.05])
 JOINTS, GRASPS = 4, 6
 WIDTH, HEIGHT = 96, 72

@@ -1,7 +1,5 @@
 """What is read: the shards of a finished job in a store, and pictures in closed form in a folder."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

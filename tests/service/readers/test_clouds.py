@@ -1,7 +1,5 @@
 """Clouds of closed-form pictures: points on the box, its face normals, frames that fit together, labels, graspness."""
 
-from __future__ import annotations
-
 import re
 from importlib.util import find_spec
 from pathlib import Path
@@ -80,8 +78,7 @@ def test_views_fused_agree_and_show_more_than_each(pictures: Pictures) -> None:
     clouds = pictures.clouds(4000, fuse=True, frame="object")
     assert len(clouds) == len(POSES)
     for scene, sample in enumerate(clouds):
-        assert sample["scene"] == scene
-        assert sample["camera/extrinsics"].shape == (VIEWS, 4, 4)
+        assert sample["scene"] == scene and sample["camera/extrinsics"].shape == (VIEWS, 4, 4)
         assert set(np.unique(sample["cloud/pixel"][:, 0])) == set(range(VIEWS))
         distance, normal = on_box(sample["cloud/points"].astype(float))
         assert distance.max() < 4 * DEPTH_M

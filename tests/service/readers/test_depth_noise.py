@@ -1,7 +1,5 @@
 """Models of depth cameras: the noise they say they make is the noise they make, and holes are where geometry says."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

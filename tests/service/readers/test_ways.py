@@ -1,7 +1,5 @@
 """The way of a grasp: its postures in turn, and those between them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -47,8 +45,7 @@ def test_a_way_goes_from_standoff_or_pregrasp_to_lift_or_squeeze():
 )
 def test_between_two_postures_positions_and_joints_go_straight(place, x, joint):
     point = point_at(way_of(shard(in_scene=True), 0), place)
-    assert point.hand_pose[0] == pytest.approx(x)
-    assert point.joint_positions == pytest.approx([joint, joint])
+    assert point.hand_pose[0] == pytest.approx(x) and point.joint_positions == pytest.approx([joint, joint])
 
 
 def test_a_turn_is_divided_evenly():

@@ -1,7 +1,5 @@
 """The language that chooses grasps by their numbers."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

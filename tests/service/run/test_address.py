@@ -1,7 +1,5 @@
 """The service of a data folder: found where it answers, joined by others; nothing of an earlier one is in its way."""
 
-from __future__ import annotations
-
 import json
 import os
 import socket
@@ -13,12 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from graspd.api.server import bind
 from graspd.client.reports import open_client
 from graspd.service.model.errors import InputError, UnavailableError
-from graspd.service.run.address import forget_address, joining, record_address, recorded_address
+from graspd.service.run.address import bind, forget_address, joining, record_address, recorded_address
 from graspd.service.run.children import Child, end_leftovers, start_of
-from graspd.service.run.supervisor import Supervisor, _reserve
+from graspd.service.run.supervisor import Supervisor
 from graspd.service.settings import Settings
 from tests.servers import free_ports
 from tests.waiting import until
@@ -83,12 +80,13 @@ def test_a_service_on_any_free_port_is_found_until_it_stops(folder: Path) -> Non
 
 @pytest.mark.skipif(sys.platform != "linux", reason="a second socket of one address is refused there")
 def test_a_port_that_was_found_free_is_kept_for_the_api() -> None:
-    with _reserve("127.0.0.1", 0) as reserved, socket.socket() as stranger:
+    with bind("127.0.0.1", 0) as reserved, socket.socket() as stranger:
         address = reserved.getsockname()
         with pytest.raises(OSError, match="in use"):
             stranger.bind(address)
         for _ in range(2):  # an API that is started again takes it again
-            bind(*address).close()
+            with bind(*address) as listener:
+                listener.listen()
 
 
 @pytest.fixture
@@ -182,9 +180,7 @@ def test_a_child_that_was_left_behind_is_ended(child: Child, tmp_path: Path) -> 
     assert not list((tmp_path / "run").iterdir())
 
 
-def test_a_process_that_got_the_number_of_a_child_lives_on(
-    child: Child, stranger: subprocess.Popen[bytes], tmp_path: Path
-) -> None:
+def test_a_stranger_with_that_pid_lives_on(child: Child, stranger: subprocess.Popen[bytes], tmp_path: Path) -> None:
     assert child.pid_file is not None
     _, started, token = json.loads(child.pid_file.read_text())
     for stale in (

@@ -1,7 +1,5 @@
 """The commands of the service: exit codes, one-line errors, JSON, private data, settings of the children."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal
@@ -12,6 +10,7 @@ import sys
 import threading
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import typer
@@ -19,7 +18,7 @@ from pydantic import SecretStr, ValidationError
 from typer.testing import CliRunner
 
 from graspd import cli as program
-from graspd.service.cli import load_settings, reporting_errors
+from graspd.service.cli import EngineSettings, engine_settings, load_settings, reporting_errors
 from graspd.service.model.errors import InputError, StoreUnavailable, UnavailableError
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
@@ -53,12 +52,8 @@ def _bad_model() -> ValidationError:
 def test_an_error_is_one_line_and_an_exit_code(
     error: BaseException, code: int, line: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    @reporting_errors
-    def command() -> None:
-        raise error
-
     with pytest.raises(typer.Exit) as ended:
-        command()
+        reporting_errors(Mock(side_effect=error))()
     assert ended.value.exit_code == code
     assert capsys.readouterr().err == line
 
@@ -117,8 +112,7 @@ def test_a_check_tells_differences_and_changes_nothing(services: Services) -> No
         leftover.unlink()
     for _ in range(2):
         shown = runner.invoke(app, damaged)
-        assert shown.exit_code == 1
-        assert "not in the index" in shown.output
+        assert shown.exit_code == 1 and "not in the index" in shown.output
     rebuild = [*damaged[:2], "--json", *damaged[3:]]
     assert [json.loads(runner.invoke(app, rebuild).stdout.splitlines()[-1])["changed"] for _ in range(2)] == [
         True,
@@ -155,9 +149,7 @@ def test_a_worker_that_never_gets_ready_is_named_with_its_log(tmp_path: Path) ->
         supervisor.wait_ready()
 
 
-def test_what_is_waited_for_is_told_and_the_wait_can_be_stopped(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_wait_says_for_what_and_can_be_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("graspd.service.run.supervisor._TOLD_EVERY_S", 0.0)
     idle, stop, told = (sys.executable, "-c", "import signal; signal.pause()"), threading.Event(), []
 
@@ -171,9 +163,7 @@ def test_what_is_waited_for_is_told_and_the_wait_can_be_stopped(
     assert str(tmp_path / "logs") in told[-1]
 
 
-def test_a_check_fails_where_no_controller_or_worker_lives(
-    rq_queue: RqQueue, redis_server: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_check_fails_without_process(rq_queue: RqQueue, redis_server: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GRASPD_REDIS_URL", redis_server)
     for command in ("controller", "worker"):
         shown = runner.invoke(program.build(), [command, "--check"])
@@ -269,3 +259,27 @@ def test_a_setting_taken_back_does_not_come_from_the_environment(name: str, monk
     for variable, text in _stated(Settings(**{name: None})).items():
         monkeypatch.setenv(variable, text)
     assert getattr(Settings(), name) is None
+
+
+@pytest.fixture
+def nothing_set(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in [name for name in os.environ if name.upper().startswith("GRASPD_")]:
+        monkeypatch.delenv(name)
+
+
+def test_where_nothing_is_set_they_are_the_defaults_and_nothing_is_loaded(nothing_set: None) -> None:
+    whole = load_settings()
+    assert engine_settings() == EngineSettings(whole.prefilter, whole.processes)
+    code = "import sys; from graspd.service.cli import engine_settings; engine_settings(); print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "pydantic_settings" not in done.stdout.split()
+
+
+def test_a_set_value_counts_and_a_bad_one_is_refused_by_name(
+    nothing_set: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("graspd_processes", "3")
+    assert engine_settings() == EngineSettings("auto", 3)
+    monkeypatch.setenv("GRASPD_PREFILTER", "perhaps")
+    with pytest.raises(InputError, match="GRASPD_PREFILTER"):
+        engine_settings()

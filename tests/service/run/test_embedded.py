@@ -1,7 +1,5 @@
 """The Redis that comes along: how it is found, who may reach it, what it keeps."""
 
-from __future__ import annotations
-
 import signal
 import stat
 import subprocess
@@ -30,9 +28,7 @@ def executable(path: Path) -> Path:
 
 
 @pytest.mark.parametrize("name", ["redis-server", "valkey-server"])
-def test_a_server_on_the_path_goes_before_the_wheels(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
-) -> None:
+def test_a_server_on_the_path_goes_before_wheels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     server = executable(tmp_path / name)
     monkeypatch.setenv("PATH", str(tmp_path))
     assert find_server() == (server, "PATH")

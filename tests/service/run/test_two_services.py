@@ -1,7 +1,5 @@
 """A second service is refused by every command that would work for it; a data folder may have any name."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -61,12 +59,6 @@ def test_a_command_of_a_second_service_on_a_redis_is_refused(
     said = done.stderr.splitlines()[-1]
     assert (done.returncode, said.split(";")[0]) == (1, "graspd: this Redis belongs to another graspd service")
     assert "Traceback" not in done.stderr
-
-
-def test_a_second_service_on_a_store_is_refused(first: Services, beside: str, tmp_path: Path) -> None:
-    done = run(["controller"], tmp_path / "second", GRASPD_STORE_URL=first.store.url, GRASPD_REDIS_URL=beside)
-    assert done.returncode == 1
-    assert done.stderr.splitlines()[-1].startswith(f"graspd: the store {first.store.url} belongs to another graspd")
 
 
 def test_the_doctor_says_so(first: Services, redis_server: str, tmp_path: Path) -> None:

@@ -1,12 +1,11 @@
 """The object store: one contract on every adapter, and what only a local one or one behind a network must do."""
 
-from __future__ import annotations
-
 import errno
 import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from unittest.mock import Mock
 from urllib.parse import urlsplit
 
 import httpx
@@ -105,12 +104,11 @@ def test_a_url_that_names_no_store_is_refused(url: str) -> None:
 
 
 def test_a_full_disk_is_one_clear_line_and_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(descriptor: int) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
     store = open_store(tmp_path.as_uri())
     with monkeypatch.context() as patch:
-        patch.setattr("graspd.service.store.store.os.fsync", full)
+        patch.setattr(
+            "graspd.service.store.store.os.fsync", Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
+        )
         with pytest.raises(StoreUnavailable, match=r"No space left on device$"):
             store.put("shards/base/a.h5", b"data")
     assert list((tmp_path / "shards" / "base").iterdir()) == []
@@ -151,8 +149,7 @@ def test_wrong_credentials_are_one_clear_line_without_the_secret(s3_url: str, mo
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "wrong-secret")
     with pytest.raises(StoreUnavailable) as found:
         open_store(s3_url).put("a", b"1")
-    assert "\n" not in str(found.value)
-    assert "wrong-secret" not in str(found.value)
+    assert "\n" not in str(found.value) and "wrong-secret" not in str(found.value)
 
 
 @pytest.mark.s3

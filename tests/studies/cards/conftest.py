@@ -1,7 +1,5 @@
 """Datasets with known contents and their cards: built-in assets, grasps drawn at random or as a test wants."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,10 +30,9 @@ from graspd.studies.cards.tally import tally_of
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.stages.context import Output, shard_of
 from tests.api import factories
-from tests.fakes import fail_task
+from tests.fakes import fail_task, plan_all
 from tests.indexes import empty_index
 from tests.memory_queue import MemoryQueue
-from tests.planning import plan_all
 
 HANDS = ("allegro", "barrett")
 OBJECTS = ("block", "mug")
@@ -49,18 +46,11 @@ Change = Callable[[str, str, dict[str, Array]], None]
 
 
 @dataclass
-class Made:
-    """A dataset: its services and snapshot."""
+class Case:
+    """A dataset's services and snapshot, its contents, the folder of its card, and the card's figures."""
 
     services: Services
     snapshot: Snapshot
-
-
-@dataclass
-class Case:
-    """A dataset, its contents, the folder of its card, and the card's figures."""
-
-    made: Made
     contents: Contents
     folder: Path
     card: dict[str, Any]
@@ -72,15 +62,16 @@ class Case:
 
 def case(folder: Path, *, drawn: bool = True, **options: Any) -> Case:
     """The card of a dataset, with its plots or without; options as of `dataset`."""
-    made = dataset(folder, **options)
-    contents = contents_of_store(made.services.store, NAME, cache=folder / "cache")
+    services = dataset(folder, **options)
+    snapshot = actions.snapshot(services, NAME)[0]
+    contents = contents_of_store(services.store, NAME, cache=folder / "cache")
     if drawn:
         card = write_card(contents, folder / "card", licence="CC-BY-4.0")
     else:
         card = undrawn(contents)
         (folder / "card").mkdir()
         (folder / "card" / "README.md").write_text(render_card(card, {}))
-    return Case(made, contents, folder / "card", card)
+    return Case(services, snapshot, contents, folder / "card", card)
 
 
 def undrawn(contents: Contents) -> dict[str, Any]:
@@ -92,30 +83,24 @@ def kitchen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Case]:
     """A whole dataset of two hands and two objects; tests only read it."""
     made = case(tmp_path_factory.mktemp(NAME))
     yield made
-    made.made.services.close()
+    made.services.close()
 
 
 @pytest.fixture(scope="package")
 def export(kitchen: Case, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The shards of that dataset as `graspd datasets export` writes them; tests only read it."""
     folder = tmp_path_factory.mktemp("export") / NAME
-    export_shards(kitchen.made.snapshot, folder, lambda shard: kitchen.made.services.store.stream(shard.key))
+    export_shards(kitchen.snapshot, folder, lambda shard: kitchen.services.store.stream(shard.key))
     return folder
 
 
-def dataset(
-    folder: Path,
-    *,
-    change: Change = lambda hand, obj, columns: None,
-    fails: tuple[str, str] | None = None,
-    grasps: int = 40,
-    **options: Any,
-) -> Made:
+def unchanged(hand: str, obj: str, columns: dict[str, Array]) -> None: ...
+
+
+def dataset(folder: Path, change: Change = unchanged, fails: Any = None, grasps: int = 40, **options: Any) -> Services:
     """Two hands x two objects, two batches each, with scenes and pictures; of the cell `fails` the first task fails."""
-    index = f"sqlite:///{folder / 'index.sqlite'}"
-    services = Services(
-        Settings(data_dir=folder), open_store((folder / "store").as_uri()), empty_index(index), MemoryQueue()
-    )
+    store, index = open_store((folder / "store").as_uri()), empty_index(f"sqlite:///{folder / 'index.sqlite'}")
+    services = Services(Settings(data_dir=folder), store, index, MemoryQueue())
     factories.add_builtins(services)
     given = {"scenes": 2, "views": 1, "width": 24, "height": 16, "stereo": False, **options}
     wanted = {"name": NAME, "hands": HANDS, "objects": OBJECTS, "grasps": grasps, **given}
@@ -127,14 +112,12 @@ def dataset(
             fail_task(services, record.id, next(plan(record)), kind="MeshError", reason="the mesh is torn")
         else:
             _finish(services, record, change)
-    return Made(services, actions.snapshot(services, NAME)[0])
+    return services
 
 
 def _finish(services: Services, record: JobRecord, change: Change) -> None:
     request, base = record.request, dict[str, Array]()
-    place: dict[str, Any] = {}
-    if request.in_scene:
-        place = {"scene": json_attribute(request.place.model_dump(mode="json"))}
+    place = {"scene": json_attribute(request.place.model_dump(mode="json"))} if request.in_scene else {}
     for task in plan(record):
         rng = np.random.default_rng([task.batch, *map(ord, request.hand + request.object)])
         if task.stage is Stage.SYNTHESIZE:
@@ -171,13 +154,8 @@ def _base(rng: np.random.Generator, joints: tuple[str, ...], count: int, batch: 
         columns["grasp/joint_positions"][:, joints.index(STILL_JOINT)] = -1.0
     for name, scale in (("contact_area_cm2", 40.0), ("epsilon", 0.3), ("wrench_volume", 3.0)):
         columns[f"quality/{name}"] = rng.gamma(9.0, scale / 9, (count, 2))
-    for name, scale in (
-        ("intersection_volume_cm3", 0.01),
-        ("penetration_depth_mm", 0.3),
-        ("self_penetration_depth_mm", 0.01),
-        ("simulated_displacement_cm", 0.05),
-        ("stability_loss", 0.05),
-    ):
+    small = {"intersection_volume_cm3": 0.01, "penetration_depth_mm": 0.3, "self_penetration_depth_mm": 0.01}
+    for name, scale in (small | {"simulated_displacement_cm": 0.05, "stability_loss": 0.05}).items():
         columns[f"quality/{name}"] = rng.gamma(2.0, scale / 2, count)
     columns["quality/contact_links"] = rng.integers(2, 9, count).astype(np.int32)
     columns["quality/valid"] = np.ones(count, np.uint8)

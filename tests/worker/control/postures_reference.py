@@ -1,28 +1,12 @@
 """Postures around a grasp in NumPy, one step after the other: what the kernels are held against."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from graspd.service.model.transforms import Floats, quat_rotate
-from graspd.worker.control.opening import (
-    CLEARANCE_M,
-    JAM_LOOKS,
-    JAM_M,
-    OPENING_STEP,
-    OPENING_STEPS,
-    PALM_CLEARANCE_M,
-    PLAIN_OPENING,
-    RETREATS_M,
-    SLIDING_STEP_M,
-    STUCK_M,
-    WAY,
-    count_fingers,
-    fingers_of_bodies,
-    fingers_of_dofs,
-)
+from graspd.worker.control import opening
+from graspd.worker.control.opening import CLEARANCE_M, JAM_LOOKS, OPENING_STEP, OPENING_STEPS, STUCK_M
 from graspd.worker.control.postures import FRICTION, MAX_PRESSING, PRESSING_M
 from graspd.worker.control.squeeze import SPREAD, SUM, TORQUE
 from graspd.worker.grasps import Posture
@@ -39,7 +23,7 @@ def pregrasp(probe: Probe, grasp: Posture) -> Posture:
     """N postures from which the hand closes, as `worker.control.postures` wants them."""
     hand = probe.hand
     q = hand.reduce(grasp.joint_positions)
-    finger = fingers_of_dofs(hand)
+    finger = opening.fingers_of_dofs(hand)
     paths = _openings(hand, q, _leaving(probe, probe.touch(grasp, reach=CLEARANCE_M), finger))
     clearance = _finger_clearance(probe, grasp.hand_pose, paths)
     stuck = np.flatnonzero((clearance.max(axis=1) < STUCK_M).any(axis=1))
@@ -73,14 +57,14 @@ def _leaving(probe: Probe, found: NearestPoints, finger: NDArray[np.int32]) -> F
             away[mine] = np.where(away[mine] * hand.closing[mine] > 0, 0.0, away[mine])
             fastest = float(np.abs(away[mine]).max())
             if fastest > 0:
-                out[b, mine] = PLAIN_OPENING * out[b, mine] + (1 - PLAIN_OPENING) * away[mine] / fastest
+                out[b, mine] = opening.PLAIN_OPENING * out[b, mine] + (1 - opening.PLAIN_OPENING) * away[mine] / fastest
     return out
 
 
 def _openings(hand: HandModel, q: Floats, direction: Floats) -> Floats:
     """(B, K, D) dof values on the way along `direction` (B, D), the grasp first, all within the limits."""
     step = OPENING_STEP * np.arange(OPENING_STEPS + 1)
-    direction = direction * np.where(slides(hand), SLIDING_STEP_M / OPENING_STEP, 1.0)
+    direction = direction * np.where(slides(hand), opening.SLIDING_STEP_M / OPENING_STEP, 1.0)
     path = q[:, None] + step[None, :, None] * direction[:, None]
     # A grasp may stand a hair outside its limits: opening must not make a jump of that.
     return np.clip(path, np.minimum(hand.lower, q)[:, None], np.maximum(hand.upper, q)[:, None])
@@ -89,10 +73,10 @@ def _openings(hand: HandModel, q: Floats, direction: Floats) -> Floats:
 def _finger_clearance(probe: Probe, hand_pose: Floats, paths: Floats) -> Floats:
     """(B, K, fingers) least distance of each finger's points to the object, at most `CLEARANCE_M`."""
     count, steps, _ = paths.shape
-    finger = fingers_of_bodies(probe.hand)[probe.points.body]
+    finger = opening.fingers_of_bodies(probe.hand)[probe.points.body]
     joints = probe.hand.expand(paths).reshape(count * steps, -1)
     distance = _distances(probe, np.repeat(hand_pose, steps, axis=0), joints, reach=CLEARANCE_M)
-    out = np.full((count * steps, count_fingers(probe.hand)), CLEARANCE_M)
+    out = np.full((count * steps, opening.count_fingers(probe.hand)), CLEARANCE_M)
     for f in np.unique(finger[finger >= 0]):
         out[:, f] = distance[:, finger == f].min(axis=1)
     return out.reshape(count, steps, -1)
@@ -113,12 +97,13 @@ def _first_clear(clearance: Floats, wanted: float) -> NDArray[np.intp]:
 
 def _without_jams(probe: Probe, hand_pose: Floats, q: Floats, opened: Floats) -> Floats:
     """(B, D) the postures `opened`, fingers held back towards the grasp q where they would run into one another."""
-    finger = fingers_of_dofs(probe.hand)
-    limit = _finger_depth(probe, hand_pose, q[:, None]) + JAM_M
+    finger = opening.fingers_of_dofs(probe.hand)
+    limit = _finger_depth(probe, hand_pose, q[:, None]) + opening.JAM_M
     share = np.ones_like(limit)
     for look in range(JAM_LOOKS):
         move = (opened - q) * np.where(finger >= 0, share[:, finger], 1.0)
-        jammed = _finger_depth(probe, hand_pose, q[:, None] + np.array(WAY)[None, :, None] * move[:, None]) > limit
+        path = q[:, None] + np.array(opening.WAY)[None, :, None] * move[:, None]
+        jammed = _finger_depth(probe, hand_pose, path) > limit
         share *= np.where(jammed, 0.5 if look < JAM_LOOKS - 1 else 0.0, 1.0)
     return q + (opened - q) * np.where(finger >= 0, share[:, finger], 1.0)
 
@@ -126,25 +111,25 @@ def _without_jams(probe: Probe, hand_pose: Floats, q: Floats, opened: Floats) ->
 def _finger_depth(probe: Probe, hand_pose: Floats, paths: Floats) -> Floats:
     """(B, fingers) deepest that each finger is in the rest of the hand, or it in the finger, on paths (B, K, D)."""
     count, steps, _ = paths.shape
-    finger = fingers_of_bodies(probe.hand)
+    finger = opening.fingers_of_bodies(probe.hand)
     joints = probe.hand.expand(paths).reshape(count * steps, -1)
     bodies = body_poses(probe.hand, np.repeat(hand_pose, steps, axis=0), joints)
     depth = probe.self_depth(bodies, probe.posed_points(bodies)).reshape(count, steps, -1).max(axis=1)
-    out = np.zeros((count, count_fingers(probe.hand)))
+    out = np.zeros((count, opening.count_fingers(probe.hand)))
     for f in np.unique(finger[finger >= 0]):
         out[:, f] = depth[:, finger == f].max(axis=1)
     return out
 
 
 def _retreat(probe: Probe, hand_pose: Floats, q: Floats) -> Posture:
-    count, choices = len(q), len(RETREATS_M)
+    count, choices = len(q), len(opening.RETREATS_M)
     back = -quat_rotate(hand_pose[:, 3:], probe.hand.palm.approach)
     poses = np.repeat(hand_pose[:, None], choices, axis=1)
-    poses[..., :3] += np.array(RETREATS_M)[None, :, None] * back[:, None]
+    poses[..., :3] += np.array(opening.RETREATS_M)[None, :, None] * back[:, None]
     joints = probe.hand.expand(q)
     joined = np.repeat(joints, choices, axis=0)
-    distance = _distances(probe, poses.reshape(-1, 7), joined, reach=PALM_CLEARANCE_M)
-    chosen = _first_clear(distance.min(axis=1).reshape(count, choices), PALM_CLEARANCE_M)
+    distance = _distances(probe, poses.reshape(-1, 7), joined, reach=opening.PALM_CLEARANCE_M)
+    chosen = _first_clear(distance.min(axis=1).reshape(count, choices), opening.PALM_CLEARANCE_M)
     return Posture(poses[np.arange(count), chosen], joints)
 
 

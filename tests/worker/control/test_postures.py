@@ -1,7 +1,5 @@
 """Pregrasp and squeeze: clear of the object before, balanced and within the hand's strength when pressing."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import mujoco
@@ -11,18 +9,10 @@ import trimesh
 import warp as wp
 
 from graspd.service.model.transforms import apply, quat_rotate
+from graspd.worker.control import postures
 from graspd.worker.control import squeeze as squeezing
 from graspd.worker.control.opening import CLEARANCE_M, JAM_M, PALM_CLEARANCE_M
-from graspd.worker.control.postures import (
-    CLOSING_M,
-    STANDS_OFF_M,
-    hold_forces,
-    normal_force,
-    pregrasp,
-    squeeze,
-    standing_off,
-    touching_links,
-)
+from graspd.worker.control.postures import hold_forces, normal_force, pregrasp, squeeze
 from graspd.worker.control.squeeze import solved
 from graspd.worker.grasps import Posture
 from graspd.worker.hands.kinematics import body_poses, generalized_forces
@@ -37,7 +27,7 @@ from graspd.worker.validation.model import MujocoOptions, build
 from tests.worker.control import postures_reference as reference
 from tests.worker.hands.grippers import gripper
 from tests.worker.models import object_from_mesh, on_one_dof, piece, two_finger_hand
-from tests.worker.quality.helpers import plate_hand, posture
+from tests.worker.quality.helpers import placed_data, plate_hand, posture
 
 BOX = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))
 PLATES = plate_hand()
@@ -82,8 +72,7 @@ def test_pregrasp_is_clear_and_within_limits() -> None:
     fingers = np.isin(Probe(hand, BOX).points.body, [1, 2])
     # Clearance is decided on 600 points; between them, a round finger's surface bulges by less than a millimetre.
     assert (found.distance[:, fingers].min(axis=1) > CLEARANCE_M - 1e-3).all()
-    assert (found.distance.min(axis=1) > 0).all()
-    assert (before.joint_positions >= hand.lower - 1e-12).all()
+    assert (found.distance.min(axis=1) > 0).all() and (before.joint_positions >= hand.lower - 1e-12).all()
     assert (before.joint_positions < held.joint_positions).all()
 
 
@@ -110,8 +99,7 @@ def test_fingers_leave_along_the_contact_normals() -> None:
 
 def test_forces_between_plates_balance_one_sided_ones_do_not() -> None:
     held = hold_forces(plate_hand(), BOX, CLOSED, total_normal_force=20.0)
-    assert held.residual[0] < 0.01
-    assert held.torque[0] == pytest.approx([10.0, 10.0], rel=0.02)
+    assert held.residual[0] < 0.01 and held.torque[0] == pytest.approx([10.0, 10.0], rel=0.02)
     held = hold_forces(plate_hand(), BOX, posture(((0, 0, 0), (0.065, 0.0))))
     assert held.residual[0] > 0.5
 
@@ -177,13 +165,10 @@ def test_what_is_light_is_held_gently_what_is_heavy_firmly() -> None:
 
 def test_a_finger_stands_off_that_is_near_and_does_not_touch() -> None:
     # The left plate touches; the right one stands at distances around both limits.
-    near, far = STANDS_OFF_M
+    near, far = postures.STANDS_OFF_M
     rights = np.array([0.0, near - 1e-3, near + 1e-3, far - 1e-3, far + 1e-3])
-    grasps = Posture(
-        np.repeat(CLOSED.hand_pose, len(rights), axis=0),
-        np.stack([np.full(len(rights), 0.065), 0.065 - rights], axis=1),
-    )
-    assert standing_off(PLATES, BOX, grasps).tolist() == [False, False, True, True, False]
+    grasps = posture(*(((0, 0, 0), (0.065, 0.065 - right)) for right in rights))
+    assert postures.standing_off(PLATES, BOX, grasps).tolist() == [False, False, True, True, False]
 
 
 OBJ = object_from_path("mug", face_error_m=0.002)
@@ -215,8 +200,7 @@ def test_hands_open_as_in_numpy(case: tuple[HandModel, Probe, Posture]) -> None:
     np.testing.assert_allclose(found.hand_pose, wanted.hand_pose, atol=1e-12)
     moved = np.abs(found.joint_positions - grasp.joint_positions).max(axis=1) > 0.01
     retreated = np.linalg.norm((found.hand_pose - grasp.hand_pose)[:, :3], axis=1) > 0
-    assert moved.sum() > 0
-    assert 0 < retreated.sum() < len(grasp)
+    assert moved.any() and 0 < retreated.sum() < len(grasp)
 
 
 def test_forces_balance_and_idle_fingers_close_as_in_numpy(case: tuple[HandModel, Probe, Posture]) -> None:
@@ -224,24 +208,20 @@ def test_forces_balance_and_idle_fingers_close_as_in_numpy(case: tuple[HandModel
     held = hold_forces(hand, OBJ, grasp, total_normal_force=20.0, friction=0.3)
     command = squeeze(hand, OBJ, grasp, total_normal_force=20.0)
     pressed = (hand.reduce(command.joint_positions) - hand.reduce(grasp.joint_positions)) * hand.stiffness
-    (residual, torque), (_, closing) = (
-        map(np.array, zip(*reference.balanced(probe, grasp, 20.0, closing=reach), strict=True))
-        for reach in (0.0, CLOSING_M)
-    )
+    both = (reference.balanced(probe, grasp, 20.0, closing=reach) for reach in (0.0, postures.CLOSING_M))
+    (residual, torque), (_, closing) = (map(np.array, zip(*one, strict=True)) for one in both)
     # Both least squares are exact but for rounding: see test_weights_are_scipy_s.
     np.testing.assert_allclose(held.residual, residual, atol=1e-8)
     np.testing.assert_allclose(held.torque, torque, atol=1e-7)
     np.testing.assert_allclose(pressed, closing, atol=1e-7)
-    assert 0 < np.count_nonzero(held.residual < 1.0) < len(grasp)
-    assert np.abs(torque - closing).max() > 1e-3
+    assert 0 < np.count_nonzero(held.residual < 1.0) < len(grasp) and np.abs(torque - closing).max() > 1e-3
 
 
 def test_links_in_contact_are_counted_as_in_numpy(case: tuple[HandModel, Probe, Posture]) -> None:
     hand, probe, grasp = case
     near = probe.touch(grasp, reach=LINK_CONTACT_M).distance < LINK_CONTACT_M
     wanted = [len(np.unique(probe.points.body[one])) for one in near]
-    assert touching_links(hand, OBJ, grasp).tolist() == wanted
-    assert len(set(wanted)) > 2
+    assert postures.touching_links(hand, OBJ, grasp).tolist() == wanted and len(set(wanted)) > 2
 
 
 BALL = object_from_mesh(trimesh.creation.icosphere(4, 0.02))
@@ -257,8 +237,7 @@ def grasp_of(hand: HandModel) -> Posture:
 def pad_forces(hand: HandModel, obj: ObjectModel, grasp: Posture) -> list[float]:
     """Normal force at each pad [N] after the hand has pressed for three seconds."""
     scene = build(hand, obj, decompose(obj), MujocoOptions())
-    data = mujoco.MjData(scene.model)
-    scene.place(data, grasp.hand_pose[0], grasp.joint_positions[0])
+    data = placed_data(scene, grasp.joint_positions[0], grasp.hand_pose[0])
     pressed = squeeze(hand, obj, grasp)
     scene.command(data, pressed.hand_pose[0], pressed.joint_positions[0])
     mujoco.mj_step(scene.model, data, nstep=round(3.0 / scene.physics.timestep))
@@ -290,16 +269,14 @@ def test_gripper_opens_for_way_in_and_squeezes_within_its_stroke() -> None:
         hand = gripper(coupled=coupled)
         opened = pregrasp(hand, BALL, grasp_of(hand)).joint_positions[0]
         # At least 3 mm clear of the object, as seen by points on the pads, in steps of 2 mm.
-        assert opened.min() >= 0.0225
-        assert opened.max() <= 0.026
+        assert opened.min() >= 0.0225 and opened.max() <= 0.026
     hand = gripper()
     thin = object_from_mesh(trimesh.creation.box((0.004, 0.02, 0.03)))
     grasp = Posture(AT, hand.expand(np.full((1, 1), 0.002 + GAP)))
     assert squeeze(hand, thin, grasp).joint_positions.min() >= 0.0
 
 
-TARGET = np.zeros(23)
-TARGET[6] = 10.0
+TARGET = 10.0 * np.eye(23)[6]
 
 
 def nonnegative_weights(matrix: np.ndarray, count: np.ndarray) -> np.ndarray:
@@ -343,5 +320,4 @@ def test_weights_keep_to_their_columns_and_leave_out_the_worse() -> None:
     made = systems(3, 40, 1)
     made[:, 20:] = np.nan
     found = nonnegative_weights(made, np.full(3, 20))
-    assert np.isfinite(found).all()
-    assert not found[:, 20:].any()
+    assert np.isfinite(found).all() and not found[:, 20:].any()

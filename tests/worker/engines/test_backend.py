@@ -1,7 +1,5 @@
 """Warp as it is started: its default device, kernels compiled ahead, and where compiled ones are kept."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

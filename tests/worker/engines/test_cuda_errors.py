@@ -1,7 +1,5 @@
 """What a GPU's errors mean for the work at hand; the errors are put in where Warp would tell them."""
 
-from __future__ import annotations
-
 import gc
 import logging
 

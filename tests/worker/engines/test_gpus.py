@@ -1,7 +1,5 @@
 """Processes of one machine take different GPUs. The GPUs are made up: only their names and ids are asked for."""
 
-from __future__ import annotations
-
 import logging
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Parts of datasets: chosen by an expression or by kind, balanced, and as files of clouds."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any
@@ -57,9 +55,8 @@ def folder(tmp_path: Path) -> Path:
 
 def test_subset_holds_what_expression_chooses_and_nothing_else(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "subset"
-    told = json.loads(
-        run("grasps", "where", "type = precision and epsilon >= 0.2", "--from", folder, "-o", out, "--json").stdout
-    )
+    where = "type = precision and epsilon >= 0.2"
+    told = json.loads(run("grasps", "where", where, "--from", folder, "-o", out, "--json").stdout)
     every = Grasps(open_shards(folder), ["quality/epsilon", "grasp/hand_pose"])
     chosen = Grasps(open_shards(out), ["quality/epsilon", "grasp/hand_pose", "quality/grasp_type"])
     poses = {sample["grasp/hand_pose"].tobytes() for sample in every}

@@ -1,7 +1,5 @@
 """A parallel gripper as a URDF: a housing and two box fingers that slide along x, 80 mm apart when open."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 from graspd.worker.hands.load import load_hand
@@ -33,6 +31,5 @@ def gripper_urdf(*, zero_is_open: bool = False, coupled: bool = True, effort: fl
 
 
 def gripper(options: Mapping[str, object] | None = None, **kwargs: object) -> HandModel:
-    """The hand of `gripper_urdf`."""
     files = {"gripper.urdf": gripper_urdf(**kwargs)}  # type: ignore[arg-type]
     return load_hand(files, name="gripper", digest="0" * 32, options=options)

@@ -1,7 +1,5 @@
 """MJCF models that tests are written with."""
 
-from __future__ import annotations
-
 #: A gripper with all that a reader has to get right: an arm joint, anchors away from the origin, two joints on a body,
 #: `ref`, degrees, an equality, a tendon, servos, defaults, groups, and things that are no hand.
 CLAW = """

@@ -1,7 +1,5 @@
 """Files that the commands of docs/how-to/hands.md name, as a reader would have them."""
 
-from __future__ import annotations
-
 import zipfile
 from pathlib import Path
 from typing import Final
@@ -57,13 +55,11 @@ def write_all(folder: Path) -> None:
 
 
 def _on_a_wrist() -> bytes:
-    fingers = (("FFJ4", "ff", "0.03 0 0.03"), ("THJ5", "th", "-0.03 0 0.03"), ("LFJ4", "lf", "0.03 0.03 0.03"))
+    places = {"FFJ4": "0.03 0 0.03", "LFJ4": "0.03 0.03 0.03"}
     return robot(
         *(link(name) for name in ("world", "wrist", "palm", "ff", "th", "lf")),
         joint("WRJ2", "world", "wrist", axis="1 0 0", limit=f"<limit {_WRIST}/>"),
         joint("WRJ1", "wrist", "palm", limit=f"<limit {_WRIST}/>"),
-        *(
-            joint(name, "palm", tip, origin=place, axis="0 1 0" if tip == "th" else "0 -1 0")
-            for name, tip, place in fingers
-        ),
+        *(joint(name, "palm", name[:2].lower(), origin=place, axis="0 -1 0") for name, place in places.items()),
+        joint("THJ5", "palm", "th", origin="-0.03 0 0.03"),
     )

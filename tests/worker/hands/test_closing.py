@@ -1,7 +1,5 @@
 """Which way joints close a hand, and where its palm faces, whatever limits and rounding say."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -88,11 +86,8 @@ def test_a_wrist_that_stands_ahead_of_the_palm_is_not_the_palm() -> None:
     wrist = '<collision><origin xyz="0 0 -0.03"/><geometry><box size="0.13 0.08 0.06"/></geometry></collision>'
     finger = '<collision><origin xyz="0 0 0.04"/><geometry><box size="0.01 0.01 0.08"/></geometry></collision>'
     thumb = '<collision><origin xyz="0.04 0 0"/><geometry><box size="0.08 0.01 0.01"/></geometry></collision>'
-    fingers = [
-        part
-        for number, y in enumerate((-0.03, 0.0, 0.03))
-        for part in (link(f"f{number}", finger), joint(f"j{number}", "palm", f"f{number}", origin=f"0 {y} 0.1"))
-    ]
+    fingers = [link(f"f{k}", finger) for k in range(3)]
+    fingers += [joint(f"j{k}", "palm", f"f{k}", origin=f"0 {0.03 * (k - 1)} 0.1") for k in range(3)]
     fingers += [link("thumb", thumb), joint("t", "palm", "thumb", origin="0.005 0 0.01", axis="0 -1 0")]
     hand = load(robot(link("palm", plate + wrist), *fingers))
     assert hand.palm.approach == pytest.approx([1, 0, 0])
@@ -123,11 +118,8 @@ def claw(fingers: int, turn: Floats, *, noise: float = 0.0, lower: float = -0.4)
         bend = {"axis": "0 -1 0", "limit": f'<limit lower="{lower}" upper="1.4" effort="10"/>'}
         base = joint(f"ja{k}", "palm", f"a{k}", origin=_at(at), **bend)
         parts.append(base.replace("<origin xyz", f'<origin rpy="{rpy(frame)}" xyz'))
-        parts.append(
-            joint(
-                f"jb{k}", f"a{k}", f"b{k}", origin="0 0 0.06", extra=f'<mimic joint="ja{k}" multiplier="0.7"/>', **bend
-            )
-        )
+        follows = f'<mimic joint="ja{k}" multiplier="0.7"/>'
+        parts.append(joint(f"jb{k}", f"a{k}", f"b{k}", origin="0 0 0.06", extra=follows, **bend))
     return robot(*parts)
 
 
@@ -140,15 +132,14 @@ def _bar(length: float) -> str:
     return f'<collision>{place}<geometry><box size="0.016 0.018 {length}"/></geometry></collision>'
 
 
-TURNS = {
-    "upright": np.array([1.0, 0, 0, 0]),
-    "on its side": quat_from_axis_angle(np.array([1.0, 0, 0]), np.asarray(np.pi / 2)),
-    "upside down": quat_from_axis_angle(np.array([0, 1.0, 0]), np.asarray(np.pi)),
-    "tilted": quat_from_axis_angle(np.array([0.6, 0.8, 0]), np.asarray(0.5)),
-}
+#: Axis, and angle [rad].
+TURNS = {"upright": ((1, 0, 0), 0), "on its side": ((1, 0, 0), np.pi / 2), "upside down": ((0, 1, 0), np.pi)}
+TURNS |= {"tilted": ((0.6, 0.8, 0), 0.5)}
+TURNS |= {f"{angle} degrees": (np.array([1, 2, 3]) / np.sqrt(14), np.deg2rad(angle)) for angle in (7, 20, 35, 100)}
+TURNS = {name: quat_from_axis_angle(np.array(axis, float), np.asarray(angle)) for name, (axis, angle) in TURNS.items()}
 
 
-@pytest.mark.parametrize("fingers", [3, 4, 5, 6])
+@pytest.mark.parametrize("fingers", [2, 3, 4, 5, 6])
 @pytest.mark.parametrize("turn", TURNS)
 def test_the_palm_faces_along_the_fingers_and_all_of_them_close(fingers: int, turn: str) -> None:
     model = load(claw(fingers, TURNS[turn]))
@@ -156,7 +147,8 @@ def test_the_palm_faces_along_the_fingers_and_all_of_them_close(fingers: int, tu
     # Rounding of nine digits in the file; a direction within five degrees of a root axis is that axis.
     np.testing.assert_allclose(model.palm.approach, axis, atol=1e-6)
     assert (model.closing == 1).all()
-    assert np.linalg.norm(model.palm.centre - (model.palm.centre @ axis) * axis) < 1e-6
+    # Two fingers are jaws: their middle is that of sampled points of their pads.
+    assert fingers == 2 or np.linalg.norm(model.palm.centre - (model.palm.centre @ axis) * axis) < 1e-6
 
 
 def test_fingers_that_meet_at_zero_close_to_it_unless_stated() -> None:
@@ -171,22 +163,13 @@ def test_a_tie_is_told_and_one_that_is_settled_is_not() -> None:
     # Fingers that lie in the plane in which they begin, half closed: nothing tells its upper side.
     flat = claw(3, TURNS["upright"], lower=-np.pi)
     told = "the palm may face either way along its axis: state its direction with --approach"
-    lying = flat.replace(b'lower="-3.141592653589793" upper="1.4"', b'lower="1.0707963" upper="2.0707963"').replace(
-        b'multiplier="0.7"', b'multiplier="0"'
-    )
+    lying = flat.replace(b'lower="-3.141592653589793" upper="1.4"', b'lower="1.0707963" upper="2.0707963"')
+    lying = lying.replace(b'multiplier="0.7"', b'multiplier="0"')
     facts = report(lying)["facts"]
     assert told in facts["notes"] and "approach (a tie)" in facts["guessed"]
     assert any("approach (a tie)" in line for line in summary(AssetKind.HAND, facts))
     assert told not in report(lying, approach=(0, 0, 1))["facts"]["notes"]
     assert told not in report(claw(3, TURNS["upright"]))["facts"]["notes"]
-
-
-@pytest.mark.parametrize("degrees", [7.0, 20.0, 35.0, 100.0])
-def test_a_turned_root_frame_turns_the_palm_with_it(degrees: float) -> None:
-    turn = quat_from_axis_angle(np.array([1.0, 2, 3]) / np.sqrt(14), np.asarray(np.deg2rad(degrees)))
-    for fingers in (2, 3):
-        model = load(claw(fingers, turn))
-        np.testing.assert_allclose(model.palm.approach, quat_rotate(turn, np.array([0, 0, 1.0])), atol=1e-6)
 
 
 def test_two_fingers_that_oppose_one_take_hold_between_them() -> None:
@@ -217,9 +200,8 @@ def test_rounding_turns_neither_palm_nor_jaws_nor_closing() -> None:
 
 def test_a_tip_that_turns_in_place_presses_by_the_joint_before() -> None:
     roll = joint("roll{0}", "b{0}", "c{0}", origin="0 0 0.045", axis="0 0 1")
-    ball = (
-        '<collision><origin xyz="0 0 0.01"/><geometry><cylinder radius="0.008" length="0.02"/></geometry></collision>'
-    )
+    shape = '<geometry><cylinder radius="0.008" length="0.02"/></geometry>'
+    ball = f'<collision><origin xyz="0 0 0.01"/>{shape}</collision>'
     tips = "".join(link(f"c{k}", ball) + roll.format(k) for k in range(3))
     model = load(claw(3, TURNS["upright"]).replace(b"</robot>", tips.encode() + b"</robot>"))
     still = replace(model, preshape=np.zeros(model.dofs))

@@ -1,7 +1,5 @@
 """What is corrected in the browser is what the command line says and writes: the same hand comes of it."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -49,9 +47,7 @@ def same(one: HandModel, other: HandModel, *, palm: bool) -> bool:
         ({"palm": {"link": "mount"}}, ["--palm", "mount"], True),
     ],
 )
-def test_corrections_and_options_make_the_same_hand(
-    said: dict[str, object], options: list[str], palm: bool, tmp_path: Path
-) -> None:
+def test_corrections_and_options_make_the_same_hand(said, options, palm: bool, tmp_path: Path) -> None:
     (tmp_path / "claw.urdf").write_bytes(CLAW)
     guessed = hand_from_path(tmp_path / "claw.urdf")
     facts = facts_of(hand_glb(guessed))

@@ -1,7 +1,5 @@
 """Postures in which fingers oppose one another: at pads, on a plane, beside pads; who has none is refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -64,19 +62,14 @@ def test_opposed_fingertips_end_on_one_plane_and_none_is_as_low(name: str) -> No
     down /= np.linalg.norm(down, axis=1, keepdims=True)
     bodies = body_poses(hand, np.tile(IDENTITY_POSE, (len(found), 1)), hand.expand(found.q))
     # How far each piece reaches beyond the middle, which is half the height above the plane.
-    reach = [
-        np.einsum("nvi,ni->nv", apply(bodies[:, p.body, None], p.vertices) - found.middle[:, None], down).max(axis=1)
-        for p in hand.pieces
-    ]
-    tips = {
-        tip: np.max([r for r, p in zip(reach, hand.pieces, strict=True) if p.body == tip], axis=0)
-        for tip in hand.fingertips
-    }
+    away = [(p.body, apply(bodies[:, p.body, None], p.vertices) - found.middle[:, None]) for p in hand.pieces]
+    reach = [(body, np.einsum("nvi,ni->nv", points, down).max(axis=1)) for body, points in away]
+    tips = {tip: np.max([r for body, r in reach if body == tip], axis=0) for tip in hand.fingertips}
     lowest = np.max(list(tips.values()), axis=0)
     assert lowest == pytest.approx(HEIGHT_M / 2, abs=2e-3)  # the surface is sampled
     low = np.sum([lowest - tip < HEIGHT_M for tip in tips.values()], axis=0)
     assert (low >= 2).all()
-    others = np.max([r for r, p in zip(reach, hand.pieces, strict=True) if p.body not in hand.fingertips], axis=0)
+    others = np.max([r for body, r in reach if body not in hand.fingertips], axis=0)
     assert (lowest - others > 0.5 * OVER_M).all()
 
 

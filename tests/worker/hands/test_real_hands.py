@@ -1,7 +1,5 @@
 """The four reference hands: kinematics against yourdfpy, and each quirk that their notes name; the built-in hands."""
 
-from __future__ import annotations
-
 import functools
 import json
 from collections.abc import Callable
@@ -35,7 +33,6 @@ FRAME_TOLERANCE = 1e-9
 
 @pytest.fixture(scope="module")
 def hands(shared_data: Path) -> Callable[..., HandModel]:
-    """A hand by its name, with options."""
     return functools.cache(lambda name: hand_from_path(shared_data / "hands" / HANDS[name][0]))
 
 
@@ -146,7 +143,6 @@ def test_fingers_stand_out_from_the_palm_and_do_not_touch(name: str) -> None:
 
 
 def frames_of(name: str | Path, joints: dict[str, float]) -> dict[str, np.ndarray]:
-    """Pose of the body that each joint carries."""
     hand = hand_from_path(name)
     values = np.array([joints[joint] for joint in hand.joint_names])
     poses = body_poses(hand, IDENTITY_POSE, values)[0]

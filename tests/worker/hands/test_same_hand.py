@@ -1,7 +1,5 @@
 """Two models of one hand: joints by name, bases by fit, fingertips as the validator."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

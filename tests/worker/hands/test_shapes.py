@@ -1,7 +1,5 @@
 """Convex pieces, meshes that become several, and samples of their surface."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -74,9 +72,10 @@ def test_a_reduced_hull_keeps_its_volume_and_stays_close() -> None:
     assert outside < 0.06 * 0.012 and beyond < 0.06 * 0.012
 
 
-@pytest.mark.parametrize(
-    ("offset", "expected"), [((0.3, 0, 0), 0.1), ((0.3, 0.3, 0), 0.1 * np.sqrt(2)), ((0.1, 0.05, 0), 0.0)]
-)
+BESIDE = [((0.3, 0, 0), 0.1), ((0.3, 0.3, 0), 0.1 * np.sqrt(2)), ((0.1, 0.05, 0), 0.0)]
+
+
+@pytest.mark.parametrize(("offset", "expected"), BESIDE)
 def test_distance_of_two_boxes(offset: tuple[float, float, float], expected: float) -> None:
     box, _ = primitives.tessellate("box", (0.2, 0.2, 0.2))
     # The sums of the weights are held to 1 in 1e6 of the size.
@@ -106,9 +105,8 @@ def test_a_hand_may_touch_with_what_it_looks_like() -> None:
     bare = link("c", f"<visual>{fat}</visual>")
     joints = joint("j1", "palm", "a"), joint("j2", "a", "b"), joint("j3", "b", "c")
     text = robot(link("palm"), link("a"), seen, bare, *joints)
-    touching, looks = (
-        {piece.link: piece.size for piece in load(text, shapes=shapes).pieces} for shapes in ("collision", "visual")
-    )
+    hands = (load(text, shapes=shapes) for shapes in ("collision", "visual"))
+    touching, looks = ({piece.link: piece.size for piece in hand.pieces} for hand in hands)
     assert touching["b"] == (0.007, 0.04)
     assert looks == {**touching, "b": (0.009, 0.04)}
 
@@ -139,15 +137,12 @@ def test_a_fork_is_taken_apart_and_its_gap_is_empty() -> None:
     assert count > 1 and share == pytest.approx(1.0, abs=0.05)
 
 
-@pytest.mark.parametrize(
-    "mesh",
-    [
-        trimesh.creation.box((0.02, 0.03, 0.04)),
-        trimesh.creation.icosphere(2, 0.02),
-        # A housing with a cavity inside: nothing gets there.
-        trimesh.creation.box((0.06, 0.06, 0.06)) + trimesh.creation.box((0.04, 0.04, 0.04)),
-    ],
-)
+#: A housing with a cavity inside: nothing gets there.
+HOUSING = trimesh.creation.box((0.06, 0.06, 0.06)) + trimesh.creation.box((0.04, 0.04, 0.04))
+FILLED = [trimesh.creation.box((0.02, 0.03, 0.04)), trimesh.creation.icosphere(2, 0.02), HOUSING]
+
+
+@pytest.mark.parametrize("mesh", FILLED)
 def test_what_its_hull_shows_well_enough_stays_one_hull(mesh: trimesh.Trimesh) -> None:
     vertices = np.asarray(mesh.vertices, float)
     (part,) = parts_of(vertices, np.asarray(mesh.faces, np.int32))

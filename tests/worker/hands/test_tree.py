@@ -1,7 +1,5 @@
 """From URDF joints to bodies: merging, mimics, couplings; where a hand begins, behind its arm or in a whole robot."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 
@@ -32,9 +30,8 @@ def test_a_fixed_joint_merges_its_links_into_one_body() -> None:
 def test_a_chain_of_mimics_resolves_with_its_offsets() -> None:
     follow_1 = '<mimic joint="j1" multiplier="0.8" offset="0.1"/>'
     follow_2 = '<mimic joint="j2" multiplier="0.5" offset="-0.05"/>'
-    hand = load(
-        chain(joint("j1", "palm", "a"), joint("j2", "a", "b", extra=follow_1), joint("j3", "b", "c", extra=follow_2))
-    )
+    followers = joint("j2", "a", "b", extra=follow_1), joint("j3", "b", "c", extra=follow_2)
+    hand = load(chain(joint("j1", "palm", "a"), *followers))
     assert hand.dof_names == ("j1",)
     # q2 = 0.8 q1 + 0.1 and q3 = 0.5 q2 - 0.05 = 0.4 q1.
     np.testing.assert_allclose(hand.expand(np.array([1.0])), [1.0, 0.9, 0.4], atol=1e-12)
@@ -92,12 +89,9 @@ def test_an_option_that_cannot_be_is_named(options: dict[str, Any], named: str) 
 
 
 def test_an_effort_is_assumed_only_where_the_urdf_gives_none() -> None:
-    joints = [
-        joint(f"j{i}", p, c, limit=f'<limit lower="0" upper="1" {said} velocity="1"/>')
-        for i, (p, c, said) in enumerate(
-            [("palm", "a", 'effort="0"'), ("a", "b", ""), ("b", "c", 'effort="5.0"'), ("c", "d", 'effort="100"')]
-        )
-    ]
+    links = ("palm", "a", 'effort="0"'), ("a", "b", ""), ("b", "c", 'effort="5.0"'), ("c", "d", 'effort="100"')
+    limit = '<limit lower="0" upper="1" {} velocity="1"/>'
+    joints = [joint(f"j{child}", parent, child, limit=limit.format(said)) for parent, child, said in links]
     np.testing.assert_allclose(load(chain(*joints, links="abcd")).effort, [0.7, 0.7, 5.0, 100.0])
 
 
@@ -250,9 +244,8 @@ def test_a_stated_angle_holds_a_wrist_and_a_dropped_link_ends_it() -> None:
     free = load(with_wrist()).mounting
     assert free is not None
     still, moved = body_poses(fixed, IDENTITY_POSE, [0.1])[0], body_poses(free, IDENTITY_POSE, [0.25, 0.1])[0]
-    ours, theirs = (
-        {p.link: apply(at[p.body], p.vertices) for p in m.pieces} for m, at in ((fixed, still), (free, moved))
-    )
+    pairs = (fixed, still), (free, moved)
+    ours, theirs = ({p.link: apply(at[p.body], p.vertices) for p in model.pieces} for model, at in pairs)
     assert ours.keys() == theirs.keys() and all(ours[name] == pytest.approx(theirs[name]) for name in ours)
     assert links_of(load(with_wrist(), root="hub", drop=["forearm"])) == {"wrist"}
 

@@ -1,7 +1,5 @@
 """Small hands for tests."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from graspd.worker.hands.check import check_hand
@@ -42,7 +40,6 @@ def load(urdf: bytes, **options: Any) -> HandModel:
 
 
 def report(urdf: bytes, **options: Any) -> dict[str, Any]:
-    """What the check tells of a hand."""
     return check_hand({"h.urdf": urdf}, "h", options)
 
 

@@ -1,7 +1,5 @@
 """Small meshes for tests, and damage to files."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import strategies as st
 from manifold3d import Manifold

@@ -1,7 +1,5 @@
 """Every format gives the same mesh however it is spelt, and what a header promises is never believed."""
 
-from __future__ import annotations
-
 import codecs
 import gzip
 import io
@@ -65,19 +63,14 @@ def glb(mesh: Mesh, **changes: object) -> bytes:
 
 def glb_of(points: np.ndarray, index: np.ndarray, changes: dict[str, object], **accessor: object) -> bytes:
     """One mesh of float32 or int16 positions; `changes` replace keys of the document."""
+    number = 5126 if points.dtype.kind == "f" else 5122
     document = {
         "asset": {"version": "2.0"},
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
         "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
         "accessors": [
-            {
-                "bufferView": 0,
-                "componentType": 5126 if points.dtype.kind == "f" else 5122,
-                "count": len(points),
-                "type": "VEC3",
-                **accessor,
-            },
+            {"bufferView": 0, "componentType": number, "count": len(points), "type": "VEC3", **accessor},
             {"bufferView": 1, "componentType": 5123, "count": index.size, "type": "SCALAR"},
         ],
         "bufferViews": [
@@ -210,10 +203,7 @@ def test_quantised_positions_of_a_glb_have_their_size(normalized: bool) -> None:
     ("change", "told"),
     [
         ({"nodes": [{"mesh": 0, "skin": 0}]}, "skinned"),
-        (
-            {"extensionsRequired": ["EXT_meshopt_compression"]},
-            "EXT_meshopt_compression is not read; export without compr",
-        ),
+        ({"extensionsRequired": ["EXT_meshopt_compression"]}, "EXT_meshopt_compression is not read; export without c"),
         ({"extensionsRequired": ["KHR_draco_mesh_compression"]}, "export without compression"),
         ({"extensionsRequired": ["ACME_warp"]}, "ACME_warp is not read; export without it"),
         ({"nodes": [{"mesh": 0, "extensions": {"EXT_mesh_gpu_instancing": {}}}]}, "EXT_mesh_gpu_instancing"),
@@ -228,18 +218,14 @@ def test_a_glb_that_would_be_read_wrongly_is_refused(change: dict[str, object], 
         read_mesh("m.glb", quantised(False, change))
 
 
+SCALED = {"mesh": 0, "scale": [1e-4] * 3}
+
+
 @pytest.mark.parametrize(
     "change",
     [
-        {
-            "extensions": {"ACME_notes": {}},
-            "nodes": [{"mesh": 0, "extensions": {"ACME_notes": {}}, "scale": [1e-4] * 3}],
-        },
-        {
-            "nodes": [{"mesh": 0, "scale": [1e-4] * 3}, {"mesh": 0}],
-            "scenes": [{"nodes": [1]}, {"nodes": [0]}],
-            "scene": 1,
-        },
+        {"extensions": {"ACME_notes": {}}, "nodes": [SCALED | {"extensions": {"ACME_notes": {}}}]},
+        {"nodes": [SCALED, {"mesh": 0}], "scenes": [{"nodes": [1]}, {"nodes": [0]}], "scene": 1},
         {"nodes": [{"mesh": 0}, {"children": [0], "scale": [1e-4] * 3}], "scenes": []},
         {"extensionsUsed": ["KHR_materials_variants"]},
     ],
@@ -254,13 +240,11 @@ def test_a_glb_is_read_as_its_scene_shows_it(change: dict[str, object]) -> None:
 def test_strips_and_fans_of_glb_are_wound_as_trimesh_winds_them(mode: int) -> None:
     order = np.array([0, 1, 2, 3, 5, 4], "<u2")
     points = np.random.default_rng(0).normal(size=(6, 3)).astype("<f4")
-    primitives = [
-        {"attributes": {"POSITION": 0}, "mode": kind} | ({"indices": 1} if kind else {}) for kind in (0, mode)
-    ]
+    points_alone = {"attributes": {"POSITION": 0}, "mode": 0}
+    primitives = [points_alone, points_alone | {"mode": mode, "indices": 1}]
     faces = read_mesh("m.glb", glb_of(points, order, {"meshes": [{"primitives": primitives}]})).faces
-    expected = (
-        trimesh.util.triangle_strips_to_faces([order]) if mode == 5 else [[0, 1, 2], [0, 2, 3], [0, 3, 5], [0, 5, 4]]
-    )
+    fan = [[0, 1, 2], [0, 2, 3], [0, 3, 5], [0, 5, 4]]
+    expected = trimesh.util.triangle_strips_to_faces([order]) if mode == 5 else fan
     # A triangle may begin at any of its corners.
     np.testing.assert_array_equal(*([np.roll(f, -np.argmin(f)).tolist() for f in given] for given in (faces, expected)))
 
@@ -324,10 +308,8 @@ def test_convex_polygons_are_fans_and_corners_on_a_line_stay() -> None:
 
 def test_re_entrant_polygons_of_very_many_corners_are_refused() -> None:
     count = 40_000
-    angle = np.linspace(0, 2 * np.pi, count, endpoint=False)
-    points = (
-        np.column_stack([np.cos(angle), np.sin(angle), 0 * angle]) * np.where(np.arange(count) % 2, 1, 0.5)[:, None]
-    )
+    angle, radius = np.linspace(0, 2 * np.pi, count, endpoint=False), np.where(np.arange(count) % 2, 1, 0.5)
+    points = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), 0 * angle])
     with pytest.raises(LimitError, match="triangulate"):
         triangulate(points, np.array([count]), np.arange(count))
 
@@ -483,12 +465,8 @@ def test_ten_thousand_damaged_meshes_load_or_are_refused(file: tuple[str, bytes]
     answers(*file, allow_open)
 
 
-FACETS_OF_FOUR = (
-    b"solid\n"
-    + 3
-    * (b"facet normal 0 0 0\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 1 1 0\nvertex 0 1 0\nendloop\nendfacet\n")
-    + b"endsolid\n"
-)
+FOUR = b"facet normal 0 0 0\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 1 1 0\nvertex 0 1 0\nendloop\nendfacet\n"
+FACETS_OF_FOUR = b"solid\n" + 3 * FOUR + b"endsolid\n"
 
 
 def test_what_trimesh_loses_of_these_files_is_read_or_refused() -> None:

@@ -1,8 +1,5 @@
 """Mass, normals, distances and simplification against closed forms."""
 
-from __future__ import annotations
-
-import io
 import subprocess
 import sys
 from collections.abc import Callable
@@ -12,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from manifold3d import Manifold
 
 from graspd.exchange.training_export import families, signature
 from graspd.service.model.errors import MeshError
@@ -24,6 +22,7 @@ from graspd.worker.objects.distance import MeshDistance, deviation, point_triang
 from graspd.worker.objects.mesh_geometry import (
     centred,
     corner_normals,
+    from_manifold,
     mass_properties,
     signed_volume,
     to_centre,
@@ -119,10 +118,6 @@ def test_simplification_is_monotone_and_exact_at_zero() -> None:
     vertices, faces = sphere(segments=128)
     same = simplify(vertices, faces, 0.0)
     assert same[0] is vertices and same[1] is faces and same[2] == 0.0
-    from manifold3d import Manifold
-
-    from graspd.worker.objects.mesh_geometry import from_manifold
-
     vertices, faces = from_manifold(Manifold.cube((0.06, 0.05, 0.04), True).refine_to_length(0.002))
     assert len(faces) > 5000
     assert len(simplify(vertices, faces, 1e-5)[1]) < 100
@@ -147,9 +142,7 @@ def box_at(place: tuple[float, ...], unit: float = 1.0) -> trimesh.Trimesh:
 
 
 def obj_of(mesh: trimesh.Trimesh, stray: str = "") -> bytes:
-    lines = ["v " + " ".join(f"{value:.6f}" for value in vertex) for vertex in mesh.vertices]
-    lines += [stray] if stray else []
-    return "\n".join([*lines, *("f " + " ".join(str(k + 1) for k in face) for face in mesh.faces)]).encode()
+    return (mesh.export(file_type="obj", digits=6) + f"\n{stray}").encode()
 
 
 def stl_of(mesh: trimesh.Trimesh) -> bytes:
@@ -165,9 +158,7 @@ def loaded(name: str, data: bytes, **options: object) -> ObjectModel:
     ("unit", "options"),
     [(1.0, {"units": "m"}), (1e-3, {"units": "mm"}), (1e-2, {"units": "cm"}), (1.0, {"scale_to": 0.2})],
 )
-def test_a_box_has_the_same_bits_wherever_its_origin_lies(
-    place: tuple[float, ...], unit: float, options: dict[str, object]
-) -> None:
+def test_a_box_has_the_same_bits_wherever_its_origin_lies(place, unit: float, options: dict[str, object]) -> None:
     there, here = (loaded("b.obj", obj_of(box_at(at, unit)), **options) for at in (place, (0.0, 0.0, 0.0)))
     assert there.centred.content == here.centred.content
     if "units" in options:
@@ -222,23 +213,20 @@ def refused(data: bytes) -> str:
     [(refused, UTM), (lambda data: str(check_object({"b.stl": data}, "box")["message"]), (3000.0, 0.0, 0.0))],
     ids=["refused", "a note"],
 )
-def test_file_whose_numbers_do_not_tell_its_points_apart_is_told(
-    tell: Callable[[bytes], str], place: tuple[float, ...]
-) -> None:
+def test_file_whose_numbers_do_not_tell_its_points_apart_is_told(tell: Callable[[bytes], str], place) -> None:
     told = tell(stl_of(box_at(place)))
     assert "where the file's numbers are" in told and "OBJ, PLY" in told
 
 
 def test_other_faults_are_not_laid_on_the_origin() -> None:
     flat = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], process=False)
-    assert "origin" not in refused(io.BytesIO(stl_of(flat)).read())
+    assert "origin" not in refused(stl_of(flat))
 
 
 _CORNERS, _FACES = np.eye(4, 3), np.array([[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]])
 
 
 def ending(code: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The child does this instead."""
     run = subprocess.run
 
     def other(command: list[str], **options: object) -> object:
@@ -261,10 +249,6 @@ def test_too_much_computing_or_a_lost_child_makes_no_other_shape(monkeypatch: py
         coacd_parts(_CORNERS, _FACES, {}, 1)
 
 
-def trimesh_box(extents: tuple[float, float, float]) -> trimesh.Trimesh:
-    return trimesh.creation.box(extents)
-
-
 def named(mesh: trimesh.Trimesh, digest: str) -> ObjectModel:
     return replace(object_from_mesh(mesh, digest), digest=digest)
 
@@ -278,10 +262,8 @@ def flask() -> trimesh.Trimesh:
 def test_copies_turned_scaled_or_meshed_anew_are_of_one_family(flask: trimesh.Trimesh) -> None:
     turned = flask.copy().apply_transform(trimesh.transformations.rotation_matrix(1.1, [1, 2, 3], [0.1, 0, 0]))
     finer, larger = flask.subdivide(), flask.copy().apply_scale(1.4)
-    others = {
-        "box": named(trimesh_box((0.05, 0.07, 0.18)), "b"),
-        "ball": named(trimesh.creation.icosphere(3, 0.05), "a"),
-    }
+    ball = named(trimesh.creation.icosphere(3, 0.05), "a")
+    others = {"box": named(trimesh.creation.box((0.05, 0.07, 0.18)), "b"), "ball": ball}
     copies = {"bottle": flask, "turned": turned, "finer": finer, "larger": larger}
     found = families(others | {name: named(mesh, f"c{k}") for k, (name, mesh) in enumerate(copies.items())})
     assert {found[name] for name in copies} == {"c0"}

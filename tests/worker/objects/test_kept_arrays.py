@@ -1,10 +1,6 @@
 """Arrays that are kept on the machine: read bit for bit, made anew when anything they follow from changes."""
 
-from __future__ import annotations
-
 import dataclasses
-import subprocess
-import sys
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -18,10 +14,9 @@ from graspd.service.model.errors import MeshError
 from graspd.service.model.transforms import IDENTITY_POSE
 from graspd.worker.hands import surface
 from graspd.worker.hands.kinematics import body_poses
-from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.surface import sample_surface
 from graspd.worker.objects import disk_cache, prepare
-from graspd.worker.objects.disk_cache import arrays_kept_or_made, content_of, recalled, recalling
+from graspd.worker.objects.disk_cache import arrays_kept_or_made, content_of
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import load_object
 from graspd.worker.quality.probe import probe_of
@@ -72,34 +67,6 @@ def test_samples_are_those_of_a_process_without_a_cache() -> None:
         assert np.array_equal(sampling.object_samples(ball, 90, seed=1), sampling._sampled(ball, 90, 1))
 
 
-def test_small_steps_are_kept_together_each_by_what_it_is_given(own_cache: Path) -> None:
-    def halves(array: np.ndarray) -> np.ndarray:
-        return recalled("half", [array], lambda: [array / 2])["0"]
-
-    for _ in range(2):
-        with recalling("steps", ("one thing",), (disk_cache,)):
-            assert halves(np.arange(3.0)).tolist() == [0, 0.5, 1]
-            assert halves(np.arange(2.0)).tolist() == [0, 0.5]
-    assert len(list((own_cache / "steps").iterdir())) == 1
-    with recalling("steps", ("one thing",), (disk_cache,)):
-        step = recalled("half", [np.arange(3.0)], lambda: list(never().values()))["0"]
-        step += 1
-        assert halves(np.arange(3.0)).tolist() == [0, 0.5, 1], "nobody writes into what is kept"
-        assert halves(np.arange(3)).dtype == float, "another type is another step"
-    assert halves(np.arange(2.0)).tolist() == [0, 0.5]
-
-
-def test_a_hand_is_the_same_from_kept_shapes_and_needs_no_scipy(tmp_path: Path) -> None:
-    first, again = hand_from_path("barrett"), hand_from_path("barrett")
-    assert first.content == again.content
-    code = (
-        "import sys; from graspd.worker.hands.load import hand_from_path; import graspd.worker.generation; "
-        "print(hand_from_path('barrett').content, *{'scipy', 'trimesh', 'pydantic_settings'} & set(sys.modules))"
-    )
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert told.split() == [first.content]
-
-
 #: Two balls in one another: a repair to remember.
 BALLS = stl(join(sphere(segments=24), sphere(segments=24, at=(0.02, 0.0, 0.0))))
 
@@ -115,13 +82,8 @@ def load_balls(files: dict[str, bytes] = BALLS, error: float = 3e-4, **options: 
 def built(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """The bounds to which objects were prepared, not read."""
     bounds: list[float] = []
-
-    def build(mesh: Any, error: float) -> ObjectModel:
-        bounds.append(error)
-        return prepare_build(mesh, error)
-
-    prepare_build = prepare.build
-    monkeypatch.setattr(prepare, "build", build)
+    build = prepare.build
+    monkeypatch.setattr(prepare, "build", lambda mesh, error: bounds.append(error) or build(mesh, error))
     return bounds
 
 
@@ -200,10 +162,8 @@ def test_no_cache_gives_one_mesh_of_a_file_for_another() -> None:
     moved = dataclasses.replace(HAND, origin=origin)
     assert not np.array_equal(sample_surface(HAND, 200).position, sample_surface(moved, 200).position)
     # A tall plate and a cube of one volume and digest, and as many corners.
-    cube, plate = (
-        dataclasses.replace(object_from_mesh(trimesh.creation.box(size)), digest=BRICK.digest, volume=BRICK.volume)
-        for size in ((0.05, 0.05, 0.05), (0.1, 0.1, 0.0125))
-    )
+    boxes = (object_from_mesh(trimesh.creation.box(size)) for size in ((0.05, 0.05, 0.05), (0.1, 0.1, 0.0125)))
+    cube, plate = (dataclasses.replace(one, digest=BRICK.digest, volume=BRICK.volume) for one in boxes)
     assert rest_probability(cube, [0]) != rest_probability(plate, [0])
     again = probe_of(two_finger_hand(), dataclasses.replace(BRICK), hand_points=64, object_points=64)
     assert again is one, "an equal model that was loaded again"

@@ -1,8 +1,5 @@
 """From triangles to a solid: what is repaired, what is refused, and that both are said."""
 
-from __future__ import annotations
-
-import json
 from pathlib import Path
 from typing import Any
 
@@ -29,18 +26,6 @@ def check(mesh: Mesh, **options: Any) -> dict[str, Any]:
     return check_object(stl(mesh), "m", face_error_m=0.0, **options)
 
 
-def test_every_bad_mesh_gets_a_verdict_that_names_the_defect(shared_data: Path) -> None:
-    entries = json.loads((shared_data / "bad" / "INDEX.json").read_text())["inputs"]
-    meshes = [entry for entry in entries if entry["kind"].startswith("mesh")]
-    assert len(meshes) >= 20
-    wrong = []
-    for entry in meshes:
-        report = report_object(str(shared_data / "bad" / entry["file"]))
-        if report["verdict"] != entry["expect"] or entry["message_names"].lower() not in report["message"].lower():
-            wrong.append((entry["file"], entry["expect"], report["verdict"], report["message"]))
-    assert not wrong
-
-
 @pytest.mark.parametrize(
     ("file", "options", "volume"),
     [
@@ -49,9 +34,7 @@ def test_every_bad_mesh_gets_a_verdict_that_names_the_defect(shared_data: Path) 
         ("open_shell.stl", {"allow_open": True}, None),
     ],
 )
-def test_the_mend_that_a_refusal_names_works(
-    shared_data: Path, file: str, options: dict[str, Any], volume: float | None
-) -> None:
+def test_the_mend_that_a_refusal_names_works(shared_data: Path, file: str, options, volume: float | None) -> None:
     report = report_object(str(shared_data / "bad" / file), options)
     assert report["verdict"] != "refuse"
     if volume is not None:
@@ -148,9 +131,8 @@ def test_published_scans_become_closed_solids(shared_data: Path, chosen: tuple[s
 
 def test_unknown_keys_and_two_meshes_are_refused() -> None:
     with pytest.raises(MeshError, match="unit"):
-        load_object(
-            {**stl(box()), "asset.json": b'{"file": "m.stl", "unit": "mm"}'}, name="m", digest="", face_error_m=0
-        )
+        wrong = {"asset.json": b'{"file": "m.stl", "unit": "mm"}'}
+        load_object({**stl(box()), **wrong}, name="m", digest="", face_error_m=0)
     with pytest.raises(MeshError, match="name one"):
         load_object({**stl(box()), "n.stl": b"x"}, name="m", digest="", face_error_m=0)
 
@@ -263,7 +245,6 @@ def test_parts_within_a_millimetre_are_one_body() -> None:
 
 
 def rattle() -> trimesh.Trimesh:
-    """A hollow box with a loose ball in it."""
     hollow, ball = trimesh.creation.box((0.04, 0.04, 0.04)), trimesh.creation.icosphere(1, 0.01)
     cavity = trimesh.creation.box((0.036, 0.036, 0.036))
     cavity.invert()

@@ -1,7 +1,6 @@
 """Which candidate of a grasp is taken after its trials."""
 
-from __future__ import annotations
-
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -31,6 +30,7 @@ from tests.worker.simulation.rigs import ball
 
 QUICK = resolve_fidelity("draft").model_copy(update={"starts": 2, "finalists": 2})
 TABLE = (Obstacle.half_space([0, 0, 1], 0.0),)
+TABLE_SPEC = SceneSpec(kind="table")
 
 
 def plain(hand, obj, state: HandState, losses: np.ndarray, placed: PlacedGrasps, *, device: str) -> GraspSet:
@@ -39,12 +39,7 @@ def plain(hand, obj, state: HandState, losses: np.ndarray, placed: PlacedGrasps,
     return replace(grasp_set(posture(*rows)), stability_loss=losses)
 
 
-def taken(
-    scores: list[list[float]],
-    monkeypatch: pytest.MonkeyPatch,
-    merit: list[list[float]] | None = None,
-    infeasible: tuple[int, ...] = (),
-) -> tuple[list[int], list[int], list[int]]:
+def taken(scores, monkeypatch, merit=None, infeasible=()) -> tuple[list[int], list[int], list[int]]:
     """Hands that are taken where hand k of grasp n scores `scores[n][k]` and is the k-th most promising; those that
     were tried, and those that were seated. Some are infeasible."""
     monkeypatch.setattr(candidates, "with_postures", plain)
@@ -110,26 +105,34 @@ def test_the_others_are_seated_only_where_the_first_two_fail(monkeypatch: pytest
 
 
 @pytest.fixture(scope="module")
-def scene():
-    hand, obj = hand_from_path("barrett"), object_from_path("block", face_error_m=QUICK.face_error_m)
-    spec = SceneSpec(kind="table")
-    poses = rest_poses(spec, obj, count=2, seed=1)["scene/object_pose"]
-    return hand, obj, PlacedGrasps(supports_of(spec), poses, np.arange(4) % 2)
+def pair():
+    return hand_from_path("barrett"), object_from_path("block", face_error_m=QUICK.face_error_m)
 
 
-def test_trial_keeps_what_holds_and_finds_more_whatever_threads(scene) -> None:
-    hand, obj, placed = scene
-    wanted = PlanRequest(4, QUICK, seed=4, placed=placed)
-    plain = synthesize(hand, obj, wanted, ExecutionContext(threads=1))
-    rollout = lift_rollout(hand, obj, lambda: ConvexPieces((obj.hull_vertices,), 1.0, 0.0, "block"))
-    one, two = (
-        synthesize(hand, obj, replace(wanted, rollout=rollout), ExecutionContext(threads=threads)) for threads in (1, 4)
-    )
+@pytest.fixture(scope="module")
+def placed(pair) -> PlacedGrasps:
+    poses = rest_poses(TABLE_SPEC, pair[1], count=2, seed=1)["scene/object_pose"]
+    return PlacedGrasps(supports_of(TABLE_SPEC), poses, np.arange(4) % 2)
+
+
+@pytest.fixture(scope="module")
+def in_scenes(pair, placed: PlacedGrasps) -> Callable[..., GraspSet]:
+    """Four grasps on tables, chosen by a rollout."""
+
+    def made(rollout=None, threads: int = 1) -> GraspSet:
+        wanted = PlanRequest(4, QUICK, seed=4, placed=placed, rollout=rollout)
+        return synthesize(*pair, wanted, ExecutionContext(threads=threads))
+
+    return made
+
+
+def test_trial_keeps_what_holds_and_finds_more_whatever_threads(pair, placed: PlacedGrasps, in_scenes) -> None:
+    rollout = lift_rollout(*pair, lambda: ConvexPieces((pair[1].hull_vertices,), 1.0, 0.0, "block"))
+    plain, one, two = in_scenes(), in_scenes(rollout), in_scenes(rollout, threads=4)
     assert np.array_equal(one.grasp.hand_pose, two.grasp.hand_pose)
     # What merit alone takes is among the candidates: where it holds, so does what is taken.
     held, before = rollout(one, placed) < 1.0 + SLIPS, rollout(plain, placed) < 1.0 + SLIPS
-    assert held.any()
-    assert (held >= before).all()
+    assert held.any() and (held >= before).all()
 
 
 def always(score: float):
@@ -152,43 +155,39 @@ def attempts(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 @pytest.mark.parametrize(("score", "made"), [(0.5, 1), (1.5, 3), (9.0, 6)])
-def test_in_scenes_a_grasp_sets_out_again_while_it_fails(scene, attempts: list[int], score: float, made: int) -> None:
-    hand, obj, placed = scene
-    wanted = PlanRequest(4, QUICK, seed=4, placed=placed, rollout=always(score))
-    found = synthesize(hand, obj, wanted, ExecutionContext(threads=1))
-    assert sorted(attempts) == sorted([*range(made)] * 4)
-    assert found.attempts == 4 * made
+def test_in_scenes_a_grasp_sets_out_again_while_it_fails(in_scenes, attempts, score: float, made: int) -> None:
+    found = in_scenes(always(score))
+    assert sorted(attempts) == sorted([*range(made)] * 4) and found.attempts == 4 * made
 
 
 @pytest.mark.parametrize(("better", "times"), [(True, GENTLER), (False, 1.0)])
-def test_hand_that_nearly_lifts_squeezes_gently_where_that_helps(scene, better: bool, times: float) -> None:
-    hand, obj, placed = scene
-
+def test_hand_that_nearly_lifts_squeezes_gently_where_that_helps(pair, in_scenes, better: bool, times: float) -> None:
     def squeezed(grasps: GraspSet, times: float) -> np.ndarray:
-        return squeeze(hand, obj, grasps.grasp, total_normal_force=times * normal_force(obj)).joint_positions
+        return squeeze(*pair, grasps.grasp, total_normal_force=times * normal_force(pair[1])).joint_positions
 
     def rollout(grasps: GraspSet, *_: object) -> np.ndarray:
         usual = np.isclose(grasps.squeeze.joint_positions, squeezed(grasps, 1.0)).all(axis=1)
         return np.where(usual, 1.5, 0.5 if better else 1.6)
 
-    found = synthesize(
-        hand, obj, PlanRequest(4, QUICK, seed=4, placed=placed, rollout=rollout), ExecutionContext(threads=1)
-    )
+    found = in_scenes(rollout)
     assert np.allclose(found.squeeze.joint_positions, squeezed(found, times))
     assert not np.allclose(squeezed(found, GENTLER), squeezed(found, 1.0))
 
 
 @pytest.fixture(scope="module")
-def free():
-    """A hand, an object, what is wanted of them, and the trial of free grasps."""
-    hand, obj = hand_from_path("barrett"), object_from_path("block", face_error_m=QUICK.face_error_m)
-    rollout = push_rollout(hand, obj, lambda: ConvexPieces((obj.hull_vertices,), 1.0, 0.0, "block"))
-    return hand, obj, PlanRequest(12, QUICK, seed=4), rollout
+def free(pair) -> Callable[..., GraspSet]:
+    """Six grasps of a free object, chosen by their trial, but for what is changed of the request."""
+    rollout = push_rollout(*pair, lambda: ConvexPieces((pair[1].hull_vertices,), 1.0, 0.0, "block"))
+    wanted = PlanRequest(6, QUICK, seed=4, rollout=rollout)
+
+    def made(threads: int = 1, **changes: object) -> GraspSet:
+        return synthesize(*pair, replace(wanted, **changes), ExecutionContext(threads=threads))
+
+    return made
 
 
 def test_the_hand_around_more_of_an_object_is_tried_first(free, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where nearness outweighs the balance."""
-    hand, obj, wanted, rollout = free
     shares, orders = [], []
     near_share, tried = Data.near_share, planner.tried
 
@@ -203,24 +202,19 @@ def test_the_hand_around_more_of_an_object_is_tried_first(free, monkeypatch: pyt
     monkeypatch.setattr(Data, "near_share", told)
     monkeypatch.setattr(planner, "tried", seen)
     monkeypatch.setattr(planner, "NEARNESS", 1e6)
-    four = QUICK.model_copy(update={"starts": 4})
-    synthesize(hand, obj, replace(wanted, count=4, fidelity=four, rollout=rollout), ExecutionContext(threads=1))
+    free(count=4, fidelity=QUICK.model_copy(update={"starts": 4}))
     in_order = shares[0][orders[0]]
     assert (np.diff(in_order, axis=1) <= 0).all()
     assert (in_order[:, 0] > in_order[:, 1]).any() and (orders[0][:, 0] > orders[0][:, 1]).any()
 
 
 def test_what_a_trial_chooses_depends_on_no_other_grasp(free) -> None:
-    hand, obj, wanted, rollout = free
-    one = synthesize(hand, obj, replace(wanted, rollout=rollout), ExecutionContext(threads=1))
-    threads = synthesize(hand, obj, replace(wanted, rollout=rollout), ExecutionContext(threads=3))
-    fewer = synthesize(hand, obj, replace(wanted, count=2, rollout=rollout), ExecutionContext(threads=1))
+    one, threads, fewer = free(), free(threads=3), free(count=2)
     assert np.array_equal(one.grasp.hand_pose, threads.grasp.hand_pose)
     assert np.array_equal(one.grasp.hand_pose[:2], fewer.grasp.hand_pose)
 
 
 def test_a_grasp_nobody_holds_sets_out_as_often_as_it_may(free, attempts: list[int]) -> None:
-    hand, obj, wanted, _ = free
     scores: list[float] = []
 
     def never(grasps: GraspSet, placed: PlacedGrasps | None, beat: np.ndarray) -> np.ndarray:
@@ -228,29 +222,24 @@ def test_a_grasp_nobody_holds_sets_out_as_often_as_it_may(free, attempts: list[i
         scores.extend(9.0 - 0.1 * (len(scores) + np.arange(len(grasps))))
         return np.array(scores[-len(grasps) :])
 
-    found = synthesize(hand, obj, replace(wanted, count=1, rollout=never), ExecutionContext(threads=1))
+    found = free(count=1, rollout=never)
     assert attempts == list(range(1 + len(FREE)))
     # Half of the hands that set out without a trial at each attempt, and of them those that can be valid are tried.
-    assert len(FREE) // 2 < len(scores) <= (1 + len(FREE)) * QUICK.starts // 2
-    assert len(found) == 1
+    assert len(FREE) // 2 < len(scores) <= (1 + len(FREE)) * QUICK.starts // 2 and len(found) == 1
 
 
 @pytest.mark.parametrize(
     ("score", "off", "made"),
     [(0.1, False, 1), (0.7, False, 2), (1.5, False, 2), (0.1, True, 3), (1.5, True, 3), (2.5, True, 1 + len(FREE))],
 )
-def test_grasps_that_slip_or_stand_off_have_retries(
-    free, attempts: list[int], monkeypatch: pytest.MonkeyPatch, score: float, off: bool, made: int
-) -> None:
-    hand, obj, wanted, _ = free
+def test_grasps_that_slip_or_stand_off_have_retries(free, attempts, monkeypatch, score, off: bool, made: int) -> None:
     if off:
         monkeypatch.setattr(planner, "standing_off", lambda hand, obj, grasp, **_: np.ones(len(grasp), bool))
-    synthesize(hand, obj, replace(wanted, count=1, rollout=always(score)), ExecutionContext(threads=1))
+    free(count=1, rollout=always(score))
     assert attempts == list(range(made))
 
 
 def test_of_grasps_that_hold_one_whose_fingers_touch_is_chosen(free, monkeypatch: pytest.MonkeyPatch) -> None:
-    hand, obj, wanted, _ = free
     seen: list[bool] = []
 
     def off_at_first(hand, obj, grasp, **_):
@@ -258,17 +247,15 @@ def test_of_grasps_that_hold_one_whose_fingers_touch_is_chosen(free, monkeypatch
         return np.full(len(grasp), seen[-1])
 
     rollout = lambda grasps, *_: np.full(len(grasps), 0.1 if not seen else 1.5)  # noqa: E731
-    one = replace(wanted, count=1, rollout=rollout)
     monkeypatch.setattr(planner, "FREE", ())
-    first = synthesize(hand, obj, one, ExecutionContext(threads=1))
+    first = free(count=1, rollout=rollout)
     seen.clear()
     monkeypatch.setattr(planner, "FREE", (STANDS,))
     monkeypatch.setattr(planner, "standing_off", off_at_first)
-    assert (synthesize(hand, obj, one, ExecutionContext(threads=1)).grasp.hand_pose != first.grasp.hand_pose).any()
+    assert (free(count=1, rollout=rollout).grasp.hand_pose != first.grasp.hand_pose).any()
 
 
 def test_hands_are_drawn_to_an_object_at_their_first_start_alone(free, monkeypatch: pytest.MonkeyPatch) -> None:
-    hand, obj, wanted, _ = free
     pulls: list[tuple[float, float]] = []
     work = planner._work
 
@@ -278,16 +265,12 @@ def test_hands_are_drawn_to_an_object_at_their_first_start_alone(free, monkeypat
 
     monkeypatch.setattr(planner, "_work", watched)
     monkeypatch.setattr(planner, "FREE", (FAILED, FAILED))
-    never = replace(wanted, count=1, rollout=always(9.0))
-    synthesize(hand, obj, never, ExecutionContext(threads=1))
-    assert pulls[0] == (PULL, PULL)
-    assert len(pulls) > 1
+    free(count=1, rollout=always(9.0))
+    assert pulls[0] == (PULL, PULL) and len(pulls) > 1
     assert set(pulls[1:]) == {(0.0, 0.0)}
 
 
 def test_attempts_made_ahead_give_grasps_of_one_after_the_other(free, monkeypatch: pytest.MonkeyPatch) -> None:
-    hand, obj, wanted, _ = free
-
     def picky(grasps: GraspSet, placed: PlacedGrasps | None, _: object = None) -> np.ndarray:
         """Takes two fifths of the hands, by where they are."""
         assert placed is None
@@ -298,7 +281,7 @@ def test_attempts_made_ahead_give_grasps_of_one_after_the_other(free, monkeypatc
     found = {}
     for ahead in (1, 4):
         monkeypatch.setattr(planner, "AHEAD", ahead)
-        found[ahead] = synthesize(hand, obj, replace(wanted, count=8, rollout=picky), ExecutionContext(threads=8))
+        found[ahead] = free(threads=8, count=8, rollout=picky)
     np.testing.assert_array_equal(found[4].grasp.hand_pose, found[1].grasp.hand_pose)
     np.testing.assert_array_equal(found[4].squeeze.joint_positions, found[1].squeeze.joint_positions)
     assert (picky(found[1], None) < 1).sum() > len(found[1].stability_loss) // 2

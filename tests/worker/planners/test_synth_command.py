@@ -1,7 +1,5 @@
 """`graspd synth`: validated as a job, called what it is, and a file that finds its hand and object again."""
 
-from __future__ import annotations
-
 import json
 import re
 import signal
@@ -24,11 +22,7 @@ from graspd.worker import generation
 from graspd.worker.files import synthesis
 from graspd.worker.files.provenance import object_of_shard
 from tests.worker.commands_run import graspd as graspd_command
-
-
-def run(*words: str | Path) -> Any:
-    return CliRunner().invoke(build(), [str(word) for word in words])
-
+from tests.worker.commands_run import refused
 
 DRAFT = "--fidelity draft --device cpu"
 
@@ -90,40 +84,29 @@ def test_grasps_that_nobody_validated_are_sound_and_never_valid(unvalidated: tup
 
 def test_evaluate_gives_a_verdict_of_each_grasp_that_agrees(validated: tuple[Path, Any]) -> None:
     told = graspd_command("evaluate", validated[0])
-    assert [(one["file"], one["row"], one["held"]) for one in told["verdicts"]] == [
-        (str(validated[0]), row, True) for row in range(3)
-    ]
+    expected = [(str(validated[0]), row, True) for row in range(3)]
+    assert [(one["file"], one["row"], one["held"]) for one in told["verdicts"]] == expected
     assert "verdicts" not in told["files"][0]
 
 
-def test_readers_take_grasps_that_nobody_validated_only_when_told(
-    validated: tuple[Path, Any], unvalidated: tuple[Path, Any]
-) -> None:
+def test_readers_take_grasps_that_nobody_validated_only_when_told(validated, unvalidated: tuple[Path, Any]) -> None:
     both = open_shards([validated[0], unvalidated[0]])
     rows = [Grasps(both, columns=["quality/epsilon"], **wish) for wish in ({}, {"unvalidated": True}, {"valid": False})]
     assert [len(found) for found in rows] == [3, 3, 6]
     assert {both.by_id(sample["shard_id"]).path for sample in rows[1]} == {unvalidated[0]}
 
 
-@pytest.mark.parametrize("command", ["export", "pictures"])
-def test_export_and_pictures_take_grasps_that_nobody_validated_only_when_told(
-    unvalidated: tuple[Path, Any], tmp_path: Path, command: str
-) -> None:
-    if command == "export":
-        words: list[str | Path] = ["export", unvalidated[0], "--format", "dexgraspbench", "-o", tmp_path / "out"]
-    else:
-        words = ["pictures", unvalidated[0], "-n", "1", "--size", "32", "--device", "cpu", "-o", tmp_path / "out.png"]
-    refused = run(*words)
-    assert refused.exit_code == 2 and "select them with --unvalidated" in refused.output
+@pytest.mark.parametrize("command", ["export --format dexgraspbench", "pictures -n 1 --size 32 --device cpu"])
+def test_export_and_pictures_take_grasps_that_nobody_validated_only_when_told(unvalidated, tmp_path, command) -> None:
+    assert "select them with --unvalidated" in refused(command, unvalidated[0], "-o", tmp_path / "out.png")
     assert not list(tmp_path.iterdir())
-    assert run(*words, "--unvalidated").exit_code == 0
+    graspd_command(f"{command} --unvalidated", unvalidated[0], "-o", tmp_path / "out.png")
 
 
-@pytest.mark.parametrize("words", [("--want", "good"), ("--validation", "validate")])
-def test_a_word_that_is_none_is_refused_before_the_files_are_read(words: tuple[str, str], tmp_path: Path) -> None:
-    done = run("synth", "--hand", "absent.urdf", "--object", "block", "-o", tmp_path / "g.h5", *words)
-    assert done.exit_code == 2
-    assert f"{words[0]}: must be one of" in done.output
+@pytest.mark.parametrize("words", ["--want good", "--validation validate"])
+def test_a_word_that_is_none_is_refused_before_the_files_are_read(words: str, tmp_path: Path) -> None:
+    said = refused(f"synth --hand absent.urdf --object block {words} -o", tmp_path / "g.h5")
+    assert f"{words.split()[0]}: must be one of" in said
 
 
 def elsewhere(file: Path, folder: Path) -> Shard:
@@ -143,9 +126,7 @@ def test_a_shard_finds_its_object_in_its_own_folder(of_own_mesh: Path, own_mesh:
     assert object_of_shard(shard, None).digest == shard.attributes["object_digest"]
 
 
-def test_a_file_of_the_right_name_and_another_content_is_not_taken(
-    of_own_mesh: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_of_the_right_name_and_another_content_is_not_taken(of_own_mesh: Path, tmp_path, monkeypatch) -> None:
     monkeypatch.setenv("GRASPD_DATA_DIR", str(tmp_path / "data"))
     shard = elsewhere(of_own_mesh, tmp_path)
     trimesh.creation.box((0.05, 0.06, 0.07)).export(tmp_path / "shard" / "clean.obj")
@@ -169,9 +150,7 @@ def test_every_command_finds_hand_and_object_of_a_file_by_itself(of_own_mesh: Pa
     graspd_command("render --views 1 --width 32 --height 24 --device cpu", tmp_path / "s.h5", "-o", tmp_path / "v.h5")
 
 
-def test_fewer_grasps_than_asked_are_told_with_the_reason_and_exit_code_3(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_fewer_grasps_than_asked_are_told_with_the_reason_and_exit_code_3(folder: Path, monkeypatch) -> None:
     out = folder / "few.h5"
     monkeypatch.setattr(generation, "passes", lambda columns: np.zeros(len(columns["quality/success"]), np.uint8))
     said = graspd_command(f"synth --hand barrett --object block -n 2 --budget 1 {DRAFT} -o", out, code=3)
@@ -186,9 +165,7 @@ def test_fewer_grasps_than_asked_are_told_with_the_reason_and_exit_code_3(
 
 
 @pytest.mark.parametrize("asked", [signal.SIGINT, signal.SIGTERM])
-def test_who_stops_it_keeps_what_was_validated(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, asked: signal.Signals
-) -> None:
+def test_who_stops_it_keeps_what_was_validated(folder: Path, monkeypatch, asked: signal.Signals) -> None:
     real, out = synthesis.synthesized, folder / f"stopped-{asked}.h5"
 
     def stopped(*given: Any, progress: Any, **named: Any) -> Any:
@@ -201,7 +178,7 @@ def test_who_stops_it_keeps_what_was_validated(
     before = signal.getsignal(asked)
     monkeypatch.setattr(synthesis, "synthesized", stopped)
     words = f"synth --hand barrett --object block -n 64 --budget 1 --validation none --json {DRAFT} -o"
-    done = run(*words.split(), out)
+    done = CliRunner().invoke(build(), [*words.split(), str(out)])
     shard = read_shard(out, kind="base")
     kept = len(shard["quality/valid"])
     assert done.exit_code == 128 + asked and 0 < kept <= 32

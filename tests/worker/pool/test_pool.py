@@ -1,7 +1,5 @@
 """Processes that work for one: the same results in order, and nothing that hangs whatever becomes of them."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

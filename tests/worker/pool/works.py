@@ -1,7 +1,5 @@
 """What the processes of a pool do in tests; imports next to nothing."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time

@@ -1,6 +1,4 @@
-"""A worker and the engine beside it, as processes: what each does when the other stops, hangs or ends."""
-
-from __future__ import annotations
+"""A worker, its registration and the engine beside it: what each does when the other stops, hangs or ends."""
 
 import os
 import signal
@@ -46,7 +44,6 @@ class Worker:
 
     @property
     def engine(self) -> int:
-        """Process of its engine."""
         pid = self.process.pid
         (child,) = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
         return int(child)
@@ -58,7 +55,6 @@ class Worker:
         return [beat.state for beat in self.queue.workers()]
 
     def begin(self) -> None:
-        """Have it begin a task."""
         self.queue.enqueue([TASK], Priority.BULK)
         until(lambda: EventKind.STARTED in self.events(), "the task began")
 
@@ -191,7 +187,7 @@ class Deaf(Link):
 
 
 def test_an_engine_is_stopped_when_the_time_of_a_task_is_over_and_then_ended(
-    rq_queue: RqQueue, redis_server: str, monkeypatch: pytest.MonkeyPatch
+    rq_queue, redis_server, monkeypatch
 ) -> None:
     monkeypatch.setattr(main, "STUCK_AFTER_S", 0.2)
     deaf = Deaf()
@@ -229,9 +225,7 @@ def resources(folder: Path, processes: int) -> TaskResources:
     return TaskResources(settings, open_store("memory://"), Device("cpu"))
 
 
-def test_tasks_that_make_grasps_share_the_processes_of_their_worker(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_tasks_that_make_grasps_share_processes_of_their_worker(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(engine, "MODULES", ())  # these need none of the engine
     worker = resources(tmp_path, 2)
     try:
@@ -243,3 +237,37 @@ def test_tasks_that_make_grasps_share_the_processes_of_their_worker(
         worker.close()
     assert resources(tmp_path, 1).pool(Stage.SYNTHESIZE) is None
     assert resources(tmp_path, 0).pool(Stage.SYNTHESIZE) is None, "on a CPU threads do it, where nobody says otherwise"
+
+
+@pytest.fixture
+def heart(rq_queue: RqQueue, redis_server: str, tmp_path: Path) -> Iterator[Heartbeat]:
+    heart = Heartbeat(redis_server, beat_of(), lease_s=LEASE_S, alive=tmp_path / "alive")
+    heart.start()
+    until(rq_queue.workers, "the first beat")
+    yield heart
+    heart.stop()
+
+
+def test_what_a_worker_is_at_is_shown_at_once(heart: Heartbeat, rq_queue: RqQueue, tmp_path: Path) -> None:
+    until((tmp_path / "alive").exists, "its file is touched")
+    heart.interval_s = 3600.0
+    heart.update(state="busy", task_id="a")
+    until(lambda: [(beat.state, beat.task_id) for beat in rq_queue.workers()] == [("busy", "a")], "the news")
+    heart.update(done=1.0, total=4.0, message="descending")
+    told = ("a", 1.0, 4.0, "descending")
+    until(lambda: [(b.task_id, b.done, b.total, b.message) for b in rq_queue.workers()] == [told], "how far it is")
+
+
+def test_a_worker_that_leaves_is_not_lost(heart: Heartbeat, rq_queue: RqQueue) -> None:
+    heart.stop()
+    assert rq_queue.workers() == []
+    assert [event.kind for _, event in rq_queue.tail("0", limit=10, wait_s=0)] == [EventKind.LEFT]
+
+
+def test_it_goes_on_when_redis_answers_again(heart: Heartbeat, rq_queue: RqQueue) -> None:
+    rq_queue.connection.config_set("min-replicas-to-write", 1)
+    try:
+        until(lambda: rq_queue.workers() == [], "its registration ends")
+    finally:
+        rq_queue.connection.config_set("min-replicas-to-write", 0)
+    until(rq_queue.workers, "it gives signs of life again")

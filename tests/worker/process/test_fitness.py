@@ -1,138 +1,122 @@
 """Which failures are the worker's own, and its check of itself with the real engine."""
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from typing import Any
 
 import pytest
 
 from graspd.service.model.errors import DamagedError, MeshError
-from graspd.service.model.messages import TaskMessage
 from graspd.service.model.states import Stage
 from graspd.service.queue.port import Event, EventKind
 from graspd.service.store.records import task_attempts
-from graspd.service.store.store import Store, open_store
 from graspd.worker import generation
 from graspd.worker.process import fitness as module
 from graspd.worker.process.fitness import Fitness
-from graspd.worker.process.runner import Runner
 from graspd.worker.process.selfcheck import EngineError, check_engine
-from graspd.worker.stages.context import TaskContext
-from tests.fakes import fake_synthesize, make_shard, message_for
+from tests.fakes import make_shard, message_for
+from tests.worker.process.test_runner import Bench, raising
 
 
-class Bench:
-    """A worker's runner, whose engine and stage can be broken."""
+class Doubted(Bench):
+    """A runner whose engine can be broken."""
 
     def __init__(self) -> None:
-        self.store: Store = open_store("memory://")
+        super().__init__()
         self.engine_works = True
-        self.error: Exception | None = None
         self.checked: list[tuple[Stage, ...]] = []
-        self.told: list[dict[str, str]] = []
-        self.fitness = Fitness(self.store, self._check)
+        self.states: list[dict[str, str]] = []
+        self.options["fitness"] = self.fitness = Fitness(self.store, self._check)
 
     def _check(self, stages: Collection[Stage]) -> None:
         self.checked.append(tuple(stages))
         if not self.engine_works:
             raise EngineError("synthesize: ImportError: libcuda.so.1")
 
-    def run(self, message: TaskMessage) -> Event:
-        def stage(message: TaskMessage, context: TaskContext) -> Any:
-            if self.error is not None:
-                raise self.error
-            return fake_synthesize(message, context)
-
-        runner = Runner({Stage.SYNTHESIZE: stage}, worker="w", publish=lambda event: None, fitness=self.fitness)
-        return runner.run(message.model_dump(mode="json", by_alias=True), TaskContext(self.store))
-
     def sits_out(self, told_to_stop: bool = False) -> bool:
-        """Whether it is fit again after its quarantine."""
-        return self.fitness.wait_in_quarantine(
-            (Stage.SYNTHESIZE,), lambda **facts: self.told.append(facts), lambda: told_to_stop
-        )
+        return self.fitness.wait_in_quarantine((Stage.SYNTHESIZE,), self._tell, lambda: told_to_stop)
+
+    def _tell(self, **facts: str) -> None:
+        self.states.append(facts)
 
     def fail(self, seed: int) -> Event:
-        self.error = RuntimeError("no result")
-        return self.run(message_for(seed=seed).model_copy(update={"task_id": f"{seed:032x}"}))
+        message = message_for(seed=seed).model_copy(update={"task_id": f"{seed:032x}"})
+        return self.run(message, raising(RuntimeError("no result")))
 
 
 @pytest.fixture
-def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
+def doubted(monkeypatch: pytest.MonkeyPatch) -> Doubted:
     monkeypatch.setattr(module, "PAUSES_S", (0.0, 0.0))
-    return Bench()
+    return Doubted()
 
 
-def test_a_task_that_failed_because_the_engine_broke_goes_back_without_an_attempt(bench: Bench) -> None:
-    bench.engine_works = False
-    event = bench.fail(1)
+def test_a_task_that_failed_because_the_engine_broke_goes_back_without_an_attempt(doubted: Doubted) -> None:
+    doubted.engine_works = False
+    event = doubted.fail(1)
     assert (event.kind, event.message) == (EventKind.RETURNED, "synthesize: ImportError: libcuda.so.1")
-    assert task_attempts(bench.store, event.task_id) == []
-    assert bench.fitness.reason == event.message
+    assert task_attempts(doubted.store, event.task_id) == []
+    assert doubted.fitness.reason == event.message
 
 
-def test_a_task_that_fails_with_a_sound_engine_has_failed(bench: Bench) -> None:
-    assert bench.fail(1).kind is EventKind.FAILED
-    assert bench.checked == [(Stage.SYNTHESIZE,)], "what its stage runs on was tried"
-    assert bench.fitness.reason == ""
+def test_a_task_that_fails_with_a_sound_engine_has_failed(doubted: Doubted) -> None:
+    assert doubted.fail(1).kind is EventKind.FAILED
+    assert doubted.checked == [(Stage.SYNTHESIZE,)], "what its stage runs on was tried"
+    assert doubted.fitness.reason == ""
 
 
 @pytest.mark.parametrize("error", [MeshError("torn"), DamagedError("no JSON")])
-def test_bad_input_casts_no_doubt_on_the_worker(bench: Bench, error: Exception) -> None:
-    bench.engine_works, bench.error = False, error
-    assert bench.run(message_for()).kind is EventKind.FAILED
-    assert bench.checked == []
+def test_bad_input_casts_no_doubt_on_the_worker(doubted: Doubted, error: Exception) -> None:
+    doubted.engine_works = False
+    assert doubted.run(message_for(), raising(error)).kind is EventKind.FAILED
+    assert doubted.checked == []
 
 
-def test_failures_in_a_row_that_others_do_not_have_are_the_workers(bench: Bench) -> None:
+def test_failures_in_a_row_that_others_do_not_have_are_the_workers(doubted: Doubted) -> None:
     for seed in (1, 2):
-        assert bench.fail(seed).kind is EventKind.FAILED
-        make_shard(bench.store, message_for(seed=seed), worker="another")
-    event = bench.fail(3)
-    assert (event.kind, task_attempts(bench.store, event.task_id)) == (EventKind.RETURNED, [])
-    assert bench.fitness.reason == "2 tasks in a row failed here and were done by other workers"
+        assert doubted.fail(seed).kind is EventKind.FAILED
+        make_shard(doubted.store, message_for(seed=seed), worker="another")
+    event = doubted.fail(3)
+    assert (event.kind, task_attempts(doubted.store, event.task_id)) == (EventKind.RETURNED, [])
+    assert doubted.fitness.reason == "2 tasks in a row failed here and were done by other workers"
 
 
 @pytest.mark.parametrize("done_elsewhere", [0, 1])
-def test_tasks_that_others_fail_too_are_no_fault_of_the_worker(bench: Bench, done_elsewhere: int) -> None:
+def test_tasks_that_others_fail_too_are_no_fault_of_the_worker(doubted: Doubted, done_elsewhere: int) -> None:
     for seed in range(6):
-        assert bench.fail(seed).kind is EventKind.FAILED
+        assert doubted.fail(seed).kind is EventKind.FAILED
         if seed < done_elsewhere:
-            make_shard(bench.store, message_for(seed=seed), worker="another")
+            make_shard(doubted.store, message_for(seed=seed), worker="another")
 
 
-def test_a_success_in_between_ends_the_row(bench: Bench) -> None:
+def test_a_success_in_between_ends_the_row(doubted: Doubted) -> None:
     for seed in (1, 2):
-        bench.fail(seed)
-        make_shard(bench.store, message_for(seed=seed), worker="another")
-    bench.error = None
-    assert bench.run(message_for(seed=9)).kind is EventKind.FINISHED
-    assert bench.fail(3).kind is EventKind.FAILED
+        doubted.fail(seed)
+        make_shard(doubted.store, message_for(seed=seed), worker="another")
+    assert doubted.run(message_for(seed=9)).kind is EventKind.FINISHED
+    assert doubted.fail(3).kind is EventKind.FAILED
 
 
-def test_a_worker_comes_back_once_its_engine_works_or_gives_up(bench: Bench) -> None:
-    bench.engine_works = False
-    assert not bench.fitness.try_engine((Stage.SYNTHESIZE,))
-    assert not bench.sits_out()
-    assert len(bench.checked) == 1 + len(module.PAUSES_S)
-    bench.told.clear()
-    bench.engine_works = True
-    assert bench.sits_out()
+def test_a_worker_comes_back_once_its_engine_works_or_gives_up(doubted: Doubted) -> None:
+    doubted.engine_works = False
+    assert not doubted.fitness.try_engine((Stage.SYNTHESIZE,))
+    assert not doubted.sits_out()
+    assert len(doubted.checked) == 1 + len(module.PAUSES_S)
+    doubted.states.clear()
+    doubted.engine_works = True
+    assert doubted.sits_out()
     reason = "synthesize: ImportError: libcuda.so.1"
-    assert bench.told == [{"state": "quarantined", "reason": reason}, {"state": "idle", "reason": ""}]
+    assert doubted.states == [{"state": "quarantined", "reason": reason}, {"state": "idle", "reason": ""}]
 
 
-def test_a_fault_that_the_check_cannot_see_is_not_cured_by_passing_it(bench: Bench) -> None:
-    test_failures_in_a_row_that_others_do_not_have_are_the_workers(bench)
-    assert not bench.sits_out(), "a fresh process must start"
+def test_a_fault_that_the_check_cannot_see_is_not_cured_by_passing_it(doubted: Doubted) -> None:
+    test_failures_in_a_row_that_others_do_not_have_are_the_workers(doubted)
+    assert not doubted.sits_out(), "a fresh process must start"
 
 
-def test_a_worker_in_quarantine_stops_when_told(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_worker_in_quarantine_stops_when_told(doubted: Doubted, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "PAUSES_S", (600.0,))
-    bench.engine_works = False
-    assert not bench.fitness.try_engine((Stage.SYNTHESIZE,))
-    assert not bench.sits_out(told_to_stop=True)
+    doubted.engine_works = False
+    assert not doubted.fitness.try_engine((Stage.SYNTHESIZE,))
+    assert not doubted.sits_out(told_to_stop=True)
 
 
 @pytest.mark.parametrize("stage", Stage)

@@ -1,7 +1,5 @@
 """Tasks, and what is none, that somebody wrote into Redis: a worker goes on."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """What becomes of a task, whatever its stage does."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +14,7 @@ from graspd.service.store.manifests import load_manifest
 from graspd.service.store.records import task_attempts
 from graspd.service.store.shards import read_shard
 from graspd.service.store.store import Store, open_store
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.process.runner import Runner
 from graspd.worker.stages import scene
 from graspd.worker.stages.context import StopReason, TaskContext
@@ -26,18 +25,22 @@ from tests.fakes import fake_synthesize, make_shard, message_for
 class Bench:
     """A runner on a store in memory."""
 
-    def __init__(self) -> None:
+    runner: Runner
+
+    def __init__(self, **options: Any) -> None:
         self.store: Store = open_store("memory://")
         self.told: list[Event] = []
         self.calls = 0
+        self.options = options
 
     def run(self, message: TaskMessage, stage: Any = fake_synthesize, **changes: Any) -> Event | None:
         def counted(task: TaskMessage, context: TaskContext) -> Any:
             self.calls += 1
             return stage(task, context)
 
-        runner = Runner({Stage.SYNTHESIZE: counted}, worker="w", publish=self.told.append)
-        return runner.run(message.model_dump(mode="json", by_alias=True) | changes, TaskContext(self.store))
+        self.runner = Runner({Stage.SYNTHESIZE: counted}, worker="w", publish=self.told.append, **self.options)
+        context = TaskContext(self.store, ExecutionContext("cuda:0" if "check_device" in self.options else "cpu"))
+        return self.runner.run(message.model_dump(mode="json", by_alias=True) | changes, context)
 
 
 @pytest.fixture
@@ -182,9 +185,7 @@ def test_a_stage_that_ignores_the_stop_still_writes_nothing(bench: Bench) -> Non
         ({"revision": 99}, "revision 99 of synthesize"),
     ],
 )
-def test_what_another_version_must_do_is_handed_back_and_no_attempt_is_used_up(
-    bench: Bench, changed: dict[str, Any], why: str
-) -> None:
+def test_what_another_version_must_do_costs_no_attempt(bench: Bench, changed: dict[str, Any], why: str) -> None:
     message = message_for()
     outcome = bench.run(message, **changed)
     assert outcome.kind is EventKind.DEFERRED and why in outcome.message and bench.calls == 0

@@ -1,9 +1,8 @@
 """Postures and grasp sets for the tests of quality."""
 
-from __future__ import annotations
-
 import dataclasses
 
+import mujoco
 import numpy as np
 import trimesh
 
@@ -12,6 +11,7 @@ from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.model import HandModel, PalmFrame
 from graspd.worker.hands.surface import farthest_points
 from graspd.worker.validation.decomposition import ConvexPieces
+from graspd.worker.validation.model import Scene
 from tests.worker.models import object_from_mesh, piece, two_finger_hand
 
 
@@ -29,31 +29,24 @@ def plate_hand(size: tuple[float, float, float] = (0.05, 0.05, 0.01)) -> HandMod
     """A gripper: two parallel plates that slide along x towards each other from a small base far below."""
     base = two_finger_hand()
     plate = trimesh.creation.box(size)
-    foot = trimesh.creation.box((0.02, 0.02, 0.02))
-    pieces = (
-        piece(0, foot, "box", (0.02, 0.02, 0.02), (0, 0, -0.15)),
-        piece(1, plate, "box", size, (0, 0, 0)),
-        piece(2, plate, "box", size, (0, 0, 0)),
-    )
+    foot = piece(0, trimesh.creation.box((0.02, 0.02, 0.02)), "box", (0.02, 0.02, 0.02), (0, 0, -0.15))
+    pieces = (foot, *(piece(body, plate, "box", size, (0, 0, 0)) for body in (1, 2)))
     turn = np.sqrt(0.5)
     origin = np.array([[0, 0, 0, 1, 0, 0, 0], [-0.1, 0, 0, turn, 0, turn, 0], [0.1, 0, 0, turn, 0, -turn, 0]])
-    return HandModel(
-        **{
-            **{name: getattr(base, name) for name in base.__dataclass_fields__},
-            "name": "plates",
-            "digest": f"{hash(size) & 0xFFFFFFFF:032x}",
-            "joint_type": np.array([0, 2, 2], np.int32),
-            "origin": origin,
-            "axis": np.array([[0, 0, 1], [0, 0, 1], [0, 0, 1]], float),
-            "lower": np.zeros(2),
-            "upper": np.full(2, 0.1),
-            "effort": np.full(2, 100.0),
-            "stiffness": np.full(2, 100.0),
-            "pieces": pieces,
-            "neighbours": frozenset({(0, 1), (0, 2)}),
-            "palm": PalmFrame(np.array([0.0, 0, -0.14]), np.array([0.0, 0, 1])),
-            "masses": np.array([0.3, 0.1, 0.1]),
-        }
+    return dataclasses.replace(
+        base,
+        name="plates",
+        digest=f"{hash(size) & 0xFFFFFFFF:032x}",
+        joint_type=np.array([0, 2, 2], np.int32),
+        origin=origin,
+        axis=np.array([[0, 0, 1], [0, 0, 1], [0, 0, 1]], float),
+        lower=np.zeros(2),
+        upper=np.full(2, 0.1),
+        effort=np.full(2, 100.0),
+        stiffness=np.full(2, 100.0),
+        pieces=pieces,
+        palm=PalmFrame(np.array([0.0, 0, -0.14]), np.array([0.0, 0, 1])),
+        masses=np.array([0.3, 0.1, 0.1]),
     )
 
 
@@ -66,6 +59,18 @@ def pad_hand() -> HandModel:
     ball = trimesh.creation.icosphere(subdivisions=3, radius=radius)
     pads = tuple(piece(body, ball, "sphere", (radius,), (0, 0, 0.005 - radius)) for body in (1, 2))
     return dataclasses.replace(plates, name="pads", digest="9ad5" * 8, pieces=(plates.pieces[0], *pads))
+
+
+#: Pose of a hand that touches nothing.
+FAR = np.array([0, 0, -0.5, 1.0, 0, 0, 0])
+
+
+def placed_data(scene: Scene, joints: np.ndarray, pose: np.ndarray = FAR) -> mujoco.MjData:
+    """Data of a scene whose hand is at a pose with these joints."""
+    data = mujoco.MjData(scene.model)
+    scene.place(data, pose, joints)
+    mujoco.mj_forward(scene.model, data)
+    return data
 
 
 def choose_contacts(near: np.ndarray, place: np.ndarray, normal: np.ndarray, *, scale: float, limit: int) -> np.ndarray:

@@ -1,7 +1,5 @@
 """Image files of views, read back by other readers, and clouds of them against the mesh."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -16,6 +14,8 @@ from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import apply
 from graspd.service.readers import Pictures, open_shards
 from graspd.service.store.shards import Shard, write_shard
+from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.surface import sample_surface
 from graspd.worker.rendering import render
 from graspd.worker.rendering.export import PNG_STEP_M, export_images
 from tests.service.readers import box_scenes
@@ -63,17 +63,14 @@ def plane(path: Path, channel: str) -> np.ndarray:
 def test_colours_labels_depth_and_normals_come_back_exactly(views, tmp_path) -> None:
     export_images(views, tmp_path)
     for view in range(2):
-        np.testing.assert_array_equal(pixels(tmp_path / f"rgb_{view:04}.png"), views["image/rgb"][view])
-        labels = pixels(tmp_path / f"semantic_segmentation_{view:04}.png")
-        np.testing.assert_array_equal(labels, views["image/segmentation"][view])
-        depth = plane(tmp_path / f"distance_to_image_plane_{view:04}.exr", "Z")
-        np.testing.assert_array_equal(depth, views["image/depth"][view])
-        distance = plane(tmp_path / f"distance_to_camera_{view:04}.exr", "Z")
-        np.testing.assert_array_equal(distance, views["image/distance"][view])
-        for k, axis in enumerate("XYZ"):
-            half = plane(tmp_path / f"normals_{view:04}.exr", axis)
-            assert half.dtype == np.float16
-            np.testing.assert_array_equal(half, views["image/normals"][view][..., k])
+        for file, column in (("rgb", "rgb"), ("semantic_segmentation", "segmentation")):
+            np.testing.assert_array_equal(pixels(tmp_path / f"{file}_{view:04}.png"), views[f"image/{column}"][view])
+        for file, column in (("distance_to_image_plane", "depth"), ("distance_to_camera", "distance")):
+            found = plane(tmp_path / f"{file}_{view:04}.exr", "Z")
+            np.testing.assert_array_equal(found, views[f"image/{column}"][view])
+        normals = np.stack([plane(tmp_path / f"normals_{view:04}.exr", axis) for axis in "XYZ"], axis=-1)
+        assert normals.dtype == np.float16
+        np.testing.assert_array_equal(normals, views["image/normals"][view])
 
 
 def test_png_depth_is_right_to_half_a_step(views, tmp_path) -> None:
@@ -126,9 +123,6 @@ def test_points_of_a_rendered_object_lie_on_its_mesh(tmp_path: Path) -> None:
 
 def test_surface_of_the_hand_of_a_shard_follows_its_kinematics() -> None:
     """All of a hand moves with its root; the points of a body that no joint carries move with nothing else."""
-    from graspd.worker.hands.load import hand_from_path
-    from graspd.worker.hands.surface import sample_surface
-
     hand = hand_from_path("barrett")
     joints = np.zeros((2, len(hand.joint_names)))
     joints[1] = 0.3

@@ -1,7 +1,5 @@
 """Pictures for people, of grasps, of their ways and as films: what must be in them."""
 
-from __future__ import annotations
-
 import io
 from dataclasses import replace
 
@@ -65,7 +63,6 @@ def coloured_pixels(picture: np.ndarray, low: int, high: int) -> np.ndarray:
 
 
 def orange(picture: np.ndarray) -> np.ndarray:
-    """Mask of the pixels that show the object."""
     return coloured_pixels(picture, 8, 30)
 
 
@@ -86,21 +83,17 @@ def test_grasp_looks_the_same_whatever_grasps_are_drawn_with_it(block, pictures)
 
 def quality(count: int) -> dict[str, np.ndarray]:
     epsilon = np.arange(count, dtype=float)[:, None] * np.array([1.0, 10.0])
-    return {
-        "quality/thresholds_m": np.array([0.001, 0.005]),
-        "quality/epsilon": epsilon,
-        "quality/contact_area_cm2": epsilon,
-        "quality/penetration_depth_mm": np.full(count, 0.25),
-    }
+    swept = {"quality/epsilon": epsilon, "quality/contact_area_cm2": epsilon}
+    depth = {"quality/penetration_depth_mm": np.full(count, 0.25)}
+    return swept | depth | {"quality/thresholds_m": np.array([0.001, 0.005])}
 
 
 def test_best_have_the_largest_epsilon_and_captions_quote_5_mm() -> None:
     chosen = np.array([True, True, True, True, False])
     assert best(quality(5), 3, chosen).tolist() == [3, 2, 1]
     assert best(quality(5), 9, chosen).tolist() == [3, 2, 1, 0]
-    assert figures(quality(5), np.array([3])) == [
-        [("epsilon", "30.000"), ("contact", "30.0 cm^2"), ("depth", "0.25 mm")]
-    ]
+    (told,) = figures(quality(5), np.array([3]))
+    assert told == [("epsilon", "30.000"), ("contact", "30.0 cm^2"), ("depth", "0.25 mm")]
 
 
 def opened(data: bytes) -> np.ndarray:
@@ -157,6 +150,10 @@ def at(name: str, height: float = 0.0) -> Waypoint:
     return Waypoint(name, DOWN + np.append(rise, np.zeros(4)), np.full(2, 0.1), rise)
 
 
+def grasped(block, scenes: PictureScenes, hand: HandModel = HAND, **options) -> np.ndarray:
+    return way_pictures(hand, block, [[at("grasp")]], scenes, (48, 48), samples=2, **options)[0, 0, 0]
+
+
 def test_every_posture_of_every_grasp_is_drawn_from_every_side(block):
     frames = [[at("grasp"), at("lift", 0.1)]] * 2
     drawn = way_pictures(HAND, block, frames, TABLE_SCENE, (48, 36), sides=3, samples=2)
@@ -168,19 +165,16 @@ def test_the_lifted_object_is_higher_in_the_picture(block):
     frames = [[at("grasp"), at("lift", 0.1)]]
     (low, high) = way_pictures(HAND, block, frames, TABLE_SCENE, (64, 64), samples=2)[0, 0]
     assert np.argwhere(orange(high))[:, 0].mean() < np.argwhere(orange(low))[:, 0].mean() - 10
-    (floating,) = way_pictures(HAND, block, [[at("grasp")]], PictureScenes(), (48, 48), samples=2)[0, 0]
-    assert orange(floating).sum() > 20, "a free grasp floats over a floor"
+    assert orange(grasped(block, PictureScenes())).sum() > 20, "a free grasp floats over a floor"
 
 
 def test_whole_hand_is_in_the_picture_where_that_is_asked_for(block):
     frames = [[replace(at("", 0.5), carried=np.zeros(3)), at("grasp")]]
-    near, whole = (
-        way_pictures(HAND, block, frames, TABLE_SCENE, (48, 48), whole=w, samples=2)[0, 0] for w in (False, True)
-    )
+    both = (way_pictures(HAND, block, frames, TABLE_SCENE, (48, 48), whole=w, samples=2) for w in (False, True))
+    near, whole = (seen[0, 0] for seen in both)
     # The camera steps back for the hand that is far above: the block is smaller, and what is drawn ends above the rim.
     assert 0 < orange(whole[1]).sum() < 0.5 * orange(near[1]).sum()
-    empty = way_pictures(HAND, block, [frames[0][1:]], TABLE_SCENE, (48, 48), samples=2)[0, 0, 0]
-    assert np.abs(whole[0][:2].astype(int) - empty[0, 0]).max() < 40
+    assert np.abs(whole[0][:2].astype(int) - grasped(block, TABLE_SCENE)[0, 0]).max() < 40
 
 
 @pytest.mark.parametrize("side", [0, 1, 2, 3])
@@ -189,20 +183,14 @@ def test_no_wall_stands_between_the_object_and_the_camera(block, side):
     size = (0.02, 0.5, 0.5) if x else (0.5, 0.02, 0.5)
     wall = Box(size=size, pose=(x, y, 0.25, 1, 0, 0, 0))
     around = PictureScenes((HalfSpace(), wall), REST)
-    free, walled = (
-        way_pictures(HAND, block, [[at("grasp")]], scenes, (48, 48), samples=2)[0, 0, 0]
-        for scenes in (TABLE_SCENE, around)
-    )
-    assert orange(walled).sum() > 0.5 * orange(free).sum()
+    assert orange(grasped(block, around)).sum() > 0.5 * orange(grasped(block, TABLE_SCENE)).sum()
 
 
 def test_each_grasp_stands_in_its_own_scene(block):
     turned = np.array([[0, 0, 0.02, np.sqrt(0.5), np.sqrt(0.5), 0, 0]])
     around = PictureScenes((HalfSpace(),), np.concatenate([REST, turned]), np.array([0, 1]))
     first, second = way_pictures(HAND, block, [[at("grasp")]] * 2, around, (48, 48), samples=2)[:, 0, 0]
-    around = PictureScenes((HalfSpace(),), turned)
-    alone = way_pictures(HAND, block, [[at("grasp")]], around, (48, 48), samples=2)[0, 0, 0]
-    np.testing.assert_array_equal(second, alone)
+    np.testing.assert_array_equal(second, grasped(block, PictureScenes((HalfSpace(),), turned)))
     assert (first != second).any()
 
 
@@ -214,7 +202,7 @@ def test_links_above_root_are_drawn_at_the_angles_of_the_wrist(block):
 
     def picture(hand, wrist) -> np.ndarray:
         where = replace(TABLE_SCENE, wrist=wrist if wrist is None else np.array([wrist]))
-        return way_pictures(hand, block, [[at("grasp")]], where, (48, 48), whole=True, samples=2)[0, 0, 0].astype(int)
+        return grasped(block, where, hand, whole=True).astype(int)
 
     bare, straight, bent = picture(mounted, None), picture(mounted, [0.0, 0.0]), picture(mounted, [0.9, 0.9])
     assert np.array_equal(bare, picture(HAND, None))
@@ -231,7 +219,6 @@ SECONDS = [0.5, 0.05, 1.2]
 
 
 def colours() -> np.ndarray:
-    """Three plain pictures: red, green, blue."""
     return np.repeat(np.repeat(200 * np.eye(3, dtype=np.uint8)[:, None, None], 24, 1), 32, 2)
 
 
@@ -351,12 +338,8 @@ def test_collision_shapes_are_drawn_on_a_toggle(coloured: HandModel) -> None:
 
 def test_a_model_for_viewers_has_the_colours(coloured: HandModel) -> None:
     scene = trimesh.load(trimesh.util.wrap_as_stream(hand_glb(coloured)), file_type="glb")
-    colours = {
-        tuple(colour)
-        for mesh in scene.geometry.values()
-        if len(getattr(mesh, "faces", ()))
-        for colour in np.unique(mesh.visual.vertex_colors[:, :3], axis=0).tolist()
-    }
+    meshes = [mesh for mesh in scene.geometry.values() if len(getattr(mesh, "faces", ()))]
+    colours = {tuple(colour) for mesh in meshes for colour in mesh.visual.vertex_colors[:, :3].tolist()}
     assert {(255, 0, 0), (0, 0, 255)} <= colours
 
 

@@ -1,7 +1,5 @@
 """The tracer against another one, Newton's camera sensor, and against itself where it takes a short cut."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 
@@ -30,12 +28,8 @@ def solid(mesh: trimesh.Trimesh) -> Solid:
     return Solid(mesh.vertices, mesh.faces, mesh.vertex_normals[mesh.faces])
 
 
-SOLIDS = [
-    FLOOR,
-    WALL,
-    solid(trimesh.creation.icosphere(subdivisions=3, radius=0.05)),
-    solid(trimesh.creation.annulus(r_min=0.03, r_max=0.05, height=0.08)),
-]
+BALL = solid(trimesh.creation.icosphere(subdivisions=3, radius=0.05))
+SOLIDS = [FLOOR, WALL, BALL, solid(trimesh.creation.annulus(r_min=0.03, r_max=0.05, height=0.08))]
 LOOKS = [
     Appearance((0.5, 0.4, 0.3), (0.3, 0.2, 0.1), shading.TILES, 2.0, roughness=0.4),
     Appearance((0.5, 0.5, 0.5), (0.2, 0.2, 0.2), shading.SPECKLE, 1.0, roughness=0.6),
@@ -63,7 +57,6 @@ def poses() -> np.ndarray:
 
 
 def shot(**changes: Any) -> CameraShot:
-    """Two cameras a world."""
     eyes = [(0.5, -0.3, 0.4), (-0.2, -0.6, 0.25)]
     cameras = np.stack([look_at(np.array(eye), np.array([0.0, 0.0, 0.05])) for eye in eyes])
     made = CameraShot(
@@ -88,7 +81,6 @@ def traced(solids: list[Solid | Box], poses: np.ndarray, what: CameraShot) -> An
 
 
 def of_one(solids: list[Solid | Box], poses: np.ndarray, looks: list[Appearance], camera: np.ndarray) -> Any:
-    """A picture of one world by one camera."""
     tracer = Tracer(solids, "cpu")
     tracer.place(poses, [looks])
     one = {"world": np.zeros(1, np.int32), "turn": np.zeros(1), "lamps": [Lamp()], "samples": 12}
@@ -235,7 +227,7 @@ def test_turning_worlds_is_turning_the_lamp_the_other_way(poses: np.ndarray) -> 
 def test_a_pixel_on_an_outline_has_the_colours_of_both_sides() -> None:
     red, green = Appearance((0.6, 0.0, 0.0), roughness=1.0), Appearance((0.0, 0.6, 0.0), roughness=1.0)
     poses = np.array([[[0, 0, -0.05, 1, 0, 0, 0], [0, 0, 0.05, 1, 0, 0, 0.0]]])
-    seen = of_one([FLOOR, SOLIDS[2]], poses, [red, green], look_at(np.array([0.3, -0.2, 0.3]), np.array([0, 0, 0.05])))
+    seen = of_one([FLOOR, BALL], poses, [red, green], look_at(np.array([0.3, -0.2, 0.3]), np.array([0, 0, 0.05])))
     floor, ball = seen.shape[0] == 0, seen.shape[0] == 1
     beside = floor & (np.roll(ball, 1, axis=1) | np.roll(ball, -1, axis=1))
     assert beside.sum() > 10

@@ -1,7 +1,5 @@
 """Pictures of scenes and their further channels against closed forms, projective geometry and a ray caster."""
 
-from __future__ import annotations
-
 import json
 import resource
 

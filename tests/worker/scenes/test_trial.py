@@ -1,7 +1,5 @@
 """The trial of candidates is the test of the validator itself, which is then not done again."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -30,12 +28,7 @@ def lifts(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Grows by the row of each lift that is simulated."""
     done: list[int] = []
     lift = Lift.lift
-
-    def counted(self, grasps, row):
-        done.append(row)
-        return lift(self, grasps, row)
-
-    monkeypatch.setattr(Lift, "lift", counted)
+    monkeypatch.setattr(Lift, "lift", lambda self, grasps, row: done.append(row) or lift(self, grasps, row))
     return done
 
 
@@ -71,50 +64,46 @@ def test_a_lift_of_anything_else_is_not_known(lifts: list[int], other: str) -> N
     assert len(lifts) == 6
 
 
-def rollout_of(
-    monkeypatch: pytest.MonkeyPatch,
-    scores: list[float],
-    outcomes: dict[bool, list[int]],
-    beat=None,
-    level: LiftLevel = "lift",
-):
-    """Scores of grasps that the short lift gives `scores`, and the lift test `outcomes` at half the friction (True) and
-    at the whole of it."""
-    count = len(scores)
-    grasps, where = (
-        MANY.take(np.zeros(count, int)),
-        PlacedGrasps(WHERE.supports, WHERE.object_pose, np.zeros(count, int)),
-    )
-    grasps.stability_loss = np.arange(count, dtype=float)
-
-    def validated(hand, obj, some, placed, *, hard=False, **_):
-        rows = some.stability_loss.astype(int)
-        outcome = np.array(outcomes[hard])[rows]
-        return type("Verdicts", (), {"success": (outcome == 1).astype(int), "outcome": outcome})
-
-    def way(hand, obj, some, placed):
-        clear = np.ones(len(some), bool)
-        return type("Way", (), {"clear": clear, "approach": some.approach, "open": some.coming})
-
-    monkeypatch.setattr(LiftRollouts, "scores", lambda *_: np.array(scores))
-    monkeypatch.setattr(rollouts, "validate_lifts", validated)
-    monkeypatch.setattr(rollouts, "plan_way", way)
-    rollout = lift_rollout(HAND, BOX, lambda: WHOLE, level=level)
-    return rollout(grasps, where, np.full(count, np.inf) if beat is None else beat)
-
-
 LIFTED, TOUCHED, FELL = 1, 3, 5
 
 
+def numbered(count: int) -> GraspSet:
+    """Grasps that are told apart by their loss."""
+    return replace(MANY.take(np.zeros(count, int)), stability_loss=np.arange(float(count)), scene=np.zeros(count, int))
+
+
+def lift_tests(monkeypatch: pytest.MonkeyPatch, outcomes: dict[bool, list[int]]) -> list[object]:
+    """Stands in for the lift test at half the friction (True) and at the whole of it; grows by what is tested."""
+    done: list[object] = []
+
+    def validated(hand, obj, some, placed, *, hard=False, **_):
+        rows = some.stability_loss.astype(int)
+        done.append((hard, rows.tolist()))
+        outcome = np.array(outcomes[hard])[rows]
+        return SimpleNamespace(success=(outcome == LIFTED).astype(int), outcome=outcome, margin=np.zeros(len(rows)))
+
+    def way(hand, obj, some, placed):
+        clear, wrist = np.ones(len(some), bool), np.zeros((len(some), 0))
+        seen = {"approach": some.approach, "open": some.coming, "lift": None, "least": 1.0 * clear, "wrist": wrist}
+        return SimpleNamespace(clear=clear, **seen)
+
+    monkeypatch.setattr(rollouts, "validate_lifts", validated)
+    monkeypatch.setattr(rollouts, "plan_way", way)
+    return done
+
+
+def rollout_of(monkeypatch, scores: list[float], outcomes, beat=None, level: LiftLevel = "lift"):
+    lift_tests(monkeypatch, outcomes)
+    monkeypatch.setattr(LiftRollouts, "scores", lambda *_: np.array(scores))
+    where = WHERE.take(np.zeros(len(scores), int))
+    rollout = lift_rollout(HAND, BOX, lambda: WHOLE, level=level)
+    return rollout(numbered(len(scores)), where, np.full(len(scores), np.inf) if beat is None else beat)
+
+
 def test_a_score_is_that_of_the_lift(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = rollout_of(
-        monkeypatch,
-        [0.2, 0.3, 0.4, 1.2, 1.3, 0.5, 4.0],
-        {
-            True: [LIFTED, FELL, FELL, FELL, FELL, TOUCHED, FELL],
-            False: [LIFTED, LIFTED, FELL, LIFTED, FELL, TOUCHED, FELL],
-        },
-    )
+    half = [LIFTED, FELL, FELL, FELL, FELL, TOUCHED, FELL]
+    outcomes = {True: half, False: [LIFTED, LIFTED, FELL, LIFTED, FELL, TOUCHED, FELL]}
+    found = rollout_of(monkeypatch, [0.2, 0.3, 0.4, 1.2, 1.3, 0.5, 4.0], outcomes)
     falls = SLIPS + 1.0 + FALLS * np.array([0.4, 1.0])
     assert found == pytest.approx([0.2, SLIPS, falls[0], 1.2, falls[1], 0.5 + TOUCHES, 4.0])
     assert found[0] <= BEST
@@ -140,50 +129,25 @@ def test_the_published_lift_is_at_full_friction(monkeypatch: pytest.MonkeyPatch)
         ("dexgraspbench", [(False, [0, 1, 2, 3]), (True, [0, 2])], [1, 0, 1, 0], [1, -1, 0, -1]),
     ],
 )
-def test_no_grasp_is_lifted_that_another_lift_decides(
-    monkeypatch: pytest.MonkeyPatch, level: LiftLevel, tested: list[object], success: list[int], hard: list[int]
-) -> None:
-    lifting = {True: [1, 1, 0, 0], False: [1, 0, 1, 0]}
-    done: list[object] = []
-
-    def validated(hand, obj, some, placed, *, hard=False, **_):
-        rows = some.stability_loss.astype(int)
-        done.append((hard, rows.tolist()))
-        lifted = np.array(lifting[hard])[rows]
-        return SimpleNamespace(success=lifted, outcome=np.where(lifted, LIFTED, FELL), margin=np.zeros(len(rows)))
-
-    def way(hand, obj, some, placed):
-        clear = np.ones(len(some), bool)
-        return SimpleNamespace(
-            clear=clear, approach=None, open=None, lift=None, least=np.ones(4), wrist=np.zeros((4, 0))
-        )
-
-    monkeypatch.setattr(rollouts, "validate_lifts", validated)
-    monkeypatch.setattr(rollouts, "plan_way", way)
-    grasps = replace(MANY.take(np.zeros(4, int)), stability_loss=np.arange(4.0), scene=np.zeros(4, int))
+def test_no_grasp_is_lifted_that_another_lift_decides(monkeypatch, level: LiftLevel, tested, success, hard) -> None:
+    done = lift_tests(monkeypatch, {True: [LIFTED, LIFTED, FELL, FELL], False: [LIFTED, FELL, LIFTED, FELL]})
     scenes = SimpleNamespace(placed=lambda _: WHERE.take(np.zeros(4, int)))
-    _, columns = scene_verdicts(HAND, BOX, grasps, scenes, level=level, pieces=WHOLE, run=ExecutionContext())
+    _, columns = scene_verdicts(HAND, BOX, numbered(4), scenes, level=level, pieces=WHOLE, run=ExecutionContext())
     assert done == tested
     assert (columns["quality/success"].tolist(), columns["quality/lift_hard"].tolist()) == (success, hard)
 
 
 @pytest.mark.parametrize(("verdict", "score"), [(1, 0.2), (0, SLIPS + 1.0 + FALLS * 0.2)])
-def test_free_grasp_that_the_validator_drops_is_no_good_candidate(
-    monkeypatch: pytest.MonkeyPatch, verdict: int, score: float
-) -> None:
+def test_free_grasp_that_the_validator_drops_is_no_good_candidate(monkeypatch, verdict: int, score: float) -> None:
     monkeypatch.setattr(rollouts, "push_rollout", lambda *_: lambda grasps, *_: np.array([0.2, 4.0, 4.0]))
-    monkeypatch.setattr(rollouts, "validate", lambda *_, **__: type("Verdicts", (), {"success": np.array([verdict])}))
+    monkeypatch.setattr(rollouts, "validate", lambda *_, **__: SimpleNamespace(success=np.array([verdict])))
     assert hold_rollout(HAND, BOX, lambda: WHOLE)(MANY, None).tolist() == pytest.approx([score, 4.0, 4.0])
 
 
 def test_a_free_grasp_that_cannot_beat_another_is_not_validated(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rollouts, "push_rollout", lambda *_: lambda grasps, *_: np.array([0.6, 0.7, 0.8]))
     validated: list[int] = []
-
-    def held(hand: object, obj: object, grasps: GraspSet, **_: object) -> object:
-        validated.append(len(grasps))
-        return type("Verdicts", (), {"success": np.ones(len(grasps))})
-
-    monkeypatch.setattr(rollouts, "validate", held)
+    held = SimpleNamespace(success=np.ones(1))
+    monkeypatch.setattr(rollouts, "validate", lambda hand, obj, grasps, **_: validated.append(len(grasps)) or held)
     found = hold_rollout(HAND, BOX, lambda: WHOLE)(MANY, None, np.array([0.5, 0.7, np.inf]))
     assert (validated, found.tolist()) == ([1], [0.6, 0.7, 0.8])

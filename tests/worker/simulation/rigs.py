@@ -1,7 +1,5 @@
 """Small simulations for tests."""
 
-from __future__ import annotations
-
 import numpy as np
 import trimesh
 
@@ -31,22 +29,12 @@ def still(dilation: float = 0.0, weight: float = 0.0) -> Schedule:
 
 
 def rig(
-    hand: HandModel,
-    obj: ObjectModel,
-    *,
-    capacity: int,
-    points: int = 300,
-    options: LossOptions | None = None,
-    cell: float = 0.0,
-    alpha: float = 0.5,
-    schedule: Schedule | None = None,
+    hand: HandModel, obj: ObjectModel, *, capacity: int, options: LossOptions | None = None, alpha: float = 0.5
 ) -> tuple[Model, Data]:
     kernels.load("cpu")
-    device_hand = DeviceHand.create(hand, "cpu")
-    device_object = DeviceObject.create(obj, "cpu", samples=object_samples(obj, 1000), phong_alpha=alpha, cell=cell)
-    model = Model.create(
-        device_hand, device_object, sample_surface(hand, points), sample_surface(hand, 300), options or LossOptions()
-    )
+    device_object = DeviceObject.create(obj, "cpu", samples=object_samples(obj, 1000), phong_alpha=alpha, cell=0.0)
+    points = sample_surface(hand, 300)
+    model = Model.create(DeviceHand.create(hand, "cpu"), device_object, points, points, options or LossOptions())
     data = Data(model, capacity)
-    data.set_schedule(schedule or still())
+    data.set_schedule(still())
     return model, data

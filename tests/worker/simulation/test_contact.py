@@ -1,7 +1,5 @@
 """The contact kernels against the float64 reference, and the physics they must keep."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 

@@ -1,6 +1,7 @@
-"""Distances and normals of surfaces and convex pieces: against closed forms, the tree of the mesh and NumPy."""
+"""Distances and normals of surfaces and pieces against closed forms, the mesh and NumPy; grids kept on disk."""
 
-from __future__ import annotations
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,9 +11,10 @@ import warp as wp
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.surface import piece_distance
+from graspd.worker.objects import disk_cache
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
-from graspd.worker.simulation import kernels
+from graspd.worker.simulation import grids, kernels
 from graspd.worker.simulation.device import DeviceHand, DeviceObject, face_planes
 from graspd.worker.simulation.grids import feature_normals
 from graspd.worker.simulation.kernels import pieces, surface
@@ -23,29 +25,25 @@ FLOAT32 = 2e-8  # float32 coordinates of size 0.1 m
 
 
 @wp.kernel
-def measure(
-    skin_in: surface.Surface,
-    point_in: wp.array(dtype=wp.vec3),
-    exact_below_in: wp.float32,
-    distance_out: wp.array(dtype=wp.float32),
-    normal_out: wp.array(dtype=wp.vec3),
-):
+def measure(skin_in: surface.Surface, point_in: wp.array[wp.vec3], exact_below_in: float, out: wp.array[wp.vec4]):
     i = wp.tid()
     sample = surface.distance(skin_in, point_in[i], 0.2, exact_below_in, 0.2)
-    distance_out[i] = sample.distance
-    normal_out[i] = sample.normal
+    out[i] = wp.vec4(sample.distance, sample.normal[0], sample.normal[1], sample.normal[2])
+
+
+def device_object(obj: ObjectModel, alpha: float, cell: float) -> DeviceObject:
+    kernels.load("cpu")
+    return DeviceObject.create(obj, "cpu", samples=object_samples(obj, 50), phong_alpha=alpha, cell=cell)
 
 
 def probe(
     obj: ObjectModel, points: np.ndarray, *, alpha: float, cell: float = 0.0, exact_below: float = 1.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    kernels.load("cpu")
-    device = DeviceObject.create(obj, "cpu", samples=object_samples(obj, 50), phong_alpha=alpha, cell=cell)
+    device = device_object(obj, alpha, cell)
     with wp.ScopedDevice("cpu"):
-        distance, normal = wp.zeros(len(points)), wp.zeros(len(points), dtype=wp.vec3)
-        at = wp.array(points - obj.centre_of_mass, dtype=wp.vec3)
-        wp.launch(measure, len(points), inputs=[device.surface, at, exact_below], outputs=[distance, normal])
-        return distance.numpy().astype(float), normal.numpy().astype(float)
+        found, at = wp.zeros(len(points), dtype=wp.vec4), wp.array(points - obj.centre_of_mass, dtype=wp.vec3)
+        wp.launch(measure, len(points), inputs=[device.surface, at, exact_below], outputs=[found])
+        return found.numpy()[:, 0].astype(float), found.numpy()[:, 1:].astype(float)
 
 
 def around(rng: np.random.Generator, radius: float, gap: float, count: int = 400) -> np.ndarray:
@@ -86,8 +84,7 @@ def test_the_smoothed_distance_is_continuous_across_the_surface() -> None:
     points = (direction[:, None] * steps[None, :, None]).reshape(-1, 3)
     found = probe(coarse, points, alpha=0.5)[0].reshape(50, -1)
     near = np.abs(found[:, :-1]) < 1e-3
-    assert near.any(axis=1).all()
-    assert np.abs(np.diff(found, axis=1))[near].max() < 1.2e-5
+    assert near.any(axis=1).all() and np.abs(np.diff(found, axis=1))[near].max() < 1.2e-5
 
 
 def test_normals_of_a_fine_ball_point_outward_everywhere() -> None:
@@ -139,14 +136,10 @@ REACH = 0.03
 
 
 @wp.kernel
-def ask(
-    surface_in: surface.Surface, point_in: wp.array(dtype=wp.vec3), listed_in: int, out: wp.array(dtype=wp.float32)
-):
+def ask(surface_in: surface.Surface, point_in: wp.array[wp.vec3], listed_out: wp.array[float], out: wp.array[float]):
     i = wp.tid()
-    if listed_in == 1:
-        out[i] = surface.near_distance(surface_in, point_in[i], REACH).distance
-    else:
-        out[i] = surface.mesh_distance(surface_in, point_in[i], REACH).distance
+    listed_out[i] = surface.near_distance(surface_in, point_in[i], REACH).distance
+    out[i] = surface.mesh_distance(surface_in, point_in[i], REACH).distance
 
 
 def near_points(obj: ObjectModel, count: int = 1200) -> np.ndarray:
@@ -169,21 +162,18 @@ def winding_number(obj: ObjectModel, points: np.ndarray) -> np.ndarray:
 
 
 def test_lists_of_faces_give_the_distances_and_signs_of_the_tree() -> None:
-    kernels.load("cpu")
     for obj in (object_from_path("mug"), object_of(trimesh.creation.box((0.06, 0.04, 0.001)))):
-        device = DeviceObject.create(obj, "cpu", samples=object_samples(obj, 50), phong_alpha=0.0, cell=0.005)
+        device = device_object(obj, alpha=0.0, cell=0.005)
         points = near_points(obj)
         with wp.ScopedDevice("cpu"):
-            at = wp.array(points, dtype=wp.vec3)
-            found, expected = wp.zeros(len(points)), wp.zeros(len(points))
-            wp.launch(ask, len(points), inputs=[device.surface, at, 1], outputs=[found])
-            wp.launch(ask, len(points), inputs=[device.surface, at, 0], outputs=[expected])
+            at, outputs = wp.array(points, dtype=wp.vec3), [wp.zeros(len(points)), wp.zeros(len(points))]
+            wp.launch(ask, len(points), inputs=[device.surface, at], outputs=outputs)
+        found, expected = (one.numpy() for one in outputs)
         assert len(device.surface.cells.face) > 0
-        np.testing.assert_allclose(np.abs(found.numpy()), np.abs(expected.numpy()), atol=ROUNDED)
-        apart = np.flatnonzero(np.abs(found.numpy()) > 1e-6)[::4]
-        inside = winding_number(obj, points[apart]) > 0.5
+        np.testing.assert_allclose(np.abs(found), np.abs(expected), atol=ROUNDED)
+        apart = np.flatnonzero(np.abs(found) > 1e-6)[::4]
         # The tree's own sign errs at some of these points of the mug.
-        np.testing.assert_array_equal(found.numpy()[apart] < 0, inside)
+        np.testing.assert_array_equal(found[apart] < 0, winding_number(obj, points[apart]) > 0.5)
 
 
 def test_normals_of_features_are_of_the_solid_at_edges() -> None:
@@ -234,3 +224,80 @@ def test_a_box_has_six_planes_however_it_is_triangulated() -> None:
     planes = face_planes(np.asarray(box.vertices), np.asarray(box.faces))
     assert len(planes) == 6
     np.testing.assert_allclose(np.sort(planes[:, 3]), [0.01, 0.01, 0.015, 0.015, 0.025, 0.025], atol=1e-12)
+
+
+Grid = dict[str, np.ndarray]
+BALL = ball(subdivisions=2)
+
+
+@pytest.fixture
+def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    return tmp_path / "graspd" / "object_grids"
+
+
+@pytest.fixture
+def computed(own_cache: Path, monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, ...]]:
+    """The shapes of the grids that were computed, not read."""
+    shapes: list[tuple[int, ...]] = []
+    sampled = grids._sampled
+
+    def watched(skin: Any, shape: tuple[int, ...]) -> Any:
+        shapes.append(shape)
+        return sampled(skin, shape)
+
+    monkeypatch.setattr(grids, "_sampled", watched)
+    return shapes
+
+
+def kept_grid(cell: float = 0.005, alpha: float = 0.0) -> Grid:
+    """The grid of a ball, as a process that begins has it."""
+    skin = device_object(BALL, alpha, cell).surface
+    cells = skin.cells
+    arrays = {"field": skin.field, "first": cells.first, "face": cells.face, "key": cells.key}
+    place = {"low": skin.field_origin, "cell": skin.field_cell, "error": skin.field_error}
+    return {name: array.numpy() for name, array in arrays.items()} | {k: np.array(v) for k, v in place.items()}
+
+
+def same(one: Grid, other: Grid) -> bool:
+    return all(one[name].dtype == other[name].dtype and np.array_equal(one[name], other[name]) for name in one)
+
+
+def test_a_later_process_reads_what_the_first_one_computed(computed: list[Any], own_cache: Path) -> None:
+    first, second = kept_grid(), kept_grid()
+    assert same(first, second) and len(first["face"]) > 0
+    assert len(computed) == 1 and len(list(own_cache.iterdir())) == 1
+
+
+def test_another_cell_faces_or_binary_is_another_grid(computed: list[Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    kept_grid()
+    coarse = kept_grid(cell=0.01)
+    kept_grid(alpha=1.0)
+    monkeypatch.setattr(grids, "binary_name", lambda module: "that of another processor")
+    kept_grid()
+    assert len(computed) == 4 and coarse["field"].size < kept_grid()["field"].size
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("face", lambda a: a + len(BALL.faces)),
+        ("face", lambda a: -1 - a),
+        ("face", lambda a: a[:-1]),
+        ("key", lambda a: a[:-1]),
+        ("key", lambda a: a.astype(float)),
+        ("first", lambda a: a[::-1].copy()),
+        ("first", lambda a: np.zeros(0, np.int32)),
+        ("first", lambda a: np.append(a[:-1], 10**6).astype(np.int32)),
+        ("field", lambda a: a[1:]),
+        ("field", None),
+    ],
+)
+def test_an_entry_that_would_lead_kernels_astray_is_made_again(computed, own_cache: Path, name: str, change) -> None:
+    first = kept_grid()
+    (file,) = own_cache.iterdir()
+    arrays = dict(disk_cache._read(file) or {})
+    array = arrays.pop(name)
+    disk_cache._write(file, arrays | ({name: change(array)} if change else {}))
+    for _ in range(2):  # the second time the entry is whole again
+        assert same(kept_grid(), first) and len(computed) == 2

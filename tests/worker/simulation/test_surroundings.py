@@ -1,7 +1,5 @@
 """Obstacles against closed forms, and against MuJoCo's distances."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import mujoco
@@ -229,8 +227,7 @@ def test_no_hand_is_nearer_to_a_solid_than_it_says_by_mujoco(name: str) -> None:
     found = obstacle_room(hand, postures, [Environment((solid,), UP)])
     true = mujoco_distances(hand, postures, solid)
     apart = true > 0
-    assert (found[apart] <= true[apart] + 1e-5).all()
-    assert (found[~apart] < 1e-5).all()
+    assert (found[apart] <= true[apart] + 1e-5).all() and (found[~apart] < 1e-5).all()
     assert 10 < apart.sum() < 55
     if not any(one.kind == "hull" for one in hand.pieces):
         np.testing.assert_allclose(found[apart], np.minimum(true[apart], FAR_M), atol=1e-5)
@@ -240,8 +237,7 @@ def test_an_outer_solid_holds_its_points_and_is_a_box_of_a_box() -> None:
     points = np.random.default_rng(0).normal(size=(400, 3))
     points *= 0.03 / np.linalg.norm(points, axis=1, keepdims=True)
     solid, error = outer_solid(points)
-    assert len(solid.planes) <= MOST_PLANES
-    assert solid.distance(points).max() <= 1e-9
+    assert len(solid.planes) <= MOST_PLANES and solid.distance(points).max() <= 1e-9
     radius = np.linalg.norm(solid.corners, axis=1).max()
     assert radius - 0.03 <= error < radius - 0.03 + 5e-4, "the ball's points are up to half a millimetre apart from it"
     # Euler: every edge of the solid is there.

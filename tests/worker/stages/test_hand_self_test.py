@@ -1,7 +1,5 @@
 """The self-test of a hand: objects that suit it, and a line that says whether it is ready."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import count
 from types import SimpleNamespace
@@ -39,7 +37,6 @@ _FINGER = '<collision><origin xyz="0 0 0.05"/><geometry><box size="0.012 0.012 0
 
 
 def held(count: int) -> Any:
-    """`count` grasps that hold, equally well."""
     ones = np.ones(count)
     columns = {f"quality/{name}": ones for name in ("success", "verdict_margin")}
     columns |= {f"quality/{name}": ones[:, None] for name in ("epsilon", "verdict_outcome")}
@@ -78,14 +75,9 @@ def test_what_a_hand_lifts_at_best_is_a_line_of_its_check() -> None:
 
 
 def three_fingers(**options: Any) -> HandModel:
-    fingers = [
-        part
-        for number, (x, y) in enumerate(((0.03, 0.0), (-0.015, 0.026), (-0.015, -0.026)))
-        for part in (
-            link(f"finger{number}", _FINGER),
-            joint(f"bend{number}", "palm", f"finger{number}", origin=f"{x} {y} 0.01", axis=f"{y} {-x} 0"),
-        )
-    ]
+    fingers = [link(f"finger{k}", _FINGER) for k in range(3)]
+    for k, (x, y) in enumerate(((0.03, 0.0), (-0.015, 0.026), (-0.015, -0.026))):
+        fingers.append(joint(f"bend{k}", "palm", f"finger{k}", origin=f"{x} {y} 0.01", axis=f"{y} {-x} 0"))
     urdf = robot(link("palm", _PALM), *fingers)
     return load_hand({"r.urdf": urdf}, name="r", digest="0" * 32, options=options)
 
@@ -136,9 +128,7 @@ def test_a_servo_that_is_stiff_for_its_limit_gives_little() -> None:
         (ValueError("array"), "not tried: the test itself failed (ValueError)"),
     ],
 )
-def test_a_test_that_ends_badly_is_told_and_stops_nothing(
-    error: Exception, says: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_test_that_ends_badly_is_told_and_stops_nothing(error: Exception, says: str, monkeypatch) -> None:
     def breaks(hand: HandModel, run: ExecutionContext) -> SelfTest:
         raise error
 

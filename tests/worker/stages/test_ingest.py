@@ -1,7 +1,5 @@
 """Uploads are hostile: each gets its verdict in bounded time, and nothing of them reaches the worker."""
 
-from __future__ import annotations
-
 import io
 import json
 import os
@@ -82,9 +80,7 @@ def start_instead(monkeypatch: pytest.MonkeyPatch, other: Callable[[list[str]], 
     monkeypatch.setattr(ingest.subprocess, "Popen", lambda command, **options: start(other(command), **options))
 
 
-def test_a_disk_without_room_says_nothing_about_the_file(
-    context: TaskContext, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_a_disk_without_room_says_nothing_about_the_file(context: TaskContext, monkeypatch, tmp_path: Path) -> None:
     # A link: whatever becomes of the name, the device stays. The child cannot write what it found.
     (target := tmp_path / "check.json").symlink_to("/dev/full")
     start_instead(monkeypatch, lambda command: [*command[:6], str(target), *command[7:]])
@@ -98,9 +94,7 @@ def child_does(monkeypatch: pytest.MonkeyPatch, code: str) -> None:
     start_instead(monkeypatch, lambda command: [*program, command[6]])
 
 
-def test_check_that_machine_killed_says_nothing_about_the_file(
-    context: TaskContext, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_check_that_machine_killed_says_nothing_about_the_file(context: TaskContext, monkeypatch) -> None:
     child_does(monkeypatch, "os.kill(os.getpid(), signal.SIGKILL)")
     with pytest.raises(OSError, match="was killed"):
         run(context.store, context, OBJECT, AssetKind.OBJECT)
@@ -125,9 +119,7 @@ def test_the_child_knows_no_credentials(context: TaskContext, monkeypatch: pytes
 
 
 @pytest.mark.parametrize("reason", [StopReason.CANCELLED, StopReason.TIMEOUT])
-def test_a_check_that_is_stopped_ends_its_child(
-    reason: StopReason, context: TaskContext, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_check_that_is_stopped_ends_its_child(reason: StopReason, context: TaskContext, monkeypatch) -> None:
     pids: list[int] = []
     popen = ingest.subprocess.Popen
 
@@ -147,15 +139,11 @@ def test_a_check_loads_no_engine() -> None:
     """It would cost four seconds of computing for every upload, and memory of the child's limit."""
     modules = ("stages.ingest", "hands.check", "objects.check", "stages.models")
     code = f"import sys, {', '.join(f'graspd.worker.{module}' for module in modules)}\n"
-    done = subprocess.run(
-        [sys.executable, "-c", f"{code}print(*sys.modules)"], capture_output=True, text=True, check=True
-    )
-    assert not {"warp", "newton", "mujoco"} & set(done.stdout.split())
+    told = subprocess.check_output([sys.executable, "-c", f"{code}print(*sys.modules)"], text=True)
+    assert not {"warp", "newton", "mujoco"} & set(told.split())
 
 
-def test_finding_that_is_long_and_check_that_complains_are_told(
-    context: TaskContext, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_finding_that_is_long_and_check_that_complains_are_told(context: TaskContext, monkeypatch) -> None:
     with monkeypatch.context() as patch:
         patch.setattr(ingest, "_FINDING_BYTES", 10)
         found, _ = ingest.check_in_child(AssetKind.OBJECT, "t", OBJECT, context)
@@ -199,32 +187,37 @@ def upload(store: Store, kind: AssetKind, filename: str, data: bytes, options: d
     except InputError as error:
         return {"verdict": "refuse", "message": str(error)}
     message = IngestMessage(schema_=TASK_SCHEMA, task_id="i", kind=kind, name=Path(filename).stem, digest=asset.digest)
-    outcome = Runner({Stage.INGEST: ingest.run}, worker="w", publish=lambda event: None).run(
-        message.model_dump(mode="json", by_alias=True), TaskContext(store)
-    )
+    runner = Runner({Stage.INGEST: ingest.run}, worker="w", publish=lambda event: None)
+    outcome = runner.run(message.model_dump(mode="json", by_alias=True), TaskContext(store))
     assert outcome.kind is EventKind.FINISHED, outcome
     return json.loads(store.get(names.asset_check(kind, asset.digest)))
+
+
+def bad_files(shared_data: Path) -> list[dict[str, str]]:
+    """What the list of bad inputs says of each: file, kind, verdict, and a word that names the defect."""
+    return list(json.loads((shared_data / "bad" / "INDEX.json").read_text())["inputs"])
+
+
+def is_expected(found: dict[str, Any], entry: dict[str, str]) -> bool:
+    return found["verdict"] == entry["expect"] and entry["message_names"].lower() in found["message"].lower()
 
 
 def kind_of(filename: str) -> AssetKind:
     return AssetKind.HAND if filename.endswith(".urdf") else AssetKind.OBJECT
 
 
-#: One for each verdict on a hand and on a mesh. What the check says of every bad file is tested beside it, without a
-#: child: tests/worker/hands/test_bad_hands.py, tests/worker/objects/test_repair.py.
+#: One for each verdict on a hand and on a mesh; of all, without a child: tests/worker/hands/test_bad_hands.py.
 SOME = ("mimic_chain.urdf", "kinematic_loop.urdf", "open_shell.stl", "inverted_normals.stl", "quads_and_ngons.obj")
 
 
 @pytest.mark.parametrize("chosen", [SOME, pytest.param((), marks=pytest.mark.slow)], ids=["some", "all"])
 def test_a_bad_file_gets_its_verdict_from_the_checking_child(shared_data: Path, chosen: tuple[str, ...]) -> None:
-    known = json.loads((shared_data / "bad" / "INDEX.json").read_text())["inputs"]
-    entries = [entry for entry in known if entry["file"] in chosen] if chosen else known
+    entries = [entry for entry in bad_files(shared_data) if not chosen or entry["file"] in chosen]
 
     def validate(entry: dict[str, str]) -> str | None:
         data, start = (shared_data / "bad" / entry["file"]).read_bytes(), computed()
         found = upload(open_store("memory://"), kind_of(entry["file"]), entry["file"], data)
-        right = found["verdict"] == entry["expect"] and entry["message_names"].lower() in found["message"].lower()
-        return None if right and computed() - start < BOUND_S else f"{entry['file']}: {found}"
+        return None if is_expected(found, entry) and computed() - start < BOUND_S else f"{entry['file']}: {found}"
 
     with ThreadPoolExecutor(TOGETHER) as pool:
         wrong = [text for text in pool.map(validate, entries) if text]

@@ -1,7 +1,5 @@
 """Prepared objects and models in the store: made once, those of the engine; and what batches draw."""
 
-from __future__ import annotations
-
 import io
 from dataclasses import fields
 from pathlib import Path
@@ -92,19 +90,16 @@ def test_a_hands_nodes_stand_where_kinematics_puts_its_bodies(name: str) -> None
     scene = scene_of(hand_glb(hand))
     poses = body_poses(hand, IDENTITY_POSE, np.zeros(len(hand.joint_names)))[0]
     expected = np.concatenate([apply(poses[piece.body], piece.vertices) for piece in hand.pieces])
-    solid = [geometry for geometry in scene.dump() if isinstance(geometry, trimesh.Trimesh)]
-    found = np.concatenate([mesh.bounds for mesh in solid])
-    np.testing.assert_allclose(
-        [found.min(axis=0), found.max(axis=0)], [expected.min(axis=0), expected.max(axis=0)], atol=TOLERANCE_M
-    )
+    found = np.concatenate([mesh.bounds for mesh in scene.dump() if isinstance(mesh, trimesh.Trimesh)])
+    for end in (np.min, np.max):
+        np.testing.assert_allclose(end(found, axis=0), end(expected, axis=0), atol=TOLERANCE_M)
 
 
 @pytest.mark.parametrize("kind", list(AssetKind))
 def test_models_that_come_with_graspd_are_those_of_its_assets(kind: AssetKind) -> None:
     for name in builtin_names(kind):
-        assert model_of(kind, name, builtin_files(kind, name)) == builtin_model(kind, name), (
-            "python -m graspd.worker.stages.models"
-        )
+        made = model_of(kind, name, builtin_files(kind, name))
+        assert made == builtin_model(kind, name), "python -m graspd.worker.stages.models"
 
 
 def test_a_model_is_published_once(tmp_path: Path) -> None:
@@ -121,16 +116,10 @@ def message(**changes: Any) -> TaskMessage:
     return message_for(Stage.RENDER, scenes=1, views=1).model_copy(update=changes)
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"batch": 1},
-        {"stage": Stage.SCENE},
-        {"hand_digest": "d" * 32},
-        {"object_digest": "d" * 32},
-        {"request": request(seed=7)},
-    ],
-)
+OTHERS = [{"batch": 1}, {"stage": Stage.SCENE}, {"hand_digest": "d" * 32}, {"object_digest": "d" * 32}]
+
+
+@pytest.mark.parametrize("changes", [*OTHERS, {"request": request(seed=7)}])
 def test_batches_stages_hands_objects_and_seeds_draw_anew(changes: dict[str, Any]) -> None:
     assert batch_seed(message(**changes)) != batch_seed(message())
     other = message(request=request(method="graspit"), output="e" * 32)

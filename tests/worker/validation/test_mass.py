@@ -1,7 +1,5 @@
 """Mass and friction of the object: what is lifted weighs what it weighs, and the payload is the heaviest of it."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -19,22 +17,11 @@ from graspd.worker.objects.options import as_asked
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.quality.wrench_space import EDGES
 from graspd.worker.simulation.environment import Obstacle, PlacedGrasps
+from graspd.worker.validation import payload as heaviest
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.key import verdict_key
 from graspd.worker.validation.lifting import validate_lifts
-from graspd.worker.validation.payload import (
-    AMPLITUDE_M,
-    AT_STOP,
-    ENOUGH,
-    FREQUENCY_HZ,
-    HOPELESS,
-    LEAST,
-    Limit,
-    capacities,
-    limit_of,
-    payloads,
-    shake_margins,
-)
+from graspd.worker.validation.payload import ENOUGH, Limit, capacities, limit_of, payloads, shake_margins
 from tests.worker.commands_run import graspd
 from tests.worker.models import object_from_mesh, two_finger_hand
 
@@ -80,14 +67,14 @@ def test_what_is_slippery_or_out_of_touch_bears_nothing_stop_all() -> None:
     assert np.isnan(payload(0.01))
     away = Posture(pinch().grasp.hand_pose - np.eye(7)[2], pinch().grasp.joint_positions)
     assert capacities(HAND, BOX, away, UP).tolist() == [0.0]
-    at_stop = replace(HAND, lower=np.full(2, -AT_STOP * 1e-3))
+    at_stop = replace(HAND, lower=np.full(2, -heaviest.AT_STOP * 1e-3))
     assert not np.isfinite(capacities(at_stop, BOX, pinch().grasp, UP)).any()
 
 
 @pytest.mark.parametrize("friction", [0.3, FRICTION, 1.0])
 def test_what_friction_bears_of_the_shake_survives_it(friction: float) -> None:
     # Along the line of the fingers an acceleration takes from the forces that press: mg <= friction (2 F - ma).
-    accelerated = AMPLITUDE_M * (2 * np.pi * FREQUENCY_HZ) ** 2
+    accelerated = heaviest.AMPLITUDE_M * (2 * np.pi * heaviest.FREQUENCY_HZ) ** 2
     borne = 2 * friction * TORQUE / LEVER_M / (ACCELERATION + friction * accelerated)
     survives, lost = (
         shake_margins(HAND, BOX.weighing(mass=share * borne, friction=friction), pinch(), TABLE, pieces=PIECES)[0]
@@ -138,14 +125,11 @@ def test_whoever_says_the_weight_is_told_what_the_grasps_lift(tmp_path: Path) ->
     words = f"{BARRETT} -n 1 --mass 0.37 -o"
     for more, told in (((), keys), (("--no-payload",), keys - {"payload_kg"})):
         said = graspd(words, tmp_path / "g.h5", *more)
-        assert keys & said.keys() == told
-        assert said["mass_kg"] == 0.37 and said.get("payload_kg", 1.0) >= 0.37
+        assert keys & said.keys() == told and said["mass_kg"] == 0.37 and said.get("payload_kg", 1.0) >= 0.37
 
 
 @pytest.mark.parametrize(("least", "kept", "outcomes"), [(0.3, 2, {}), (90.0, 0, {"weak": 2})])
-def test_a_job_counts_grasps_that_lift_the_wanted_payload(
-    tmp_path: Path, least: float, kept: int, outcomes: dict[str, int]
-) -> None:
+def test_a_job_counts_grasps_that_lift_the_wanted_payload(tmp_path, least, kept: int, outcomes: dict[str, int]) -> None:
     words = f"{BARRETT} -n 2 --budget 1 --mass 0.2 --min-payload {least} --shake -o"
     told = graspd(words, tmp_path / "g.h5", code=0 if kept else 3)
     shard = read_shard(tmp_path / "g.h5")
@@ -172,27 +156,21 @@ def test_of_several_directions_the_worst_counts() -> None:
 
 
 def test_what_is_wanted_is_told_with_what_the_best_grasp_lifts() -> None:
-    grasps = pinch().take(np.zeros(ENOUGH, int))
-    placed = TABLE.take(np.zeros(ENOUGH, int))
-
     def limit(wanted: float, count: int = ENOUGH) -> Limit | None:
-        rows = np.arange(count)
-        return limit_of(HAND, BOX, grasps.take(rows), pieces=PIECES, placed=placed.take(rows), wanted=wanted)
+        rows = np.zeros(count, int)
+        return limit_of(HAND, BOX, pinch().take(rows), pieces=PIECES, placed=TABLE.take(rows), wanted=wanted)
 
     lifts = bears(FRICTION)
     found = limit(3 * lifts)
-    assert found is not None and found.hopeless
-    assert 0.95 * lifts < found.lifts_kg < lifts < found.bound_kg < 1.1 * lifts
+    assert found.hopeless and 0.95 * lifts < found.lifts_kg < lifts < found.bound_kg < 1.1 * lifts
     assert found.line == (
         "two_finger lifts 0.34 kg at friction 0.6 in the best of 8 grasps, and at most 0.38 kg by actuator effort; "
         "1.06 kg are wanted"
     )
-    near = limit(0.9 * HOPELESS * lifts)
-    assert near is not None and not near.hopeless
+    assert not limit(0.9 * heaviest.HOPELESS * lifts).hopeless
     assert limit(0.9 * lifts) is None, "they lift it"
-    few = limit(3 * lifts, ENOUGH - 1)
-    assert few is not None and not few.hopeless, "it may be their shape"
-    assert limit(3 * lifts, LEAST - 1) is None, "too few to tell"
+    assert not limit(3 * lifts, ENOUGH - 1).hopeless, "it may be their shape"
+    assert limit(3 * lifts, heaviest.LEAST - 1) is None, "too few to tell"
 
 
 @pytest.mark.parametrize("wanted", [ENOUGH // 2, ENOUGH])

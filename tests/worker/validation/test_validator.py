@@ -1,7 +1,5 @@
 """The validator: what any engine must say of simple grasps, and that its levels say the same."""
 
-from __future__ import annotations
-
 import dataclasses
 import inspect
 import re
@@ -35,13 +33,13 @@ from graspd.worker.validation.model import MujocoOptions, blend, build, scene_of
 from graspd.worker.validation.protocol import HOLD_S, MAX_DISPLACEMENT_M, MAX_ROTATION, Outcome, Rollout, Test
 from graspd.worker.validation.validator import validate
 from tests.worker.models import object_from_mesh, on_one_dof, two_finger_hand
-from tests.worker.quality.helpers import BOX, CONTACT, PADS, WHOLE, grasp_of, many_grasps, pad_hand, plate_hand, posture
+from tests.worker.quality import helpers
+from tests.worker.quality.helpers import BOX, CONTACT, FAR, PADS, WHOLE, grasp_of, many_grasps, placed_data, posture
 
 
 def test_a_pressed_box_is_held_and_a_free_one_falls() -> None:
     verdict = validate(PADS, BOX, grasp_of(), level="dexgraspbench", pieces=WHOLE)
-    assert verdict.reasons == ["held"]
-    assert verdict.success.tolist() == [1]
+    assert verdict.reasons == ["held"] and verdict.success.tolist() == [1]
     assert (verdict.outcome == Outcome.HELD).all()
     away = posture(((0, 0, -0.5), (0.0, 0.0)))
     verdict = validate(PADS, BOX, grasp_of(contact=away), pieces=WHOLE)
@@ -74,8 +72,7 @@ def test_penetration_counts_at_pregrasp_where_simulation_starts(level: str) -> N
 def test_the_engine_has_the_numbers_of_hand_and_object() -> None:
     model = build(PADS, BOX, WHOLE, MujocoOptions()).model
     fingers = [int(model.joint(f"joint{b}").dofadr[0]) for b in PADS.joint_body]
-    assert model.dof_damping[fingers] == pytest.approx(0.02 * PADS.stiffness)
-    assert not model.dof_armature.any()
+    assert model.dof_damping[fingers] == pytest.approx(0.02 * PADS.stiffness) and not model.dof_armature.any()
     assert not model.dof_frictionloss.any()
     assert [model.body(f"body{b}").mass[0] for b in range(3)] == pytest.approx(PADS.masses)
     body = model.body("object")
@@ -87,15 +84,11 @@ def test_the_engine_has_the_numbers_of_hand_and_object() -> None:
 
 
 @pytest.mark.parametrize(("jaws", "contacts"), [(False, 2), (True, 8)], ids=["hand", "gripper"])
-def test_a_pair_of_pieces_has_one_contact_but_between_jaws(
-    jaws: bool, contacts: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_pair_of_pieces_has_one_contact_but_between_jaws(jaws: bool, contacts: int, monkeypatch) -> None:
     if not jaws:
         monkeypatch.setattr(model, "jaws_of", lambda hand: None)
-    scene = build(plate_hand(), BOX, WHOLE, MujocoOptions())
-    data = mujoco.MjData(scene.model)
-    scene.place(data, CONTACT.hand_pose[0], CONTACT.joint_positions[0] + 1e-3)
-    mujoco.mj_forward(scene.model, data)
+    scene = build(helpers.plate_hand(), BOX, WHOLE, MujocoOptions())
+    data = placed_data(scene, CONTACT.joint_positions[0] + 1e-3, CONTACT.hand_pose[0])
     # A plate's face lies flat on the box: with multi-contact each of the two has four points.
     assert len(data.contact.dist) == contacts
 
@@ -106,7 +99,7 @@ def test_displacement_is_that_of_the_mesh_s_own_frame() -> None:
     far = object_from_mesh(mesh)
     scene = build(PADS, far, ConvexPieces((far.hull_vertices,), 1.0, 0.0, "far"), MujocoOptions())
     test = Test(scene)
-    scene.place(test.data, np.array([0, 0, -0.5, 1.0, 0, 0, 0]), np.zeros(2))
+    scene.place(test.data, FAR, np.zeros(2))
     assert test._motion() == (pytest.approx(0, abs=1e-12), 0)
     angle = 0.2
     turned = [np.cos(angle / 2), 0, 0, np.sin(angle / 2)]
@@ -153,11 +146,9 @@ def test_cheaper_levels_say_what_the_letter_says(level: str) -> None:
 def test_hard_holds_no_more_and_threads_change_nothing() -> None:
     grasps = many_grasps()
     normal, hard = (validate(PADS, BOX, grasps, hard=h, pieces=WHOLE) for h in (False, True))
-    assert (hard.success <= normal.success).all()
-    assert normal.key != hard.key
+    assert (hard.success <= normal.success).all() and normal.key != hard.key
     one, two = (validate(PADS, BOX, many_grasps(), pieces=WHOLE, run=ExecutionContext(threads=n)) for n in (1, 2))
-    assert np.array_equal(one.margin, two.margin)
-    assert one.key == two.key
+    assert np.array_equal(one.margin, two.margin) and one.key == two.key
 
 
 def test_progress_is_told_by_one_thread_and_counts_every_grasp() -> None:
@@ -173,15 +164,13 @@ def test_progress_is_told_by_one_thread_and_counts_every_grasp() -> None:
         alone.release()
 
     validate(PADS, BOX, many_grasps(), level="fast", pieces=WHOLE, run=ExecutionContext(threads=4, progress=progress))
-    assert overlaps == 0
-    assert told == list(range(1, len(many_grasps()) + 1))
+    assert overlaps == 0 and told == list(range(1, len(many_grasps()) + 1))
 
 
 def test_terms_depend_not_on_grasps_but_on_everything_else(monkeypatch: pytest.MonkeyPatch) -> None:
     terms = verdict_key(PADS, BOX, "dexgraspbench", False, pieces=WHOLE)
     found = [validate(PADS, BOX, grasp_of(force=force), level="dexgraspbench", pieces=WHOLE) for force in (10.0, 20.0)]
-    assert [verdicts.terms for verdicts in found] == [terms, terms]
-    assert found[0].key != found[1].key
+    assert [verdicts.terms for verdicts in found] == [terms, terms] and found[0].key != found[1].key
     heavier = dataclasses.replace(PADS, masses=PADS.masses * 2)
     others = {
         terms,
@@ -212,40 +201,26 @@ def test_a_constant_moves_the_keys_of_the_levels_that_it_moves(monkeypatch: pyte
 
 def test_every_constant_is_said_to_move_verdicts_or_not() -> None:
     # A new constant belongs in key.py, or here if no verdict depends on it.
-    # These move lifts: lifting.py has them.
-    still = {"postures.ROOM_M", "postures.WIDE", "model.TOUCH_ROUNDING_M"}
-    # Of short tests.
-    still |= {"protocol.STILL", "protocol.LOST"}
-    # Of the choice of grasps.
-    still |= {"postures.STANDS_OFF_M"}
-    # Of raised pregrasps, which are among the postures that are validated.
-    still |= {f"postures.{name}" for name in ("RAISE_LOOKS", "RAISE_OPEN_M", "RAISE_CLOSING_M", "HIGHEST_RAISE_M")}
-    # Of the object of a verdict, which is in its key, and the bound of what is taken.
-    still |= {"matter.MASS_KG", "matter.FRICTION", "matter.MOST_KG"}
-    named = {f"{part.__name__.rpartition('.')[2]}.{name}" for part, names in MOVES.items() for name in names}
-    for modules in LEVEL_MOVES.values():
-        named |= {f"{part.__name__.rpartition('.')[2]}.{name}" for part, names in modules.items() for name in names}
-    there = {
-        f"{part.__name__.rpartition('.')[2]}.{name}"
-        for part in MOVES
-        for name in vars(part)
-        if name.lstrip("_").isupper() and _assigned(part, name)
-    }
-    assert there == named | still
+    # These move lifts (lifting.py has them), short tests, or the choice of grasps.
+    still = "postures.ROOM_M postures.WIDE model.TOUCH_ROUNDING_M protocol.STILL protocol.LOST postures.STANDS_OFF_M "
+    # These move pregrasps, which are validated; the object, which is in the key; and the bound of masses.
+    still += "postures.RAISE_LOOKS postures.RAISE_OPEN_M postures.RAISE_CLOSING_M postures.HIGHEST_RAISE_M "
+    still += "matter.MASS_KG matter.FRICTION matter.MOST_KG"
+    tables = [MOVES, *LEVEL_MOVES.values()]
+    named = {_called(part, name) for table in tables for part, names in table.items() for name in names}
+    # Constants of a module are those that it assigns.
+    assigned = {part: re.findall(r"^(_?[A-Z][A-Z0-9_]*)\b[^=\n]*=", inspect.getsource(part), re.M) for part in MOVES}
+    assert {_called(part, name) for part, names in assigned.items() for name in names} == named | {*still.split()}
 
 
-def _assigned(module: ModuleType, name: str) -> bool:
-    """Whether the constant is the module's own, not imported from another."""
-    return re.search(rf"^{name}\b[^=\n]*=", inspect.getsource(module), re.MULTILINE) is not None
+def _called(module: ModuleType, name: str) -> str:
+    return f"{module.__name__.rpartition('.')[2]}.{name}"
 
 
 def test_forward_kinematics_agree_with_ours() -> None:
     hand = two_finger_hand()
-    scene = build(hand, BOX, WHOLE, MujocoOptions())
-    data = mujoco.MjData(scene.model)
     pose, joints = np.array([0.1, 0.2, -0.3, 0.5, -0.5, 0.5, 0.5]), np.array([0.4, -0.2])
-    scene.place(data, pose, joints)
-    mujoco.mj_forward(scene.model, data)
+    data = placed_data(build(hand, BOX, WHOLE, MujocoOptions()), joints, pose)
     ours = body_poses(hand, pose, joints)[0]
     for b in range(hand.bodies):
         assert data.body(f"body{b}").xpos == pytest.approx(ours[b, :3], abs=1e-12)
@@ -256,10 +231,8 @@ def test_coupled_joints_stay_coupled_while_moving() -> None:
     hand = on_one_dof(PADS, 0.5, 0.01)
     scene = build(hand, BOX, WHOLE, MujocoOptions())
     assert scene.model.nu == 1
-    data = mujoco.MjData(scene.model)
-    far = np.array([0, 0, -0.5, 1.0, 0, 0, 0])
-    scene.place(data, far, hand.expand(np.array([0.0])))
-    scene.command(data, far, hand.expand(np.array([0.06])))
+    data = placed_data(scene, hand.expand(np.array([0.0])))
+    scene.command(data, FAR, hand.expand(np.array([0.06])))
     mujoco.mj_step(scene.model, data, nstep=500)
     joints = data.qpos[scene.joint_qpos]
     assert joints[0] == pytest.approx(0.06, abs=1e-5)
@@ -269,8 +242,7 @@ def test_coupled_joints_stay_coupled_while_moving() -> None:
 def test_actuators_never_exceed_the_effort() -> None:
     weak = dataclasses.replace(PADS, effort=np.array([2.0, 3.0]))
     scene = build(weak, BOX, WHOLE, MujocoOptions())
-    data = mujoco.MjData(scene.model)
-    scene.place(data, CONTACT.hand_pose[0], CONTACT.joint_positions[0])
+    data = placed_data(scene, CONTACT.joint_positions[0], CONTACT.hand_pose[0])
     scene.command(data, CONTACT.hand_pose[0], CONTACT.joint_positions[0] + 0.08)
     mujoco.mj_step(scene.model, data, nstep=5)
     assert data.actuator_force == pytest.approx([2.0, 3.0])
@@ -285,14 +257,12 @@ def test_unknown_levels_are_refused_and_cancelled_validator_stops() -> None:
 
 def test_a_convex_object_is_one_piece_and_an_l_is_cut_and_kept(tmp_path: Path) -> None:
     pieces = decompose(BOX, cache=tmp_path)
-    assert len(pieces) == 1
-    assert pieces.volume_ratio == pytest.approx(1.0, abs=1e-6)
+    assert len(pieces) == 1 and pieces.volume_ratio == pytest.approx(1.0, abs=1e-6)
     parts = [trimesh.creation.box((0.1, 0.02, 0.02)), trimesh.creation.box((0.02, 0.1, 0.02))]
     parts[1].apply_translation([0.04, 0.04, 0])
     shape = object_from_mesh(trimesh.boolean.union(parts, engine="manifold"))
     pieces = decompose(shape, cache=tmp_path)
-    assert 2 <= len(pieces) <= 4
-    assert pieces.volume_ratio == pytest.approx(1.0, abs=0.05)
+    assert 2 <= len(pieces) <= 4 and pieces.volume_ratio == pytest.approx(1.0, abs=0.05)
     assert len(list(tmp_path.glob("*.npz"))) == 2
     cube = np.asarray(trimesh.creation.box((0.02, 0.02, 0.02)).vertices)
     assert union_volume((cube, cube + np.array([0.01, 0, 0]))) == pytest.approx(12e-6, rel=1e-5)
@@ -317,9 +287,7 @@ class Exploding(Test):
 
 
 @pytest.mark.parametrize("level", ["dexgraspbench", "standard"])
-def test_a_blown_up_push_is_not_held_and_spoils_no_other_grasp(
-    level: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_blown_up_push_is_not_held_and_spoils_no_other_grasp(level: str, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     test = Exploding(build(PADS, BOX, WHOLE, MujocoOptions()))
     rollout = getattr(test, level)(grasp_of(), 0)
@@ -408,7 +376,7 @@ def test_a_push_ends_once_it_is_decided(moved: Motion, turned: Motion, outcome: 
     assert seconds is None or push.elapsed == pytest.approx(seconds)
 
 
-SHORT_PADS, PLATES = pad_hand(), plate_hand()
+SHORT_PADS, PLATES = helpers.pad_hand(), helpers.plate_hand()
 TABLE = Obstacle.half_space((0, 0, 1), -0.3)
 
 

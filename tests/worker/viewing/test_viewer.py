@@ -1,7 +1,5 @@
 """`graspd view`: it serves a page, its slider moves hand and object, grasps follow one another, it ends cleanly."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal

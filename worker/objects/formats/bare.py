@@ -34,7 +34,9 @@ def read_ply(data: bytes) -> Soup:
     found = re.search(rb"[\r\n]end_header", data[:65536])
     if not data.startswith(b"ply") or found is None:
         raise MeshError("a PLY file begins with the word ply and a header of at most 64 KiB")
-    end, line_end = found.end(), _line_end(data[: found.end()])
+    end = found.end()
+    # Data after the header may be binary and begin with any byte.
+    line_end = next(ending for ending in (b"\r\n", b"\n", b"\r") if ending in data[:end])
     start = data.index(line_end, end) + len(line_end)
     order, elements = _header(data[:end].decode("ascii", "replace").splitlines()[1:])
     body = _Ascii(data[start:]) if order is None else _Binary(data[start:], order)
@@ -50,11 +52,6 @@ def read_ply(data: bytes) -> Soup:
                 raise MeshError("the faces have no list vertex_indices")
             polygons = lists[name]
     return Soup(vertices, triangulate(vertices, *polygons))
-
-
-def _line_end(header: bytes) -> bytes:
-    """Return the line end of the header: data after it may be binary and begin with any byte."""
-    return next(end for end in (b"\r\n", b"\n", b"\r") if end in header)
 
 
 def _header(lines: list[str]) -> tuple[str | None, list[_Element]]:

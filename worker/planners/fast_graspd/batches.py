@@ -16,7 +16,7 @@ from graspd.service.model.transforms import Floats
 from graspd.worker.grasps import GraspSet
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners.fast_graspd.scene_starts import free_ways
-from graspd.worker.planners.fast_graspd.schedule import WarmStart, in_scene, with_rollout
+from graspd.worker.planners.fast_graspd.schedule import WarmStart, in_scene
 from graspd.worker.planners.fast_graspd.starts import start_generator
 from graspd.worker.planners.port import BatchRequest
 from graspd.worker.planners.threads import StepCounter
@@ -37,7 +37,8 @@ class Batches:
         if wanted[0].placed is not None:
             self.fidelity = in_scene(self.fidelity)
         elif self.has_rollout:
-            self.fidelity = with_rollout(self.fidelity)
+            # Retries replace half of the initial starts.
+            self.fidelity = self.fidelity.model_copy(update={"starts": -(-self.fidelity.starts // 2)})
         if warm is not None:
             self.fidelity = warm.adapted(self.fidelity)
         counts = [one.count for one in wanted]
@@ -49,7 +50,9 @@ class Batches:
         """(n,) whether the hands of a row start more open than their pre-shape, because no start was clear in it."""
         self.errors: dict[int, Exception] = {}
         """Errors of the batches that stopped."""
-        self._steps = [StepCounter(one.wanted.count * (hands(self.fidelity) + 1), one.run) for one in asked]
+        known = self.fidelity
+        hands = known.starts * known.coarse_iterations + finalists(known) * known.fine_iterations
+        self._steps = [StepCounter(one.wanted.count * (hands + 1), one.run) for one in asked]
         placed = [one.placed for one in wanted if one.placed is not None]
         self.placed: PlacedGrasps | None = placed_together(placed) if placed else None
         self.ways: list[Floats] = []
@@ -127,7 +130,3 @@ class Batches:
 def finalists(fidelity: Fidelity) -> int:
     """Return the number of hands per grasp that enter the fine phase, at most the number of starts."""
     return min(fidelity.finalists, fidelity.starts)
-
-
-def hands(fidelity: Fidelity) -> int:
-    return fidelity.starts * fidelity.coarse_iterations + finalists(fidelity) * fidelity.fine_iterations

@@ -107,7 +107,7 @@ class LaunchPart:
             np.concatenate([getattr(part, name) for part in (self, other)])
             for name in ("rows", "loss", "merit", "attempts")
         )
-        state = _joined_states([self.state, other.state])
+        state = HandState.joined([self.state, other.state])
         return LaunchPart(rows, state, loss, merit, curve, joined(both) if both else None, attempts)
 
 
@@ -249,7 +249,9 @@ def _begun(launch: _Launch, rows: Rows, run: ExecutionContext) -> _Begun:
         np.concatenate([part.touch for part in parts if part.touch is not None]) if parts[0].touch is not None else None
     )
     depth = np.concatenate([part.depth for part in parts])
-    return _Begun(np.concatenate([part.rows for part in parts]), _joined_states([p.state for p in parts]), depth, touch)
+    return _Begun(
+        np.concatenate([part.rows for part in parts]), HandState.joined([p.state for p in parts]), depth, touch
+    )
 
 
 def _set_out(launch: _Launch, rows: Rows, attempt: Rows) -> _Begun:
@@ -429,10 +431,6 @@ def _descend(
     return data.state(data.capacity)
 
 
-def _joined_states(states: Sequence[HandState]) -> HandState:
-    return HandState(*(np.concatenate([getattr(s, name) for s in states]) for name in ("pivot", "rotation", "q")))
-
-
 def grasps_of(
     hand: HandModel,
     obj: ObjectModel,
@@ -448,7 +446,7 @@ def grasps_of(
         grasps = joined(known)
     else:
         loss = np.concatenate([part.loss for part in parts])
-        state = _joined_states([part.state for part in parts])
+        state = HandState.joined([part.state for part in parts])
         grasps = with_postures(hand, obj, state, loss, placed, device=device)
     attempts = int(sum(part.attempts.sum() for part in parts))
     info = {"loss_curve": np.round(curve, 5).tolist(), "chunk": CHUNK}

@@ -63,11 +63,6 @@ def in_scene(fidelity: Fidelity) -> Fidelity:
     )
 
 
-def with_rollout(fidelity: Fidelity) -> Fidelity:
-    """Return the fidelity for free objects with rollouts: retries replace half of the initial starts."""
-    return fidelity.model_copy(update={"starts": -(-fidelity.starts // 2)})
-
-
 def _share(iterations: int, share: float) -> int:
     return int(np.ceil(share * iterations))
 

@@ -1,7 +1,5 @@
 """A service without processes with two hands and three objects, on SQLite and on PostgreSQL."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

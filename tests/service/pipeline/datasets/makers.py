@@ -1,10 +1,9 @@
 """Hands and objects without content, datasets on them, and their tasks done or failed on the spot."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 
+from graspd.service.index.views import CellView
 from graspd.service.model import names
 from graspd.service.model.planning import plan
 from graspd.service.model.states import AssetKind, Stage
@@ -12,8 +11,7 @@ from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.datasets import actions
 from graspd.service.pipeline.datasets.spec import DatasetRequest
 from graspd.service.store.library import publish_asset
-from tests.fakes import fail_task, finish, record_of
-from tests.planning import plan_all
+from tests.fakes import fail_task, finish, plan_all, record_of
 
 
 def add_asset(services: Services, kind: str, name: str, *, content: str = "", verdict: str | None = "accept") -> str:
@@ -48,5 +46,9 @@ def fail(services: Services, job: str, reason: str = "it broke") -> None:
             fail_task(services, job, task, services.index.jobs.task(task.id).attempt, reason=reason)
 
 
+def cells_of(services: Services, name: str = "grasps") -> list[CellView]:
+    return list(services.index.datasets.cells(name, limit=200).items)
+
+
 def jobs_of(services: Services, name: str) -> list[str]:
-    return [cell.job_id for cell in services.index.datasets.cells(name, limit=200).items]
+    return [cell.job_id for cell in cells_of(services, name)]

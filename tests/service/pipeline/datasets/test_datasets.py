@@ -1,7 +1,5 @@
 """A dataset from its creation to its end and its export; its options; and that the store tells it all."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import subprocess
@@ -37,10 +35,8 @@ from graspd.service.pipeline.datasets.spec import DatasetRequest
 from graspd.service.pipeline.fidelity_choice import Resolver
 from graspd.service.store.records import charts_of, job_events, load_dataset, publish
 from graspd.service.store.store import open_store
-from tests.dataset_status import status
-from tests.fakes import finish, record_of
-from tests.planning import plan_all
-from tests.service.pipeline.datasets.makers import add_asset, done, fail, jobs_of, wanted
+from tests.fakes import finish, plan_all, record_of
+from tests.service.pipeline.datasets.makers import add_asset, cells_of, done, fail, jobs_of, wanted
 from tests.service.pipeline.test_fidelity_choice import lifts, run
 
 
@@ -131,17 +127,15 @@ def test_status_tells_each_cell(either: Services) -> None:
     finish(either, jobs[0])
     finish(either, jobs[1], batches=1)
     fail(either, jobs[2], "the mesh is torn")
-    found = status(either.index, "grasps")
-    assert [cell.state for cell in found.cells] == ["succeeded", "running", "failed", "queued"]
-    assert [cell.grasps for cell in found.cells] == [64, 32, 0, 0]
-    assert [cell.progress for cell in found.cells] == [1.0, 0.5, 0.0, 0.0]
-    done, failed = found.cells[0], found.cells[2]
-    assert done.valid_yield == done.valid / done.candidates and found.cells[3].valid_yield is None
+    cells = cells_of(either)
+    told = [(cell.state, cell.grasps, cell.progress) for cell in cells]
+    assert told == [("succeeded", 64, 1.0), ("running", 32, 0.5), ("failed", 0, 0.0), ("queued", 0, 0.0)]
+    done, failed = cells[0], cells[2]
+    assert done.valid_yield == done.valid / done.candidates and cells[3].valid_yield is None
     assert (failed.tasks_failed, failed.attempts_failed, failed.reason) == (2, 2, "the mesh is torn")
-    whole = found.dataset
+    whole = either.index.datasets.get("grasps")
     assert (whole.state, whole.grasps, whole.tasks, whole.tasks_done, whole.tasks_failed) == ("running", 96, 8, 3, 2)
-    assert whole.progress == pytest.approx(3 / 8)
-    assert whole.seconds == pytest.approx(1.5) and whole.shards == 3
+    assert whole.progress == pytest.approx(3 / 8) and whole.seconds == pytest.approx(1.5) and whole.shards == 3
 
 
 def test_a_dataset_that_found_fewer_grasps_tells_the_outcomes(either: Services) -> None:
@@ -149,13 +143,12 @@ def test_a_dataset_that_found_fewer_grasps_tells_the_outcomes(either: Services) 
     plan_all(either)
     first, second = jobs_of(either, "grasps")
     finish(either, first, outcomes={"slipped": 3})
-    assert status(either.index, "grasps").dataset.reason is None
+    assert either.index.datasets.get("grasps").reason is None
     finish(either, second, outcomes={"slipped": 1, "turned": 2})
-    found = status(either.index, "grasps")
-    whole = found.dataset
+    whole = either.index.datasets.get("grasps")
     assert whole.valid < 64 and whole.outcomes == {"turned": 2, "slipped": 4}
     assert whole.reason is not None and f"found {whole.valid} of 64 valid" in whole.reason
-    reasons = [cell.reason or "" for cell in found.cells]
+    reasons = [cell.reason or "" for cell in cells_of(either)]
     assert "3 slipped;" in reasons[0] and f"2 {OUTCOMES['turned']}, 1 slipped;" in reasons[1]
 
 
@@ -166,9 +159,9 @@ def test_cancel_stops_what_is_planned_and_what_is_not(services: Services) -> Non
     finish(services, jobs_of(services, "grasps")[0])
     assert actions.cancel(services, "grasps").cancelled
     plan_all(services)
-    found = status(services.index, "grasps")
-    assert [cell.state for cell in found.cells] == ["succeeded", "cancelled", "cancelled", "cancelled"]
-    assert found.dataset.state == "cancelled" and services.index.feed.believed_queued()[0] == set()
+    assert [cell.state for cell in cells_of(services)] == ["succeeded", "cancelled", "cancelled", "cancelled"]
+    assert services.index.datasets.get("grasps").state == "cancelled"
+    assert services.index.feed.believed_queued()[0] == set()
     with pytest.raises(ConflictError, match="nothing to cancel"):
         actions.cancel(services, "grasps")
 
@@ -179,8 +172,7 @@ def test_a_job_that_another_dataset_waits_for_goes_on(either: Services) -> None:
     plan_all(either)
     actions.cancel(either, "one")
     plan_all(either)
-    states = [cell.state for cell in status(either.index, "one").cells]
-    assert states == ["cancelled", "queued", "cancelled", "cancelled"]
+    assert [cell.state for cell in cells_of(either, "one")] == ["cancelled", "queued", "cancelled", "cancelled"]
 
 
 def test_retry_starts_failed_and_cancelled_cells_again(services: Services) -> None:
@@ -196,8 +188,7 @@ def test_retry_starts_failed_and_cancelled_cells_again(services: Services) -> No
     plan_all(services)
     assert actions.retry(services, "grasps").state is State.QUEUED
     plan_all(services)
-    found = status(services.index, "grasps")
-    assert [cell.state for cell in found.cells] == ["succeeded", "running", "queued", "queued"]
+    assert [cell.state for cell in cells_of(services)] == ["succeeded", "running", "queued", "queued"]
     assert len(services.index.feed.believed_queued()[0]) == 1 + 2 + 2
     for job in jobs:
         finish(services, job)
@@ -320,8 +311,6 @@ def test_a_folder_that_cannot_be_made_is_the_callers_mistake(source: Fetch, snap
 
 ANNEALED = {"method": "graspit", "options": {"keep": 20, "steps": 40000}}
 AUTO = {"fidelity": "auto", "target": "gsr>=0.6"}
-
-
 _ON_BALL = (("draft", 40, 0.3), ("standard", 15, 0.8))
 
 

@@ -1,12 +1,11 @@
 """Machine and store as the doctor sees them, and checks side by side."""
 
-from __future__ import annotations
-
 import os
 import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
+from unittest.mock import Mock
 
 import obstore
 import pytest
@@ -31,15 +30,13 @@ def test_room_is_validated_by_the_fullest_disk(tmp_path: Path, free: int, condit
     found = disk(settings, usage=lambda folder: (0, 0, free if folder == tmp_path / "far" else 200 * GIB))
     assert found.condition is condition
     if condition is not Condition.GOOD:
-        assert str(tmp_path / "far") in found.message
-        assert "GRASPD_STORE_URL" in found.fix
+        assert str(tmp_path / "far") in found.message and "GRASPD_STORE_URL" in found.fix
 
 
 def test_a_data_folder_that_others_can_read_is_told(tmp_path: Path) -> None:
     tmp_path.chmod(0o755)
     found = data_folder(Settings(data_dir=tmp_path))
-    assert found.condition is Condition.WARNING
-    assert found.fix == f"chmod 700 {tmp_path}"
+    assert found.condition is Condition.WARNING and found.fix == f"chmod 700 {tmp_path}"
     tmp_path.chmod(0o700)
     assert data_folder(Settings(data_dir=tmp_path)).condition is Condition.GOOD
 
@@ -50,8 +47,7 @@ def test_a_data_folder_on_a_network_is_told(tmp_path: Path) -> None:
     mounts.write_text(kinds)
     folder = tmp_path / "data"
     found = data_folder(Settings(data_dir=folder), mounts=mounts)
-    assert found.condition is Condition.WARNING
-    assert "nfs4" in found.message
+    assert found.condition is Condition.WARNING and "nfs4" in found.message
     elsewhere = Settings(data_dir=folder, redis_url="redis://other", index_url="postgresql+psycopg://other/graspd")
     assert data_folder(elsewhere, mounts=mounts).condition is Condition.GOOD
     for path, kind in ((folder, "nfs4"), (tmp_path / "tmp" / "x", "tmpfs"), (Path("/etc"), "ext4")):
@@ -78,15 +74,10 @@ def test_findings_come_in_order_and_one_that_hangs_is_bad() -> None:
         hold.wait(30)
         return good("late")
 
-    def break_off() -> Finding:
-        raise ZeroDivisionError("by nothing")
-
-    def away() -> Finding:
-        raise StoreUnavailable("the store is away")
-
+    away = Mock(side_effect=StoreUnavailable("the store is away"))
     checks = [
         Check("hangs", hang, limit_s=0.05, mend_hang="restart it"),
-        Check("breaks", break_off),
+        Check("breaks", Mock(side_effect=ZeroDivisionError("by nothing"))),
         Check("away", away),
         Check("good", lambda: good("fine")),
     ]
@@ -96,8 +87,7 @@ def test_findings_come_in_order_and_one_that_hangs_is_bad() -> None:
         hold.set()
     assert [one.name for one in found] == ["hangs", "breaks", "away", "good"]
     assert [one.condition for one in found] == [Condition.BAD] * 3 + [Condition.GOOD]
-    assert found[0].fix == "restart it"
-    assert "ZeroDivisionError: by nothing" in found[1].message
+    assert found[0].fix == "restart it" and "ZeroDivisionError: by nothing" in found[1].message
     assert found[2].message == "the store is away"
 
 
@@ -120,13 +110,10 @@ def test_a_bucket_is_good_and_nothing_is_left_in_it(tmp_path: Path, s3_url: str)
 
 
 @pytest.mark.s3
-def test_a_wrong_secret_is_bad_and_the_mend_names_the_variables(
-    tmp_path: Path, s3_url: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_wrong_secret_names_its_variables(tmp_path: Path, s3_url: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "of-somebody-else")
     found = store(Settings(data_dir=tmp_path, store_url=s3_url))
-    assert not found.ok and "AWS_SECRET_ACCESS_KEY" in found.fix
-    assert "of-somebody-else" not in str(found)
+    assert not found.ok and "AWS_SECRET_ACCESS_KEY" in found.fix and "of-somebody-else" not in str(found)
 
 
 def test_a_store_in_memory_is_gone_with_its_process() -> None:

@@ -1,7 +1,5 @@
 """An engine with the arrays of MuJoCo Warp in which MuJoCo itself steps: its verdicts must be the validator's."""
 
-from __future__ import annotations
-
 import enum
 from types import SimpleNamespace
 from typing import Any

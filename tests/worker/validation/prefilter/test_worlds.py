@@ -1,7 +1,5 @@
 """Many worlds at once come to the standard level's verdicts, by the same looks, whatever order they take grasps in."""
 
-from __future__ import annotations
-
 import dataclasses
 import logging
 from collections.abc import Iterator
@@ -70,18 +68,14 @@ def test_outcomes_margins_and_depths_are_the_certificates(found: PrefilterOutcom
     assert found.ticks[0] * 10 == validate(PADS, BOX, grasp_of(), pieces=WHOLE).steps
 
 
-def test_verdicts_do_not_depend_on_which_world_takes_a_grasp(
-    found: PrefilterOutcomes, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_verdicts_do_not_depend_on_which_world_takes_a_grasp(found: PrefilterOutcomes, monkeypatch) -> None:
     rows = np.arange(len(found.outcome))[::-1]
     other = pool(monkeypatch, Stand(), 3).validate(every_kind().take(rows))
     np.testing.assert_array_equal(other.outcome[rows], found.outcome)
     np.testing.assert_array_equal(other.margin[rows], found.margin)
 
 
-def test_grasps_that_need_more_room_are_validated_again_with_it(
-    standard: Verdicts, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_grasps_that_need_more_room_are_validated_again_with_it(standard: Verdicts, monkeypatch) -> None:
     found = pool(monkeypatch, Stand(needs_rows=ROWS + 1), 4).validate(every_kind())
     assert not found.overflow.any()
     np.testing.assert_array_equal(found.outcome, standard.outcome)
@@ -90,25 +84,16 @@ def test_grasps_that_need_more_room_are_validated_again_with_it(
 def test_what_finds_no_room_or_blows_up_is_said_and_never_clear(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(screening, "DOUBLINGS", 1)
     found = pool(monkeypatch, Stand(needs_rows=1 << 30), 4).validate(grasp_of())
-    assert found.held.all()
-    assert found.overflow.all()
-    assert not (found.clearly_held | found.clearly_failed).any()
+    assert found.held.all() and found.overflow.all() and not (found.clearly_held | found.clearly_failed).any()
     found = pool(monkeypatch, Stand(diverges=True), 1).validate(grasp_of())
-    assert Outcome.DIVERGED in found.outcome[0]
-    assert not (found.clearly_held | found.clearly_failed).any()
+    assert Outcome.DIVERGED in found.outcome[0] and not (found.clearly_held | found.clearly_failed).any()
 
 
 def test_the_band_is_clear_of_neither_side() -> None:
-    n, held = 4, [Outcome.HELD] * 6
-    lost = [Outcome.DISPLACED] + [Outcome.NOT_TRIED] * 5
-    found = PrefilterOutcomes(
-        outcome=np.array([held, held, lost, lost], np.uint8),
-        margin=np.array([0.79, 0.81, 1.19, 1.21]),
-        penetration_m=np.zeros(n),
-        self_penetration_m=np.zeros(n),
-        overflow=np.zeros(n, bool),
-        ticks=np.zeros(n, np.int32),
-    )
+    held, lost = [Outcome.HELD] * 6, [Outcome.DISPLACED] + [Outcome.NOT_TRIED] * 5
+    outcome, margin = np.array([held, held, lost, lost], np.uint8), np.array([0.79, 0.81, 1.19, 1.21])
+    depths, overflow, ticks = np.zeros((2, 4)), np.zeros(4, bool), np.zeros(4, np.int32)
+    found = PrefilterOutcomes(outcome, margin, *depths, overflow=overflow, ticks=ticks)
     assert found.clearly_held.tolist() == [True, False, False, False]
     assert found.clearly_failed.tolist() == [False, False, False, True]
 
@@ -148,9 +133,7 @@ def test_at_level_certificate_the_first_judge_only_refuses(standard: Verdicts) -
 
 def test_at_level_screen_clear_verdicts_stand_both_ways(standard: Verdicts, monkeypatch: pytest.MonkeyPatch) -> None:
     first = verdicts(ON, "fast")
-    for held in (0, 1):
-        assert (first.validated_by[first.success == held] == ValidatedBy.MUJOCO_WARP).any()
-    assert first.level == "fast"
+    assert {*first.success[first.validated_by == ValidatedBy.MUJOCO_WARP]} == {0, 1} and first.level == "fast"
     np.testing.assert_array_equal(first.success, standard.success)
     monkeypatch.setattr(screening, "BAND", (0.0, 1e9))
     band = verdicts(ON, "fast")
@@ -169,9 +152,8 @@ def test_the_letter_and_grippers_are_the_cpus(monkeypatch: pytest.MonkeyPatch) -
 
 def test_the_key_says_who_judges() -> None:
     runs = (ExecutionContext(), ExecutionContext(prefilter="off"), ExecutionContext(device="cpu", prefilter="auto"))
-    keys = {verdicts(run, grasps=grasp_of()).terms for run in runs}
-    assert len(keys) == 1
-    assert verdicts(ON, grasps=grasp_of()).terms not in keys
+    (key,) = {verdicts(run, grasps=grasp_of()).terms for run in runs}
+    assert verdicts(ON, grasps=grasp_of()).terms != key
 
 
 def test_who_insists_on_it_is_told_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -187,40 +169,30 @@ def lies(found: PrefilterOutcomes) -> PrefilterOutcomes:
     return dataclasses.replace(found, outcome=np.ones_like(found.outcome), margin=np.zeros(len(found.margin)))
 
 
-def test_a_first_judge_that_the_cpu_contradicts_is_not_believed(
-    standard: Verdicts, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_first_judge_that_the_cpu_contradicts_is_not_believed(standard: Verdicts, monkeypatch, caplog) -> None:
     true = screening.WorldPool.validate
     monkeypatch.setattr(screening.WorldPool, "validate", lambda *some, **more: lies(true(*some, **more)))
     not_rechecked = verdicts(ON, "fast")
-    assert not_rechecked.success.all()
-    assert not_rechecked.rechecked == 0
+    assert not_rechecked.success.all() and not_rechecked.rechecked == 0
     monkeypatch.setattr(screening, "RECHECK_ONE_IN", 2)
     with caplog.at_level(logging.WARNING):
         found = verdicts(ON, "fast")
-    assert found.contradicted > 1
-    assert found.rechecked >= found.contradicted
-    assert (found.validated_by == ValidatedBy.MUJOCO).all()
+    assert found.rechecked >= found.contradicted > 1 and (found.validated_by == ValidatedBy.MUJOCO).all()
     np.testing.assert_array_equal(found.success, standard.success)
     assert "the CPU validates all" in caplog.text
 
 
-def test_where_a_gpu_has_no_memory_for_it_the_cpu_judges(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_where_a_gpu_has_no_memory_for_it_the_cpu_judges(monkeypatch, caplog: pytest.LogCaptureFixture) -> None:
     def full(*_: Any) -> Any:
         raise RuntimeError("Failed to allocate 4096 bytes on device 'cuda:0'")
 
     monkeypatch.setattr(screening, "WorldPool", full)
     with caplog.at_level(logging.WARNING):
         found = verdicts(ON)
-    assert (found.validated_by == ValidatedBy.MUJOCO).all()
-    assert "no memory for the prefilter" in caplog.text
+    assert (found.validated_by == ValidatedBy.MUJOCO).all() and "no memory for the prefilter" in caplog.text
 
 
-def test_grasps_that_overflow_the_first_judge_are_the_cpus(
-    stand_in: Stand, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_grasps_that_overflow_the_first_judge_are_the_cpus(stand_in: Stand, monkeypatch, caplog) -> None:
     verdicts(ON, grasps=grasp_of())
     assert "overflow" not in caplog.text
     monkeypatch.setattr(screening, "DOUBLINGS", 1)
@@ -244,10 +216,8 @@ def test_a_shard_tells_of_each_grasp_who_validated_it(mode: Any) -> None:
     found = scored(PADS, BOX, every_kind(), request, pieces=lambda obj: WHOLE, run=run)
     columns = found.columns
     assert ("quality/validated_by" in columns) == (mode == "on")
-    assert found.verdict_key == verdicts(run, "fast").terms
-    if mode == "on":
-        assert (columns["quality/validated_by"] == ValidatedBy.MUJOCO_WARP).any()
-        assert columns.keys() <= SCHEMAS["base"].keys()
+    assert found.verdict_key == verdicts(run, "fast").terms and columns.keys() <= SCHEMAS["base"].keys()
+    assert mode == "off" or (columns["quality/validated_by"] == ValidatedBy.MUJOCO_WARP).any()
 
 
 def test_verdicts_that_were_asked_before_are_not_asked_twice(stand_in: Stand) -> None:
@@ -280,7 +250,5 @@ def test_clear_verdicts_on_500_grasps_are_the_certificates() -> None:
             clear += is_clear.tolist()
             same += (found.clearly_held == held)[is_clear].tolist()
             kinds |= set(held.tolist())
-    assert kinds == {False, True}, "the set must hold both kinds"
-    assert len(clear) >= 500
-    assert np.mean(clear) > 0.8
-    assert np.mean(same) >= 0.99
+    assert kinds == {False, True} and len(clear) >= 500, "the set must hold both kinds"
+    assert np.mean(clear) > 0.8 and np.mean(same) >= 0.99

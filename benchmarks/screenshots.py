@@ -1,6 +1,6 @@
 """Pictures of every page of the dashboard for its documentation, of a real service with real grasps.
 
-usage: python -m tests.browser.screenshots [--data-dir DIR] [--out docs/images]
+usage: python -m benchmarks.screenshots [--data-dir DIR] [--out docs/images]
 
 Starts the service, gives it work (some minutes on two cores), publishes the charts of the docs, and photographs each
 page at the width of a laptop or a phone, light or dark. With --data-dir the service and its work are kept, and the
@@ -29,7 +29,7 @@ from graspd.service.settings import Settings
 from tests.browser.conftest import ARGUMENTS
 from tests.waiting import until
 
-REPOSITORY: Final = Path(__file__).resolve().parents[2]
+REPOSITORY: Final = Path(__file__).resolve().parents[1]
 CHARTS: Final = [REPOSITORY / "docs" / "results" / one / "chart.json" for one in ("", "scenes-chart")]
 MAPS: Final = REPOSITORY / "docs" / "results" / "stability" / "stability.json"
 WORK_S: Final = 3600.0

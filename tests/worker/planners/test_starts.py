@@ -1,7 +1,6 @@
-"""Starts across an object: pairs of points that look away from each other, and hands that hold between them."""
+"""Starts of free hands and starts across an object: pairs of opposite points, and hands that hold between them."""
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,37 +9,165 @@ import trimesh
 
 from graspd.commands.synth import _said
 from graspd.service.model.domain import JobOptions
-from graspd.service.model.fidelity import resolve_fidelity
+from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.transforms import apply, quat_from_matrix, quat_rotate
+from graspd.studies.stability.assets import ring_hand
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.files.synthesis import synthesized
 from graspd.worker.grasps import Posture
 from graspd.worker.hands.flat_pinches import pinches_of
-from graspd.worker.hands.jaws import pads_of, thinnest_fingertip
+from graspd.worker.hands.jaws import fingertip_pad, pads_of, thinnest_fingertip
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
+from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.pinch_postures import oppositions_of
+from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
-from graspd.worker.planners.fast_graspd.antipodal_starts import (
-    ACROSS,
-    NEAR_M,
-    Openings,
-    across,
-    crossings_of,
-    outlines_of,
-    promising,
-    room_beside,
-    why_narrow,
-)
+from graspd.worker.planners import PlanRequest, synthesize
+from graspd.worker.planners.fast_graspd import antipodal_starts, starts
+from graspd.worker.planners.fast_graspd.antipodal_starts import Openings, across, crossings_of, promising, why_narrow
 from graspd.worker.planners.fast_graspd.candidates import posture_of
 from graspd.worker.planners.fast_graspd.pairs import pair_of
 from graspd.worker.planners.fast_graspd.scene_starts import REACHING, clear_scene_starts, free_ways, hindrance
-from graspd.worker.planners.fast_graspd.starts import CLEAR, start_generator
+from graspd.worker.planners.fast_graspd.starts import CLEAR, NO_PLACE, RETREATS, clear_starts, start_generator
 from graspd.worker.simulation.data import HandState
 from graspd.worker.simulation.environment import Environment, Obstacle, Scenes
+from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.obstacles import MARGIN_M, DeviceObstacles, body_room
 from tests.worker.models import object_from_mesh
-from tests.worker.simulation.rigs import ball
+from tests.worker.simulation.rigs import ball, object_of
+
+#: A box that an Allegro hand spans in one direction only, and half of its width there [m].
+SIDES = (0.1, 0.24, 0.24)
+HALF = SIDES[0] / 2
+DRAFT = FIDELITIES["draft"]
+
+
+def draft_model(hand: HandModel, obj: ObjectModel, scenes: Sequence[Environment] = ()) -> Model:
+    pair = pair_of(hand, obj, DRAFT, "cpu")
+    obstacles = DeviceObstacles.create(hand, scenes, obj.centre_of_mass, "cpu") if scenes else None
+    return pair.model(pair.coarse, obstacles)
+
+
+def model_of(sides: tuple[float, float, float]) -> Model:
+    return draft_model(hand_from_path("allegro"), object_of(trimesh.creation.box(sides)))
+
+
+@pytest.fixture(scope="module")
+def model() -> Model:
+    return model_of(SIDES)
+
+
+def starts_of(model: Model, count: int, each: int) -> tuple[HandState, np.ndarray]:
+    return clear_starts(model, [start_generator(3, 0, i, k) for i in range(count) for k in range(each)], each=each)
+
+
+def spans(model: Model, state: HandState) -> np.ndarray:
+    """(n,) whether pads of fingertips are on both sides of the thin direction of the box."""
+    hand = model.hand.model
+    posture = posture_of(hand, model.obj.model, state)
+    pose = body_poses(hand, posture.hand_pose, posture.joint_positions)[:, list(hand.fingertips)]
+    pads = np.array([fingertip_pad(hand, tip).centre for tip in hand.fingertips])
+    x = (quat_rotate(pose[..., 3:], pads) + pose[..., :3])[..., 0] - model.obj.model.centre_of_mass[0]
+    return (x.min(axis=1) < -HALF) & (x.max(axis=1) > HALF)
+
+
+def test_every_second_start_has_fingers_on_both_sides_of_a_box(model: Model) -> None:
+    state, _ = starts_of(model, 24, 4)
+    looking, reaching = spans(model, state).reshape(24, 2, 2).mean(axis=(0, 1))
+    # 0.71 against 0.33: a palm that looks at a random place stands at an edge by chance.
+    assert reaching > looking + 0.2
+
+
+def test_starts_do_not_depend_on_others_and_draws_go_on(model: Model) -> None:
+    reaching = antipodal_starts.ReachSampling.of(model)
+    seeds, first, retreats = np.arange(8, dtype=np.int32), np.zeros(8, np.int32), np.array(RETREATS)
+    found, number = reaching.starts(seeds, first, retreats)
+    for i in (0, 3, 7):
+        alone, draw = reaching.starts(seeds[i : i + 1], first[:1], retreats)
+        assert draw[0] == number[i]
+        for name in ("pivot", "rotation", "q"):
+            np.testing.assert_array_equal(getattr(alone, name)[0], getattr(found, name)[i])
+    # Draws go on where the last one ended.
+    again, same = reaching.starts(seeds, number, retreats)
+    later, after = reaching.starts(seeds, number + 1, retreats)
+    np.testing.assert_array_equal(same, number)
+    np.testing.assert_array_equal(again.pivot, found.pivot)
+    more = after >= 0
+    assert more.any() and (after > number)[more].all()
+    assert not (later.pivot == found.pivot)[more].all(axis=1).any()
+
+
+def test_what_is_too_wide_all_over_is_looked_at_only() -> None:
+    wide = model_of((0.25, 0.25, 0.25))
+    assert antipodal_starts.ReachSampling.of(wide) is None
+    looking, _ = starts_of(wide, 2, 2)
+    alone = [start_generator(3, 0, i, k) for i in range(2) for k in range(2)]
+    np.testing.assert_array_equal(looking.pivot, clear_starts(wide, alone)[0].pivot)
+
+
+@pytest.mark.parametrize("side", [0.01, 0.2])
+def test_all_starts_reach_around_what_pads_cannot_hold(side: float) -> None:
+    model = model_of((side, side, side))
+    assert antipodal_starts.ReachSampling.of(model).only
+    _, depth = starts_of(model, 16, 2)
+    assert (depth <= CLEAR).mean() > 0.9
+
+
+def test_draws_are_those_of_each_generator_alone_and_look_at_the_object() -> None:
+    hand, obj = hand_from_path("allegro"), object_from_path("mug")
+    pair, seeds = starts._Pair(hand, obj), range(64)
+    state, way = starts.draw(pair, [start_generator(7, 0, i, 0) for i in seeds])
+    np.testing.assert_allclose(quat_rotate(state.rotation, hand.palm.approach), way, atol=1e-12)
+    # From a palm the surface is as far away as the gap says, straight ahead.
+    near, far = (state.pivot + gap * way + pair.centre for gap in starts.GAP)
+    mesh = trimesh.Trimesh(obj.vertices, obj.faces)
+    assert max(mesh.nearest.on_surface((near + far) / 2)[1]) <= (starts.GAP[1] - starts.GAP[0]) / 2 + 1e-9
+    for i in seeds[::16]:
+        alone, _ = starts.draw(pair, [start_generator(7, 0, i, 0)])
+        np.testing.assert_array_equal(alone.pivot[0], state.pivot[i])
+        np.testing.assert_array_equal(alone.q[0], state.q[i])
+
+
+@pytest.fixture(scope="module")
+def cube() -> ObjectModel:
+    return object_of(trimesh.creation.box((0.06, 0.06, 0.06)))
+
+
+@pytest.fixture(scope="module")
+def ring() -> HandModel:
+    """Its six fingers stand side by side."""
+    return ring_hand(6)
+
+
+def test_a_ring_of_six_has_a_place_only_when_it_opens(ring: HandModel, cube: ObjectModel) -> None:
+    model, generators = draft_model(ring, cube), [start_generator(5, 0, i, 0) for i in range(4)]
+    state, depth = clear_starts(model, generators)
+    assert (depth > NO_PLACE).all()
+    opened = starts.open_further(model, generators, state, depth, np.array([True, True, True, False]))
+    assert opened.tolist() == [1, 1, 1, 0] and (depth[:3] <= CLEAR).all() and depth[3] > NO_PLACE
+    closed = ring.closing > 0
+    assert (state.q[:3, closed].mean(axis=1) < ring.preshape[closed].mean()).all()
+
+
+def test_a_hand_that_has_a_place_keeps_it(cube: ObjectModel) -> None:
+    model, generators = draft_model(hand_from_path("barrett"), cube), [start_generator(5, 0, i, 0) for i in range(4)]
+    state, depth = clear_starts(model, generators)
+    before = state.pivot.copy(), state.rotation.copy(), state.q.copy()
+    assert not starts.open_further(model, generators, state, depth, np.ones(4, bool)).any()
+    for was, now in zip(before, (state.pivot, state.rotation, state.q), strict=True):
+        np.testing.assert_array_equal(was, now)
+
+
+def test_a_grasp_that_opened_does_not_depend_on_its_batch(ring: HandModel, cube: ObjectModel) -> None:
+    many, few = (
+        synthesize(ring, cube, PlanRequest(count, DRAFT, seed=3), ExecutionContext(threads=threads)).grasp
+        for count, threads in ((5, 3), (2, 1))
+    )
+    np.testing.assert_array_equal(many.hand_pose[:2], few.hand_pose)
+    np.testing.assert_array_equal(many.joint_positions[:2], few.joint_positions)
+
 
 UP = np.array([0.0, 0, 1])
 
@@ -73,7 +200,7 @@ def test_pairs_of_a_ball_are_its_chords_within_the_cones() -> None:
     assert radius.max() - radius.min() < 0.05 * obj.radius  # a mesh of flat faces
     assert radius == pytest.approx(obj.radius, rel=0.05)
     # A chord at an angle t to the normals is 2 r cos t long; normals of faces are off by a few degrees.
-    assert (0.5 * pairs.width / obj.radius).min() > ACROSS - 0.06
+    assert (0.5 * pairs.width / obj.radius).min() > antipodal_starts.ACROSS - 0.06
     assert max(np.linalg.norm(end - obj.centre_of_mass, axis=1).max() for end in pairs.ends()) <= obj.radius + 1e-9
 
 
@@ -84,8 +211,7 @@ def test_what_a_hand_cannot_span_or_reach_is_told(block, barrett) -> None:
     assert not Openings.of(known, block, deep).within_reach
     wide = replace(block, vertices=10 * block.vertices, centre_of_mass=10 * block.centre_of_mass)
     opening = Openings.of(known, wide, lying(wide))
-    assert not opening.within_reach
-    assert not len(opening.sums)
+    assert not opening.within_reach and not len(opening.sums)
 
 
 def test_hands_reach_across_what_lies_flat_from_above(barrett) -> None:
@@ -96,8 +222,7 @@ def test_hands_reach_across_what_lies_flat_from_above(barrett) -> None:
     assert len(Openings.in_scene(barrett, flat, standing).known) == len(oppositions_of(barrett))
     found = across(barrett, flat, opening, np.random.default_rng(1).random((60, 6)), free_ways(scene, flat))
     line = np.einsum("nij,nj->ni", found.turn, opening.known.axis[found.posture])
-    assert np.abs(line @ UP).max() < 1e-6
-    assert (found.away @ UP).min() > 0.6
+    assert np.abs(line @ UP).max() < 1e-6 and (found.away @ UP).min() > 0.6
 
 
 def test_hands_hold_the_middle_and_come_from_a_free_way(block, barrett) -> None:
@@ -120,8 +245,8 @@ def test_hands_hold_the_middle_and_come_from_a_free_way(block, barrett) -> None:
 
 def hindered(hand, obj, scenes: Scenes, height: float, share: float) -> float:
     """Merit lost by a hand so far above an object, palm down, its fingers closed by a share of their range."""
-    placed, pair = scenes.placed(np.zeros(1, int)), pair_of(hand, obj, resolve_fidelity("draft"), "cpu")
-    model = pair.model(pair.coarse, DeviceObstacles.create(hand, placed.scenes, obj.centre_of_mass, "cpu"))
+    placed = scenes.placed(np.zeros(1, int))
+    model = draft_model(hand, obj, placed.scenes)
     at = np.array([[0, 0, float(obj.vertices[:, 2].max()) - obj.centre_of_mass[2] + height]])
     q = np.where(hand.closing > 0, hand.lower + share * hand.span, hand.upper - share * hand.span)
     # The palm looks along its z axis: turned about x it looks down.
@@ -165,8 +290,8 @@ def test_outlines_tell_how_far_a_hand_must_rise(block, barrett, tips_m) -> None:
     found = across(barrett, block, opening, uniform, ways)
     centre = found.pivot + block.centre_of_mass
     known = oppositions_of(barrett).q
-    outlines = outlines_of(barrett, known)
-    assert outlines is outlines_of(barrett, known.copy()) and len(outlines_of(barrett, known[:3]).points) == 3
+    outlines, again, few = (antipodal_starts.outlines_of(barrett, q) for q in (known, known.copy(), known[:3]))
+    assert outlines is again and len(few.points) == 3
     told = outlines.lacks(found.posture, found.turn, centre, scene, room=0.006)
     root = centre - np.einsum("nij,j->ni", found.turn, barrett.palm.centre)
     q = found.q(barrett, np.zeros((60, barrett.dofs)))
@@ -187,7 +312,7 @@ def test_draws_that_need_not_rise_come_first_in_their_order(block, barrett) -> N
     uniform, ways = np.random.default_rng(1).random((5, 40, 6)), free_ways(scene, block)
     order, off = promising(barrett, block, opening, uniform, ways, scene, room=0.006, keep=40)
     assert np.array_equal(np.sort(order, axis=1), np.tile(np.arange(40), (5, 1)))
-    near = off <= NEAR_M
+    near = off <= antipodal_starts.NEAR_M
     assert near.any() and not near.all()
     for places, offs, alike in zip(order, off, near, strict=True):
         assert (np.diff(places[alike]) > 0).all()
@@ -202,8 +327,7 @@ def test_what_lies_flat_is_between_the_fingers_at_the_start(block, barrett) -> N
     thin = replace(thin, hull_vertices=block.hull_vertices * scale)
     (table,) = lying(thin).obstacles
     placed = Scenes((replace(table, tips_m=0.0),), on_its_table(thin).object_pose).placed(np.zeros(4, int))
-    pair = pair_of(barrett, thin, resolve_fidelity("draft"), "cpu")
-    model = pair.model(pair.coarse, DeviceObstacles.create(barrett, placed.scenes, thin.centre_of_mass, "cpu"))
+    model = draft_model(barrett, thin, placed.scenes)
     ways = [free_ways(placed.scenes[0], thin)]
     generators = [start_generator(0, 0, i, k) for i in range(4) for k in range(REACHING)]
     state, depth = clear_scene_starts(model, generators, each=REACHING, placed=placed, ways=ways)
@@ -236,9 +360,7 @@ def beside_walls(gap: float, axes: tuple[int, ...]) -> Environment:
 
 def test_a_gap_is_named_with_the_fingertip_that_does_not_fit(barrett) -> None:
     told = why_narrow(barrett, BOX, [beside_walls(0.008, (0, 1))])
-    assert told is not None
-    assert "about 8 mm" in told
-    assert f"{1e3 * thinnest_fingertip(barrett):.0f} mm" in told
+    assert "about 8 mm" in told and f"{1e3 * thinnest_fingertip(barrett):.0f} mm" in told
     # One of several scenes that has room is enough, and so is one axis that is free.
     assert why_narrow(barrett, BOX, [beside_walls(0.008, (0, 1)), beside_walls(0.03, (0, 1))]) is None
     assert why_narrow(barrett, BOX, [beside_walls(0.008, (0,))]) is None
@@ -256,9 +378,9 @@ def test_a_ball_beside_a_pair_keeps_its_distance_from_a_wall() -> None:
     right = pairs.ends()[1][:, 0] > 0.5 * SIZE[0] - 1e-6
     across = right & (pairs.axis[:, 0] > 0.999)
     assert across.any()
-    room = room_beside(pairs, beside_walls(gap, (0,)), width)
+    room = antipodal_starts.room_beside(pairs, beside_walls(gap, (0,)), width)
     assert room[across] == pytest.approx(gap - width, abs=1e-4)
-    assert np.isinf(room_beside(pairs, beside_walls(gap, ()), width)).all()
+    assert np.isinf(antipodal_starts.room_beside(pairs, beside_walls(gap, ()), width)).all()
 
 
 def test_pairs_with_room_for_fingertips_are_drawn_more_often(barrett) -> None:
@@ -279,5 +401,4 @@ def test_candidate_grasps_none_of_which_is_valid_come_with_the_reason(tmp_path) 
     made = synthesized("allegro", str(sheet), request, place=place, scenes=1)
     found = made.summary()
     assert (found["grasps"], found["valid"], found["reason"]) == (1, 0, None)
-    assert "is 4 mm high" in found["narrow"]
-    assert _said({"file": "g.h5", **found}).endswith(found["narrow"])
+    assert "is 4 mm high" in found["narrow"] and _said({"file": "g.h5", **found}).endswith(found["narrow"])

@@ -1,6 +1,4 @@
-"""Gradients of the penalties, of penetration and of obstacles, against central differences of a float64 energy."""
-
-from __future__ import annotations
+"""Kinematics against float64 NumPy; gradients of penalties and obstacles against central differences of energies."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -8,32 +6,154 @@ from typing import get_args
 
 import numpy as np
 import pytest
+import warp as wp
 
 from graspd.service.model.errors import InputError
 from graspd.service.model.fidelity import Fidelity
-from graspd.service.model.transforms import apply, compose, invert, quat_from_axis_angle, quat_multiply
+from graspd.service.model.transforms import apply, compose, invert, quat_from_axis_angle, quat_multiply, quat_rotate
 from graspd.worker.grasps import Posture
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
-from graspd.worker.hands.model import HandModel
+from graspd.worker.hands.model import ConvexPiece, HandModel
 from graspd.worker.hands.surface import piece_distance, sample_surface
 from graspd.worker.scenes.placement import outer_solid
-from graspd.worker.simulation.data import Data, HandState, Schedule
+from graspd.worker.simulation.data import HandState, Schedule
 from graspd.worker.simulation.environment import Environment, Obstacle
-from graspd.worker.simulation.model import (
-    REFERENCE_POINTS,
-    REFERENCE_SAMPLES,
-    REFERENCE_SELF_POINTS,
-    LossOptions,
-    Model,
-)
+from graspd.worker.simulation.kernels import kinematics, wrenches
+from graspd.worker.simulation.model import REFERENCE_POINTS, REFERENCE_SAMPLES, REFERENCE_SELF_POINTS, LossOptions
 from graspd.worker.simulation.obstacles import DeviceObstacles, PosedFeatures
 from graspd.worker.simulation.projection import Projection, ProjectionOptions
 from graspd.worker.simulation.record import OPTIMIZERS, record_evaluation, record_iteration, record_placement
 from graspd.worker.simulation.sampling import object_samples
 from tests.worker.simulation.rigs import ball, rig, still
-from tests.worker.simulation.solids import nearest_edges
-from tests.worker.simulation.test_kinematics import differences, root_poses
+
+_GOLDEN = (np.sqrt(5) - 1) / 2
+
+
+def least_along(f: Callable[[np.ndarray], np.ndarray], edges: np.ndarray) -> np.ndarray:
+    """(E,) least value of a convex function of points (E, 3) on edges (E, 2, 3)."""
+    low, high = np.zeros((len(edges), 1)), np.ones((len(edges), 1))
+    for _ in range(45):
+        a, b = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
+        one, other = (f(edges[:, 0] + at * (edges[:, 1] - edges[:, 0])) for at in (a, b))
+        left = (one < other)[:, None]
+        low, high = np.where(left, low, a), np.where(left, b, high)
+    middle = edges[:, 0] + (low + high) / 2 * (edges[:, 1] - edges[:, 0])
+    return np.minimum(f(middle), np.minimum(f(edges[:, 0]), f(edges[:, 1])))
+
+
+def link_distance(piece: ConvexPiece, points: np.ndarray) -> np.ndarray:
+    """(N,) signed distance of points (N, 3) in the body frame: as `piece_distance`, and outside of boxes and cylinders
+    the true one."""
+    local = apply(invert(piece.pose), points)
+    if piece.kind == "box":
+        beyond = np.abs(local) - np.array(piece.size) / 2
+    elif piece.kind == "cylinder":
+        beyond = np.stack([np.hypot(local[:, 0], local[:, 1]), np.abs(local[:, 2])], -1)
+        beyond -= [piece.size[0], piece.size[1] / 2]
+    else:
+        return piece_distance(piece, points)
+    return np.linalg.norm(np.maximum(beyond, 0.0), axis=1) + np.minimum(beyond.max(axis=1), 0.0)
+
+
+def nearest_edges(hand: HandModel, bodies: np.ndarray, obstacle: Obstacle, far: float) -> np.ndarray:
+    """(P,) distance of the nearest of the obstacle's edges from each piece, or how deep an edge of the piece is in the
+    obstacle; `far` where that is more. `bodies` (L, 7)."""
+    out = np.full(len(hand.pieces), far)
+    features = hand.features
+    for number, piece in enumerate(hand.pieces):
+        pose = bodies[piece.body]
+        middle = piece.vertices.mean(axis=0)
+        reach = np.linalg.norm(piece.vertices - middle, axis=1).max()
+        if obstacle.distance(apply(pose, middle)) > reach + far:
+            continue
+        edges = apply(invert(pose), obstacle.corners)[obstacle.edges]
+        half = np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1) / 2
+        edges = edges[link_distance(piece, edges.mean(axis=1)) - half < far]  # no distance falls faster than one to one
+        if len(edges):
+            out[number] = min(far, least_along(lambda x, p=piece: link_distance(p, x), edges).min())
+        mine = slice(features.first_edge[number], features.first_edge[number + 1])
+        edges = apply(pose, features.edges[mine])
+        pierce = (least_along(obstacle.distance, edges) - features.thickness[mine]).min()
+        if pierce < min(out[number], 0.0):
+            out[number] = pierce
+    return out
+
+
+HANDS = ("allegro", "barrett", "shadow")
+EACH_HAND = pytest.mark.parametrize("name", HANDS)
+FK_TOLERANCE = 3e-7  # float32 positions of a hand 0.2 m large through at most 8 joints
+
+
+Energy = Callable[[HandState], float]
+
+
+def random_state(hand: HandModel, count: int, seed: int = 0) -> HandState:
+    rng = np.random.default_rng(seed)
+    rotation = rng.normal(size=(count, 4))
+    rotation /= np.linalg.norm(rotation, axis=1, keepdims=True)
+    q = hand.lower + rng.random((count, hand.dofs)) * (hand.upper - hand.lower)
+    return HandState(0.05 * rng.normal(size=(count, 3)), rotation, q)
+
+
+def root_poses(hand: HandModel, state: HandState) -> np.ndarray:
+    return np.concatenate([state.pivot - quat_rotate(state.rotation, hand.palm.centre), state.rotation], axis=1)
+
+
+def bodies_of(hand: HandModel, state: HandState) -> np.ndarray:
+    return body_poses(hand, root_poses(hand, state), hand.expand(state.q))
+
+
+def moved(state: HandState, column: int, step: float) -> HandState:
+    pivot, rotation, q = state.pivot.copy(), state.rotation.copy(), state.q.copy()
+    if column < 3:
+        pivot[0, column] += step
+    elif column < 6:
+        rotation[0] = quat_multiply(quat_from_axis_angle(np.eye(3)[column - 3], np.array(step)), rotation[0])
+    else:
+        q[0, column - 6] += step
+    return HandState(pivot, rotation, q)
+
+
+def differences(energy: Energy, state: HandState, columns: int, step: float) -> np.ndarray:
+    """Central differences by the columns of a gradient: root translation, root rotation, dofs."""
+    ends = [[energy(moved(state, c, s)) for s in (step, -step)] for c in range(columns)]
+    return np.array([(high - low) / (2 * step) for high, low in ends])
+
+
+@EACH_HAND
+def test_the_kernel_places_bodies_where_float64_kinematics_does(name: str) -> None:
+    hand = hand_from_path(name)
+    state = random_state(hand, 6)
+    model, data = rig(hand, ball(), capacity=6)
+    data.set_state(state)
+    record_placement(model, data).run()
+    np.testing.assert_allclose(data.body_p.numpy(), bodies_of(hand, state)[..., :3], atol=FK_TOLERANCE)
+
+
+@EACH_HAND
+def test_transpose_is_the_derivative_of_the_map_it_belongs_to(name: str) -> None:
+    """Random forces at random points: their work by the transpose equals central differences in float64."""
+    hand = hand_from_path(name)
+    rng = np.random.default_rng(3)
+    state = random_state(hand, 1, seed=3)
+    local = 0.02 * rng.normal(size=(hand.bodies, 3))
+    force = rng.normal(size=(hand.bodies, 3))
+
+    def work(at: HandState) -> float:
+        return float((apply(bodies_of(hand, at)[0], local) * force).sum())
+
+    expected = differences(work, state, 6 + hand.dofs, step=1e-6)
+    model, data = rig(hand, ball(), capacity=1)
+    data.set_state(state)
+    record_placement(model, data).run()
+    points = apply(bodies_of(hand, state)[0], local)
+    wrench = np.concatenate([force, np.cross(points, force)], axis=1)
+    data.wrench.assign(np.round(wrench[None] / wrenches.UNIT).astype(np.int64))
+    wp.launch(kinematics.backward, 1, inputs=[model.hand.tree], outputs=[data.hands, data.gradient], device="cpu")
+    # Sums of up to 23 float32 products of size 1.
+    np.testing.assert_allclose(data.gradient.numpy()[0], expected, atol=2e-5)
+
 
 #: float32 depths of 1e-3 m from coordinates of 0.1 m are good to 1e-5 relative; points that enter or leave within the
 #: difference add the rest.
@@ -42,28 +162,15 @@ RELATIVE = 2e-3
 ALONE = LossOptions(simulate=False, leak=0.0, range_weight=0.0)
 
 
-def bodies_of(hand: HandModel, state: HandState) -> np.ndarray:
-    return body_poses(hand, root_poses(hand, state), hand.expand(state.q))[0]
-
-
 def fist_in_ball(hand: HandModel) -> HandState:
     """A hand whose palm is 5 mm inside the ball, fingers half closed into it."""
     q = hand.lower + np.where(hand.closing >= 0, 0.6, 0.4) * (hand.upper - hand.lower)
     return HandState(np.array([[0.03, 0.002, -0.001]]), np.array([[0.0, 0.0, 0.0, 1.0]]), q[None])
 
 
-def check_gradient(
-    model: Model,
-    data: Data,
-    state: HandState,
-    energy: Callable[[HandState], float],
-    *,
-    least: float = 0.0,
-    relative: float = RELATIVE,
-    **weights: float,
-) -> None:
+def check_gradient(simulation, state: HandState, energy: Energy, *, least=0.0, relative=RELATIVE, **weights) -> None:
     """The gradient at a state with these weights of the schedule, all others 0, is that of the energy."""
-    schedule = still()
+    (model, data), schedule = simulation, still()
     for name, value in weights.items():
         getattr(schedule, name)[:] = value
     data.set_schedule(schedule)
@@ -82,15 +189,12 @@ def test_object_points_inside_links_push_along_the_gradient(name: str) -> None:
     samples = object_samples(obj, 1000) - obj.centre_of_mass
 
     def energy(at: HandState) -> float:
-        poses = bodies_of(hand, at)
-        total = 0.0
-        for piece in hand.pieces:
-            depth = -piece_distance(piece, apply(invert(poses[piece.body]), samples))
-            total += float((np.maximum(depth, 0) ** 2).sum())
-        return total * REFERENCE_SAMPLES / len(samples)
+        (poses,) = bodies_of(hand, at)
+        depths = (-piece_distance(piece, apply(invert(poses[piece.body]), samples)) for piece in hand.pieces)
+        return sum(float((np.maximum(depth, 0) ** 2).sum()) for depth in depths) * REFERENCE_SAMPLES / len(samples)
 
-    model, data = rig(hand, obj, capacity=1, options=ALONE)
-    check_gradient(model, data, state, energy, least=0.01, object_penetration=1.0)
+    simulation = rig(hand, obj, capacity=1, options=ALONE)
+    check_gradient(simulation, state, energy, least=0.01, object_penetration=1.0)
 
 
 @pytest.mark.parametrize("name", ["allegro", "shadow"])
@@ -101,7 +205,7 @@ def test_links_inside_links_are_parted_along_the_true_gradient(name: str) -> Non
     counts = {(a, b): a != b and (min(a, b), max(a, b)) not in hand.neighbours for a, b in pairs}
 
     def energy(at: HandState) -> float:
-        poses = bodies_of(hand, at)
+        (poses,) = bodies_of(hand, at)
         world = apply(poses[points.body], points.position)
         total = 0.0
         for piece in hand.pieces:
@@ -115,8 +219,8 @@ def test_links_inside_links_are_parted_along_the_true_gradient(name: str) -> Non
     states = [HandState(np.array([[0.5, 0.0, 0.0]]), np.array([[1.0, 0.0, 0.0, 0.0]]), q) for q in draws]
     state = max(states, key=energy)
 
-    model, data = rig(hand, ball(), capacity=1, options=replace(ALONE, self_margin=0.0))
-    check_gradient(model, data, state, energy, least=1e-4, self_penetration=1.0)
+    simulation = rig(hand, ball(), capacity=1, options=replace(ALONE, self_margin=0.0))
+    check_gradient(simulation, state, energy, least=1e-4, self_penetration=1.0)
 
 
 def beside_a_ball(hand: HandModel, gap: float) -> HandState:
@@ -133,15 +237,15 @@ def test_points_that_touch_nothing_are_pulled_by_the_gradient(name: str) -> None
     state = beside_a_ball(hand, 0.05)
 
     def energy(at: HandState) -> float:
-        gap = np.linalg.norm(apply(bodies_of(hand, at)[points.body], points.position), axis=1) - radius
+        gap = np.linalg.norm(apply(bodies_of(hand, at)[0, points.body], points.position), axis=1) - radius
         assert gap.min() > 0 and gap.max() < band, "all points take part, none penetrates"
         return float(-2 * weight * pull * length * (share * np.exp(-gap / length)).sum())
 
     options = replace(ALONE, band=band, exact_below=band, pull=pull, pull_length=length)
     # A fine ball, faces as they are: its distances are those of a sphere to 0.02 mm.
-    model, data = rig(hand, ball(radius, subdivisions=5), capacity=1, options=options, alpha=0.0)
+    simulation = rig(hand, ball(radius, subdivisions=5), capacity=1, options=options, alpha=0.0)
     # Normals of faces are off by 0.3 degrees.
-    check_gradient(model, data, state, energy, relative=1e-2, penetration=weight)
+    check_gradient(simulation, state, energy, relative=1e-2, penetration=weight)
 
 
 def test_share_of_a_hand_that_is_near_is_its_area_over_the_whole() -> None:
@@ -152,8 +256,8 @@ def test_share_of_a_hand_that_is_near_is_its_area_over_the_whole() -> None:
     model, data = rig(hand, ball(radius, subdivisions=5), capacity=3, options=LossOptions(simulate=False))
     data.set_state(state)
     record_evaluation(model, data).run()
-    gaps = [np.linalg.norm(apply(bodies_of(hand, s)[points.body], points.position), axis=1) - radius for s in states]
-    expected = [points.area[gap < reach].sum() / points.area.sum() for gap in gaps]
+    gaps = np.linalg.norm(apply(bodies_of(hand, state)[:, points.body], points.position), axis=2) - radius
+    expected = (points.area * (gaps < reach)).sum(axis=1) / points.area.sum()
     assert expected[0] > expected[1] > expected[2] == 0.0
     # Distances of the mesh are those of the ball to 0.02 mm: at most one point of 300 is on the other side.
     np.testing.assert_allclose(data.near_share(reach, 3), expected, atol=1 / 200)
@@ -194,8 +298,7 @@ def test_loss_and_gradient_are_finite_wherever_the_hand_is(solver: str, slivers:
     data.set_schedule(still(dilation=0.01, weight=1e4))
     data.set_state(HandState(places, np.tile([1.0, 0.0, 0.0, 0.0], (3, 1)), np.tile(hand.preshape, (3, 1))))
     record_evaluation(model, data).run()
-    assert np.all(np.isfinite(data.loss.numpy()))
-    assert np.all(np.isfinite(data.gradient.numpy()))
+    assert np.all(np.isfinite(data.loss.numpy())) and np.all(np.isfinite(data.gradient.numpy()))
 
 
 def test_small_descent_steps_never_raise_the_loss() -> None:
@@ -237,7 +340,6 @@ def test_a_step_moves_and_turns_a_hand_against_its_gradient(optimizer: str) -> N
 
 
 MARGIN = 0.004
-HANDS = ("allegro", "barrett", "shadow")
 
 
 def sphere_points(count: int, seed: int) -> np.ndarray:
@@ -274,7 +376,7 @@ def kept(hand: HandModel, obstacle: Obstacle) -> np.ndarray:
     return np.where(tip & (obstacle.tips_m is not None), obstacle.tips_m or 0.0, MARGIN)
 
 
-def simulation_in(hand: HandModel, obstacles: tuple[Obstacle, ...]) -> tuple[Model, Data]:
+def simulation_in(hand: HandModel, obstacles: tuple[Obstacle, ...]):
     obj = ball()
     model, data = rig(hand, obj, capacity=1, options=ALONE)
     scene = Environment(obstacles, np.array([0.0, 0, 1]))
@@ -309,12 +411,12 @@ def test_obstacles_push_the_hand_along_the_true_gradient(name: str, scene: str) 
     def energy(at: HandState) -> float:
         short = [np.minimum(distances(hand, at, o) - kept(hand, o), 0.0) for o in obstacles]
         solids = [o for o in obstacles if len(o.corners)]
-        short += [nearest_edges(hand, bodies_of(hand, at), o, MARGIN) - MARGIN for o in solids]
+        short += [nearest_edges(hand, bodies_of(hand, at)[0], o, MARGIN) - MARGIN for o in solids]
         return float(sum((s**2).sum() for s in short))
 
-    model, data = simulation_in(hand, obstacles)
-    check_gradient(model, data, state, energy, least=1e-3, penetration=1.0)
-    assert data.depths.points.numpy()[0] == 0.0, "the object pushes nothing here"
+    simulation = simulation_in(hand, obstacles)
+    check_gradient(simulation, state, energy, least=1e-3, penetration=1.0)
+    assert simulation[1].depths.points.numpy()[0] == 0.0, "the object pushes nothing here"
 
 
 @pytest.mark.parametrize("room", [0.0, 0.006])
@@ -341,7 +443,7 @@ def projected(hand: HandModel, state: HandState, obstacle: Obstacle) -> HandStat
     return Projection(*simulation_in(hand, (obstacle,)), ProjectionOptions()).run(state, 60)[0]
 
 
-@pytest.mark.parametrize("name", HANDS)
+@EACH_HAND
 def test_projection_brings_hands_out_of_tables_and_sticks(name: str) -> None:
     """The stick is pushed into the largest face of the palm: no corner of the hand is near it."""
     hand, (table,) = hand_from_path(name), SCENES["table"]
@@ -349,7 +451,7 @@ def test_projection_brings_hands_out_of_tables_and_sticks(name: str) -> None:
     state.pivot += (-0.003 - distances(hand, state, table).min()) * table.planes[0, :3]
     assert distances(hand, projected(hand, state, table), table).min() > MARGIN
     state = reaching(hand)
-    bodies = bodies_of(hand, state)
+    (bodies,) = bodies_of(hand, state)
     palm = max((p for p in hand.pieces if p.kind == "box"), key=lambda p: sorted(p.size)[1])
     frame = compose(bodies[palm.body], palm.pose)
     thin = int(np.argmin(palm.size))
@@ -361,5 +463,5 @@ def test_projection_brings_hands_out_of_tables_and_sticks(name: str) -> None:
     stick = Obstacle.box(pose, size)
     assert nearest_edges(hand, bodies, stick, MARGIN).min() < -5e-4
     found = projected(hand, state, stick)
-    posed = bodies_of(hand, found)
+    (posed,) = bodies_of(hand, found)
     assert min(nearest_edges(hand, posed, stick, 0.1).min(), distances(hand, found, stick).min()) > MARGIN - 1e-4

@@ -1,0 +1,96 @@
+"""Condition of an index without opening it: unlike opening, this changes nothing."""
+
+from __future__ import annotations
+
+import sqlite3
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from sqlalchemy import URL, make_url, text
+
+from graspd.service.index.database import (
+    REVISION,
+    REVISION_TABLE,
+    UNUSABLE,
+    connect_postgres,
+    mapped,
+    revision_of,
+    unusable,
+)
+from graspd.service.model.errors import IndexDamaged, IndexUnavailable
+
+_TIMEOUT_S: Final = 5.0
+
+
+@dataclass(frozen=True)
+class IndexCondition:
+    """State that the database reports."""
+
+    kind: str
+    revision: str
+    """Revision of its tables; "" if it has none yet."""
+    newest: str
+    connections: tuple[int, int] = (0, 0)
+    """Used and allowed connections; zeros if unknown."""
+    may_write: bool = True
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether opening it changes nothing."""
+        return bool(self.revision) and self.revision == self.newest
+
+
+def look(url: str | URL) -> IndexCondition | None:
+    """Return the condition of an index; None if the file of an SQLite index does not exist yet.
+
+    Raises:
+        InputError, IndexUnavailable: as in `Database`.
+        IndexDamaged: the file has invalid content.
+    """
+    try:
+        parsed = make_url(url)
+        if parsed.get_backend_name() == "sqlite":
+            return _look_at_file(Path(str(parsed.database)))
+        return _look_at_postgres(url)
+    except UNUSABLE as error:
+        raise unusable(error) from None
+
+
+def _look_at_file(path: Path) -> IndexCondition | None:
+    if not path.exists():
+        return None
+    try:
+        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True, timeout=_TIMEOUT_S)) as connection:
+            said = connection.execute("PRAGMA quick_check(1)").fetchone()[0]
+            if said != "ok":
+                raise IndexDamaged(f"the index {path} is damaged: {said}")
+            tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+            query = f"SELECT version_num FROM {REVISION_TABLE}"
+            rows = connection.execute(query).fetchall() if REVISION_TABLE in tables else []
+    except sqlite3.DatabaseError as error:
+        if getattr(error, "sqlite_errorcode", 0) & 0xFF in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB):
+            raise IndexDamaged(f"the index {path} is damaged: {error}") from None
+        raise IndexUnavailable(f"the index {path} cannot be read: {error}") from None
+    return IndexCondition(f"SQLite {sqlite3.sqlite_version}", rows[0][0] if rows else "", REVISION)
+
+
+def _look_at_postgres(url: str | URL) -> IndexCondition:
+    engine = connect_postgres(url)
+    try:
+        with mapped(), engine.connect() as connection:
+
+            def ask(question: str) -> str:
+                return str(connection.scalar(text(question)))
+
+            return IndexCondition(
+                f"PostgreSQL {ask('SHOW server_version')}",
+                revision_of(connection),
+                REVISION,
+                (int(ask("SELECT count(*) FROM pg_stat_activity")), int(ask("SHOW max_connections"))),
+                ask("SELECT pg_is_in_recovery()") == "False"
+                and ask("SELECT has_schema_privilege(current_schema(), 'CREATE')") == "True",
+            )
+    finally:
+        engine.dispose()
