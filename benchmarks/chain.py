@@ -1,16 +1,16 @@
 """Cost of a valid grasp from the planner to its row in the shard, for two checkouts in one run; prints Markdown.
 
 usage: python -m benchmarks.chain BEFORE AFTER DATA_DIR [--grasps 64] [--pairs allegro:mug shadow:bottle] [--json OUT]
-       python -m benchmarks.chain BEFORE AFTER --service [--pictures] [--method autograsp] [--grasps 256] [--pairs ...]
+       python -m benchmarks.chain BEFORE AFTER --service [--pictures] [--job JSON] [--after JSON] [--grasps 256] [...]
 
 BEFORE and AFTER are checkouts of graspd; DATA_DIR holds hands/. One thread runs each stage. Times are processor time,
 so other load changes the ratios little. Nothing is stored or sent: docs/results/service.md has these costs.
 
 With --service, a job of a built-in hand and object runs through a whole service of each checkout: submitted over HTTP,
 planned, validated, measured, stored, indexed. A small job loads everything first. Processor time is that of all
-processes of the service; the table also has the time per candidate of BEFORE's planner alone. With --pictures, jobs
-have the options of examples/million/million.toml: per batch, six pictures of the object at rest on a table, and eight
-rechecks.
+processes of the service. With --pictures, jobs have the options of examples/million/million.toml: per batch, six
+pictures of the object at rest on a table, and eight rechecks. Version 0.2 gives every object a mass of 0.1 kg: compare
+with it by `--after '{"mass": 0.1}'`, and grasps on tables by `--job '{"scene": "table", "scenes": 4}'`.
 """
 
 from __future__ import annotations
@@ -140,8 +140,8 @@ def through_service(root: Path, hand: str, obj: str, grasps: int, wanted: dict[s
         return {"valid": job["valid"], "wall": wall, "processor": service.processor_s() - spent}
 
 
-def service_table(pair: str, before: dict[str, float], after: dict[str, float], raw_ms: float) -> list[str]:
-    """Return rates of both jobs, and their ratios to the candidate rate of the first checkout's planner."""
+def service_table(pair: str, before: dict[str, float], after: dict[str, float]) -> list[str]:
+    """Return the rates and costs of both jobs, and their ratios."""
     rates = [found["valid"] / found["wall"] for found in (before, after)]
     costs = [1e3 * found["processor"] / found["valid"] for found in (before, after)]
     return [
@@ -151,9 +151,6 @@ def service_table(pair: str, before: dict[str, float], after: dict[str, float], 
         "| --- | --: | --: | --: |",
         f"| valid grasps/s | {rates[0]:.2f} | {rates[1]:.2f} | {rates[1] / rates[0]:.2f} |",
         row("core-ms per valid grasp", *costs),
-        f"| core-ms per candidate of the planner alone, before | {raw_ms:.1f} | | |",
-        f"| valid grasps per candidate of the planner alone, in equal processor time | {raw_ms / costs[0]:.2f} "
-        f"| {raw_ms / costs[1]:.2f} | |",
         "",
     ]
 
@@ -161,15 +158,15 @@ def service_table(pair: str, before: dict[str, float], after: dict[str, float], 
 def compare_services(given: argparse.Namespace) -> dict[str, Any]:
     """Run jobs of all pairs through both services, one after the other."""
     found: dict[str, Any] = {}
-    for number, pair in enumerate(given.pairs):
+    for pair in given.pairs:
         hand, obj = pair.split(":")
-        roots = [root.resolve() for root in (given.before, given.after)]
-        alone = run(roots[0], hand, obj, "64", str(100 + number))
-        wanted = {"method": given.method} | (PILOT if given.pictures else {})
-        both = [through_service(root, hand, obj, given.grasps or 256, wanted) for root in roots]
-        found[pair] = dict(zip(("planner", "before", "after"), (alone, *both), strict=True))
-        lines = service_table(pair, *both, raw_ms=alone["ms"]["planner"] / alone["candidates"])
-        sys.stdout.write("\n".join(lines) + "\n")
+        wanted = given.job | (PILOT if given.pictures else {})
+        both = [
+            through_service(root.resolve(), hand, obj, given.grasps or 256, wanted | more)
+            for root, more in ((given.before, {}), (given.after, given.after_job))
+        ]
+        found[pair] = dict(zip(("before", "after"), both, strict=True))
+        sys.stdout.write("\n".join(service_table(pair, *both)) + "\n")
         sys.stdout.flush()
     return found
 
@@ -193,7 +190,8 @@ def main() -> None:
     parser.add_argument("data", type=Path, nargs="?")
     parser.add_argument("--service", action="store_true", help="jobs through the whole service")
     parser.add_argument("--pictures", action="store_true", help="with --service: also pictures, as in the pilot")
-    parser.add_argument("--method", default="fast_graspd", help="with --service: a planner that is equal in both")
+    parser.add_argument("--job", type=json.loads, default={}, help="with --service: further options of the jobs")
+    parser.add_argument("--after", dest="after_job", type=json.loads, default={}, help="the same, for AFTER only")
     parser.add_argument("--grasps", type=int, help="of each pair, in batches of 32: 64 candidates, or 256 valid ones")
     parser.add_argument("--pairs", nargs="*", default=["allegro:mug", "shadow:bottle"])
     parser.add_argument("--json", type=Path)

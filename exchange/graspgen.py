@@ -195,8 +195,11 @@ def _grasps(file: str, hand: HandModel, record: dict[str, Any], pose: Floats) ->
 
 def _found(path: Path, uuid: str) -> tuple[str, dict[str, Any]]:
     if path.suffix == ".json":
-        with path.open("rb") as stream:
-            return str(path), _parsed(str(path), stream.read(LARGEST + 1))
+        try:
+            with path.open("rb") as stream:
+                return str(path), _parsed(str(path), stream.read(LARGEST + 1))
+        except OSError as error:
+            raise InputError(f"{path} cannot be read: {error.strerror}") from None
     files = sorted(path.glob("*.tar")) if path.is_dir() else [path]
     names: list[str] = []
     found: tuple[str, dict[str, Any]] | None = None

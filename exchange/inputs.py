@@ -19,7 +19,7 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.environment import PlacedGrasps
 
 #: JSON files beside shards that contain no grasps.
-BESIDE_SHARDS: Final = ("snapshot.json", "subset.json", "card.json")
+BESIDE_SHARDS: Final = ("snapshot.json", "subset.json", "card.json", "clouds.json")
 
 
 @dataclass(frozen=True)

@@ -247,7 +247,7 @@ def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[Impo
     task = _task(path, object_name)
     ways, rest, numbers = _ways(path, task)
     if not len(ways) or min(map(len, ways)) < _STOPS:
-        raise InputError(f"{path} has no episodes of the task {task_of(object_name)!r} with a complete trajectory")
+        raise InputError(f"{path} has no episodes of task {task} with a complete trajectory")
     model, thing = hand_from_path(hand), scaled_object(obj)
 
     def posture(qpos: Floats) -> Posture:

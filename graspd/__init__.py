@@ -2,7 +2,7 @@
 
     import graspd
 
-    grasps = graspd.synthesize("my_hand.urdf", "mug.stl", count=64, scene="table")
+    grasps = graspd.synthesize("my_hand.urdf", "mug.stl", grasps=64, scene="table")
     best = grasps.valid().top("epsilon", 10)
     best.hand_pose, best.joint_positions, best.joint_names
     graspd.open("grasps.h5")

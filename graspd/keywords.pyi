@@ -37,12 +37,12 @@ class JobKeywords(TypedDict, total=False):
     target: str
 
 class SynthesizeKeywords(TypedDict, total=False):
-    count: int
+    grasps: int
     method: str
     fidelity: str
     seed: int
     scene: str | Path
-    beside: Sequence[str | Path]
+    neighbours: Sequence[str | Path]
     scenes: int
     mass: float | None
     want: Literal["valid", "candidates"]

@@ -16,8 +16,7 @@ from graspd.service.model.options import accepted, rows, with_keywords
 if TYPE_CHECKING:
     from graspd.keywords import SynthesizeKeywords
 
-_NAMES: Final = {row.keyword: row.name for row in rows(LocalOptions, "python")}
-_KEYWORDS: Final = {flag: row.keyword for row in rows(LocalOptions, "python") for flag in row.flags}
+_KEYWORDS: Final = {flag: row.name for row in rows(LocalOptions, "python") for flag in row.flags}
 _FLAG: Final = re.compile(r"--[a-z]+(?:-[a-z]+)*")
 
 
@@ -37,11 +36,11 @@ def synthesize(
         hand: a URDF, a ZIP with one, or the name of a built-in hand.
         object: a mesh (STL, OBJ, PLY, GLB, OFF) or the name of a built-in object.
         progress: called with the finished share, 0 to 1.
-        options: docs/reference/options.md lists them, with units, bounds and defaults. `count` is the number of
+        options: docs/reference/options.md lists them, with units, bounds and defaults. `grasps` is the number of
             grasps wanted; there are fewer if the budget ends first.
 
     Returns:
-        Grasps: at most `count`; poses in the object frame [m], joints [rad or m]. `reason` explains a shortfall.
+        Grasps: at most `grasps`; poses in the object frame [m], joints [rad or m]. `reason` explains a shortfall.
 
     Raises:
         InputError: an argument is invalid (MeshError, HandError: a file); the message contains the fix.
@@ -56,8 +55,7 @@ def synthesize(
     except ModuleNotFoundError as error:
         raise ImportError(f"synthesize needs {error.name}; run pip install 'graspd[worker]'") from error
     # None means that the option was not given.
-    given = {_NAMES[keyword]: value for keyword, value in options.items() if value is not None}
-    asked = accepted(LocalOptions, given, names={name: keyword for keyword, name in _NAMES.items()})
+    asked = accepted(LocalOptions, {name: value for name, value in options.items() if value is not None})
     told = (lambda done, total, _message: progress(done / total)) if progress else None
     try:
         made = synthesized_as(str(hand), str(object), asked, progress=told)

@@ -88,7 +88,7 @@ def keywords_stub() -> str:
         ("SynthesizeKeywords", LocalOptions, "python"),
     )
     for title, model, place in tables:
-        fields = [f"    {name}: {text}" for name, _, text in keywords_of(model, place)]
+        fields = [f"    {row.name}: {text}" for row, text in keywords_of(model, place)]
         parts.append("\n".join(["", f"class {title}(TypedDict, total=False):", *fields]))
     return "\n".join(parts) + "\n"
 

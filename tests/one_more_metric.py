@@ -41,8 +41,8 @@ def main(folder: Path, older_index: str) -> None:
     before = [getattr(grasp, NAME) for grasp in index.grasps.page().items]
     index.close()
     made = case(folder, drawn=False, change=measured)
-    services = made.made.services
-    shard = next(shard.id for shard in made.made.snapshot.shards if shard.kind == "base")
+    services = made.services
+    shard = next(shard.id for shard in made.snapshot.shards if shard.kind == "base")
     engine = services.index.database._engine
     with TestClient(create_app(services.settings, services), base_url=BASE_URL) as http:
         query = {f"min_{NAME}": 5, f"max_{NAME}": 10, "sort": NAME, "order": "asc"}

@@ -74,9 +74,7 @@ class JobOptions(Model):
     """True for jobs of a service; False for work in this process."""
 
     grasps: Annotated[
-        int,
-        Option("basic", flags="--grasps -n", keyword="count"),
-        Form("grasps", "Number of grasps", "in batches of 32"),
+        int, Option("basic", flags="--grasps -n"), Form("grasps", "Number of grasps", "in batches of 32")
     ] = Field(32, ge=1, le=1_000_000, description="number of grasps; in a dataset, for each pair of hand and object")
     method: Annotated[Name, Option("basic")] = Field(
         "fast_graspd", description=f"planner: {', '.join(METHODS)}, or one of another package"

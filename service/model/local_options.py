@@ -34,7 +34,7 @@ class LocalOptions(MeshOptions, JobOptions):
     scenes: Annotated[int, Option("basic", _LOCAL)] = Field(
         SCENES, ge=1, le=MOST_SCENES, description="scenes over which the grasps are distributed"
     )
-    neighbours: Annotated[tuple[str | Path, ...], Option("basic", _LOCAL, "--with", "beside")] = Field(  # type: ignore[assignment]
+    neighbours: Annotated[tuple[str | Path, ...], Option("basic", _LOCAL, "--with")] = Field(  # type: ignore[assignment]
         (), max_length=MOST_NEIGHBOURS, description="neighbour in the scene: a file or a built-in object; up to eight"
     )
     touch: Annotated[Touch | None, Option(places=_LOCAL)] = Field(  # type: ignore[assignment]

@@ -46,8 +46,6 @@ class Option:
     places: tuple[Place, ...] = EVERYWHERE
     flags: str = ""
     """Flags on the command line, separated by spaces; empty: `--` and the option's name."""
-    keyword: str = ""
-    """Keyword of `graspd.synthesize`; empty: the option's name."""
     typed: str = ""
     """Description for command line and form, if it differs from the description for HTTP."""
     schema: int = 0
@@ -67,10 +65,6 @@ class Row:
     @property
     def flags(self) -> list[str]:
         return self.option.flags.split() or [f"--{self.name.replace('_', '-')}"]
-
-    @property
-    def keyword(self) -> str:
-        return self.option.keyword or self.name
 
     @property
     def meaning(self) -> str:
@@ -125,8 +119,8 @@ def with_keywords(model: type[BaseModel], place: Place) -> Callable[[FunctionT],
         written = inspect.signature(function)
         own = [one for one in written.parameters.values() if one.kind is not inspect.Parameter.VAR_KEYWORD]
         options = [
-            inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=row.default, annotation=text)
-            for name, row, text in keywords_of(model, place)
+            inspect.Parameter(row.name, inspect.Parameter.KEYWORD_ONLY, default=row.default, annotation=text)
+            for row, text in keywords_of(model, place)
         ]
         function.__signature__ = written.replace(parameters=[*own, *options])  # type: ignore[attr-defined]
         return function
@@ -134,9 +128,8 @@ def with_keywords(model: type[BaseModel], place: Place) -> Callable[[FunctionT],
     return decorate
 
 
-def keywords_of(model: type[BaseModel], place: Place) -> list[tuple[str, Row, str]]:
-    found = rows(model, place)
-    return [(row.keyword if place == "python" else row.name, row, type_text(row.field.annotation)) for row in found]
+def keywords_of(model: type[BaseModel], place: Place) -> list[tuple[Row, str]]:
+    return [(row, type_text(row.field.annotation)) for row in rows(model, place)]
 
 
 def type_text(annotation: Any) -> str:

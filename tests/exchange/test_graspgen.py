@@ -150,3 +150,5 @@ def test_links_compressed_and_large_files_are_not_followed(data: Path, tmp_path:
         tar.addfile(tarfile.TarInfo("block.grasps.json"), io.BytesIO())
     with pytest.raises(InputError, match="no tar file"):
         graspgen.read(tmp_path / "packed.tar", hand="barrett", obj="block")
+    with pytest.raises(InputError, match="cannot be read: No such file"):
+        graspgen.read(tmp_path / "none.json", hand="barrett", obj="block")

@@ -104,7 +104,7 @@ def test_a_documented_command_that_fails_turns_the_run_red(tmp_path: Path, monke
 
 def test_the_lines_that_read_the_first_grasps_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    graspd.synthesize("allegro", "mug", count=4, fidelity="draft", seed=1).save("mug.h5")
+    graspd.synthesize("allegro", "mug", grasps=4, fidelity="draft", seed=1).save("mug.h5")
     (block,) = re.findall(r"```python\n(.*?)```", (TUTORIALS[0]).read_text(), re.DOTALL)
     said: dict[str, Any] = {}
     exec(block, said)

@@ -23,8 +23,8 @@ from tests.one_more_option import FLAG, MEANING, NAME
 @pytest.mark.parametrize(
     ("wrong", "typed", "called"),
     [
-        ({"grasps": 0}, "--grasps: ", "count: "),
-        ({"neighbours": ["mug"] * 9}, "--with: ", "beside: "),
+        ({"grasps": 0}, "--grasps: ", "grasps: "),
+        ({"neighbours": ["mug"] * 9}, "--with: ", "neighbours: "),
         ({"options": "steps"}, "--option: ", "options: "),
         ({"min_payload": -1}, "--min-payload: ", "min_payload: "),
         ({"payload": "perhaps"}, "--payload: ", "payload: "),
@@ -37,9 +37,8 @@ def test_every_message_is_in_the_words_of_the_caller(wrong: dict[str, Any], type
     with pytest.raises(InputError) as refused:
         parsed_options(LocalOptions, wrong)
     assert str(refused.value).startswith(typed)
-    names = {row.name: row.keyword for row in rows(LocalOptions, "python")}
     with pytest.raises(InputError) as refused:
-        graspd.synthesize("barrett", "block", **{names[name]: value for name, value in wrong.items()})  # type: ignore[arg-type]
+        graspd.synthesize("barrett", "block", **wrong)
     assert str(refused.value).startswith(called)
 
 

@@ -73,9 +73,10 @@ def hold_rollout(
 
     def rollout(grasps: GraspSet, placed: PlacedGrasps | None, beat: Floats | None = None) -> Floats:
         grasps = grasps.moved(np.zeros(3))
-        score = short(grasps, placed, np.zeros(0))
+        beat = np.full(len(grasps), np.inf) if beat is None else beat
+        score = short(grasps, placed, beat)
         # Skip candidates that cannot beat the previous score.
-        held = np.flatnonzero((score < SLIPS + 1.0) & (score < (np.inf if beat is None else beat)))
+        held = np.flatnonzero((score < SLIPS + 1.0) & (score < beat))
         if len(held):
             verdicts = validate(hand, obj, grasps.take(held), level=level, pieces=pieces(), known=known, run=run)
             fell = held[verdicts.success != 1]

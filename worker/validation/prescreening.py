@@ -107,30 +107,33 @@ class PushRollout(Test):
         super().__init__(scenes[0])
         self._half, self._whole = scenes
 
-    def score(self, grasps: GraspSet, row: int) -> float:
+    def score(self, grasps: GraspSet, row: int, beat: float = np.inf) -> float:
         """Return the worst displacement or rotation over its limit in pushes at half friction; below 1: held.
-        If it is not below 1, return the same at full friction plus `SLIPS`."""
+        If it is not below 1, return the same at full friction plus `SLIPS`.
+        Return inf as soon as the score cannot improve on `beat`; below 1 + `SLIPS`, only half friction would."""
         self.scene = self._half
         if self._start(grasps, row).outcomes[0] is Outcome.PENETRATION:
             return DEEP
         if not self._close(grasps, row, give_up=True, stages=FREE_CLOSING) or void(self.data):
             return LOST
         self._save()
-        pushed = self._pushed()
-        if pushed < 1.0:
+        pushed = self._pushed(min(beat, 1.0))
+        if pushed < min(beat, 1.0):
             return pushed
+        if beat < SLIPS + 1.0:
+            return np.inf
         self.scene = self._whole
         return SLIPS + self._pushed()
 
-    def _pushed(self) -> float:
-        """Return the worst displacement or rotation over its limit; stop at the first push that exceeds a limit."""
+    def _pushed(self, enough: float = 1.0) -> float:
+        """Return the worst displacement or rotation over its limit; stop at the first push that reaches `enough`."""
         worst = 0.0
         for corner in CORNERS:
             self._restore()
             self.data.xfrc_applied[self.scene.object_body, :3] = PULL * self.scene.push * corner
             self._run(PUSHED * STAGE_S)
             worst = max(worst, LOST if void(self.data) else self._excess())
-            if worst >= 1.0:
+            if worst >= enough:
                 break
         return worst
 
@@ -183,7 +186,10 @@ def push_rollout(
     shorts = _Shorts(hand, obj, pieces)
 
     def rollout(grasps: GraspSet, placed: PlacedGrasps | None, beat: Floats | None = None) -> Floats:
-        return shorts.scored(len(grasps), None, PushRollout, lambda test, row: test.score(grasps, row))
+        least = np.full(len(grasps), np.inf) if beat is None else beat
+        return shorts.scored(
+            len(grasps), None, PushRollout, lambda test, row: test.score(grasps, row, float(least[row]))
+        )
 
     return rollout
 

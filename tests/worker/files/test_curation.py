@@ -63,6 +63,8 @@ def test_subset_holds_what_expression_chooses_and_nothing_else(folder: Path, tmp
     assert 0 < len(chosen) == told["kept"] < told["looked_at"] == 3 * COUNT
     for sample in chosen:
         assert sample["grasp/hand_pose"].tobytes() in poses and sample["quality/grasp_type"] == 2
+    for beside in ("card.json", "clouds.json"):
+        (out / beside).write_text("{}")
     names = {file.name for file in expand(out)}
     assert names <= {"base-00000.h5", "base-00001.h5"}, "what tells of the subset is no file of grasps"
 

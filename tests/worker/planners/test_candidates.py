@@ -154,10 +154,33 @@ def attempts(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return made
 
 
-@pytest.mark.parametrize(("score", "made"), [(0.5, 1), (1.5, 3), (9.0, 6)])
+@pytest.mark.parametrize(("score", "made"), [(0.5, 1), (1.5, 6), (9.0, 7)])
 def test_in_scenes_a_grasp_sets_out_again_while_it_fails(in_scenes, attempts, score: float, made: int) -> None:
     found = in_scenes(always(score))
     assert sorted(attempts) == sorted([*range(made)] * 4) and found.attempts == 4 * made
+
+
+def test_a_retry_is_told_the_score_to_beat(in_scenes) -> None:
+    """A grasp that lifts at full friction only is improved by half friction alone."""
+    beats: list[float] = []
+
+    def rollout(grasps: GraspSet, placed: PlacedGrasps, beat: np.ndarray) -> np.ndarray:
+        beats.extend(beat.tolist())
+        return np.full(len(grasps), 1.5)
+
+    in_scenes(rollout)
+    assert beats[:4] == [np.inf] * 4 and set(beats[4:]) == {1.5}
+
+
+def test_a_retry_that_is_no_better_changes_nothing(in_scenes, attempts, monkeypatch: pytest.MonkeyPatch) -> None:
+    scores = iter([1.4] + [1.5] * 10_000)
+    worse = in_scenes(lambda grasps, *_: np.full(len(grasps), next(scores)))
+    assert len(attempts) > 4
+    monkeypatch.setattr(planner, "IN_SCENES", ())
+    scores = iter([1.4] + [1.5] * 10_000)
+    assert np.array_equal(
+        in_scenes(lambda grasps, *_: np.full(len(grasps), next(scores))).grasp.hand_pose, worse.grasp.hand_pose
+    )
 
 
 @pytest.mark.parametrize(("better", "times"), [(True, GENTLER), (False, 1.0)])
@@ -259,9 +282,9 @@ def test_hands_are_drawn_to_an_object_at_their_first_start_alone(free, monkeypat
     pulls: list[tuple[float, float]] = []
     work = planner._work
 
-    def watched(launch, begun):
+    def watched(launch, begun, *rest):
         pulls.append((launch.coarse.options.pull, launch.fine.options.pull))
-        return work(launch, begun)
+        return work(launch, begun, *rest)
 
     monkeypatch.setattr(planner, "_work", watched)
     monkeypatch.setattr(planner, "FREE", (FAILED, FAILED))

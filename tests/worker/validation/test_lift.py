@@ -221,6 +221,17 @@ def test_free_box_is_pushed_away_the_less_the_firmer_it_is_held() -> None:
     assert found[-1] < 0.2
 
 
+def test_pushes_that_cannot_beat_a_score_end_early() -> None:
+    rollout, squeeze = push_rollout(HAND, BOX, lambda: WHOLE), ACROSS * LEAST_PUSHED
+    hands = joined([grasp(0.8 * squeeze), grasp(2.4 * squeeze)])
+    slips, holds = rollout(hands, None)
+    assert holds < 1.0 < SLIPS + 1.0 < slips
+    # Only half friction would beat a grasp that holds at full friction.
+    assert rollout(hands, None, np.array([1.9, 1.1 * holds])).tolist() == [np.inf, holds]
+    assert rollout(hands, None, np.array([2.0, 0.9 * holds]))[0] == slips
+    assert rollout(hands, None, np.array([2.0, 0.9 * holds]))[1] >= 0.9 * holds
+
+
 def test_a_free_box_that_nothing_holds_flies_as_far_as_pushed() -> None:
     seconds = round(STAGE_S * prescreening.PUSHED / PHYSICS.timestep) * PHYSICS.timestep
     freely = 0.5 * prescreening.PULL * ACCELERATION * seconds**2 / MAX_DISPLACEMENT_M

@@ -81,19 +81,24 @@ class Selection:
     grasps: dict[int, GraspSet]
 
     @classmethod
-    def none(cls, count: int, dofs: int) -> Selection:
+    def none(cls, beat: Floats, dofs: int) -> Selection:
+        """Return a selection without candidates; only scores below `beat` (n,) will count."""
+        count = len(beat)
         empty = HandState(np.zeros((count, 3)), np.zeros((count, 4)), np.zeros((count, dofs)))
-        return cls(empty, np.zeros(count), np.full(count, np.inf), {})
+        return cls(empty, np.zeros(count), beat.copy(), {})
+
+    def has(self, which: NDArray[np.intp]) -> NDArray[np.bool_]:
+        return np.array([int(grasp) in self.grasps for grasp in which], bool)
 
     def take(
         self, found: GraspSet, seated: Refinements, rows: NDArray[np.intp], which: NDArray[np.intp], score: Floats
     ) -> None:
-        """Store candidates `rows` (k,) of the grasps `which` (k,) where they are better."""
+        """Store candidates `rows` (k,) of the grasps `which` (k,) where they are better, or the first ones."""
         state, losses = seated.state[rows], seated.losses[rows]
-        for k in np.flatnonzero(score < self.score[which]):
+        for k in np.flatnonzero((score < self.score[which]) | ~self.has(which)):
             grasp = int(which[k])
             self.grasps[grasp] = found.take(slice(k, k + 1))
-            self.score[grasp], self.losses[grasp] = score[k], losses[k]
+            self.score[grasp], self.losses[grasp] = min(score[k], self.score[grasp]), losses[k]
             for name in ("pivot", "rotation", "q"):
                 getattr(self.state, name)[grasp] = getattr(state, name)[k]
 
@@ -109,21 +114,24 @@ def tried(
     placed: PlacedGrasps | None,
     rollout: RolloutOf,
     *,
+    beat: Floats | None = None,
     together: int = TOGETHER,
     device: str = "cpu",
 ) -> Selection:
     """Return each grasp's first candidate with a good enough rollout, or else the one with the smallest score.
     `together` candidates of each grasp are seated and simulated in the order (n, each) of merit, then as many again for
-    grasps without a good one. Unbalanced or infeasible hands have no rollout; a grasp's first hand is still used."""
+    grasps without a good one. Unbalanced or infeasible hands have no rollout; a grasp's first hand is still used.
+    Candidates that do not beat the scores `beat` (n,) of earlier attempts leave these scores unchanged."""
     good = GOOD if placed is None else GOOD_IN_SCENES
-    taken, left = Selection.none(len(order), hand.dofs), np.arange(len(order))
+    beat = np.full(len(order), np.inf) if beat is None else beat
+    taken, left = Selection.none(beat, hand.dofs), np.arange(len(order))
     for wave in np.split(order, range(together, order.shape[1], together), axis=1):
         if not len(left):
             break
         seated = seat(wave[left], left)
         for rows in ranked(seated.merit, len(left)).T:
-            worth = ((seated.merit[rows] < HOPEFUL) | (taken.score[left] > POOR)) & ~seated.infeasible[rows]
-            open_ = ~(taken.score[left] < good) & (worth | np.isinf(taken.score[left]))
+            worth = (seated.merit[rows] < HOPEFUL) | (taken.score[left] > POOR)
+            open_ = ~(taken.score[left] < good) & (worth & ~seated.infeasible[rows] | ~taken.has(left))
             if not open_.any():
                 continue
             which = left[open_]
@@ -131,7 +139,8 @@ def tried(
             found = with_postures(
                 hand, obj, seated.state[rows[open_]], seated.losses[rows[open_]], where, device=device
             )
-            score = _scores(found, seated.infeasible[rows[open_]], which, taken.score[which], rollout)
+            hopeless = seated.infeasible[rows[open_]] | ~worth[open_]
+            score = _scores(found, hopeless, which, taken.score[which], rollout)
             _gentler(hand, obj, found, score, which, rollout, device)
             taken.take(found, seated, rows[open_], which, score)
         left = left[~(taken.score[left] < good)]
