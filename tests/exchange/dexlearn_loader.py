@@ -9,7 +9,6 @@ import json
 from dataclasses import dataclass
 from glob import glob
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import yaml
@@ -30,7 +29,7 @@ class Sample:
     """(K, 3, J)"""
     clouds: list[np.ndarray]
     """(P, 3) each, at the scale of the first grasp"""
-    scene: dict[str, Any]
+    scene: dict
 
 
 class Data:
@@ -55,7 +54,7 @@ class Data:
             found += [self._sample(Path(file), kind) for file in sorted(files)]
         return found
 
-    def test_scenes(self) -> list[dict[str, Any]]:
+    def test_scenes(self) -> list[dict]:
         """What is sampled for: each scene of a held-out object, with its clouds as `clouds`."""
         pattern = self.config["test_scene_cfg"]
         files = [f for name in self.split("test") for f in _glob(f"{self.objects}/scene_cfg/{name}/{pattern}")]
@@ -73,14 +72,14 @@ class Data:
         number = int(kind.split("_")[0]) if self.config["grasp_type_cond"] else 0
         return Sample(file, number, pose[..., :3], _matrices(pose[..., 3:7]), pose[..., 7:], clouds, scene)
 
-    def _scene(self, file: Path) -> dict[str, Any]:
-        scene: dict[str, Any] = np.load(file, allow_pickle=True).item()
+    def _scene(self, file: Path) -> dict:
+        scene = np.load(file, allow_pickle=True).item()
         for thing in scene["scene"].values():
             for key in [key for key, value in thing.items() if key.endswith("_path") and isinstance(value, str)]:
                 thing[key] = str(file.parent / thing[key])
         return scene
 
-    def _clouds(self, scene: dict[str, Any]) -> list[np.ndarray]:
+    def _clouds(self, scene: dict) -> list[np.ndarray]:
         files = sorted(_glob(f"{self.objects}/{self.config['pc_path']}/{scene['scene_id']}/partial_pc**.npy"))
         assert files, f"{scene['scene_id']} has no cloud to draw"
         return [np.load(file, allow_pickle=True) for file in files]

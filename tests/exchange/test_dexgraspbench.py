@@ -3,7 +3,6 @@ its tabletop test says what ours says, and grasps come back as they were."""
 
 import json
 from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -188,12 +187,12 @@ def random_postures(hand: HandModel) -> GraspSet:
     return GraspSet(drawn(), drawn(), drawn(), np.full(2, np.nan))
 
 
-def assert_at(body: Any, pose: np.ndarray) -> None:
+def assert_at(body, pose: np.ndarray) -> None:
     np.testing.assert_allclose(body.xpos, pose[:3], atol=ROUNDING_M)
     np.testing.assert_allclose(body.xmat.reshape(3, 3), quat_to_matrix(pose[3:]), atol=1e-7)
 
 
-def _chain(root: list[float], chain: list[Any]) -> str:
+def _chain(root: list[float], chain: list) -> str:
     def text(values: list[float]) -> str:
         return " ".join(map(str, values))
 
@@ -285,7 +284,7 @@ def test_its_loader_puts_hand_and_object_where_they_stand(tabletop: Path, hand: 
     assert lowest == pytest.approx(found.model.geom_pos[floor, 2], abs=1e-6)
 
 
-def geom_bottom(found: Any, geom: int) -> float:
+def geom_bottom(found, geom: int) -> float:
     model, data = found.model, found.data
     mesh = model.geom_dataid[geom]
     first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]

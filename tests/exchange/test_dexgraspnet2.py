@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import pytest
@@ -200,7 +200,7 @@ def test_what_shows_no_scene_or_no_clear_grasp_is_told(on_tables: Path, tmp_path
     assert "no picture shows" in said
     none = PictureReference(0, "base", "views", 0, np.eye(4), IDENTITY_POSE, np.zeros(0, np.intp))
     monkeypatch.setattr(dexgraspnet2, "by_scene", lambda pictures: [[none]])
-    lots: list[Any] = [SimpleNamespace(id="base")]
+    lots = [SimpleNamespace(id="base")]
     with pytest.raises(InputError, match="no grasp is valid and clear"):
         dexgraspnet2.write(lots, cast(Pictures, None), tmp_path, frozenset())
 

@@ -2,7 +2,6 @@
 
 import os
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -27,7 +26,7 @@ TINY = 1e-9  # positions and quaternions are only re-ordered, not computed with
 class Bomb:
     """Runs a command when it is unpickled."""
 
-    def __reduce__(self) -> Any:
+    def __reduce__(self):
         return os.mkdir, ("bomb-went-off",)
 
 

@@ -12,7 +12,6 @@ import re
 import tarfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -40,7 +39,7 @@ def data(exported: Callable[[str], Path]) -> Path:
     return exported("graspgen")
 
 
-def record_of(data: Path, uuid: str) -> dict[str, Any]:
+def record_of(data: Path, uuid: str) -> dict:
     """As its reader finds it: the index names the shard, the shard is searched for the key."""
     folder = data / "grasps" / "barrett"
     number = json.loads((folder / "uuid_index.json").read_text())[uuid]
@@ -56,7 +55,7 @@ def record_of(data: Path, uuid: str) -> dict[str, Any]:
     return dict(found[0])
 
 
-def read_back(record: dict[str, Any], folder: Path) -> Any:
+def read_back(record: dict, folder: Path):
     (folder / "block.json").write_text(json.dumps(record))
     return graspgen.read(folder / "block.json", hand="barrett", obj="block")
 
@@ -129,7 +128,7 @@ def test_what_nobody_validated_has_no_label(on_tables: Path, tmp_path: Path) -> 
         ({"squeeze_pose": [[0, 0, 0, 1, 0, 0, 0]]}, "numbers of pregrasps"),
     ],
 )
-def test_a_record_that_is_wrong_is_told(data: Path, tmp_path: Path, change: dict[str, Any], said: str) -> None:
+def test_a_record_that_is_wrong_is_told(data: Path, tmp_path: Path, change: dict, said: str) -> None:
     record = record_of(data, "block")
     record["grasps"] |= change
     with pytest.raises(InputError, match=said):

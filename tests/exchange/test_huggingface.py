@@ -4,7 +4,6 @@ import io
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -39,12 +38,12 @@ def configs(folder: Path) -> dict[str, dict[str, list[Path]]]:
     }
 
 
-def rows_of(folder: Path, table: str, name: str) -> list[dict[str, Any]]:
+def rows_of(folder: Path, table: str, name: str) -> list[dict]:
     files = [file for split in configs(folder)[table].values() for file in split]
     return [row for file in files for row in pq.read_table(file).to_pylist() if row["object"] == name]
 
 
-def picture(cell: dict[str, Any]) -> np.ndarray:
+def picture(cell: dict) -> np.ndarray:
     """What its feature `Image` makes of a cell."""
     assert cell["path"] is None
     with Image.open(io.BytesIO(cell["bytes"])) as image:

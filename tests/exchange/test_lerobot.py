@@ -11,7 +11,6 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -36,7 +35,7 @@ def root(exported: Callable[[str], Path]) -> Path:
     return exported("lerobot")
 
 
-def frames(root: Path) -> list[dict[str, Any]]:
+def frames(root: Path) -> list[dict]:
     """All frames in the order of their files, as the reader joins them, cast to the features of `info.json`."""
     info = json.loads((root / "meta" / "info.json").read_text())
     rows = []
@@ -55,7 +54,7 @@ def frames(root: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def episodes(root: Path) -> list[dict[str, Any]]:
+def episodes(root: Path) -> list[dict]:
     files = sorted((root / "meta" / "episodes").glob("*/*.parquet"))
     rows = [row for file in files for row in pq.read_table(file).to_pylist()]
     return sorted(rows, key=lambda row: row["episode_index"])

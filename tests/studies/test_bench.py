@@ -4,7 +4,6 @@ import json
 import re
 import time
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
@@ -159,7 +158,7 @@ def test_pages_recipe_finds_point_of_the_mesh_behind_each_pixel(tmp_path: Path) 
     with h5py.File(tmp_path / "scenes.h5", "w") as file:
         file["scene/object_pose"] = poses
     (recipe,) = re.findall(r"```python\n(.*?)```", PAGE, re.S)
-    names: dict[str, Any] = {}
+    names = {}
     exec(recipe, names)
     points = names["object_points"](tmp_path / "views.h5", tmp_path / "scenes.h5", 0)
     seen = points[arrays["image/segmentation"][0] == 2]

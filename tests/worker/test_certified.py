@@ -2,7 +2,6 @@
 
 from collections import Counter
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -44,7 +43,7 @@ def block() -> ObjectModel:
     return object_from_path("block")
 
 
-def wish(**changes: Any) -> JobRequest:
+def wish(**changes) -> JobRequest:
     return JobRequest(**{"hand": "allegro", "object": "block", "grasps": COUNT, "fidelity": "draft", **changes})
 
 
@@ -65,7 +64,7 @@ def test_a_batch_of_valid_grasps_holds_nothing_else(valid: ValidatedBatch) -> No
 def judge(monkeypatch: pytest.MonkeyPatch, *pushes: Outcome, feasible: bool) -> None:
     """Verdicts repeat these outcomes of the third push, and the gate passes all grasps or none."""
 
-    def verdicts(_hand: Any, _obj: Any, grasps: GraspSet, **__: Any) -> SimpleNamespace:
+    def verdicts(_hand, _obj, grasps: GraspSet, **__) -> SimpleNamespace:
         outcome = np.full((len(grasps), 6), Outcome.HELD, np.uint8)
         outcome[:, 2] = np.resize(pushes, len(grasps))
         held = (outcome[:, 2] == Outcome.HELD).astype(np.int8)
@@ -97,7 +96,7 @@ def test_what_the_validator_saw_of_each_try_is_counted(hand: HandModel, block: O
 def test_a_batch_that_is_stopped_is_what_was_validated_before(hand, block, monkeypatch, after: int) -> None:
     rounds, real = [], generation.Batch.made
 
-    def counted(*given: Any) -> Any:
+    def counted(*given):
         if len(rounds) == after:
             raise TaskCancelled("stopped")
         rounds.append(real(*given))
@@ -117,7 +116,7 @@ def test_a_batch_that_is_stopped_is_what_was_validated_before(hand, block, monke
 def test_a_grasp_like_one_that_is_kept_makes_room_for_another(hand: HandModel, block: ObjectModel, monkeypatch) -> None:
     real = generation.synthesize
 
-    def twins(*given: Any, **named: Any) -> GraspSet:
+    def twins(*given, **named) -> GraspSet:
         found = real(*given, **named)
         return found.take(np.arange(len(found)) // 2 * 2)  # each grasp twice
 
@@ -158,7 +157,7 @@ def test_the_methods_own_options_reach_it(hand: HandModel, block: ObjectModel) -
 def test_a_budget_that_finds_nothing_ends_with_nothing(hand: HandModel, block: ObjectModel, monkeypatch) -> None:
     planned: list[int] = []
 
-    def plan(_hand: Any, _obj: Any, wanted: PlanRequest, *_: Any, **__: Any) -> GraspSet:
+    def plan(_hand, _obj, wanted: PlanRequest, *_, **__) -> GraspSet:
         count = wanted.count
         planned.append(wanted.batch)
         posture = Posture(np.tile([0.0, 0, 1, 1, 0, 0, 0], (count, 1)), np.zeros((count, len(hand.joint_names))))
@@ -175,7 +174,7 @@ def test_a_budget_that_finds_nothing_ends_with_nothing(hand: HandModel, block: O
 def test_hands_that_are_no_numbers_are_dropped_and_counted(hand: HandModel, block: ObjectModel, monkeypatch) -> None:
     whole = generation.synthesize
 
-    def plan(*arguments: Any, **options: Any) -> GraspSet:
+    def plan(*arguments, **options) -> GraspSet:
         made = whole(*arguments, **options)
         made.grasp.hand_pose[::2] = np.nan
         return made
@@ -209,7 +208,7 @@ def test_only_grasps_that_hold_in_enough_models_count(hand: HandModel, block: Ob
 
 
 def test_valid_grasps_that_hold_in_no_other_model_are_told_apart(hand, block: ObjectModel, monkeypatch) -> None:
-    def nowhere(*args: Any, held: np.ndarray, models: int, wanted: float, **kwargs: Any) -> Robustness:
+    def nowhere(*args, held: np.ndarray, models: int, wanted: float, **kwargs) -> Robustness:
         verdicts = np.where(held[:, None], 0, -1).astype(np.int8) * np.ones((1, models), np.int8)
         return Robustness(verdicts, np.full(verdicts.shape, Axis.POSE, np.uint8), wanted, 0.0)
 

@@ -4,7 +4,6 @@ import threading
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -50,7 +49,7 @@ def noted(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int, int]]:
     calls: list[tuple[int, int, int]] = []
     whole = generation.synthesize
 
-    def plan(hand: Any, obj: Any, wanted: PlanRequest, *rest: Any, **named: Any) -> GraspSet:
+    def plan(hand, obj, wanted: PlanRequest, *rest, **named) -> GraspSet:
         calls.append((wanted.batch // generation.ROUND_STRIDE, wanted.first, wanted.count))
         return whole(hand, obj, wanted, *rest, **named)
 
@@ -72,7 +71,7 @@ def test_a_round_ends_as_soon_as_enough_are_found(pair, monkeypatch: pytest.Monk
     """A round has eight grasps at least; the first few of it are often enough, and the others are never planned."""
     whole = generation.validate
 
-    def strict(hand: Any, obj: Any, grasps: GraspSet, **named: Any) -> Any:
+    def strict(hand, obj, grasps: GraspSet, **named):
         verdicts = whole(hand, obj, grasps, **named)
         return replace(verdicts, success=verdicts.success * (verdicts.margin < np.median(margins)).astype(np.int8))
 
@@ -93,7 +92,7 @@ def test_lane_without_a_place_ends_blocked_where_another_has_one(pair, scenes, m
     whole = generation.synthesize
     refused: list[int] = []
 
-    def narrow(hand: Any, obj: Any, wanted: PlanRequest, *rest: Any, **named: Any) -> GraspSet:
+    def narrow(hand, obj, wanted: PlanRequest, *rest, **named) -> GraspSet:
         if wanted.first in without and not wanted.others_have_place:
             refused.append(wanted.first)
             raise NoStartFound("no place")
@@ -197,7 +196,7 @@ def assert_same(batches, others) -> None:
 def test_joined_batches_of_a_job_are_the_same_from_plan_to_verdict(pair, alone, monkeypatch) -> None:
     launches, whole = list[list[int]](), together.synthesize_batches
 
-    def noted(hand: Any, obj: Any, asked: Sequence[BatchRequest], **named: Any) -> Any:
+    def noted(hand, obj, asked: Sequence[BatchRequest], **named):
         launches.append([one.wanted.batch for one in asked])
         return whole(hand, obj, asked, **named)
 
@@ -251,13 +250,13 @@ def test_waves_of_batches_in_scenes_are_the_same(pair, own_scenes: list[Scenes],
 def test_a_batch_without_a_place_has_no_grasps_but_for_the_first(pair, own_scenes, monkeypatch, refused) -> None:
     whole = together.synthesize_batches
 
-    def narrow(hand: Any, obj: Any, asked: Sequence[BatchRequest], **named: Any) -> Any:
+    def narrow(hand, obj, asked: Sequence[BatchRequest], **named):
         made = whole(hand, obj, asked, **named)
         return [NoStartFound("no way in") if k == refused else grasps for k, grasps in enumerate(made)]
 
     monkeypatch.setattr(together, "synthesize_batches", narrow)
     wish = ASKED.model_copy(update={"validation": "none", "want": "candidates"})
-    asked: dict[str, Any] = {"sizes": [2, 2], "scenes": own_scenes[:2], "join": 2, "empty_on": (NoStartFound,)}
+    asked = {"sizes": [2, 2], "scenes": own_scenes[:2], "join": 2, "empty_on": (NoStartFound,)}
     with nullcontext() if refused else pytest.raises(NoStartFound, match="no way in"):
         made = validated_batches(*pair, wish, **asked, run=ExecutionContext(threads=2))
         assert [len(one.grasps) for one in made] == [2, 0]

@@ -1,7 +1,6 @@
 """Inputs that users of such tools report, each tried as its report says: `data/reports` beside the checkout."""
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 import trimesh
@@ -40,7 +39,7 @@ RADIAL |= {"closing": dict.fromkeys(("jf0_prox", "jf1_prox", "jf2_prox"), 1)}
         ("O17_git_lfs_pointer/mug.stl", {}, True, ["mug.stl is a Git LFS pointer", "git lfs pull"], {}),
     ],
 )
-def test_a_report_comes_out_as_it_should(shared_data, file, options, is_refused, words, facts: dict[str, Any]) -> None:
+def test_a_report_comes_out_as_it_should(shared_data, file, options, is_refused, words, facts: dict) -> None:
     check = report_hand if file.startswith("H") else report_object
     found = check(str(shared_data / "reports" / file), options)
     assert (found["verdict"] == "refuse") is is_refused, found["message"]

@@ -2,12 +2,9 @@
 
 import csv
 import json
-import re
-import shlex
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree
 
 import mujoco
@@ -25,7 +22,6 @@ from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.rendering.hands import hand_parts
 from tests.conftest import REPOSITORY
-from tests.exchange.robots.arms import write_arm
 from tests.exchange.robots.conftest import COMMON
 from tests.worker.commands_run import graspd, refused
 
@@ -35,7 +31,7 @@ GRASP |= {"post_grasp_retreat", "post_place_retreat", "max_contact_force", "allo
 POINT = {"positions", "velocities", "accelerations", "effort", "time_from_start"}
 
 
-def export(shard: Path, format_: str, folder: Path, *more: str) -> dict[str, Any]:
+def export(shard: Path, format_: str, folder: Path, *more: str) -> dict:
     return graspd(f"export --format {format_} --all -o", folder, shard, *more)
 
 
@@ -269,27 +265,6 @@ def test_without_usd_core_a_line_says_what_to_install(free_shard: Path, tmp_path
 
 
 PAGE = (REPOSITORY / "docs" / "how-to" / "robots.md").read_text()
-
-
-def commands() -> list[list[str]]:
-    blocks = re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL)
-    return [shlex.split(line, comments=True) for block in blocks for line in block.splitlines() if line.strip()]
-
-
-@pytest.mark.slow
-def test_every_command_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("mink")
-    pytest.importorskip("pxr")
-    monkeypatch.chdir(tmp_path)
-    write_arm(tmp_path).rename("arm.urdf")
-    assert len(commands()) >= 12
-    for program, *arguments in commands():
-        if program == "python":
-            subprocess.run([sys.executable, "-I", *arguments], check=True, capture_output=True)
-            continue
-        assert program == "graspd"
-        graspd("", *arguments)
-        assert Path(arguments[arguments.index("-o") + 1]).exists()
 
 
 def test_every_format_of_the_command_is_on_the_page() -> None:

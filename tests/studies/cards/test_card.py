@@ -6,7 +6,6 @@ import shutil
 import sys
 from collections import Counter
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -182,7 +181,7 @@ def test_the_card_of_many_objects_is_folded_and_bounded(tmp_path: Path) -> None:
         assert head(numbers(contents, tally))["size_categories"] == [words]
 
 
-def closed(tmp_path: Path, *, drawn: bool = False, **options: Any) -> Case:
+def closed(tmp_path: Path, *, drawn: bool = False, **options) -> Case:
     found = case(tmp_path, drawn=drawn, **options)
     found.services.close()
     return found

@@ -3,18 +3,10 @@
 import gc
 import logging
 
-import numpy as np
 import pytest
 import warp as wp
 
-from graspd.service.model.fidelity import FIDELITIES
 from graspd.worker.engines.devices import DeviceLost, check_device, is_out_of_memory
-from graspd.worker.execution_context import ExecutionContext
-from graspd.worker.hands.load import hand_from_path
-from graspd.worker.objects.prepare import object_from_path
-from graspd.worker.planners import synthesize
-from graspd.worker.planners.fast_graspd import planner
-from graspd.worker.planners.port import PlanRequest
 from graspd.worker.planners.threads import run_parts
 
 #: As Warp 1.19 says it.
@@ -94,23 +86,3 @@ def test_one_grasp_without_room_and_other_errors_end_the_work() -> None:
     with pytest.raises(RuntimeError, match="700"):
         run_parts([range(32)], lost)
     assert tried == [range(32)]
-
-
-def test_grasps_made_in_halves_are_those_of_one_launch(monkeypatch: pytest.MonkeyPatch) -> None:
-    hand, block = hand_from_path("barrett"), object_from_path("block")
-    fidelity = FIDELITIES["draft"].model_copy(update={"coarse_iterations": 6, "fine_iterations": 6})
-    wanted = PlanRequest(count=4, fidelity=fidelity)
-    whole = synthesize(hand, block, wanted, ExecutionContext(threads=1))
-
-    class Small(planner.Data):
-        """Of a device with room for two grasps."""
-
-        def __init__(self, model: object, batch: int) -> None:
-            if batch > 2 * fidelity.starts:
-                raise RuntimeError(NO_MEMORY)
-            super().__init__(model, batch)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(planner, "Data", Small)
-    halves = synthesize(hand, block, wanted, ExecutionContext(threads=1))
-    assert np.array_equal(whole.grasp.hand_pose, halves.grasp.hand_pose)
-    assert np.array_equal(whole.grasp.joint_positions, halves.grasp.joint_positions)

@@ -3,7 +3,6 @@
 import re
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import pytest
 import trimesh
@@ -30,7 +29,7 @@ from tests.worker.stages.test_ingest import bad_files, is_expected, upload, zipp
 
 
 @pytest.mark.parametrize(("kind", "report_of"), [("urdf", report_hand), ("mesh", report_object)])
-def test_every_bad_file_gets_a_verdict_that_names_the_defect(shared_data: Path, kind: str, report_of: Any) -> None:
+def test_every_bad_file_gets_a_verdict_that_names_the_defect(shared_data: Path, kind: str, report_of) -> None:
     entries = [entry for entry in bad_files(shared_data) if entry["kind"].startswith(kind)]
     assert len(entries) >= 20
     found = [(entry, report_of(str(shared_data / "bad" / entry["file"]))) for entry in entries]
@@ -201,7 +200,7 @@ def test_a_joint_above_a_named_root_does_not_matter_and_is_told(fault: str) -> N
 WITHOUT_MIMIC = jaws().replace(MIMIC.encode(), b"")
 
 
-def coupled(multiplier: float) -> dict[str, Any]:
+def coupled(multiplier: float) -> dict:
     return {"couplings": {"jr": {"of": "jl", "multiplier": multiplier}}}
 
 
@@ -227,7 +226,7 @@ _FREE = '<link name="ball"/><joint name="loose" type="floating"><parent link="ba
         (jaws(LIMIT, LIMIT, _FREE), {}, "joint 'loose': type 'floating' cannot be used"),
     ],
 )
-def test_what_is_wrong_with_a_urdf_is_told_by_name(data: bytes, options: dict[str, Any], told: str) -> None:
+def test_what_is_wrong_with_a_urdf_is_told_by_name(data: bytes, options: dict, told: str) -> None:
     assert told in report(data, **options)["message"]
 
 

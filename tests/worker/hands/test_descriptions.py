@@ -6,7 +6,6 @@ import subprocess
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import pytest
 import trimesh
@@ -48,13 +47,13 @@ def urdf(tmp_path: Path) -> Path:
     return folder / "leap.urdf"
 
 
-def facts(report: dict[str, Any]) -> tuple[str, list[float], list[str], list[float]]:
+def facts(report: dict) -> tuple[str, list[float], list[str], list[float]]:
     assert report["verdict"] == "accept", report["message"]
     said = report["facts"]
     return said["root"], said["palm_approach"], said["fingertips"], list(said["effort"].values())
 
 
-def added(path: Path) -> dict[str, Any]:
+def added(path: Path) -> dict:
     """The report of the files that the service gets from `hands add`."""
     with upload_of(path) as (upload, main):
         said = json.dumps({"file": main}) if main else ""
@@ -173,7 +172,7 @@ def verdicts(files: Mapping[str, bytes], main: str, folder: Path) -> list[str]:
         uploaded = check_hand(files_of_upload(AssetKind.HAND, "h.zip", packed, limit_bytes=1 << 22), "h")
     except InputError as error:
         uploaded = {"verdict": "refuse", "message": str(error)}
-    found: list[dict[str, Any]] = [report_hand(str(folder / main)), report_hand(str(folder)), uploaded]
+    found: list[dict] = [report_hand(str(folder / main)), report_hand(str(folder)), uploaded]
     return ["accept" if one["verdict"] == "accept" else one["message"] for one in found]
 
 

@@ -3,7 +3,6 @@
 import re
 from dataclasses import dataclass, field, fields, make_dataclass
 from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -35,7 +34,7 @@ def load(text: str = CLAW, **options: object) -> HandModel:
     return load_hand(files, name="claw", digest="0" * 32, options=options)
 
 
-def report_of(text: str = CLAW, **others: bytes) -> dict[str, Any]:
+def report_of(text: str = CLAW, **others: bytes) -> dict:
     return check_hand({"h.xml": text.encode(), "meshes/tip.stl": tip(), **others}, "h")
 
 
@@ -243,7 +242,7 @@ def test_asset_json_puts_joints_on_a_tendon_and_takes_it_away() -> None:
         ({"t": {"left_bend": 1, "left_curl": 1}, "u": {"left_curl": 1, "left_spread": 1}}, "'left_curl' is on two"),
     ],
 )
-def test_a_tendon_that_cannot_be_is_refused_in_one_line(tendons: dict[str, Any], says: str) -> None:
+def test_a_tendon_that_cannot_be_is_refused_in_one_line(tendons: dict, says: str) -> None:
     with pytest.raises(HandError, match=says) as error:
         load(tendons=tendons)
     assert "\n" not in str(error.value)

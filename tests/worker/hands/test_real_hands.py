@@ -4,7 +4,6 @@ import functools
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -36,7 +35,7 @@ def hands(shared_data: Path) -> Callable[..., HandModel]:
     return functools.cache(lambda name: hand_from_path(shared_data / "hands" / HANDS[name][0]))
 
 
-def bare_files(shared_data: Path, name: str) -> tuple[dict[str, bytes], dict[str, Any]]:
+def bare_files(shared_data: Path, name: str) -> tuple[dict[str, bytes], dict]:
     """The files of a hand without the notes beside them, and these."""
     _, files, _ = files_from_path(shared_data / "hands" / HANDS[name][0])
     return files, json.loads(files.pop("hand.json"))

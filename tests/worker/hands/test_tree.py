@@ -1,7 +1,6 @@
 """From URDF joints to bodies: merging, mimics, couplings; where a hand begins, behind its arm or in a whole robot."""
 
 import math
-from typing import Any
 
 import numpy as np
 import pytest
@@ -83,7 +82,7 @@ def test_roots_and_dropped_links_take_what_hangs_on_them() -> None:
         ({"fix": {"j1": 0.0, "j2": 0.0, "j3": 0.0}}, "no moving joint"),
     ],
 )
-def test_an_option_that_cannot_be_is_named(options: dict[str, Any], named: str) -> None:
+def test_an_option_that_cannot_be_is_named(options: dict, named: str) -> None:
     with pytest.raises(HandError, match=named):
         load(chain(*THREE), **options)
 

@@ -1,7 +1,5 @@
 """Small hands for tests."""
 
-from typing import Any
-
 from graspd.worker.hands.check import check_hand
 from graspd.worker.hands.load import load_hand
 from graspd.worker.hands.model import HandModel
@@ -35,11 +33,11 @@ def robot(*parts: str) -> bytes:
     return ('<robot name="test">' + "".join(parts) + "</robot>").encode()
 
 
-def load(urdf: bytes, **options: Any) -> HandModel:
+def load(urdf: bytes, **options) -> HandModel:
     return load_hand({"h.urdf": urdf}, name="h", digest="0" * 32, options=options)
 
 
-def report(urdf: bytes, **options: Any) -> dict[str, Any]:
+def report(urdf: bytes, **options) -> dict:
     return check_hand({"h.urdf": urdf}, "h", options)
 
 

@@ -3,7 +3,6 @@
 import dataclasses
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -71,7 +70,7 @@ def test_samples_are_those_of_a_process_without_a_cache() -> None:
 BALLS = stl(join(sphere(segments=24), sphere(segments=24, at=(0.02, 0.0, 0.0))))
 
 
-def load_balls(files: dict[str, bytes] = BALLS, error: float = 3e-4, **options: Any) -> ObjectModel:
+def load_balls(files: dict[str, bytes] = BALLS, error: float = 3e-4, **options) -> ObjectModel:
     """As a process that begins."""
     prepare._prepared.cache_clear()
     prepare._repaired.cache_clear()
@@ -139,7 +138,7 @@ HAND = two_finger_hand()
 
 
 @pytest.mark.parametrize("model", [BRICK, HAND], ids=["object", "hand"])
-def test_whatever_differs_in_a_model_changes_its_content(model: Any) -> None:
+def test_whatever_differs_in_a_model_changes_its_content(model) -> None:
     for field in dataclasses.fields(model):
         changed = dataclasses.replace(model, **{field.name: np.array([7])})
         assert (changed.content == model.content) == (field.name in ("name", "digest")), field.name

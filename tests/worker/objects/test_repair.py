@@ -1,7 +1,6 @@
 """From triangles to a solid: what is repaired, what is refused, and that both are said."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +21,7 @@ from tests.worker.objects.shapes import Mesh, box, cylinder, join, sphere, stl
 ROUNDING = 1e-6
 
 
-def check(mesh: Mesh, **options: Any) -> dict[str, Any]:
+def check(mesh: Mesh, **options) -> dict:
     return check_object(stl(mesh), "m", face_error_m=0.0, **options)
 
 
@@ -211,7 +210,7 @@ def boxes(gap: float, upper: tuple[float, float, float] = (0.04, 0.05, 0.03)) ->
     return trimesh.util.concatenate([lower, other])
 
 
-def check_parts(mesh: trimesh.Trimesh, suffix: str = "obj", **options: Any) -> dict[str, Any]:
+def check_parts(mesh: trimesh.Trimesh, suffix: str = "obj", **options) -> dict:
     data = mesh.export(file_type=suffix)
     return check_object({f"m.{suffix}": data if isinstance(data, bytes) else data.encode()}, "m", **options)
 

@@ -8,7 +8,6 @@ from importlib import metadata
 from importlib.metadata import EntryPoint
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
@@ -69,7 +68,7 @@ def test_cancelling_stops_at_the_first_look(name: str) -> None:
 
 
 #: Knobs that make a call short; the mesh, which is what the fidelities here differ in, stays theirs.
-SHORT: dict[str, Any] = dict.fromkeys(("coarse_points", "fine_points", "object_points"), 64)
+SHORT = dict.fromkeys(("coarse_points", "fine_points", "object_points"), 64)
 SHORT |= {"starts": 1, "finalists": 1, "coarse_iterations": 3, "fine_iterations": 2, "polish_iterations": 1}
 METHODS = sorted(name for name in PLANNERS if method(name).free)
 PAIR = ("draft", "fine")

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -18,7 +17,7 @@ def work(rq_queue: RqQueue, redis_server: str, tmp_path: Path) -> Callable[..., 
     """Runs a worker with a table of stages, until no task waits; whether it ended well."""
     settings = Settings(redis_url=redis_server, data_dir=tmp_path, device="cpu")
 
-    def run(table: Any, **options: Any) -> bool:
+    def run(table, **options) -> bool:
         return run_worker(settings, start=engine_of(table), **{"burst": True} | options)
 
     return run

@@ -3,7 +3,6 @@
 import logging
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -34,7 +33,7 @@ GARBLED = raising(ArithmeticError("not a number"))
 
 
 @pytest.mark.parametrize("stage", [fake_synthesize, GARBLED])
-def test_the_task_goes_back_without_a_result_or_an_attempt(stage: Any) -> None:
+def test_the_task_goes_back_without_a_result_or_an_attempt(stage) -> None:
     bench, message = Bench(check_device=broken), message_for()
     event = bench.run(message, stage)
     assert event.kind is EventKind.RETURNED

@@ -11,7 +11,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing import Pipe
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -172,10 +171,10 @@ class Deaf(Link):
     """To an engine that hears and says nothing until it is killed."""
 
     def __init__(self) -> None:
-        self.told: list[Any] = []
+        self.told = []
         self.killed = False
 
-    def say(self, word: str, about: Any = None) -> None:
+    def say(self, word: str, about=None) -> None:
         self.told.append(about)
 
     def hear(self, wait_s: float) -> None:

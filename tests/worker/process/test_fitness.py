@@ -1,7 +1,6 @@
 """Which failures are the worker's own, and its check of itself with the real engine."""
 
 from collections.abc import Collection
-from typing import Any
 
 import pytest
 
@@ -127,10 +126,10 @@ def test_the_engine_of_every_stage_passes(stage: Stage) -> None:
 def test_an_engine_that_breaks_or_gives_nonsense_does_not_pass(monkeypatch: pytest.MonkeyPatch) -> None:
     plan = generation.validated_grasps
 
-    def broken(*args: Any, **options: Any) -> None:
+    def broken(*args, **options) -> None:
         raise ImportError("libwarp.so: cannot open\nshared object file")
 
-    def nonsense(*args: Any, **options: Any) -> Any:
+    def nonsense(*args, **options):
         found = plan(*args, **options)
         found.grasps.grasp.hand_pose[:] = float("nan")
         return found

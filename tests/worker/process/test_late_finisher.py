@@ -2,7 +2,6 @@
 
 import logging
 import threading
-from typing import Any
 
 from graspd.service.model.messages import TaskMessage
 from graspd.service.model.states import Priority, Stage
@@ -14,8 +13,8 @@ from tests.fakes import fake_synthesize, message_for
 from tests.waiting import until
 
 
-def test_a_task_that_was_taken_away_ends_in_a_line_and_no_traceback(rq_queue: RqQueue, work: Any, caplog: Any) -> None:
-    def slow(message: TaskMessage, context: TaskContext) -> Any:
+def test_a_task_that_was_taken_away_ends_in_a_line_and_no_traceback(rq_queue: RqQueue, work, caplog) -> None:
+    def slow(message: TaskMessage, context: TaskContext):
         (lease,) = rq_queue.leases()
         rq_queue.release(lease)
         return fake_synthesize(message, TaskContext(context.store))
@@ -28,7 +27,7 @@ def test_a_task_that_was_taken_away_ends_in_a_line_and_no_traceback(rq_queue: Rq
     assert not rq_queue.connection.keys("rq:job:*"), "nothing is left of it"
 
 
-def test_a_worker_that_an_error_broke_off_has_work_left(rq_queue: RqQueue, work: Any, monkeypatch) -> None:
+def test_a_worker_that_an_error_broke_off_has_work_left(rq_queue: RqQueue, work, monkeypatch) -> None:
     """Batch scripts start it again then; where none waits any more, they end."""
     table = {Stage.SYNTHESIZE: fake_synthesize}
     assert work(table), "none waits"
@@ -45,13 +44,13 @@ def test_a_worker_that_an_error_broke_off_has_work_left(rq_queue: RqQueue, work:
     assert work(table, burst=False, max_tasks=1), "as many as were wanted"
 
 
-def test_the_end_of_a_task_waits_until_redis_takes_writes(rq_queue: RqQueue, work: Any, kinds: Any) -> None:
+def test_the_end_of_a_task_waits_until_redis_takes_writes(rq_queue: RqQueue, work, kinds) -> None:
     """Redis refuses writes here for want of replicas, as it does on a full disk."""
 
     def refuse(replicas: int) -> None:
         rq_queue.connection.config_set("min-replicas-to-write", replicas)
 
-    def stage(message: TaskMessage, context: TaskContext) -> Any:
+    def stage(message: TaskMessage, context: TaskContext):
         until(lambda: rq_queue.tail("0", limit=1, wait_s=0), "it was told that the task began")
         refuse(1)
         threading.Timer(1.0, refuse, [0]).start()

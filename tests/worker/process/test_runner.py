@@ -1,7 +1,6 @@
 """What becomes of a task, whatever its stage does."""
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -27,14 +26,14 @@ class Bench:
 
     runner: Runner
 
-    def __init__(self, **options: Any) -> None:
+    def __init__(self, **options) -> None:
         self.store: Store = open_store("memory://")
         self.told: list[Event] = []
         self.calls = 0
         self.options = options
 
-    def run(self, message: TaskMessage, stage: Any = fake_synthesize, **changes: Any) -> Event | None:
-        def counted(task: TaskMessage, context: TaskContext) -> Any:
+    def run(self, message: TaskMessage, stage=fake_synthesize, **changes) -> Event | None:
+        def counted(task: TaskMessage, context: TaskContext):
             self.calls += 1
             return stage(task, context)
 
@@ -48,7 +47,7 @@ def bench() -> Bench:
     return Bench()
 
 
-def raising(error: Exception) -> Any:
+def raising(error: Exception):
     def stage(message: TaskMessage, context: TaskContext) -> None:
         raise error
 
@@ -84,7 +83,7 @@ def test_a_shard_left_without_its_manifest_is_described_as_it_is(bench: Bench) -
     other.put(first.key, bench.store.get(first.key))
     bench.store = other
 
-    def different(task: TaskMessage, context: TaskContext) -> Any:
+    def different(task: TaskMessage, context: TaskContext):
         return fake_synthesize(task.model_copy(update={"batch": 9}), context)
 
     bench.run(message, different)
@@ -131,7 +130,7 @@ def full_disk(message: TaskMessage, context: TaskContext) -> None:
         (full_disk, "No space left on device: no file could be written"),
     ],
 )
-def test_a_part_that_is_away_or_full_costs_no_attempt(bench: Bench, stage: Any, said: str) -> None:
+def test_a_part_that_is_away_or_full_costs_no_attempt(bench: Bench, stage, said: str) -> None:
     message = message_for(attempt=3)
     outcome = bench.run(message, stage)
     assert (outcome.kind, outcome.message) == (EventKind.DEFERRED, said)
@@ -157,7 +156,7 @@ def test_a_failure_that_cannot_be_recorded_is_deferred(bench: Bench, monkeypatch
     ],
 )
 def test_why_a_task_was_stopped_decides_what_is_told(bench: Bench, reason: StopReason, kind: EventKind | None) -> None:
-    def stopping(message: TaskMessage, context: TaskContext) -> Any:
+    def stopping(message: TaskMessage, context: TaskContext):
         context.stop(reason)
         context.check()
 
@@ -168,7 +167,7 @@ def test_why_a_task_was_stopped_decides_what_is_told(bench: Bench, reason: StopR
 
 
 def test_a_stage_that_ignores_the_stop_still_writes_nothing(bench: Bench) -> None:
-    def deaf(message: TaskMessage, context: TaskContext) -> Any:
+    def deaf(message: TaskMessage, context: TaskContext):
         context.stop(StopReason.CANCELLED)
         return fake_synthesize(message, TaskContext(context.store))
 
@@ -185,7 +184,7 @@ def test_a_stage_that_ignores_the_stop_still_writes_nothing(bench: Bench) -> Non
         ({"revision": 99}, "revision 99 of synthesize"),
     ],
 )
-def test_what_another_version_must_do_costs_no_attempt(bench: Bench, changed: dict[str, Any], why: str) -> None:
+def test_what_another_version_must_do_costs_no_attempt(bench: Bench, changed: dict, why: str) -> None:
     message = message_for()
     outcome = bench.run(message, **changed)
     assert outcome.kind is EventKind.DEFERRED and why in outcome.message and bench.calls == 0
@@ -204,7 +203,7 @@ def test_what_another_version_must_do_costs_no_attempt(bench: Bench, changed: di
     ],
     ids=["number", "path", "scene", "file", "size", "many"],
 )
-def test_what_is_no_message_is_refused(bench: Bench, forged: dict[str, Any]) -> None:
+def test_what_is_no_message_is_refused(bench: Bench, forged: dict) -> None:
     message = message_for(scene="table")
     if "scene" in forged:
         forged = {"request": message.request.model_dump(mode="json") | forged}

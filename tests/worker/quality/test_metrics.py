@@ -3,7 +3,6 @@
 import dataclasses
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -294,7 +293,7 @@ def test_later_process_measures_with_what_the_first_one_computed(own_cache: Path
     first = distances_of(Probe(FINGERS, BALL, hand_points=100, object_points=64))
     assert len(list(own_cache.iterdir())) == 1
 
-    def never(self: Any, points: Any, reach: float = 0.0) -> Any:
+    def never(self, points, reach: float = 0.0):
         raise AssertionError("it is there already")
 
     with monkeypatch.context() as patched:

@@ -18,7 +18,7 @@ from graspd.worker.grasps import Posture
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import load_hand
 from graspd.worker.hands.model import HandModel
-from graspd.worker.rendering import Extras, render, sheets
+from graspd.worker.rendering import Extras, render
 from graspd.worker.rendering.hands import DrawnHand, drawn_bodies, hand_parts, without_visuals
 from graspd.worker.rendering.pictures import THREE_SIDES, grasp_pictures
 from graspd.worker.rendering.scenery import TABLE, TABLE_SIZE, seen_share, slab_poses, slabs
@@ -119,19 +119,6 @@ def test_a_views_page_has_a_row_per_placement_and_a_column_for_a_hand(block, ste
     assert page.shape[1] == without.shape[1] + 64 + GAP
     shown = (page == [255, 0, 255]).all(axis=-1)
     assert shown.sum() == 2 * 48 * 64 and not shown[:, : without.shape[1] - MARGIN].any()
-
-
-def test_boxes_are_drawn_the_loose_ones_with_the_wider_line() -> None:
-    views = {
-        "image/rgb": np.zeros((1, 60, 80, 3)),
-        "image/segmentation": np.zeros((1, 60, 80)),
-        "box/bounding_box_3d": np.tile([-10.0, -10, 1], (1, 8, 1)),
-        "camera/intrinsics": np.eye(3)[None],
-        "box/bounding_box_2d_loose": np.array([[10.0, 10, 70, 50]]),
-        "box/bounding_box_2d_tight": np.array([[30.0, 20, 60, 40]]),
-    }
-    row = np.asarray(sheets._boxes(views, 0).convert("L"), float)[30]
-    assert row[5:20].sum() > 1.5 * row[25:35].sum() > 0
 
 
 def test_depth_colours_darken_with_distance_and_grey_is_nothing():

@@ -2,7 +2,6 @@
 
 from functools import partial
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -65,7 +64,7 @@ def evaluated(state: HandState) -> Projection:
 
 def equations(found: Projection, state: HandState, b: int) -> tuple[np.ndarray, np.ndarray, int]:
     """J'WJ (n, n), J'We (n,) and the number of residuals of hand b, in double precision."""
-    r: Any = found.residuals
+    r = found.residuals
     count = int(r.count.numpy()[b])
     body, other, point, direction, value, weight = (
         getattr(r, name).numpy()[b, :count] for name in ("body", "other", "point", "direction", "value", "weight")
@@ -196,11 +195,11 @@ def test_batch_has_the_same_bits_where_threads_come_in_any_order(monkeypatch: py
     check_same(*states)
 
 
-def replayed_graphs(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+def replayed_graphs(monkeypatch: pytest.MonkeyPatch) -> list:
     """Graphs that `Launches` replays from now on, for a device that is said to be CUDA."""
-    replayed: list[Any] = []
+    replayed = []
 
-    def replay(graph: Any) -> None:
+    def replay(graph) -> None:
         replayed.append(graph)
         wp.capture_launch(graph)
 

@@ -1,7 +1,6 @@
 """Distances and normals of surfaces and pieces against closed forms, the mesh and NumPy; grids kept on disk."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -242,7 +241,7 @@ def computed(own_cache: Path, monkeypatch: pytest.MonkeyPatch) -> list[tuple[int
     shapes: list[tuple[int, ...]] = []
     sampled = grids._sampled
 
-    def watched(skin: Any, shape: tuple[int, ...]) -> Any:
+    def watched(skin, shape: tuple[int, ...]):
         shapes.append(shape)
         return sampled(skin, shape)
 
@@ -263,13 +262,13 @@ def same(one: Grid, other: Grid) -> bool:
     return all(one[name].dtype == other[name].dtype and np.array_equal(one[name], other[name]) for name in one)
 
 
-def test_a_later_process_reads_what_the_first_one_computed(computed: list[Any], own_cache: Path) -> None:
+def test_a_later_process_reads_what_the_first_one_computed(computed: list, own_cache: Path) -> None:
     first, second = kept_grid(), kept_grid()
     assert same(first, second) and len(first["face"]) > 0
     assert len(computed) == 1 and len(list(own_cache.iterdir())) == 1
 
 
-def test_another_cell_faces_or_binary_is_another_grid(computed: list[Any], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_cell_faces_or_binary_is_another_grid(computed: list, monkeypatch: pytest.MonkeyPatch) -> None:
     kept_grid()
     coarse = kept_grid(cell=0.01)
     kept_grid(alpha=1.0)

@@ -3,7 +3,6 @@
 from dataclasses import replace
 from itertools import count
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -36,7 +35,7 @@ _PALM = '<collision><geometry><box size="0.09 0.09 0.02"/></geometry></collision
 _FINGER = '<collision><origin xyz="0 0 0.05"/><geometry><box size="0.012 0.012 0.1"/></geometry></collision>'
 
 
-def held(count: int) -> Any:
+def held(count: int):
     ones = np.ones(count)
     columns = {f"quality/{name}": ones for name in ("success", "verdict_margin")}
     columns |= {f"quality/{name}": ones[:, None] for name in ("epsilon", "verdict_outcome")}
@@ -74,7 +73,7 @@ def test_what_a_hand_lifts_at_best_is_a_line_of_its_check() -> None:
     assert len(summary(AssetKind.HAND, {"self_test": replace(held, limit=None).facts()})) == 1
 
 
-def three_fingers(**options: Any) -> HandModel:
+def three_fingers(**options) -> HandModel:
     fingers = [link(f"finger{k}", _FINGER) for k in range(3)]
     for k, (x, y) in enumerate(((0.03, 0.0), (-0.015, 0.026), (-0.015, -0.026))):
         fingers.append(joint(f"bend{k}", "palm", f"finger{k}", origin=f"{x} {y} 0.01", axis=f"{y} {-x} 0"))
@@ -102,7 +101,7 @@ def test_objects_are_no_thinner_than_opposed_pads_come_together(monkeypatch: pyt
 def test_a_busy_machine_leaves_nothing_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("time.monotonic", count(0.0, 1e4).__next__)
 
-    def batches(hand: HandModel, obj: ObjectModel, count: int, run: ExecutionContext) -> Any:
+    def batches(hand: HandModel, obj: ObjectModel, count: int, run: ExecutionContext):
         run.progress(1, 10, "planning")
         run.check("planning")
         return [held(count)]

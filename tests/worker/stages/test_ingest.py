@@ -11,7 +11,6 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -179,7 +178,7 @@ def zipped(files: dict[str, bytes]) -> bytes:
     return buffer.getvalue()
 
 
-def upload(store: Store, kind: AssetKind, filename: str, data: bytes, options: dict[str, Any] | None = None) -> Any:
+def upload(store: Store, kind: AssetKind, filename: str, data: bytes, options: dict | None = None):
     """What a user is told of an upload: refused at the door, or what the worker's check says."""
     try:
         files = files_of_upload(kind, filename, data, limit_bytes=UPLOAD_BYTES)
@@ -198,7 +197,7 @@ def bad_files(shared_data: Path) -> list[dict[str, str]]:
     return list(json.loads((shared_data / "bad" / "INDEX.json").read_text())["inputs"])
 
 
-def is_expected(found: dict[str, Any], entry: dict[str, str]) -> bool:
+def is_expected(found: dict, entry: dict[str, str]) -> bool:
     return found["verdict"] == entry["expect"] and entry["message_names"].lower() in found["message"].lower()
 
 

@@ -5,7 +5,6 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -52,7 +51,7 @@ from tests.networks import LEARNED, network_files, random_network
 STAGES = {Stage.SCENE: scene.run, Stage.SYNTHESIZE: synthesize.run, Stage.RENDER: render.run}
 
 
-def job_of(store: Store, span: int = 1, **request: Any) -> JobRecord:
+def job_of(store: Store, span: int = 1, **request) -> JobRecord:
     """A job of the built-in hand and object, in the store with them."""
     hand = publish_asset(store, AssetKind.HAND, "barrett", builtin_files(AssetKind.HAND, "barrett"))
     obj = publish_asset(store, AssetKind.OBJECT, "block", builtin_files(AssetKind.OBJECT, "block"))
@@ -86,7 +85,7 @@ class Bench:
     store: Store
     job: JobRecord = field(init=False)
 
-    def run(self, **request: Any) -> tuple[EventKind, str]:
+    def run(self, **request) -> tuple[EventKind, str]:
         """Kind and words of the end of a job's first batch."""
         for one in request.get("neighbours", ()):
             files = builtin_files(AssetKind.OBJECT, one["object"])
@@ -164,7 +163,7 @@ def test_neighbours_in_a_bin_stand_in_scenes_grasps_and_pictures(table: Bench) -
     assert set(np.unique(views["image/segmentation"])) - {0, 1, 2}
 
 
-def render_alone(bench: Bench, base: Shard) -> dict[str, Any]:
+def render_alone(bench: Bench, base: Shard) -> dict:
     message = message_of(bench.job, list(plan(bench.job))[-1], attempt=1, max_attempt=3)
     request, obj = bench.job.request, object_of(bench.store, message)
     options = {"views": 1, "stereo": False, "width": request.width, "height": request.height}
@@ -204,7 +203,7 @@ ASKEW |= {"neighbours": [{"object": "mug", "pose": [0.02, 0, 0, 1, 0, 0, 0]}]}
         ({"scene": "table", "method": "elsewhere"}, "unknown method"),
     ],
 )
-def test_what_only_a_worker_can_know_fails_the_job_in_a_line(table: Bench, changes: dict[str, Any], words: str) -> None:
+def test_what_only_a_worker_can_know_fails_the_job_in_a_line(table: Bench, changes: dict, words: str) -> None:
     kind, said = Bench(table.store).run(**TABLE | {"views": 0, "grasps": 1} | changes)
     assert kind is EventKind.FAILED and re.search(words, said)
 
@@ -221,7 +220,7 @@ def small_batches(monkeypatch: pytest.MonkeyPatch) -> None:
 small = pytest.mark.usefixtures("small_batches")
 
 
-def made(store: Store, span: int, **request: Any) -> tuple[JobRecord, list[tuple[Stage, Shard, Any]]]:
+def made(store: Store, span: int, **request) -> tuple[JobRecord, list[tuple]]:
     """What a job makes whose tasks have so many batches: stage, shard and manifest of each task."""
     job = job_of(store, span, fidelity="draft", seed=3, **request)
     end = end_of(store, job)
@@ -236,7 +235,7 @@ def made(store: Store, span: int, **request: Any) -> tuple[JobRecord, list[tuple
     [{"scenes": 2}, {"rechecks": SIZE}, {"scene": "table", "scenes": 2, "budget": 20}],
     ids=["scenes after", "rechecks of the first batch", "scenes before"],
 )
-def test_a_range_is_its_batches_one_after_the_other(request_of: dict[str, Any]) -> None:
+def test_a_range_is_its_batches_one_after_the_other(request_of: dict) -> None:
     apart = made(open_store("memory://"), 1, grasps=2 * SIZE + 1, **request_of)[1]
     _, together = made(open_store("memory://"), 3, grasps=2 * SIZE + 1, **request_of)
     assert len(apart) == 3 * len(together) > 0
@@ -307,7 +306,7 @@ def test_a_batch_without_a_place_has_no_grasps_but_for_the_first(monkeypatch, re
     """As where none is found within the budget: the grasps of the other batches stay."""
     whole = generation.validated_grasps
 
-    def some(*given: Any, batch: int, **options: Any) -> Any:
+    def some(*given, batch: int, **options):
         if batch in refused:
             raise NoStartFound("no hand finds a way in")
         return whole(*given, batch=batch, **options)
@@ -401,7 +400,7 @@ def test_a_network_whose_finding_was_lost_is_checked_by_a_worker(store: Store, n
         {"supports": [{"kind": "box", "size": [1, 1, 0.1]}]},
     ],
 )
-def test_scene_is_refused_at_door_where_planner_finds_no_table(scene: Any) -> None:
+def test_scene_is_refused_at_door_where_planner_finds_no_table(scene) -> None:
     place = JobOptions(scene=scene).place
     assert place == scene_of(JobOptions(scene=scene).scene, faces="drawn", touch=0.0, beside=())
     try:

@@ -3,7 +3,6 @@
 import io
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -112,7 +111,7 @@ def test_a_model_is_published_once(tmp_path: Path) -> None:
     assert store.get(key) == sealed(key, object_glb(obj))
 
 
-def message(**changes: Any) -> TaskMessage:
+def message(**changes) -> TaskMessage:
     return message_for(Stage.RENDER, scenes=1, views=1).model_copy(update=changes)
 
 
@@ -120,7 +119,7 @@ OTHERS = [{"batch": 1}, {"stage": Stage.SCENE}, {"hand_digest": "d" * 32}, {"obj
 
 
 @pytest.mark.parametrize("changes", [*OTHERS, {"request": request(seed=7)}])
-def test_batches_stages_hands_objects_and_seeds_draw_anew(changes: dict[str, Any]) -> None:
+def test_batches_stages_hands_objects_and_seeds_draw_anew(changes: dict) -> None:
     assert batch_seed(message(**changes)) != batch_seed(message())
     other = message(request=request(method="graspit"), output="e" * 32)
     assert batch_seed(other) == batch_seed(message()), "two methods show their grasps in the same pictures"

@@ -9,7 +9,6 @@ import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -57,7 +56,7 @@ SCENE = json_attribute(SceneSpec(kind="bin").model_dump(mode="json"))
 
 
 @contextmanager
-def viewing(hand: HandModel, obj: ObjectModel, columns: dict[str, np.ndarray]) -> Iterator[Any]:
+def viewing(hand: HandModel, obj: ObjectModel, columns: dict[str, np.ndarray]) -> Iterator:
     from graspd.worker.viewing import Viewer, ViewerContent
 
     said = {"hand": "two fingers", "object": "block", "scene": SCENE}
@@ -86,7 +85,7 @@ def first(request) -> None:
         request.getfixturevalue("viewer").choose("all")
 
 
-def shown_at(viewer: Any, place: float) -> None:
+def shown_at(viewer, place: float) -> None:
     viewer.slider.value = place
     viewer.show()
 

@@ -2,7 +2,6 @@
 
 import enum
 from types import SimpleNamespace
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -25,11 +24,11 @@ class Stand:
         self.needs_rows, self.diverges = needs_rows, diverges
         self.steps = 0
 
-    def put_model(self, model: Any) -> Any:
+    def put_model(self, model):
         return SimpleNamespace(opt=SimpleNamespace(warn_overflow=1), mjm=model)
 
-    def make_data(self, model: Any, *, nworld: int, nconmax: int, njmax: int) -> Any:
-        def zeros(*shape: int, dtype: Any = wp.float32) -> Any:
+    def make_data(self, model, *, nworld: int, nconmax: int, njmax: int):
+        def zeros(*shape: int, dtype=wp.float32):
             return wp.zeros((nworld, *shape), dtype=dtype)
 
         room = nworld * nconmax
@@ -57,12 +56,12 @@ class Stand:
 
     _FIELDS = ("qpos", "qvel", "qacc_warmstart", "ctrl", "mocap_pos", "mocap_quat", "xfrc_applied")
 
-    def _load(self, data: Any) -> None:
+    def _load(self, data) -> None:
         for name in self._FIELDS:
             for one, row in zip(data.each, getattr(data, name).numpy(), strict=True):
                 getattr(one, name)[:] = row
 
-    def step(self, model: Any, data: Any) -> None:
+    def step(self, model, data) -> None:
         self.steps += 1
         self._load(data)
         for one in data.each:
@@ -76,7 +75,7 @@ class Stand:
         if data.njmax < self.needs_rows:
             data.overflow.fill_(int(self.OverflowType.NEFC))
 
-    def fwd_position(self, model: Any, data: Any) -> None:
+    def fwd_position(self, model, data) -> None:
         self._load(data)
         for one in data.each:
             mujoco.mj_forward(model.mjm, one)
@@ -92,5 +91,5 @@ class Stand:
         data.contact.dist.assign(depth)
 
 
-def _contacts(data: Any) -> list[tuple[Any, float]]:
+def _contacts(data) -> list[tuple]:
     return list(zip(data.contact.geom.tolist(), data.contact.dist.tolist(), strict=True)) if data.ncon else []

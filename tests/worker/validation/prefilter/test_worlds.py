@@ -3,7 +3,6 @@
 import dataclasses
 import logging
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 import pytest
@@ -183,7 +182,7 @@ def test_a_first_judge_that_the_cpu_contradicts_is_not_believed(standard: Verdic
 
 
 def test_where_a_gpu_has_no_memory_for_it_the_cpu_judges(monkeypatch, caplog: pytest.LogCaptureFixture) -> None:
-    def full(*_: Any) -> Any:
+    def full(*_):
         raise RuntimeError("Failed to allocate 4096 bytes on device 'cuda:0'")
 
     monkeypatch.setattr(screening, "WorldPool", full)
@@ -210,7 +209,7 @@ def test_an_audit_follows_the_grasp_and_not_its_batch(monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize("mode", ["on", "off"])
-def test_a_shard_tells_of_each_grasp_who_validated_it(mode: Any) -> None:
+def test_a_shard_tells_of_each_grasp_who_validated_it(mode) -> None:
     request = JobOptions(grasps=1, validation="fast", want="candidates", rechecks=0)
     run = ExecutionContext(prefilter=mode, threads=1)
     found = scored(PADS, BOX, every_kind(), request, pieces=lambda obj: WHOLE, run=run)
