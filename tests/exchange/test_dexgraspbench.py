@@ -18,7 +18,6 @@ from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
-from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.environment import Obstacle, PlacedGrasps
 from tests.exchange.bench_loader import PREFIX, files_of, load, tabletop_test
 from tests.worker.commands_run import graspd
@@ -28,7 +27,7 @@ ROUNDING_M = 1e-8
 
 
 @pytest.fixture(scope="module")
-def bench(hand: HandModel, block: ObjectModel, grasps: GraspSet, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def bench(hand: HandModel, block, grasps: GraspSet, tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("bench")
     dexgraspbench.write(hand, block, grasps, range(len(grasps)), root)
     return root
@@ -53,7 +52,7 @@ def test_a_grasp_has_each_field_that_is_read(bench: Path, hand: HandModel, grasp
     assert json.loads((bench / "assets/object/graspd/valid_split/all.json").read_text()) == ["block"]
 
 
-def test_the_object_weighs_what_the_evaluator_wants(bench: Path, block: ObjectModel) -> None:
+def test_the_object_weighs_what_the_evaluator_wants(bench: Path, block) -> None:
     found = load(bench, files_of(bench, "graspd_barrett")[0], "graspd_barrett")
     number = found.model.body("object").id
     assert found.model.body_mass[number] == pytest.approx(0.1, rel=1e-4)  # float32 of MuJoCo's meshes
@@ -63,7 +62,7 @@ def test_the_object_weighs_what_the_evaluator_wants(bench: Path, block: ObjectMo
     assert info["mass"] == pytest.approx(info["density"] * block.volume, rel=0.05)  # the pieces' against the mesh's
 
 
-def test_every_file_beside_the_pieces_is_a_piece_also_later(bench, hand, block: ObjectModel, grasps: GraspSet) -> None:
+def test_every_file_beside_the_pieces_is_a_piece_also_later(bench, hand, block, grasps: GraspSet) -> None:
     pieces = bench / np.load(files_of(bench, "graspd_barrett")[0], allow_pickle=True).item()["obj_path"] / "urdf/meshes"
     (pieces / "convex_piece_099.obj").write_text("of another decomposition")
     dexgraspbench.write(hand, block, grasps, [0], bench)
@@ -71,7 +70,7 @@ def test_every_file_beside_the_pieces_is_a_piece_also_later(bench, hand, block: 
 
 
 @pytest.mark.parametrize("name", ["barrett", "allegro", "shadow"])
-def test_the_evaluators_hand_stands_where_ours_does(name: str, block: ObjectModel, tmp_path: Path) -> None:
+def test_the_evaluators_hand_stands_where_ours_does(name: str, block, tmp_path: Path) -> None:
     hand = hand_from_path(name)
     grasps = random_postures(hand)
     files = dexgraspbench.write(hand, block, grasps, [0, 1], tmp_path)
@@ -104,7 +103,7 @@ def test_evaluators_bodies_and_actuators_are_those_of_the_hand(bench: Path, hand
         assert any(name.startswith(prefix) for name in said["valid_body_name"])
 
 
-def test_a_hand_of_meshes_is_loaded_with_them(shared_data: Path, block: ObjectModel, tmp_path, monkeypatch) -> None:
+def test_a_hand_of_meshes_is_loaded_with_them(shared_data: Path, block, tmp_path, monkeypatch) -> None:
     hand = hand_from_path(shared_data / "hands" / "allegro" / "allegro_hand_right.urdf")
     (file,) = dexgraspbench.write(hand, block, random_postures(hand), [0], tmp_path)
     monkeypatch.chdir(tmp_path)  # nothing may depend on where the export was written
@@ -164,7 +163,7 @@ def test_benchmarks_hand_is_mapped_to_its_model(shared_data, block, tmp_path, co
     assert [ours for _, ours in mapping["joints"]][first + len(chain) - 1] == tip
 
 
-def test_grasps_for_benchmarks_own_model_come_back_as_they_were(block: ObjectModel, tmp_path: Path) -> None:
+def test_grasps_for_benchmarks_own_model_come_back_as_they_were(block, tmp_path: Path) -> None:
     hand = hand_from_path("shadow")
     grasps = random_postures(hand)
     dexgraspbench.write(hand, block, grasps, [0, 1], tmp_path)
@@ -335,7 +334,7 @@ def test_an_import_is_validated_by_its_lift(tabletop: Path, candidates: Shard, t
     assert {"grasp/approach", "grasp/lift", "quality/lift_hard", "scene/object_pose"} <= set(found.arrays)
 
 
-def test_free_grasps_and_grasps_on_tables_do_not_mix(tabletop, hand, block: ObjectModel, grasps: GraspSet) -> None:
+def test_free_grasps_and_grasps_on_tables_do_not_mix(tabletop, hand, block, grasps: GraspSet) -> None:
     dexgraspbench.write(hand, block, grasps, [0], tabletop)
     assert len(files_of(tabletop, CONFIG)) == 1 and len(files_of(tabletop, CONFIG, EXPERIMENT)) == COUNT
     sets = dexgraspbench.read(tabletop, hand="barrett", obj="block")

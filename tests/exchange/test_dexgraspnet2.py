@@ -3,7 +3,6 @@
 import shutil
 import tracemalloc
 import zipfile
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -24,8 +23,6 @@ from graspd.service.store.shards import Shard, read_shard, write_shard
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.jaws import fingertip_pad
 from graspd.worker.hands.kinematics import body_poses
-from graspd.worker.hands.model import HandModel
-from graspd.worker.objects.model import ObjectModel
 from graspd.worker.rendering.annotate import TABLE
 from tests.exchange.dexgraspnet2_loader import graspness_at, pointed, sample, some_views
 from tests.worker.commands_run import graspd, refused
@@ -38,7 +35,7 @@ POINT_M = 8e-5
 
 
 @pytest.fixture(scope="module")
-def root(exported: Callable[[str], Path]) -> Path:
+def root(exported) -> Path:
     return exported("dexgraspnet2")
 
 
@@ -48,7 +45,7 @@ def split(root: Path) -> range:
     return TRAIN if next((root / "data" / "dex_grasps_new" / "scene_0000").rglob("*.npz")).stem == "block" else VAL
 
 
-def test_every_view_that_may_be_drawn_can_be_read(root: Path, hand: HandModel) -> None:
+def test_every_view_that_may_be_drawn_can_be_read(root: Path, hand) -> None:
     for split in (TRAIN, VAL):
         for scene, view in some_views(root, split, 6, seed=3):
             found = sample(root, scene, view, "barrett", list(hand.joint_names))
@@ -75,7 +72,7 @@ def test_a_fingertip_stands_where_ours_does_in_the_camera(root, split, hand, sto
         assert len(rows)
 
 
-def test_the_object_of_the_cloud_is_where_grasps_mean_it(root, split, hand: HandModel, block: ObjectModel) -> None:
+def test_the_object_of_the_cloud_is_where_grasps_mean_it(root, split, hand, block) -> None:
     mesh = trimesh.Trimesh(block.vertices, block.faces, process=False)
     for scene, view in some_views(root, split, 4, seed=5):
         found = sample(root, scene, view, "barrett", list(hand.joint_names))
@@ -98,7 +95,7 @@ def placed(root: Path, scene: str, view: int, points: np.ndarray) -> np.ndarray:
     return np.asarray(points @ pose[:, :3].T + pose[:, 3])
 
 
-def test_a_grasp_points_where_its_script_says(root, split, hand: HandModel, stored: Shard, block: ObjectModel) -> None:
+def test_a_grasp_points_where_its_script_says(root, split, hand, stored: Shard, block) -> None:
     surface, names = surface_samples(block), list(hand.joint_names)
     pads = [fingertip_pad(hand, tip).centre for tip in hand.fingertips]
     (scene, view), *_ = some_views(root, split, 1, seed=6)
@@ -114,7 +111,7 @@ def test_a_grasp_points_where_its_script_says(root, split, hand: HandModel, stor
     assert len(rows)
 
 
-def test_graspness_is_that_of_its_script(root: Path, split: range, hand: HandModel, block: ObjectModel) -> None:
+def test_graspness_is_that_of_its_script(root: Path, split: range, hand, block) -> None:
     surface = surface_samples(block)
     for scene, view in some_views(root, split, 3, seed=7):
         found = sample(root, scene, view, "barrett", list(hand.joint_names))
@@ -128,14 +125,14 @@ def test_graspness_is_that_of_its_script(root: Path, split: range, hand: HandMod
         assert found.graspness.max() > np.log(0.5)
 
 
-def test_graspness_belongs_to_cloud_that_a_depth_camera_tells(on_tables: Path, hand: HandModel, tmp_path: Path) -> None:
+def test_graspness_belongs_to_cloud_that_a_depth_camera_tells(on_tables: Path, hand, tmp_path: Path) -> None:
     graspd("export --format dexgraspnet2 --noise stereo -o", tmp_path, on_tables)
     for scene, view in some_views(tmp_path, TRAIN, 4, seed=8):
         found = sample(tmp_path, scene, view, "barrett", list(hand.joint_names))
         assert found.has_graspness and (found.graspness[found.seg == 1] > np.log(1e-3)).any()
 
 
-def test_a_view_of_nothing_has_no_cloud_and_no_graspness(on_tables: Path, hand: HandModel, tmp_path: Path) -> None:
+def test_a_view_of_nothing_has_no_cloud_and_no_graspness(on_tables: Path, hand, tmp_path: Path) -> None:
     views = read_shard(on_tables / "block-views.h5", kind="views")
     labels = np.array(views["image/segmentation"])
     labels[::2] = np.minimum(labels[::2], TABLE)
@@ -236,7 +233,7 @@ def test_pixels_of_the_object_take_what_is_nearest() -> None:
     assert not scene.of_view(depth, labels, K, np.eye(4), ahead + np.array([0, 0, 0.13, 0, 0, 0, 0])).any()
 
 
-def test_a_hand_looks_between_its_thumb_and_its_fingers(hand: HandModel, grasps: GraspSet) -> None:
+def test_a_hand_looks_between_its_thumb_and_its_fingers(hand, grasps: GraspSet) -> None:
     palm, line = lines_of_sight(hand, grasps.grasp)
     np.testing.assert_allclose(np.linalg.norm(line, axis=1), 1)
     assert palm.shape == (len(grasps.grasp), 3)
@@ -247,7 +244,7 @@ def test_a_hand_looks_between_its_thumb_and_its_fingers(hand: HandModel, grasps:
     assert lines_of_sight(hand, still)[1] @ hand.palm.approach > 0.9
 
 
-def test_many_grasps_take_no_more_memory(block: ObjectModel) -> None:
+def test_many_grasps_take_no_more_memory(block) -> None:
     surface = surface_samples(block)
 
     def most(count: int) -> int:

@@ -1,7 +1,6 @@
 """A folder that DexLearn trains on: each field as its loader reads it, and the grasps as they were."""
 
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import mujoco
@@ -17,10 +16,7 @@ from graspd.service.model.transforms import apply, invert, pose_to_matrix
 from graspd.service.readers import Pictures, open_shards
 from graspd.service.readers.clouds import COLUMNS
 from graspd.service.readers.depth_noise import noise_of
-from graspd.service.store.shards import Shard
 from graspd.worker.hands.kinematics import body_poses
-from graspd.worker.hands.model import HandModel
-from graspd.worker.objects.model import ObjectModel
 from tests.exchange.dexlearn_loader import Data, Sample
 from tests.worker.commands_run import graspd
 
@@ -32,7 +28,7 @@ POINT_M = 2e-5
 
 
 @pytest.fixture(scope="module")
-def checkout(exported: Callable[[str], Path]) -> Path:
+def checkout(exported) -> Path:
     return exported("dexlearn")
 
 
@@ -55,7 +51,7 @@ def every(checkout: Path, name: str) -> list[Sample]:
     return [one for split in ("train", "test") for one in data.samples(split) if name in one.file.parts]
 
 
-def test_a_fingertip_stands_where_ours_does(checkout: Path, hand: HandModel, stored: Shard) -> None:
+def test_a_fingertip_stands_where_ours_does(checkout: Path, hand, stored) -> None:
     model = mujoco.MjModel.from_xml_path(str(checkout / "assets" / "hand" / "graspd_barrett" / "hand.xml"))
     state = mujoco.MjData(model)
     tip = hand.fingertips[0]
@@ -75,7 +71,7 @@ def test_a_fingertip_stands_where_ours_does(checkout: Path, hand: HandModel, sto
     assert len(rows) == len(set(rows)) > 0
 
 
-def test_a_cloud_lies_on_the_object_where_its_scene_has_it(checkout: Path, block: ObjectModel) -> None:
+def test_a_cloud_lies_on_the_object_where_its_scene_has_it(checkout: Path, block) -> None:
     mesh = trimesh.Trimesh(block.vertices, block.faces, process=False)
     for sample in every(checkout, "block"):
         thing = sample.scene["scene"]["block"]
@@ -86,7 +82,7 @@ def test_a_cloud_lies_on_the_object_where_its_scene_has_it(checkout: Path, block
             assert np.abs(trimesh.proximity.closest_point(there, cloud)[1]).max() < POINT_M
 
 
-def test_a_cloud_of_a_free_object_lies_on_it_where_it_is_itself(on_tables: Path, block: ObjectModel) -> None:
+def test_a_cloud_of_a_free_object_lies_on_it_where_it_is_itself(on_tables: Path, block) -> None:
     pictures = Pictures(open_shards(on_tables), COLUMNS, valid=False)
     mesh = trimesh.Trimesh(block.vertices, block.faces, process=False)
     seen = [look for look in looks(pictures) if look.base != "a" * 64]

@@ -15,10 +15,7 @@ from graspd.exchange.scoring import write_scored
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import compose, quat_to_matrix
 from graspd.service.store.shards import Shard, read_shard
-from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.load import hand_from_path
-from graspd.worker.hands.model import HandModel
-from graspd.worker.objects.model import ObjectModel
 
 TINY = 1e-9  # positions and quaternions are only re-ordered, not computed with
 
@@ -42,7 +39,7 @@ def test_a_file_that_would_run_code_is_refused_and_does_not(tmp_path: Path, monk
             load_npy(Path("x.npy"))
 
 
-def test_a_grasp_of_dexgraspbench_moves_with_its_object(hand, block: ObjectModel, grasps: GraspSet, tmp_path) -> None:
+def test_a_grasp_of_dexgraspbench_moves_with_its_object(hand, block, grasps, tmp_path) -> None:
     (path, *_) = dexgraspbench.write(hand, block, grasps, [0], tmp_path)
     row = load_npy(path)
     moved = np.array([0.3, -0.2, 0.7, *Rotation.from_euler("xyz", [0.3, 1.1, -2.0]).as_quat(scalar_first=True)])
@@ -55,7 +52,7 @@ def test_a_grasp_of_dexgraspbench_moves_with_its_object(hand, block: ObjectModel
     np.testing.assert_allclose(turn, quat_to_matrix(grasps.grasp.hand_pose[0, 3:]), atol=TINY)
 
 
-def test_dexgraspbench_scales_are_sets_and_another_hand_is_told(hand, block, grasps: GraspSet, tmp_path) -> None:
+def test_dexgraspbench_scales_are_sets_and_another_hand_is_told(hand, block, grasps, tmp_path) -> None:
     paths = dexgraspbench.write(hand, block, grasps, range(2), tmp_path)
     save_record(paths[0], load_npy(paths[0]) | {"obj_scale": 0.5})
     sets = dexgraspbench.read(tmp_path, hand="barrett", obj="block")
@@ -76,7 +73,7 @@ def test_dexgraspnets_angles_turn_about_the_fixed_axes(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.grasps.grasp.hand_pose[0, :3], [0.1, 0.2, -0.3])
 
 
-def test_dexgraspnets_joints_are_one_number_more_its_scale_meshs(tmp_path: Path, block: ObjectModel) -> None:
+def test_dexgraspnets_joints_are_one_number_more_its_scale_meshs(tmp_path: Path, block) -> None:
     qpos = dict.fromkeys(("WRJTx", "WRJTy", "WRJTz", "WRJRx", "WRJRy", "WRJRz"), 0.0)
     path = _dexgraspnet(tmp_path, qpos | {"robot0:THJ4": 0.37}, 1.0)
     (found,) = published.read_dexgraspnet(path, hand="shadow", obj="block")
@@ -100,7 +97,7 @@ def test_columns_and_rotating_axes_are_scipys_rotations() -> None:
         np.testing.assert_allclose(quat_to_matrix(found), matrices, atol=1e-12)
 
 
-def test_multidex_gives_the_grasps_of_one_robot_on_one_object(hand: HandModel, tmp_path: Path) -> None:
+def test_multidex_gives_the_grasps_of_one_robot_on_one_object(hand, tmp_path: Path) -> None:
     torch = pytest.importorskip("torch", reason="torch is not installed; `pip install torch` runs this test")
     joints = len(hand.joint_names)
     q = torch.cat([torch.tensor([0.1, 0.2, 0.3, 1.0, 0, 0, 0, 1, 0]), torch.full((joints,), 0.4)])
@@ -112,7 +109,7 @@ def test_multidex_gives_the_grasps_of_one_robot_on_one_object(hand: HandModel, t
     np.testing.assert_allclose(found.grasps.grasp.joint_positions, 0.4, atol=1e-6)
 
 
-def test_ddgcs_quaternion_and_joints_are_put_in_our_order(hand: HandModel, tmp_path: Path) -> None:
+def test_ddgcs_quaternion_and_joints_are_put_in_our_order(hand, tmp_path: Path) -> None:
     place = np.array([[0.1, 0.2, 0.3, 0.0, 0.0, np.sin(0.5), np.cos(0.5)]])
     angles = np.array([[0.1, 0.2, 0.3, 0.1, 0.5, 0.6, 0.7, 0.8]])
     for name, values in (("translation", place), ("representation", angles)):
@@ -126,7 +123,7 @@ def test_ddgcs_quaternion_and_joints_are_put_in_our_order(hand: HandModel, tmp_p
     assert abs(joints["finger_2_distal"]) == pytest.approx(0.6)
 
 
-def test_imported_grasps_are_scored_and_say_where_they_come_from(hand, block, grasps: GraspSet, tmp_path) -> None:
+def test_imported_grasps_are_scored_and_say_where_they_come_from(hand, block, grasps, tmp_path) -> None:
     dexgraspbench.write(hand, block, grasps, range(len(grasps)), tmp_path / "bench")
     (found,) = dexgraspbench.read(tmp_path / "bench", hand="barrett", obj="block")
     origin = Origin("dexgraspbench", "a test", "CC0-1.0")

@@ -10,7 +10,6 @@ import io
 import json
 import re
 import tarfile
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -23,10 +22,7 @@ from graspd.exchange import graspgen
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import IDENTITY_POSE
 from graspd.service.store import validity
-from graspd.service.store.shards import Shard
 from graspd.worker.hands.kinematics import body_poses
-from graspd.worker.hands.model import HandModel
-from graspd.worker.objects.model import ObjectModel
 from tests.worker.commands_run import refused
 from tests.worker.hands.grippers import OPENING, gripper
 
@@ -35,7 +31,7 @@ ROUNDING_M = 1e-12
 
 
 @pytest.fixture(scope="module")
-def data(exported: Callable[[str], Path]) -> Path:
+def data(exported) -> Path:
     return exported("graspgen")
 
 
@@ -69,7 +65,7 @@ def test_every_object_of_a_split_has_a_record_and_a_mesh(data: Path) -> None:
         assert (data / "objects" / paths[uuid]).is_file()
 
 
-def test_its_grasps_are_ours_with_their_verdicts(data, hand: HandModel, block: ObjectModel, stored: Shard) -> None:
+def test_its_grasps_are_ours_with_their_verdicts(data, hand, block, stored) -> None:
     record = record_of(data, "block")
     poses, mask = np.array(record["grasps"]["transforms"]), np.array(record["grasps"]["object_in_gripper"])
     assert poses.shape == (8, 4, 4) and mask.dtype == bool
@@ -85,7 +81,7 @@ def test_its_grasps_are_ours_with_their_verdicts(data, hand: HandModel, block: O
     np.testing.assert_allclose(mesh.bounds, [block.vertices.min(0), block.vertices.max(0)], atol=1e-8)
 
 
-def test_hands_are_turned_into_its_convention_and_jaws_close_along_x(data: Path, hand: HandModel) -> None:
+def test_hands_are_turned_into_its_convention_and_jaws_close_along_x(data: Path, hand) -> None:
     said = yaml.safe_load((data / "grippers" / "barrett.yaml").read_text())
     place, turn = said["transform_offset_from_asset_to_graspgen_convention"]
     matrix = Rotation.from_quat(turn).as_matrix()  # x y z w, as SciPy has it
@@ -99,7 +95,7 @@ def test_hands_are_turned_into_its_convention_and_jaws_close_along_x(data: Path,
     assert 0.07 < said["depth"] < 0.11
 
 
-def test_of_grasps_without_joints_fingers_close_until_they_touch(data: Path, hand: HandModel, tmp_path: Path) -> None:
+def test_of_grasps_without_joints_fingers_close_until_they_touch(data: Path, hand, tmp_path: Path) -> None:
     record = record_of(data, "block")
     del record["gripper"]
     (back,) = read_back(record, tmp_path)

@@ -2,7 +2,6 @@
 
 import io
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +14,7 @@ from graspd.service import parquet
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import apply, compose, pose_from_matrix
 from graspd.service.readers import Pictures, open_shards
-from graspd.service.store.shards import Shard
 from graspd.worker.hands.kinematics import body_poses
-from graspd.worker.hands.model import HandModel
 
 pq = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed; pip install 'graspd[parquet]'")
 #: Poses in float64 from one frame into another [m].
@@ -25,7 +22,7 @@ ROUNDING_M = 1e-12
 
 
 @pytest.fixture(scope="module")
-def folder(exported: Callable[[str], Path]) -> Path:
+def folder(exported) -> Path:
     return exported("huggingface")
 
 
@@ -61,7 +58,7 @@ def test_its_card_names_all_files_and_columns_of_pictures(folder: Path) -> None:
         assert told == {name: {"_type": "Image"} for name in ("rgb", "depth", "segmentation")}
 
 
-def test_a_row_is_a_grasp_of_ours(folder: Path, stored: Shard, hand: HandModel) -> None:
+def test_a_row_is_a_grasp_of_ours(folder: Path, stored, hand) -> None:
     rows = rows_of(folder, "grasps", "block")
     assert sorted(row["row"] for row in rows) == list(range(8))
     for row in rows:
@@ -73,7 +70,7 @@ def test_a_row_is_a_grasp_of_ours(folder: Path, stored: Shard, hand: HandModel) 
             assert row[f"{name}_joints"] == stored[f"{name}/joint_positions"][row["row"]].tolist()
 
 
-def test_picture_has_what_was_seen_and_fingertips_where_they_are(folder, on_tables, hand, stored: Shard) -> None:
+def test_picture_has_what_was_seen_and_fingertips_where_they_are(folder, on_tables, hand, stored) -> None:
     pictures = Pictures(open_shards(on_tables), valid=False)
     ours = {(one["object"], one["row"]): one for one in pictures}
     tip = hand.fingertips[0]
@@ -110,7 +107,7 @@ def test_what_is_no_table_of_grasps_is_told(folder: Path, tmp_path: Path, monkey
         huggingface.read(folder, hand="barrett", obj="block")
 
 
-def test_the_package_itself_reads_the_folder(folder: Path, tmp_path: Path, stored: Shard) -> None:
+def test_the_package_itself_reads_the_folder(folder: Path, tmp_path: Path, stored) -> None:
     datasets = pytest.importorskip("datasets", reason="`pip install datasets` runs this test")
     grasps = datasets.load_dataset(str(folder), "grasps", cache_dir=str(tmp_path))
     assert sum(len(split) for split in grasps.values()) == 16

@@ -9,7 +9,6 @@ import io
 import itertools
 import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -20,9 +19,7 @@ from graspd.exchange import lerobot
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import compose
 from graspd.service.readers import Pictures, open_shards
-from graspd.service.store.shards import Shard
 from graspd.worker.hands.kinematics import body_poses
-from graspd.worker.hands.model import HandModel
 from tests.worker.commands_run import refused
 
 pq = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed; pip install 'graspd[parquet]'")
@@ -31,7 +28,7 @@ FLOAT32_M = 1e-6
 
 
 @pytest.fixture(scope="module")
-def root(exported: Callable[[str], Path]) -> Path:
+def root(exported) -> Path:
     return exported("lerobot")
 
 
@@ -102,7 +99,7 @@ def test_statistics_are_those_of_the_frames(root: Path) -> None:
     np.testing.assert_allclose(picture[:, 0, 0], mean, atol=0.02)  # of a tenth of the pixels
 
 
-def test_an_episode_is_the_way_of_its_grasp(root: Path, on_tables: Path, hand: HandModel, stored: Shard) -> None:
+def test_an_episode_is_the_way_of_its_grasp(root: Path, on_tables: Path, hand, stored) -> None:
     pictures = [one for one in Pictures(open_shards(on_tables)) if one["object"] == "block"]
     rows, tip = frames(root), hand.fingertips[0]
     mine = [episode for episode in episodes(root) if episode["tasks"] == ["lift the block"]]
@@ -127,7 +124,7 @@ def test_an_episode_is_the_way_of_its_grasp(root: Path, on_tables: Path, hand: H
         assert any(np.array_equal(some[0]["observation.images.scene"], one) for one in seen)
 
 
-def test_grasps_come_back_with_their_ways(root: Path, stored: Shard) -> None:
+def test_grasps_come_back_with_their_ways(root: Path, stored) -> None:
     (back,) = lerobot.read(root, hand="barrett", obj="block", object_name="block")
     assert back.grasps.approach is not None and back.grasps.lift is not None
     np.testing.assert_allclose(back.grasps.approach[..., :3], stored["grasp/approach"][..., :3], atol=FLOAT32_M)

@@ -4,7 +4,6 @@ import json
 import math
 import time
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -131,7 +130,7 @@ def a_record(*maps: StabilityMap) -> Stability:
     return Stability("2026-11-21T12:00:00.000Z", "graspd stability", {"graspd": "0"}, list(maps or [a_map()]))
 
 
-def test_a_report_has_pictures_tables_and_says_what_still_breaks(tmp_path: Path) -> None:
+def test_a_report_has_pictures_tables_and_says_what_still_breaks(tmp_path) -> None:
     found = [graded(value, 1.0, 2.0) for value in (0.5, 1.5, 2.5, math.nan, math.inf)]
     assert found == ["good", "weak", "broken", "broken", "broken"]
     data, page, picture = write(a_record(), tmp_path)
@@ -144,7 +143,7 @@ def test_a_report_has_pictures_tables_and_says_what_still_breaks(tmp_path: Path)
 
 
 @pytest.mark.parametrize("content", ["no json", "{}", '{"maps": 3}'])
-def test_wrong_files_and_options_are_the_callers_mistake(tmp_path: Path, content: str) -> None:
+def test_wrong_files_and_options_are_the_callers_mistake(tmp_path, content: str) -> None:
     (tmp_path / "wrong.json").write_text(content)
     assert "no stability.json" in refused("stability --from", tmp_path / "wrong.json")
     assert "magic" in refused("stability --only magic")
@@ -243,7 +242,7 @@ def assert_valid_ones_are_clear(hand: HandModel, found: ValidatedBatch, spec: Sc
         assert mujoco_room(hand, found.grasps.grasp.take(rows), seen).min() >= MARGIN_M - 1e-6
 
 
-def test_a_plate_flat_on_a_table_ends_with_fewer_and_says_so(tmp_path: Path) -> None:
+def test_a_plate_flat_on_a_table_ends_with_fewer_and_says_so(tmp_path) -> None:
     plate = tmp_path / "plate.stl"
     trimesh.creation.box((0.15, 0.15, 0.003)).export(plate)
     words = "synth --hand barrett --units m --scene table --faces all --scenes 1 -n 2 --budget 2 --fidelity draft"
@@ -294,7 +293,7 @@ def test_a_cell_of_a_scene_tells_the_share_of_valid_grasps(valid: list[int], out
     assert scenes._told(found)[:2] == (np.mean(valid), outcome)  # type: ignore[arg-type]
 
 
-def test_maps_of_several_runs_are_drawn_and_published_as_one(tmp_path: Path) -> None:
+def test_maps_of_several_runs_are_drawn_and_published_as_one(tmp_path) -> None:
     cells = [MapCell("one", 1.0, "a", 0.5, "good")]
     for name, value in (("first", 1.0), ("second", 2.0)):
         one = StabilityMap("shared", name, "x", "y", "m", "b", cells, "s", "g")

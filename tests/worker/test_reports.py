@@ -1,7 +1,5 @@
 """Inputs that users of such tools report, each tried as its report says: `data/reports` beside the checkout."""
 
-from pathlib import Path
-
 import pytest
 import trimesh
 
@@ -48,7 +46,7 @@ def test_a_report_comes_out_as_it_should(shared_data, file, options, is_refused,
 
 
 @pytest.mark.parametrize("file", ["O02_concave_ngon/u_channel.obj", "O12_far_from_origin/box_5m.obj"])
-def test_reported_meshes_are_grasped(shared_data: Path, tmp_path: Path, file: str) -> None:
+def test_reported_meshes_are_grasped(shared_data, tmp_path, file: str) -> None:
     mesh = shared_data / "reports" / file
     words = "synth --hand barrett --fidelity draft -n 4 --object"
     assert graspd(words, mesh, "-o", tmp_path / "g.h5")["valid"] == 4

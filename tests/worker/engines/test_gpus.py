@@ -5,7 +5,6 @@ import subprocess
 import sys
 from collections import Counter
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -17,7 +16,7 @@ FOUR = [Gpu(f"cuda:{k}", f"GPU-{k:04}", "H200") for k in range(4)]
 
 
 @pytest.fixture(autouse=True)
-def own_locks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def own_locks(tmp_path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Locks of this test alone; a lock that is taken twice here is as one of two processes."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(devices, "_held", [])
@@ -26,7 +25,7 @@ def own_locks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]
         lock.close()
 
 
-def test_each_process_takes_its_own_gpu_then_they_share_evenly(tmp_path: Path) -> None:
+def test_each_process_takes_its_own_gpu_then_they_share_evenly(tmp_path) -> None:
     taken = [take(FOUR, tmp_path).name for _ in range(10)]
     assert taken[:4] == [gpu.name for gpu in FOUR]
     assert sorted(Counter(taken).values()) == [2, 2, 3, 3]
@@ -35,7 +34,7 @@ def test_each_process_takes_its_own_gpu_then_they_share_evenly(tmp_path: Path) -
     assert take(seen, tmp_path).id == "GPU-0002"
 
 
-def test_the_gpu_of_a_killed_process_is_free_again(tmp_path: Path) -> None:
+def test_the_gpu_of_a_killed_process_is_free_again(tmp_path) -> None:
     script = (
         "import sys, time, pathlib\n"
         "from graspd.worker.engines.devices import Gpu, take\n"
@@ -52,7 +51,7 @@ def test_the_gpu_of_a_killed_process_is_free_again(tmp_path: Path) -> None:
     assert take(two, tmp_path).name == "cuda:0"
 
 
-def test_without_a_place_for_locks_it_is_the_first(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_without_a_place_for_locks_it_is_the_first(tmp_path, caplog: pytest.LogCaptureFixture) -> None:
     (tmp_path / "file").write_text("")
     with caplog.at_level(logging.WARNING):
         assert take(FOUR, tmp_path / "file" / "gpus").name == "cuda:0"

@@ -1,7 +1,5 @@
 """JSON and TOML that is nested a hundred thousand deep, wherever a stranger's file or shard may hold some."""
 
-from pathlib import Path
-
 import pytest
 
 from graspd.client.dataset_commands import read_spec
@@ -28,7 +26,7 @@ DEEP = "[" * 100_000 + "]" * 100_000
         ("provenance.json", lambda path: with_provenance(Contents.__new__(Contents), path)),
     ],
 )
-def test_a_file_that_is_nested_deep_is_refused_in_one_line(name: str, reader, tmp_path: Path) -> None:
+def test_a_file_that_is_nested_deep_is_refused_in_one_line(name: str, reader, tmp_path) -> None:
     file = tmp_path / name
     file.write_text(f"hands = {DEEP}" if name.endswith("toml") else f'{{"hands": {DEEP}}}')
     with pytest.raises(InputError, match=name) as refused:

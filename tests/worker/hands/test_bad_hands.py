@@ -2,7 +2,6 @@
 
 import re
 from functools import partial
-from pathlib import Path
 
 import pytest
 import trimesh
@@ -29,14 +28,14 @@ from tests.worker.stages.test_ingest import bad_files, is_expected, upload, zipp
 
 
 @pytest.mark.parametrize(("kind", "report_of"), [("urdf", report_hand), ("mesh", report_object)])
-def test_every_bad_file_gets_a_verdict_that_names_the_defect(shared_data: Path, kind: str, report_of) -> None:
+def test_every_bad_file_gets_a_verdict_that_names_the_defect(shared_data, kind: str, report_of) -> None:
     entries = [entry for entry in bad_files(shared_data) if entry["kind"].startswith(kind)]
     assert len(entries) >= 20
     found = [(entry, report_of(str(shared_data / "bad" / entry["file"]))) for entry in entries]
     assert not [(entry, told["verdict"], told["message"]) for entry, told in found if not is_expected(told, entry)]
 
 
-def test_mesh_behind_symbolic_link_out_of_the_folder_is_not_read(tmp_path: Path) -> None:
+def test_mesh_behind_symbolic_link_out_of_the_folder_is_not_read(tmp_path) -> None:
     outside = tmp_path / "outside.stl"
     outside.write_bytes(b"secret")
     folder = tmp_path / "hand"

@@ -1,7 +1,6 @@
 """What is corrected in the browser is what the command line says and writes: the same hand comes of it."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -47,7 +46,7 @@ def same(one: HandModel, other: HandModel, *, palm: bool) -> bool:
         ({"palm": {"link": "mount"}}, ["--palm", "mount"], True),
     ],
 )
-def test_corrections_and_options_make_the_same_hand(said, options, palm: bool, tmp_path: Path) -> None:
+def test_corrections_and_options_make_the_same_hand(said, options, palm: bool, tmp_path) -> None:
     (tmp_path / "claw.urdf").write_bytes(CLAW)
     guessed = hand_from_path(tmp_path / "claw.urdf")
     facts = facts_of(hand_glb(guessed))

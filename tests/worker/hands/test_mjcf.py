@@ -2,7 +2,6 @@
 
 import re
 from dataclasses import dataclass, field, fields, make_dataclass
-from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -167,7 +166,7 @@ def test_bad_model_is_refused_in_one_line_that_names_the_defect(text: str, named
     assert "\n" not in report["message"] and len(report["message"]) < 400
 
 
-def test_nothing_but_the_upload_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_but_the_upload_is_read(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
     # MuJoCo would find these on the disk: the reader must not let it look.
     monkeypatch.chdir(tmp_path)
     (tmp_path / "meshes").mkdir()
@@ -178,7 +177,7 @@ def test_nothing_but_the_upload_is_read(tmp_path: Path, monkeypatch: pytest.Monk
             load(text)
 
 
-def test_a_model_brings_what_it_includes_and_reads_nothing_else(tmp_path: Path) -> None:
+def test_a_model_brings_what_it_includes_and_reads_nothing_else(tmp_path) -> None:
     (tmp_path / "meshes").mkdir()
     (tmp_path / "meshes" / "tip.stl").write_bytes(tip())
     (tmp_path / "meshes" / "other.stl").write_bytes(tip())
@@ -259,7 +258,7 @@ def test_what_a_hand_does_not_have_does_not_change_its_content() -> None:
     assert {f.name for f in fields(HandModel) if "told_if_set" in f.metadata} == {"tendons", "drag", "mounting"}
 
 
-def test_a_shadow_urdf_has_the_tendons_that_urdf_cannot_say(shared_data: Path) -> None:
+def test_a_shadow_urdf_has_the_tendons_that_urdf_cannot_say(shared_data) -> None:
     path = shared_data / "hands/shadow/shadow_hand_right.urdf"
     hand = hand_from_path(path)
     assert pulls(hand) == {f"{f}J0": {f"{f}J2": 1.0, f"{f}J1": 1.0} for f in FINGERS}

@@ -1,7 +1,6 @@
 """Postures in which fingers oppose one another: at pads, on a plane, beside pads; who has none is refused."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -124,7 +123,7 @@ def test_without_opposing_digits_grasps_are_not_even_planned() -> None:
         validated_grasps(pointer(), ball, JobOptions(want="candidates", grasps=1), count=1)
 
 
-def test_what_a_hand_can_hold_is_asked_once_on_a_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_a_hand_can_hold_is_asked_once_on_a_machine(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     # Without the cache in memory, as a process that begins.
     assert [oppositions._can_hold.__wrapped__(hand) for hand in (gripper(), pointer())] == [True, False]

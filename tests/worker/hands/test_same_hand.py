@@ -1,7 +1,6 @@
 """Two models of one hand: joints by name, bases by fit, fingertips as the validator."""
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -63,7 +62,7 @@ def test_a_joint_of_another_name_is_named_and_can_be_said() -> None:
         same_hand(HAND, named(HAND, names), {"FFJ3": "curl"})
 
 
-def test_a_urdf_and_the_mjcf_that_is_written_of_it_are_one_hand(tmp_path: Path) -> None:
+def test_a_urdf_and_the_mjcf_that_is_written_of_it_are_one_hand(tmp_path) -> None:
     back = hand_from_path(tmp_path / write_hand(HAND, "shadow", tmp_path))
     # Twelve digits are written.
     assert same_hand(HAND, back).fingertips_m < 1e-9

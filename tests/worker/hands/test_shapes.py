@@ -1,7 +1,6 @@
 """Convex pieces, meshes that become several, and samples of their surface."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -157,7 +156,7 @@ def test_a_failed_decomposition_leaves_the_hull_and_is_not_kept(monkeypatch: pyt
     assert measured(mesh)[0] > 1
 
 
-def test_real_hands_keep_their_hulls_but_for_barretts_palm(shared_data: Path) -> None:
+def test_real_hands_keep_their_hulls_but_for_barretts_palm(shared_data) -> None:
     counts = {"allegro/allegro_hand_right.urdf": 23, "barrett_bh280/bh280.urdf": 14, "barrett/bhand_model.urdf": 33}
     for file, count in counts.items():
         assert len(hand_from_path(shared_data / "hands" / file).pieces) == count, file

@@ -3,7 +3,6 @@
 import io
 import json
 import struct
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -202,7 +201,7 @@ def test_names_lead_nowhere_else(reference: str) -> None:
     assert beside("m/part.obj", reference, there.__contains__) is None
 
 
-def test_a_hand_brings_looks_its_meshes_name_none_from_outside(tmp_path: Path) -> None:
+def test_a_hand_brings_looks_its_meshes_name_none_from_outside(tmp_path) -> None:
     folder = tmp_path / "hand"
     (folder / "m" / "looks").mkdir(parents=True)
     outside = b"newmtl other\nmap_Kd ../../secret.png\n"

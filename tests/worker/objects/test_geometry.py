@@ -2,9 +2,7 @@
 
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -90,7 +88,7 @@ def test_distances_are_those_of_a_fine_grid_and_of_spheres() -> None:
     assert deviation(sphere(0.04, 128), sphere(0.041, 128)) == pytest.approx(1e-3, abs=3e-5)
 
 
-def test_mesh_distance_equals_the_minimum_over_all_triangles(shared_data: Path) -> None:
+def test_mesh_distance_equals_the_minimum_over_all_triangles(shared_data) -> None:
     path = shared_data / "objects" / "024_bowl" / "clean.stl"
     model = object_from_path(path, 0.0)
     faces = model.faces.astype(np.int64)
@@ -213,7 +211,7 @@ def refused(data: bytes) -> str:
     [(refused, UTM), (lambda data: str(check_object({"b.stl": data}, "box")["message"]), (3000.0, 0.0, 0.0))],
     ids=["refused", "a note"],
 )
-def test_file_whose_numbers_do_not_tell_its_points_apart_is_told(tell: Callable[[bytes], str], place) -> None:
+def test_file_whose_numbers_do_not_tell_its_points_apart_is_told(tell, place) -> None:
     told = tell(stl_of(box_at(place)))
     assert "where the file's numbers are" in told and "OBJ, PLY" in told
 

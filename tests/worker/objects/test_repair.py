@@ -1,7 +1,5 @@
 """From triangles to a solid: what is repaired, what is refused, and that both are said."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import trimesh
@@ -33,7 +31,7 @@ def check(mesh: Mesh, **options) -> dict:
         ("open_shell.stl", {"allow_open": True}, None),
     ],
 )
-def test_the_mend_that_a_refusal_names_works(shared_data: Path, file: str, options, volume: float | None) -> None:
+def test_the_mend_that_a_refusal_names_works(shared_data, file: str, options, volume: float | None) -> None:
     report = report_object(str(shared_data / "bad" / file), options)
     assert report["verdict"] != "refuse"
     if volume is not None:
@@ -41,7 +39,7 @@ def test_the_mend_that_a_refusal_names_works(shared_data: Path, file: str, optio
         assert report["facts"]["volume_m3"] == pytest.approx(volume, rel=0.015)
 
 
-def test_an_open_mesh_is_marked_as_such(shared_data: Path) -> None:
+def test_an_open_mesh_is_marked_as_such(shared_data) -> None:
     files = {"m.stl": (shared_data / "bad" / "open_shell.stl").read_bytes()}
     model = load_object(files, name="m", digest="", face_error_m=0.0, options={"allow_open": True})
     assert not model.watertight and model.volume > 0
@@ -117,7 +115,7 @@ SOME = ("011_banana", "025_mug", "048_hammer", "koala")
 
 
 @pytest.mark.parametrize("chosen", [SOME, pytest.param((), marks=pytest.mark.slow)], ids=["some", "all"])
-def test_published_scans_become_closed_solids(shared_data: Path, chosen: tuple[str, ...]) -> None:
+def test_published_scans_become_closed_solids(shared_data, chosen: tuple[str, ...]) -> None:
     known = sorted((shared_data / "objects").glob("*/raw.*"))
     scans = [path for path in known if path.parent.name in chosen] if chosen else known
     assert len(scans) == (len(chosen) or 14)

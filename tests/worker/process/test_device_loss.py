@@ -2,13 +2,11 @@
 
 import logging
 from functools import partial
-from pathlib import Path
 
 import pytest
 
 from graspd.service.model.states import Priority, Stage
 from graspd.service.queue.port import EventKind
-from graspd.service.queue.rq_queue import RqQueue
 from graspd.service.store.manifests import shard_exists
 from graspd.service.store.records import task_attempts
 from graspd.worker.engines.devices import DeviceLost
@@ -20,7 +18,7 @@ from tests.worker.process.test_runner import Bench, raising
 
 
 @pytest.fixture(autouse=True)
-def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def own_cache(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
 
@@ -64,7 +62,7 @@ def test_a_device_that_works_is_not_blamed() -> None:
     assert (bench.run(message_for(), GARBLED).kind, bench.runner.device_lost) == (EventKind.FAILED, "")
 
 
-def test_the_worker_ends_and_leaves_the_other_tasks(rq_queue: RqQueue, work, kinds, monkeypatch, caplog) -> None:
+def test_the_worker_ends_and_leaves_the_other_tasks(rq_queue, work, kinds, monkeypatch, caplog) -> None:
     monkeypatch.setattr(engine, "Runner", partial(Runner, check_device=broken))
     rq_queue.enqueue([message_for(), message_for(seed=1)], Priority.BULK)
     with caplog.at_level(logging.ERROR):

@@ -10,7 +10,6 @@ from rq.serializers import JSONSerializer
 
 from graspd.service.model.states import Priority, Stage
 from graspd.service.queue.port import EventKind
-from graspd.service.queue.rq_queue import RqQueue
 from tests.fakes import fake_synthesize, message_for
 
 
@@ -38,7 +37,7 @@ FORGERIES: dict[str, Callable[[Any, Path], object]] = {
 
 
 @pytest.mark.parametrize("what", FORGERIES)
-def test_what_is_no_task_is_passed_over(rq_queue: RqQueue, work: Any, kinds: Any, tmp_path: Path, what: str) -> None:
+def test_what_is_no_task_is_passed_over(rq_queue, work: Any, kinds: Any, tmp_path: Path, what: str) -> None:
     witness = tmp_path / "witness"
     FORGERIES[what](rq_queue.connection, witness)
     rq_queue.enqueue([message_for()], Priority.BULK)

@@ -6,14 +6,13 @@ import threading
 from graspd.service.model.messages import TaskMessage
 from graspd.service.model.states import Priority, Stage
 from graspd.service.queue.port import EventKind
-from graspd.service.queue.rq_queue import RqQueue
 from graspd.worker.process.main import GraspWorker
 from graspd.worker.stages.context import TaskContext
 from tests.fakes import fake_synthesize, message_for
 from tests.waiting import until
 
 
-def test_a_task_that_was_taken_away_ends_in_a_line_and_no_traceback(rq_queue: RqQueue, work, caplog) -> None:
+def test_a_task_that_was_taken_away_ends_in_a_line_and_no_traceback(rq_queue, work, caplog) -> None:
     def slow(message: TaskMessage, context: TaskContext):
         (lease,) = rq_queue.leases()
         rq_queue.release(lease)
@@ -27,7 +26,7 @@ def test_a_task_that_was_taken_away_ends_in_a_line_and_no_traceback(rq_queue: Rq
     assert not rq_queue.connection.keys("rq:job:*"), "nothing is left of it"
 
 
-def test_a_worker_that_an_error_broke_off_has_work_left(rq_queue: RqQueue, work, monkeypatch) -> None:
+def test_a_worker_that_an_error_broke_off_has_work_left(rq_queue, work, monkeypatch) -> None:
     """Batch scripts start it again then; where none waits any more, they end."""
     table = {Stage.SYNTHESIZE: fake_synthesize}
     assert work(table), "none waits"
@@ -44,7 +43,7 @@ def test_a_worker_that_an_error_broke_off_has_work_left(rq_queue: RqQueue, work,
     assert work(table, burst=False, max_tasks=1), "as many as were wanted"
 
 
-def test_the_end_of_a_task_waits_until_redis_takes_writes(rq_queue: RqQueue, work, kinds) -> None:
+def test_the_end_of_a_task_waits_until_redis_takes_writes(rq_queue, work, kinds) -> None:
     """Redis refuses writes here for want of replicas, as it does on a full disk."""
 
     def refuse(replicas: int) -> None:

@@ -3,7 +3,6 @@
 import json
 import math
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -103,7 +102,7 @@ def frogger_edges(grasp: dict[str, list[list[float]]]) -> np.ndarray:
     return np.concatenate([force, np.cross(np.array(grasp["contact_points_object"])[:, None], force)], axis=-1)
 
 
-def test_published_frogger_grasps_have_their_ferrari_canny(shared_data: Path) -> None:
+def test_published_frogger_grasps_have_their_ferrari_canny(shared_data) -> None:
     files = sorted((shared_data / "reference_grasps" / "frogger_allegro").glob("*.json"))
     grasps = [grasp for file in files for grasp in json.loads(file.read_text())["grasps"]]
     assert len(grasps) == 378

@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -113,7 +112,7 @@ def test_a_grasp_does_not_depend_on_the_scenes_of_the_others(planned) -> None:
     assert np.array_equal(found.grasp.hand_pose, grasps.grasp.hand_pose[:3])
 
 
-def test_synth_in_a_scene_counts_grasps_that_lift(tmp_path: Path) -> None:
+def test_synth_in_a_scene_counts_grasps_that_lift(tmp_path) -> None:
     out = tmp_path / "g.h5"
     table = "synth --hand barrett --object block --scene table"
     said = graspd(f"{table} --scenes 2 -n 3 --budget 8 --fidelity draft -o", out)
@@ -126,7 +125,7 @@ def test_synth_in_a_scene_counts_grasps_that_lift(tmp_path: Path) -> None:
     assert (again["gsr"], again["clear_share"]) == (said["valid"] / said["grasps"], 1.0)
 
 
-def test_what_is_of_free_objects_only_is_refused_in_scenes(tmp_path: Path) -> None:
+def test_what_is_of_free_objects_only_is_refused_in_scenes(tmp_path) -> None:
     out, pair = tmp_path / "g.h5", "--hand barrett --object block -o"
     graspd(f"synth -n 1 --want candidates --validation none --fidelity draft {pair}", out)
     assert "synth --scene" in refused("evaluate --protocol lift", out)
@@ -192,7 +191,7 @@ def planned_beside():
     return hand, thing, placed, grasps
 
 
-def test_synth_with_neighbours_writes_them_lifts_judge_alike(tmp_path: Path) -> None:
+def test_synth_with_neighbours_writes_them_lifts_judge_alike(tmp_path) -> None:
     out = tmp_path / "g.h5"
     table = "--scene table --with mug --scenes 1 -n 4 --want candidates --fidelity draft"
     said = graspd(f"synth --hand barrett --object block {table} -o", out)
@@ -214,7 +213,7 @@ def test_synth_with_neighbours_writes_them_lifts_judge_alike(tmp_path: Path) -> 
         ("--scene table --with no-such-thing", "no-such-thing"),
     ],
 )
-def test_what_cannot_stand_beside_an_object_is_told_in_one_line(tmp_path: Path, args: str, words: str) -> None:
+def test_what_cannot_stand_beside_an_object_is_told_in_one_line(tmp_path, args: str, words: str) -> None:
     said = refused(f"synth --hand barrett --object block {args} -o", tmp_path / "g.h5")
     assert words in said and "Traceback" not in said
 
@@ -230,7 +229,7 @@ def test_a_gripper_lifts_a_box_from_a_table() -> None:
 
 
 @pytest.fixture(scope="module")
-def shadow(shared_data: Path) -> HandModel:
+def shadow(shared_data) -> HandModel:
     hand = hand_from_path(shared_data / "hands" / "shadow" / "shadow_hand_right.urdf")
     assert hand.mounting is not None
     return hand
@@ -260,7 +259,7 @@ def lowest(mounting: HandModel, poses: np.ndarray, wrist: np.ndarray) -> float:
     return min(float(apply(bodies[:, p.body, None], p.vertices)[..., 2].min()) for p in mounting.pieces)
 
 
-def test_starts_keep_the_forearm_off_the_table(shared_data: Path, block: ObjectModel, table: Scenes) -> None:
+def test_starts_keep_the_forearm_off_the_table(shared_data, block: ObjectModel, table: Scenes) -> None:
     # A wrist that is held bent forwards: behind a palm that faces down the forearm is lowest.
     held = {"root": "palm", "fix": {"WRJ1": 0.48, "WRJ2": 0.0}}
     shadow = hand_from_path(shared_data / "hands" / "shadow" / "shadow_hand_right.urdf", held)

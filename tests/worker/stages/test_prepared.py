@@ -2,7 +2,6 @@
 
 import io
 from dataclasses import fields
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -101,7 +100,7 @@ def test_models_that_come_with_graspd_are_those_of_its_assets(kind: AssetKind) -
         assert made == builtin_model(kind, name), "python -m graspd.worker.stages.models"
 
 
-def test_a_model_is_published_once(tmp_path: Path) -> None:
+def test_a_model_is_published_once(tmp_path) -> None:
     store = open_store(tmp_path.as_uri())
     obj = object_from_path("block")
     publish_model(store, AssetKind.OBJECT, obj)

@@ -3,7 +3,6 @@
 import copy
 import dataclasses
 import json
-from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -437,7 +436,7 @@ def test_a_drive_stays_what_it_is_with_followers_or_on_a_tendon() -> None:
     assert 2 * cord.limit(back.effort) == pytest.approx(ratio.effort[dof])
 
 
-def test_the_same_model_gives_the_same_verdicts(tmp_path: Path) -> None:
+def test_the_same_model_gives_the_same_verdicts(tmp_path) -> None:
     row = evaluate(plates_case(), validation_hand=same_hand(PADS_HAND, PADS_HAND), cache=tmp_path)
     assert row["foreign_held"] == {"both": 2, "nominal": 0, "foreign": 0, "neither": 1}
     assert (row["agreement"], row["foreign_share"], row["fingertips_mm"]) == (1.0, 1.0, pytest.approx(0.0, abs=1e-6))
@@ -445,7 +444,7 @@ def test_the_same_model_gives_the_same_verdicts(tmp_path: Path) -> None:
     json.dumps(row, allow_nan=False)
 
 
-def test_a_model_with_other_pads_says_otherwise(tmp_path: Path) -> None:
+def test_a_model_with_other_pads_says_otherwise(tmp_path) -> None:
     # The other model's pads do not reach the object: they are 40 mm nearer to their joints.
     back, (foot, *pads) = np.array([0, 0, -0.04, 0, 0, 0, 0]), PADS_HAND.pieces
     moved = (dataclasses.replace(p, vertices=p.vertices + back[:3], pose=p.pose + back) for p in pads)
@@ -460,7 +459,7 @@ def test_a_model_with_other_pads_says_otherwise(tmp_path: Path) -> None:
     assert evaluate(plates_case(), validation_hand=theirs_in_ours, cache=tmp_path)["foreign_share"] == 0.0
 
 
-def test_rows_add_up_by_their_grasps(tmp_path: Path) -> None:
+def test_rows_add_up_by_their_grasps(tmp_path) -> None:
     row = evaluate(plates_case(), validation_hand=same_hand(PADS_HAND, PADS_HAND), cache=tmp_path)
     lost = {**row, "foreign_held": {"both": 0, "nominal": 1, "foreign": 1, "neither": 0}, "fingertips_mm": 0.4}
     whole = combine([row, lost])

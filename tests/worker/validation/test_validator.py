@@ -7,7 +7,6 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from types import ModuleType
 
 import mujoco
@@ -255,7 +254,7 @@ def test_unknown_levels_are_refused_and_cancelled_validator_stops() -> None:
         validate(PADS, BOX, grasp_of(), pieces=WHOLE, run=ExecutionContext(cancelled=lambda: True))
 
 
-def test_a_convex_object_is_one_piece_and_an_l_is_cut_and_kept(tmp_path: Path) -> None:
+def test_a_convex_object_is_one_piece_and_an_l_is_cut_and_kept(tmp_path) -> None:
     pieces = decompose(BOX, cache=tmp_path)
     assert len(pieces) == 1 and pieces.volume_ratio == pytest.approx(1.0, abs=1e-6)
     parts = [trimesh.creation.box((0.1, 0.02, 0.02)), trimesh.creation.box((0.02, 0.1, 0.02))]
@@ -269,7 +268,7 @@ def test_a_convex_object_is_one_piece_and_an_l_is_cut_and_kept(tmp_path: Path) -
 
 
 @pytest.mark.slow
-def test_shell_that_convex_pieces_fill_in_is_refused_with_reason(tmp_path: Path) -> None:
+def test_shell_that_convex_pieces_fill_in_is_refused_with_reason(tmp_path) -> None:
     """At this radius even the most pieces allowed stand more than 2 mm away from the inner wall."""
     shell = trimesh.creation.icosphere(subdivisions=2, radius=0.15)
     inner = trimesh.creation.icosphere(subdivisions=2, radius=0.1495)
@@ -287,7 +286,7 @@ class Exploding(Test):
 
 
 @pytest.mark.parametrize("level", ["dexgraspbench", "standard"])
-def test_a_blown_up_push_is_not_held_and_spoils_no_other_grasp(level: str, tmp_path: Path, monkeypatch) -> None:
+def test_a_blown_up_push_is_not_held_and_spoils_no_other_grasp(level: str, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     test = Exploding(build(PADS, BOX, WHOLE, MujocoOptions()))
     rollout = getattr(test, level)(grasp_of(), 0)
@@ -411,7 +410,7 @@ def test_displacement_is_free_fall_without_hand_and_none_at_rest() -> None:
 THUMB = ("joint_12.0", "joint_13.0", "joint_14.0", "joint_15.0")
 
 
-def test_a_published_grasp_without_its_thumb_is_refused(shared_data: Path) -> None:
+def test_a_published_grasp_without_its_thumb_is_refused(shared_data) -> None:
     case = load_case(shared_data / "reference_grasps" / "frogger_allegro" / "056_tennis_ball.json")
     some = case.grasps.take(np.arange(3))
     thumb = np.array([name in THUMB for name in case.hand.joint_names])
