@@ -5,12 +5,15 @@ from dataclasses import replace
 import numpy as np
 import trimesh
 
+from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.store.shards import json_attribute
 from graspd.worker.generation import ValidatedBatch
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import ConvexPiece, HandModel, PalmFrame
 from graspd.worker.objects.mesh_geometry import corner_normals
 from graspd.worker.objects.model import ObjectModel
+from graspd.worker.scenes.kinds import rest_poses, supports_of
+from graspd.worker.simulation.environment import Scenes
 
 
 def object_from_mesh(mesh: trimesh.Trimesh, name: str = "thing") -> ObjectModel:
@@ -89,6 +92,12 @@ def on_one_dof(hand: HandModel, rate: float = 1.0, offset: float = 0.0) -> HandM
     dof, multiplier = np.array([-1, 0, 0], np.int32), np.array([1.0, 1.0, rate])
     offsets = np.array([0.0, 0.0, offset])
     return replace(hand, digest="1" * 32, dof=dof, multiplier=multiplier, offset=offsets, **first)
+
+
+def on_tables(obj: ObjectModel, *, count: int = 2, seed: int = 1) -> Scenes:
+    """So many scenes of an object at rest on a table."""
+    table = SceneSpec(kind="table")
+    return Scenes(supports_of(table), rest_poses(table, obj, count=count, seed=seed)["scene/object_pose"])
 
 
 def quality_columns(count: int) -> dict[str, np.ndarray]:

@@ -11,7 +11,6 @@ import pytest
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import MeshError, TaskCancelled
 from graspd.service.model.fidelity import resolve_fidelity
-from graspd.service.model.scene_spec import SceneSpec
 from graspd.worker import generation, together
 from graspd.worker.engines.joins import batches_at_once, fitting
 from graspd.worker.execution_context import CoreSharing, ExecutionContext, parallel_map
@@ -23,14 +22,12 @@ from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import BatchRequest, NoStartFound, PlanRequest
 from graspd.worker.pool.pool import MODULES, Pool
 from graspd.worker.rounds import SMALLEST_PART, parts_of
-from graspd.worker.scenes.kinds import rest_poses, supports_of
 from graspd.worker.simulation.environment import Scenes
 from graspd.worker.together import validated_batches
-from tests.worker.models import assert_same_batch
+from tests.worker.models import assert_same_batch, on_tables
 
 REQUEST = JobOptions(fidelity=resolve_fidelity("draft"), rechecks=2, seed=3)
 ASKED = REQUEST.model_copy(update={"rechecks": 0, "grasps": 6, "seed": 0})
-TABLE = SceneSpec(kind="table")
 COUNT = 2 * SMALLEST_PART
 
 
@@ -41,7 +38,7 @@ def pair():
 
 @pytest.fixture(scope="module")
 def scenes(pair) -> Scenes:
-    return Scenes(supports_of(TABLE), rest_poses(TABLE, pair[1], count=3, seed=1)["scene/object_pose"])
+    return on_tables(pair[1], count=3)
 
 
 def noted(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int, int]]:
@@ -231,8 +228,8 @@ def test_a_run_in_this_process_makes_the_batches_of_a_job(pair) -> None:
 @pytest.fixture(scope="module")
 def own_scenes(pair) -> list[Scenes]:
     """Of each of three batches its own."""
-    poses = rest_poses(TABLE, pair[1], count=6, seed=1)["scene/object_pose"]
-    return [Scenes(supports_of(TABLE), poses[first : first + 2]) for first in (0, 2, 4)]
+    whole = on_tables(pair[1], count=6)
+    return [replace(whole, object_pose=whole.object_pose[first : first + 2]) for first in (0, 2, 4)]
 
 
 @pytest.mark.parametrize("apart", [True, False])

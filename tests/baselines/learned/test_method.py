@@ -14,7 +14,6 @@ from graspd.baselines.learned.method import ELEVATION, NEAREST_M, RETREATS, Seed
 from graspd.baselines.learned.network import Proposals, encode, save
 from graspd.service.model.errors import InputError
 from graspd.service.model.fidelity import resolve_fidelity
-from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.transforms import apply, compose, quat_from_axis_angle, quat_from_matrix, quat_rotate
 from graspd.service.store.network_file import ProposalNetwork
 from graspd.worker.execution_context import ExecutionContext
@@ -29,15 +28,14 @@ from graspd.worker.planners.fast_graspd.scene_starts import ROOM, free_ways
 from graspd.worker.planners.fast_graspd.starts import CLEAR, Probe, start_generator
 from graspd.worker.planners.known_networks import keep_file
 from graspd.worker.planners.registry import of_this_machine
-from graspd.worker.scenes.kinds import rest_poses, supports_of
 from graspd.worker.simulation.data import HandState
 from graspd.worker.simulation.environment import Obstacle, PlacedGrasps
 from graspd.worker.simulation.obstacles import DeviceObstacles
 from tests.networks import random_network
+from tests.worker.models import on_tables
 
 FEW = {"coarse_iterations": 20, "fine_iterations": 6, "polish_iterations": 2}
 QUICK = resolve_fidelity("draft").model_copy(update=FEW)
-TABLE = SceneSpec(kind="table")
 
 
 @pytest.fixture(scope="module")
@@ -56,8 +54,7 @@ def network(hand: HandModel) -> ProposalNetwork:
 
 
 def on_table(obj: ObjectModel, count: int, seed: int = 0) -> PlacedGrasps:
-    poses = rest_poses(TABLE, obj, count=2, seed=seed)["scene/object_pose"]
-    return PlacedGrasps(supports_of(TABLE), poses, np.arange(count) % 2)
+    return on_tables(obj, seed=seed).placed(np.arange(count) % 2)
 
 
 def keep(network: ProposalNetwork) -> str:

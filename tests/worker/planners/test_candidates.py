@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from graspd.service.model.fidelity import resolve_fidelity
-from graspd.service.model.scene_spec import SceneSpec
 from graspd.worker.control.postures import normal_force, squeeze
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet
@@ -18,19 +17,17 @@ from graspd.worker.planners.fast_graspd import candidates, planner
 from graspd.worker.planners.fast_graspd.candidates import GENTLER, Refinements
 from graspd.worker.planners.fast_graspd.planner import FAILED, FREE, STANDS
 from graspd.worker.planners.fast_graspd.schedule import PULL
-from graspd.worker.scenes.kinds import rest_poses, supports_of
 from graspd.worker.scenes.rollout import lift_rollout
 from graspd.worker.simulation.data import Data, HandState
 from graspd.worker.simulation.environment import Obstacle, PlacedGrasps
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.prescreening import SLIPS, push_rollout
-from tests.worker.models import two_finger_hand
+from tests.worker.models import on_tables, two_finger_hand
 from tests.worker.quality.helpers import grasp_set, posture
 from tests.worker.simulation.rigs import ball
 
 QUICK = resolve_fidelity("draft").model_copy(update={"starts": 2, "finalists": 2})
 TABLE = (Obstacle.half_space([0, 0, 1], 0.0),)
-TABLE_SPEC = SceneSpec(kind="table")
 
 
 def plain(hand, obj, state: HandState, losses: np.ndarray, placed: PlacedGrasps, *, device: str) -> GraspSet:
@@ -111,8 +108,7 @@ def pair():
 
 @pytest.fixture(scope="module")
 def placed(pair) -> PlacedGrasps:
-    poses = rest_poses(TABLE_SPEC, pair[1], count=2, seed=1)["scene/object_pose"]
-    return PlacedGrasps(supports_of(TABLE_SPEC), poses, np.arange(4) % 2)
+    return on_tables(pair[1]).placed(np.arange(4) % 2)
 
 
 @pytest.fixture(scope="module")

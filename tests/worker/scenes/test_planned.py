@@ -29,7 +29,7 @@ from graspd.worker.planners.fast_graspd.scene_starts import clear_scene_starts, 
 from graspd.worker.planners.fast_graspd.starts import CLEAR, start_generator
 from graspd.worker.planners.port import PlanRequest
 from graspd.worker.scenes.clearance import MARGIN_M, approach, transfer
-from graspd.worker.scenes.kinds import rest_poses, supports_of
+from graspd.worker.scenes.kinds import supports_of
 from graspd.worker.scenes.placement import joined_pieces, scenes_of
 from graspd.worker.scenes.rollout import scene_verdicts
 from graspd.worker.scenes.trajectory import plan_way
@@ -38,7 +38,7 @@ from graspd.worker.simulation.mounting import mounting_room
 from graspd.worker.simulation.obstacles import DeviceObstacles
 from tests.worker.commands_run import graspd, refused
 from tests.worker.hands.grippers import gripper
-from tests.worker.models import object_from_mesh
+from tests.worker.models import object_from_mesh, on_tables
 from tests.worker.simulation.test_surroundings import mujoco_distances, mujoco_room, parted
 
 #: What a draft's finish may lack of a distance that it aims at exactly [m].
@@ -50,9 +50,7 @@ QUICK = resolve_fidelity("draft").model_copy(update={"starts": 2})
 def planned():
     hand = hand_from_path("barrett")
     obj = object_from_path("block", face_error_m=QUICK.face_error_m)
-    spec = SceneSpec(kind="table")
-    scenes = Scenes(supports_of(spec), rest_poses(spec, obj, count=2, seed=1)["scene/object_pose"])
-    placed = scenes.placed(np.arange(8) % 2)
+    placed = on_tables(obj).placed(np.arange(8) % 2)
     return hand, obj, placed, synthesize(hand, obj, PlanRequest(count=8, fidelity=QUICK, seed=4, placed=placed))
 
 
@@ -220,10 +218,8 @@ def test_what_cannot_stand_beside_an_object_is_told_in_one_line(tmp_path, args: 
 
 def test_a_gripper_lifts_a_box_from_a_table() -> None:
     hand, box = gripper(), object_from_mesh(trimesh.creation.box((0.03, 0.04, 0.06)))
-    spec = SceneSpec(kind="table")
-    scenes = Scenes(supports_of(spec), rest_poses(spec, box, count=2, seed=1)["scene/object_pose"])
     wanted = JobOptions(scene="table", fidelity="draft", want="candidates", grasps=4, seed=2)
-    found = validated_grasps(hand, box, wanted, count=4, scenes=scenes, run=ExecutionContext(threads=1))
+    found = validated_grasps(hand, box, wanted, count=4, scenes=on_tables(box), run=ExecutionContext(threads=1))
     # A box between flat pads is the plainest of tasks: hardly a grasp may miss it.
     assert found.shares["lift_share"] >= 0.75
 
@@ -242,8 +238,7 @@ def block() -> ObjectModel:
 
 @pytest.fixture(scope="module")
 def table(block: ObjectModel) -> Scenes:
-    spec = SceneSpec(kind="table")
-    return Scenes(supports_of(spec), rest_poses(spec, block, count=2, seed=1)["scene/object_pose"])
+    return on_tables(block)
 
 
 @pytest.fixture(scope="module")
