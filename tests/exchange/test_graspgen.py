@@ -24,7 +24,7 @@ from graspd.service.model.transforms import IDENTITY_POSE
 from graspd.service.store import validity
 from graspd.worker.hands.kinematics import body_poses
 from tests.worker.commands_run import refused
-from tests.worker.hands.grippers import OPENING, gripper
+from tests.worker.hands.urdfs import OPENING, gripper
 
 #: JSON gives float64 back as it was; what is left is a quaternion made a matrix [m].
 ROUNDING_M = 1e-12

@@ -11,8 +11,7 @@ from graspd.worker.hands.load import hand_from_path, load_hand
 from graspd.worker.hands.model import HandModel
 from graspd.worker.stages.models import hand_glb
 from tests.worker.commands_run import graspd
-from tests.worker.hands.grippers import gripper
-from tests.worker.hands.urdfs import BOX, joint, link, robot
+from tests.worker.hands.urdfs import BOX, gripper, joint, link, robot
 
 CLAW = robot(
     link("palm", BOX),

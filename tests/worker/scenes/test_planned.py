@@ -37,7 +37,7 @@ from graspd.worker.simulation.environment import STANDOFF_M, PlacedGrasps, Scene
 from graspd.worker.simulation.mounting import mounting_room
 from graspd.worker.simulation.obstacles import DeviceObstacles
 from tests.worker.commands_run import graspd, refused
-from tests.worker.hands.grippers import gripper
+from tests.worker.hands.urdfs import gripper
 from tests.worker.models import object_from_mesh, on_tables
 from tests.worker.simulation.test_surroundings import mujoco_distances, mujoco_room, parted
 

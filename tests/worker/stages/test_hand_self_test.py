@@ -28,8 +28,7 @@ from graspd.worker.stages.hand_self_test import (
     tried_softly,
 )
 from graspd.worker.validation.payload import Limit
-from tests.worker.hands.grippers import OPENING, gripper
-from tests.worker.hands.urdfs import joint, link, robot
+from tests.worker.hands.urdfs import OPENING, gripper, joint, link, robot
 
 _PALM = '<collision><geometry><box size="0.09 0.09 0.02"/></geometry></collision>'
 _FINGER = '<collision><origin xyz="0 0 0.05"/><geometry><box size="0.012 0.012 0.1"/></geometry></collision>'

@@ -30,7 +30,7 @@ from graspd.worker.process.runner import Runner
 from graspd.worker.stages import hand_self_test, ingest
 from graspd.worker.stages.context import StopReason, TaskContext
 from graspd.worker.stages.hand_self_test import SelfTest
-from tests.worker.hands.grippers import gripper_urdf
+from tests.worker.hands.urdfs import gripper_urdf
 from tests.worker.objects.shapes import sphere, stl
 
 TETRAHEDRON = """v 0 0 0\nv 0.05 0 0\nv 0 0.05 0\nv 0 0 0.05\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"""
