@@ -107,8 +107,7 @@ UNVALIDATED = base_of([0, 0], [1, 0], None)
 
 
 def test_valid_grasps_are_taken_unless_others_are_asked_for() -> None:
-    assert choose(VALIDATED)[0].tolist() == [True, False, False]
-    assert choose(VALIDATED, every=True)[0].all()
+    assert choose(VALIDATED)[0].tolist() == [True, False, False] and choose(VALIDATED, every=True)[0].all()
     assert choose(UNVALIDATED, unvalidated=True)[0].tolist() == [True, False]
     words = [choose(VALIDATED)[1], choose(UNVALIDATED, unvalidated=True)[1], choose(VALIDATED, every=True)[1]]
     assert words == ["valid grasps", "feasible grasps that are not validated", "grasps of any kind"]

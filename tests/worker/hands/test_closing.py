@@ -154,8 +154,7 @@ def test_the_palm_faces_along_the_fingers_and_all_of_them_close(fingers: int, tu
 def test_fingers_that_meet_at_zero_close_to_it_unless_stated() -> None:
     outwards = claw(3, TURNS["upright"], lower=0.0).replace(b'axis xyz="0 -1 0"', b'axis xyz="0 1 0"')
     hand = load(outwards, approach=[0, 0, 1])
-    assert hand.closing.tolist() == [-1, -1, -1]
-    assert hand.preshape == pytest.approx(0.75 * hand.upper)
+    assert hand.closing.tolist() == [-1, -1, -1] and hand.preshape == pytest.approx(0.75 * hand.upper)
     assert load(outwards, approach=[0, 0, 1], closing={"ja0": 1}).closing.tolist() == [1, -1, -1]
 
 
@@ -192,8 +191,7 @@ def test_rounding_turns_neither_palm_nor_jaws_nor_closing() -> None:
         np.testing.assert_allclose(load(claw(3, TURNS["upright"], noise=noise)).palm.approach, [0, 0, 1], atol=1e-9)
     for noise in (1e-17, -1e-17):
         line = np.array([noise, 1.0, -noise])
-        assert sign_of(line) == 1 and sign_of(-line) == -1
-        assert sign_of(np.array([1.0, -1.0 - noise, 0])) == 1
+        assert sign_of(line) == 1 and sign_of(-line) == -1 and sign_of(np.array([1.0, -1.0 - noise, 0])) == 1
     for lower in ("-0.7", "-0.7000001", "-0.6999999"):
         assert (load(claw(3, TURNS["upright"]).replace(b'"-0.4"', f'"{lower}"'.encode())).closing == 1).all()
 

@@ -87,8 +87,7 @@ def test_joints_on_tendons_and_servos_go_as_far_as_limits_let() -> None:
     assert hand.dof_names == ("left", "right")
     q = dict(zip(hand.joint_names, hand.expand(np.array([0.6, 0.4])), strict=True))
     # left - 2 left_end keeps its length; the right end would have to bend to -0.4, and its range begins at 0.
-    assert q["left_end"] == pytest.approx(0.3)
-    assert "right_end" not in q and "right_tip" not in q
+    assert q["left_end"] == pytest.approx(0.3) and "right_end" not in q and "right_tip" not in q
     # 20 (u - q) with u to 0.7; and 0.2 u - 20 q with u to 70. The joints alone would go to 1.4.
     assert hand.upper.tolist() == pytest.approx([0.7, 0.7])
 
@@ -219,8 +218,7 @@ def test_a_command_of_torques_pulls_jaws_keep_their_ratio() -> None:
     assert tendon.gain(stiffness) * length[0] == pytest.approx(pull)
     text = re.sub('<joint joint="left_curl" coef="0.5"/>', '<joint joint="right_slide" coef="0.5"/>', CLAW)
     hand = load(re.sub('<position joint="right_slide"[^>]*>', "", text))
-    assert not hand.tendons
-    assert "right_slide" not in hand.dof_names
+    assert not hand.tendons and "right_slide" not in hand.dof_names
 
 
 def test_asset_json_puts_joints_on_a_tendon_and_takes_it_away() -> None:

@@ -34,8 +34,7 @@ from tests.worker.models import object_from_mesh
 def test_fingertips_lie_on_both_sides_of_the_middle(name: str) -> None:
     hand = hand_from_path(name)
     found = oppositions_of(hand)
-    assert len(found) >= 20
-    assert (np.diff(found.width) >= 0).all()
+    assert len(found) >= 20 and (np.diff(found.width) >= 0).all()
     assert ((found.q >= hand.lower) & (found.q <= hand.upper)).all()
     root = np.tile([0.0, 0, 0, 1, 0, 0, 0], (len(found), 1))
     tips = body_poses(hand, root, hand.expand(found.q))[:, list(hand.fingertips), :3]
@@ -52,8 +51,7 @@ def test_a_wide_hand_opposes_over_a_range_one_finger_nothing() -> None:
     assert widths[0] < 0.08 < 0.12 < widths[-1]
     hand = hand_from_path("barrett")
     alone = oppositions_of(replace(hand, name="alone", fingertips=hand.fingertips[:1]))
-    assert len(alone) == 0
-    assert alone.widest == 0.0
+    assert len(alone) == 0 and alone.widest == 0.0
 
 
 HEIGHT_M = 0.012
@@ -62,8 +60,7 @@ HEIGHT_M = 0.012
 @pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
 def test_opposed_fingertips_end_on_one_plane_and_none_is_as_low(name: str) -> None:
     hand, found = hand_from_path(name), pinches_of(hand_from_path(name), HEIGHT_M)
-    assert len(found) >= 20
-    assert (np.diff(found.width) >= 0).all()
+    assert len(found) >= 20 and (np.diff(found.width) >= 0).all()
     down = hand.palm.approach - (found.axis @ hand.palm.approach)[:, None] * found.axis
     down /= np.linalg.norm(down, axis=1, keepdims=True)
     bodies = body_poses(hand, np.tile(IDENTITY_POSE, (len(found), 1)), hand.expand(found.q))
@@ -89,8 +86,7 @@ def test_what_reaches_the_pads_has_no_such_postures() -> None:
 def test_hand_looks_at_thing_from_both_sides_and_leaves_it_room(size: Size) -> None:
     hand = hand_from_path("allegro")
     found, points = spans_of(hand, size), sample_surface(hand, 3000)
-    assert len(found) >= 10
-    assert ((found.q >= hand.lower) & (found.q <= hand.upper)).all()
+    assert len(found) >= 10 and ((found.q >= hand.lower) & (found.q <= hand.upper)).all()
     pose = body_poses(hand, np.tile(IDENTITY_POSE, (len(found), 1)), hand.expand(found.q))[:, points.body]
     place = quat_rotate(pose[..., 3:], points.position) + pose[..., :3]
     look = quat_rotate(pose[..., 3:], points.normal)
@@ -146,8 +142,7 @@ PLANE_M = 1e-9
 @pytest.mark.parametrize(("zero_is_open", "closes"), [(False, -1.0), (True, -1.0)], ids=["0 closed", "0 open"])
 def test_what_brings_the_pads_together_closes(zero_is_open: bool, closes: float, coupled: bool) -> None:
     hand = gripper(zero_is_open=zero_is_open, coupled=coupled)
-    assert (hand.closing == closes).all()
-    assert (hand.preshape == (0.0 if zero_is_open else 0.04)).all()
+    assert (hand.closing == closes).all() and (hand.preshape == (0.0 if zero_is_open else 0.04)).all()
     assert hand.palm.approach == pytest.approx([0, 0, 1])
     assert sorted(hand.body_names[body] for body in hand.fingertips) == ["left", "right"]
 
@@ -155,16 +150,14 @@ def test_what_brings_the_pads_together_closes(zero_is_open: bool, closes: float,
 def test_what_is_stated_of_closing_gains_and_limits_stays() -> None:
     assert gripper({"closing": {"right_slide": 1}}).closing.tolist() == [1.0]
     hand = gripper({"stiffness": 300.0}, effort=12.0)
-    assert hand.effort.tolist() == [12.0]
-    assert hand.stiffness.tolist() == [300.0]
+    assert hand.effort.tolist() == [12.0] and hand.stiffness.tolist() == [300.0]
 
 
 @pytest.mark.parametrize("zero_is_open", [False, True])
 def test_the_opening_is_the_distance_of_the_pads_in_mujoco(zero_is_open: bool) -> None:
     hand = gripper(zero_is_open=zero_is_open)
     jaws = jaws_of(hand)
-    assert jaws is not None
-    assert jaws.opening == pytest.approx(OPENING, abs=PLANE_M)
+    assert jaws is not None and jaws.opening == pytest.approx(OPENING, abs=PLANE_M)
     for width in (0.0, 0.02, 0.08):
         q, _, axis = jaws.at(np.array([width]))
         assert np.abs(axis[0]) == pytest.approx([1, 0, 0], abs=1e-9)
@@ -186,8 +179,7 @@ def _apart(hand: HandModel, q: np.ndarray) -> float:
 @pytest.mark.parametrize(("coupled", "each"), [(True, 25.0 * 2), (False, 25.0)])
 def test_without_effort_each_pad_gets_newtons(coupled: bool, each: float) -> None:
     hand = gripper(coupled=coupled, effort=None)
-    assert hand.effort == pytest.approx(each)
-    assert hand.stiffness == pytest.approx(2000.0 * each / 25.0)
+    assert hand.effort == pytest.approx(each) and hand.stiffness == pytest.approx(2000.0 * each / 25.0)
 
 
 def test_a_gripper_without_fingers_is_refused() -> None:

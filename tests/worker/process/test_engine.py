@@ -149,8 +149,7 @@ def test_a_worker_ends_with_its_engine_and_leaves_the_lease_to_the_controller(st
     worker = start()
     worker.begin()
     os.kill(worker.engine, signal.SIGKILL)
-    assert worker.process.wait(60) == 1
-    assert worker.queue.leases() and worker.events() == [EventKind.STARTED]
+    assert worker.process.wait(60) == 1 and worker.queue.leases() and worker.events() == [EventKind.STARTED]
 
 
 @pytest.mark.parametrize("which", ["engine", "worker"])

@@ -65,8 +65,7 @@ def test_a_task_that_fails_with_a_sound_engine_has_failed(doubted: Doubted) -> N
 @pytest.mark.parametrize("error", [MeshError("torn"), DamagedError("no JSON")])
 def test_bad_input_casts_no_doubt_on_the_worker(doubted: Doubted, error: Exception) -> None:
     doubted.engine_works = False
-    assert doubted.run(message_for(), raising(error)).kind is EventKind.FAILED
-    assert doubted.checked == []
+    assert doubted.run(message_for(), raising(error)).kind is EventKind.FAILED and doubted.checked == []
 
 
 def test_failures_in_a_row_that_others_do_not_have_are_the_workers(doubted: Doubted) -> None:
@@ -96,8 +95,7 @@ def test_a_success_in_between_ends_the_row(doubted: Doubted) -> None:
 
 def test_a_worker_comes_back_once_its_engine_works_or_gives_up(doubted: Doubted) -> None:
     doubted.engine_works = False
-    assert not doubted.fitness.try_engine((Stage.SYNTHESIZE,))
-    assert not doubted.sits_out()
+    assert not doubted.fitness.try_engine((Stage.SYNTHESIZE,)) and not doubted.sits_out()
     assert len(doubted.checked) == 1 + len(module.PAUSES_S)
     doubted.states.clear()
     doubted.engine_works = True
@@ -114,8 +112,7 @@ def test_a_fault_that_the_check_cannot_see_is_not_cured_by_passing_it(doubted: D
 def test_a_worker_in_quarantine_stops_when_told(doubted: Doubted, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "PAUSES_S", (600.0,))
     doubted.engine_works = False
-    assert not doubted.fitness.try_engine((Stage.SYNTHESIZE,))
-    assert not doubted.sits_out(told_to_stop=True)
+    assert not doubted.fitness.try_engine((Stage.SYNTHESIZE,)) and not doubted.sits_out(told_to_stop=True)
 
 
 @pytest.mark.parametrize("stage", Stage)

@@ -66,8 +66,7 @@ def test_a_task_leaves_a_shard_and_a_manifest_that_describes_it(bench: Bench) ->
     assert [event.kind for event in bench.told] == [EventKind.STARTED]
     manifest = load_manifest(bench.store, Stage.SYNTHESIZE, message.output)
     shard = read_shard(bench.store.get(manifest.key), kind="base")
-    assert manifest.counts["N"] == len(manifest.grasps) == 32
-    assert manifest.valid == shard["quality/valid"].sum()
+    assert manifest.counts["N"] == len(manifest.grasps) == 32 and manifest.valid == shard["quality/valid"].sum()
     assert manifest.index_threshold_m == 0.005
     assert [g.epsilon for g in manifest.grasps] == list(shard["quality/epsilon"][:, 1])
     assert all(g.stability_loss is None for g in manifest.grasps), "nan is no JSON number"
@@ -77,8 +76,7 @@ def test_a_task_leaves_a_shard_and_a_manifest_that_describes_it(bench: Bench) ->
 def test_a_task_that_was_done_before_is_not_done_again(bench: Bench) -> None:
     message = message_for()
     bench.run(message)
-    assert bench.run(message, raising(AssertionError("it ran"))).kind is EventKind.FINISHED
-    assert bench.calls == 1
+    assert bench.run(message, raising(AssertionError("it ran"))).kind is EventKind.FINISHED and bench.calls == 1
 
 
 def test_a_shard_left_without_its_manifest_is_described_as_it_is(bench: Bench) -> None:

@@ -394,8 +394,7 @@ def hand_on(radius: float, at: float, q: np.ndarray) -> int:
 def test_a_ball_is_held_in_a_power_grasp_in_the_palm_or_by_pads() -> None:
     hand = hand_from_path("allegro")
     closed = np.where(hand.closing != 0, hand.lower + 0.7 * hand.span, hand.preshape)
-    assert hand_on(0.03, 0.0, closed) == GraspType.POWER
-    assert hand_on(0.01, 0.5, hand.preshape) == GraspType.NONE
+    assert hand_on(0.03, 0.0, closed) == GraspType.POWER and hand_on(0.01, 0.5, hand.preshape) == GraspType.NONE
     ball = object_from_mesh(trimesh.creation.icosphere(subdivisions=3, radius=0.03))
     # Pads stand 65 mm from the middle and slide inwards by 65 - 30 - 5 mm.
     found = measure(pad_hand(), ball, grasp_set(posture(((0, 0, 0), (0.065, 0.065)))))

@@ -214,8 +214,7 @@ def test_every_picture_is_shown_for_its_time_and_again(suffix):
     if suffix == ".webp" and not features.check("webp"):
         pytest.skip("this Pillow writes no WebP")
     with Image.open(io.BytesIO(animation(colours(), SECONDS, suffix))) as film:
-        assert film.n_frames == 3
-        assert film.info.get("loop") == 0
+        assert film.n_frames == 3 and film.info.get("loop") == 0
         for frame, wanted, shown in zip(ImageSequence.Iterator(film), colours(), [500, 50, 1200], strict=True):
             # WebP is lossy: a plain colour comes back within a few of 256 steps.
             assert np.abs(np.asarray(frame.convert("RGB")).astype(int) - wanted).max() <= 6

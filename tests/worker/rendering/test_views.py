@@ -115,8 +115,7 @@ def test_depths_are_of_sphere_and_plane_and_infinite_elsewhere(ball_views, ball)
         # Where the ray grazes, the facets' 8 um inside the sphere grow without bound along the ray.
         square_on = discriminant > 0.06 * square * RADIUS**2
         seen = square_on & (ball_views["image/segmentation"][view] == 2)
-        assert seen.sum() > 500
-        assert np.array_equal(seen, square_on)
+        assert seen.sum() > 500 and np.array_equal(seen, square_on)
         assert np.abs(ball_views["image/depth"][view] - depth)[seen].max() < DEPTH_M
         table = ball_views["image/segmentation"][view] == 1
         depth = -origin[2] / rays[..., 2]
@@ -201,8 +200,7 @@ def test_columns_are_of_a_views_shard_and_mono_pictures_say_so(mug_views, ball) 
     assert mug_views["camera/eye"].tolist() == [1, 2] * 4
     assert mug_views["camera/scene_index"].tolist() == [0] * 4 + [1] * 4
     mono = shoot(ball, REST[:1], stereo=False)
-    assert mono["camera/eye"].tolist() == [0, 0]
-    assert mono["camera/stereo_baseline_m"].tolist() == [0.0, 0.0]
+    assert mono["camera/eye"].tolist() == [0, 0] and mono["camera/stereo_baseline_m"].tolist() == [0.0, 0.0]
     with pytest.raises(InputError, match="at least one"):
         shoot(ball, REST[:1], views=0)
 
@@ -410,14 +408,12 @@ def test_the_drawn_hand_is_in_its_own_pictures_and_in_no_other(ball):
         np.testing.assert_array_equal(values, seen[name])
     assert seen["camera/hand_grasp"].tolist() == [5, 5, -1, -1]
     changed = (seen["image/rgb_hand"] != seen["image/rgb"]).any(axis=-1)
-    assert changed[:2].mean(axis=(1, 2)).min() > 0.05
-    assert not changed[2:].any()
+    assert changed[:2].mean(axis=(1, 2)).min() > 0.05 and not changed[2:].any()
 
 
 def test_channels_are_named_in_any_order_and_move_pictures_alone() -> None:
     assert parse_channels(["occlusion", " distance"]) == ("distance", "occlusion")
-    assert parse_channels(["all"]) == ("distance", "normals", "occlusion")
-    assert parse_channels([""]) == ()
+    assert parse_channels(["all"]) == ("distance", "normals", "occlusion") and parse_channels([""]) == ()
     with pytest.raises(InputError, match="unknown channel 'flow'"):
         parse_channels(["flow"])
 

@@ -194,8 +194,7 @@ def test_synth_with_neighbours_writes_them_lifts_judge_alike(tmp_path) -> None:
     table = "--scene table --with mug --scenes 1 -n 4 --want candidates --fidelity draft"
     said = graspd(f"synth --hand barrett --object block {table} -o", out)
     shard = read_shard(out, kind="base")
-    assert shard["scene/neighbour_pose"].shape == (1, 1, 7)
-    assert shard.attributes["neighbours"] == ["mug"]
+    assert shard["scene/neighbour_pose"].shape == (1, 1, 7) and shard.attributes["neighbours"] == ["mug"]
     assert json.loads(str(shard.attributes["scene"]))["neighbours"][0]["object"] == "mug"
     told = graspd("evaluate --protocol lift", out)
     assert told["clear_share"] == said["clear_share"]

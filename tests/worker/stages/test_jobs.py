@@ -133,8 +133,7 @@ def test_readers_give_way_of_a_grasp_and_the_grasps_of_a_picture(table: Bench) -
     shards = open_shards(table.store, job=table.job.id)
     columns = ("grasp/approach", "grasp/lift", "grasp/scene_index", "quality/lift_hard", "quality/clearance_m")
     grasps = Grasps(shards, columns)
-    assert grasps[0]["grasp/approach"].shape == (6, 7)
-    assert len(grasps.arrays()["quality/lift_hard"]) == 6
+    assert grasps[0]["grasp/approach"].shape == (6, 7) and len(grasps.arrays()["quality/lift_hard"]) == 6
     pictures = Pictures(shards)
     assert sum(len(picture["grasp/hand_pose"]) for picture in pictures) == 6
     base, views = table.made(Stage.SYNTHESIZE), table.made(Stage.RENDER)
@@ -253,8 +252,7 @@ def test_a_range_is_its_batches_one_after_the_other(request_of: dict) -> None:
             if (firsts := {"grasp/scene_index": scenes, "grasp/base_index": bases}.get(path)) is not None:
                 pieces = [piece + first for piece, first in zip(pieces, firsts, strict=False)]
             np.testing.assert_array_equal(column, np.concatenate(pieces), err_msg=path)
-        assert manifest.batches == 3
-        assert manifest.valid == sum(one.valid for one in of_parts)
+        assert manifest.batches == 3 and manifest.valid == sum(one.valid for one in of_parts)
         assert manifest.candidates == sum(one.candidates for one in of_parts)
         assert manifest.rechecked == sum(one.rechecked for one in of_parts)
         if stage is Stage.SYNTHESIZE:
