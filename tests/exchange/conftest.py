@@ -60,8 +60,7 @@ def exported(on_tables: Path, tmp_path_factory: pytest.TempPathFactory) -> Calla
     def export(format_: str) -> Path:
         folder = tmp_path_factory.mktemp(format_) / "data"
         every = "" if format_ in ("dexgraspnet2", "graspgen") else "--all "
-        told = graspd(f"export --format {format_} {every}-o", folder, on_tables)
-        assert told["grasps"] == 16
+        assert graspd(f"export --format {format_} {every}-o", folder, on_tables)["grasps"] == 16
         return folder
 
     return export

@@ -73,8 +73,7 @@ def test_every_file_beside_the_pieces_is_a_piece_also_later(bench, hand, block, 
 def test_the_evaluators_hand_stands_where_ours_does(name: str, block, tmp_path: Path) -> None:
     hand = hand_from_path(name)
     grasps = random_postures(hand)
-    files = dexgraspbench.write(hand, block, grasps, [0, 1], tmp_path)
-    found = load(tmp_path, files[1], f"graspd_{name}")
+    found = load(tmp_path, dexgraspbench.write(hand, block, grasps, [0, 1], tmp_path)[1], f"graspd_{name}")
     assert found.model.nq == 7 + len(hand.joint_names) + 7
     for posture in dexgraspbench.POSTURES:
         found.at(found.grasp[f"{posture}_qpos"])

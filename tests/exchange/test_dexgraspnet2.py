@@ -200,8 +200,7 @@ def test_the_object_of_the_cloud_is_where_grasps_mean_it(root, split, hand, bloc
         found = sample(root, scene, view, "barrett", list(hand.joint_names))
         path = root / "data" / "scenes" / scene / "realsense"
         first = dexgraspnet2._object_pose(root / "data" / "dex_grasps_new" / scene / "barrett" / "block.npz", 0)
-        camera = pose_from_matrix(np.linalg.inv(np.load(path / "camera_poses.npy")[view]))
-        there = compose(camera, first)
+        there = compose(pose_from_matrix(np.linalg.inv(np.load(path / "camera_poses.npy")[view])), first)
         points = found.point_clouds[found.seg == 1]
         local = (points - there[:3]) @ trimesh.transformations.quaternion_matrix(there[3:])[:3, :3]
         assert np.abs(trimesh.proximity.closest_point(mesh, local)[1]).max() < POINT_M

@@ -467,8 +467,7 @@ def test_a_still_joint_is_told_and_no_flaw_that_is_not_there(kitchen: Case) -> N
 
 
 def test_cells_of_sphere_are_equal_and_one_direction_is_one_cell() -> None:
-    rng = np.random.default_rng(3)
-    vectors = rng.normal(size=(48_000, 3))
+    vectors = np.random.default_rng(3).normal(size=(48_000, 3))
     counts = cell_counts(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
     assert counts.shape == (BANDS, SECTORS) and counts.sum() == 48_000
     assert np.abs(counts - 1000).max() < 6 * np.sqrt(1000)  # six standard deviations of a count

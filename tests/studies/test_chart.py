@@ -114,8 +114,7 @@ def test_the_front_has_no_point_that_another_beats() -> None:
 def test_the_first_valid_grasp_takes_the_calls_of_a_coin() -> None:
     """Against 20,000 simulated waits; standard error below 1 %."""
     share, grasps = 0.3, 2
-    rng = np.random.default_rng(1)
-    waits = rng.geometric(1 - (1 - share) ** grasps, size=20_000)
+    waits = np.random.default_rng(1).geometric(1 - (1 - share) ** grasps, size=20_000)
     assert first_valid(share, [1.5, 9.0, 1.4], grasps) == pytest.approx(1.5 * waits.mean(), rel=0.02)
     assert first_valid(0.0, [1.5], grasps) is None
 

@@ -104,8 +104,7 @@ def test_a_job_whose_every_grasp_is_bad_ends_with_none(hand: HandModel) -> None:
 
 
 def test_a_long_run_does_not_drift(pair: Pair) -> None:
-    state = descents.starts_of(pair, 2)
-    drift = descents.descend(pair, state, FIDELITIES["draft"], iterations=1500).drift
+    drift = descents.descend(pair, descents.starts_of(pair, 2), FIDELITIES["draft"], iterations=1500).drift
     # float32: a normalised quaternion is off by a few units in the last place, 6e-8, and never by nothing at all.
     assert 0 < drift < 1e-6
 
@@ -173,8 +172,7 @@ def test_fingers_open_outward_scale_and_follow_by_ratio() -> None:
     doubled = 2 * tips(small, small.expand(small.lower))
     np.testing.assert_allclose(tips(large, large.expand(large.lower)), doubled, atol=3e-6)
     hand = ring_hand(2, coupling="distal follows", ratio=0.5)
-    joints = hand.expand(np.full(hand.dofs, 0.6))
-    by_name = dict(zip(hand.joint_names, joints, strict=True))
+    by_name = dict(zip(hand.joint_names, hand.expand(np.full(hand.dofs, 0.6)), strict=True))
     assert by_name["joint_0_2"] == pytest.approx(0.5 * by_name["joint_0_1"])
 
 

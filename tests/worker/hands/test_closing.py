@@ -50,8 +50,7 @@ def opposing_thumb(bends: str) -> list[str]:
 
 
 def hand_of(text: bytes, **options: object) -> HandModel:
-    said = {"approach": [0, 1, 0], **options}
-    return load(text, **said)
+    return load(text, **{"approach": [0, 1, 0], **options})
 
 
 def closing_of(hand: HandModel) -> dict[str, int]:

@@ -216,8 +216,7 @@ def test_a_urdf_that_is_none_is_told_why(data: bytes, told: str) -> None:
 def test_macros_are_found_in_any_encoding(coding: str, name: str, tmp_path: Path) -> None:
     text = claw("meshes/pad.stl").replace("<robot", '<robot xmlns:xacro="http://www.ros.org/wiki/xacro"', 1)
     text = DECLARED.format("UTF-16") + text.replace('"0.08 0.04 0.02"', '"${2 * 0.04} 0.04 0.02"')
-    files = {name: text.encode(coding), "meshes/pad.stl": PAD}
-    assert verdicts(files, name, tmp_path) == ["accept"] * 3
+    assert verdicts({name: text.encode(coding), "meshes/pad.stl": PAD}, name, tmp_path) == ["accept"] * 3
 
 
 @pytest.mark.parametrize(
@@ -245,8 +244,7 @@ def test_a_mesh_is_found_however_it_is_written(written: str, there: str, tmp_pat
 @pytest.mark.parametrize("written", ["../{}", "package://any/../../{}", "/{}", "file:///../{}", "%2e%2e/{}", "C:\\{}"])
 def test_a_mesh_outside_the_folder_is_read_by_no_spelling(written: str, tmp_path: Path) -> None:
     (tmp_path / "secret.stl").write_bytes(PAD)
-    files = {"h.urdf": claw(written.format("secret.stl")).encode()}
-    found = verdicts(files, "h.urdf", tmp_path / "h")
+    found = verdicts({"h.urdf": claw(written.format("secret.stl")).encode()}, "h.urdf", tmp_path / "h")
     assert all("outside" in one or "not there" in one for one in found)
 
 

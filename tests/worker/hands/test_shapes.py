@@ -57,8 +57,7 @@ def test_samples_of_round_solids_are_uniform_in_area(kind: str) -> None:
 
 
 def test_a_reduced_hull_keeps_its_volume_and_stays_close() -> None:
-    rng = np.random.default_rng(3)
-    points = rng.normal(size=(800, 3))
+    points = np.random.default_rng(3).normal(size=(800, 3))
     points *= 0.012 / np.linalg.norm(points, axis=1, keepdims=True)
     vertices, faces = reduce_hull(points)
     assert len(vertices) <= MAX_HULL_VERTICES and len(faces) <= 2 * MAX_HULL_VERTICES - 4
@@ -259,8 +258,7 @@ def test_points_lie_on_the_surface_with_outward_unit_normals(name: str) -> None:
 
 def test_points_spread_more_evenly_than_random_ones() -> None:
     """Blue noise keeps the nearest neighbours apart: random points come arbitrarily close."""
-    hand = hand_of(shape('<sphere radius="0.05"/>'))
-    points = sample_surface(hand, 600)
+    points = sample_surface(hand_of(shape('<sphere radius="0.05"/>')), 600)
     mine = points.position[points.body == 0]
     gaps = cKDTree(mine).query(mine, k=2)[0][:, 1]
     spacing = np.sqrt(4 * np.pi * 0.05**2 / len(mine))
@@ -271,5 +269,4 @@ def test_seats_follow_weights_and_farthest_points_are_distinct() -> None:
     seats = apportion(np.array([3.0, 1.0, 0.0]), 8, np.array([100, 100, 100]))
     assert seats.tolist() == [6, 2, 0]
     assert apportion(np.array([3.0, 1.0]), 8, np.array([2, 100])).tolist() == [2, 6]
-    points = np.random.default_rng(0).random((50, 3))
-    assert len(set(farthest_points(points, 50).tolist())) == 50
+    assert len(set(farthest_points(np.random.default_rng(0).random((50, 3)), 50).tolist())) == 50

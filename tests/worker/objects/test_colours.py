@@ -167,8 +167,7 @@ def test_obj_has_colours_of_its_library_and_mean_of_its_picture() -> None:
 
 
 def textured_dae(named: str) -> bytes:
-    text = dae().decode()
-    before, rest = text.split("<technique", 1)
+    before, rest = dae().decode().split("<technique", 1)
     technique, after = rest.split("</technique>", 1)
     assert "<color>" in technique
     return (before + TEXTURED + after).replace("<library_nodes>", IMAGE.format(named) + "<library_nodes>").encode()

@@ -398,7 +398,6 @@ def test_candidate_grasps_none_of_which_is_valid_come_with_the_reason(tmp_path) 
     sheet = tmp_path / "sheet.stl"
     trimesh.creation.box([0.08, 0.08, 0.004]).export(sheet)
     place, request = SceneSpec(kind="table"), JobOptions(want="candidates", grasps=1, fidelity="draft", scene="table")
-    made = synthesized("allegro", str(sheet), request, place=place, scenes=1)
-    found = made.summary()
+    found = synthesized("allegro", str(sheet), request, place=place, scenes=1).summary()
     assert (found["grasps"], found["valid"], found["reason"]) == (1, 0, None)
     assert "is 4 mm high" in found["narrow"] and _said({"file": "g.h5", **found}).endswith(found["narrow"])

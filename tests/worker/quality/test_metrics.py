@@ -336,8 +336,7 @@ def moved(hand: HandModel, by: float) -> np.ndarray:
 def test_shifted_hand_is_off_by_the_shift_a_joint_by_its_points() -> None:
     # To rounding: every point moves by the same.
     assert distances(moved(pad_hand(), 0.003), FIRST, SECOND) == pytest.approx([0.003], abs=1e-12)
-    hand = plate_hand()
-    points = hand_points(hand, posture(((0, 0, 0), (0.02, 0.02)), ((0, 0, 0), (0.03, 0.02))))
+    points = hand_points(plate_hand(), posture(((0, 0, 0), (0.02, 0.02)), ((0, 0, 0), (0.03, 0.02))))
     slid = np.linalg.norm(points[0] - points[1], axis=1) > 1e-9
     assert 0 < slid.sum() < diversity.POINTS
     assert distances(points, FIRST, SECOND) == pytest.approx([0.010 * slid.mean()], abs=1e-12)
@@ -386,8 +385,7 @@ def hand_on(radius: float, at: float, q: np.ndarray) -> int:
     hand = hand_from_path("allegro")
     centre = hand.palm.centre + hand.palm.approach * (at + radius)
     ball = object_from_mesh(trimesh.creation.icosphere(subdivisions=3, radius=radius))
-    pose = np.array([[*-centre, 1, 0, 0, 0]])
-    grasp = grasp_set(Posture(pose, hand.expand(q[None])))
+    grasp = grasp_set(Posture(np.array([[*-centre, 1, 0, 0, 0]]), hand.expand(q[None])))
     return int(measure(hand, ball, grasp)["quality/grasp_type"][0])
 
 

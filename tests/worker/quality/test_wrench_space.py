@@ -83,8 +83,7 @@ def test_size_order_and_rotation_of_contacts_do_not_matter() -> None:
 
 
 def test_origin_outside_the_space_has_no_ball() -> None:
-    rng = np.random.default_rng(0)
-    epsilon, volume = measure_space(rng.normal(size=(20, 8, 6)) + 10)
+    epsilon, volume = measure_space(np.random.default_rng(0).normal(size=(20, 8, 6)) + 10)
     assert epsilon == 0.0 and volume > 0.0
 
 

@@ -241,8 +241,7 @@ def test_a_mesh_is_not_seen_from_inside() -> None:
     poses = np.zeros((1, 2, 7))
     poses[..., 3] = 1.0
     poses[0, 0, 2] = -0.05
-    seen = of_one([FLOOR, around], poses, LOOKS[:2], shot().extrinsics[0])
-    assert set(np.unique(seen.shape)) == {-1, 0}
+    assert set(np.unique(of_one([FLOOR, around], poses, LOOKS[:2], shot().extrinsics[0]).shape)) == {-1, 0}
 
 
 def test_lines_of_tiles_thinner_than_a_pixel_darken_it_a_little() -> None:

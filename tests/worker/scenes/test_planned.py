@@ -58,8 +58,7 @@ def test_every_grasp_is_clear_of_the_table_by_mujocos_distances(planned) -> None
     hand, _, placed, grasps = planned
     tips, rest = parted(hand)
     for number, scene in enumerate(placed.scenes):
-        rows = np.flatnonzero(placed.index == number)
-        mine = grasps.grasp.take(rows)
+        mine = grasps.grasp.take(np.flatnonzero(placed.index == number))
         assert mujoco_distances(rest, mine, scene.obstacles[0]).min() >= MARGIN_M
         # They may touch the table. A draft's few steps of finish leave less than this to fix; then none is clear.
         assert mujoco_distances(tips, mine, scene.obstacles[0]).min() >= -DRAFT_M

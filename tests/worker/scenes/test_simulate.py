@@ -305,8 +305,7 @@ def test_neighbours_do_not_move_the_object() -> None:
 
 
 def test_on_a_table_each_face_has_its_neighbours() -> None:
-    thing = box(0.04, 0.06, 0.09)
-    _, _, poses = laid("table", [LOW, TALL], count=1, faces="all", thing=thing)
+    _, _, poses = laid("table", [LOW, TALL], count=1, faces="all", thing=box(0.04, 0.06, 0.09))
     ups = [quat_rotate(pose[3:] * [1, -1, -1, -1], np.array([0, 0, 1.0])) for pose in poses["scene/object_pose"]]
     assert len(np.unique(np.round(ups, 6), axis=0)) == len(ups) >= 4
     assert poses["scene/neighbour_pose"].shape == (len(ups), 2, 7)

@@ -110,8 +110,7 @@ def test_a_score_is_that_of_the_lift(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_lifting_at_half_the_friction_is_asked_to_be_better(monkeypatch: pytest.MonkeyPatch) -> None:
     outcomes = {True: [LIFTED, FELL], False: [LIFTED, LIFTED]}
-    found = rollout_of(monkeypatch, [0.2, 0.3], outcomes, np.array([1.5, 1.5]))
-    assert found == pytest.approx([0.2, 1.5])
+    assert rollout_of(monkeypatch, [0.2, 0.3], outcomes, np.array([1.5, 1.5])) == pytest.approx([0.2, 1.5])
 
 
 def test_the_published_lift_is_at_full_friction(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -106,8 +106,7 @@ def test_one_contact_gives_object_the_momentum_of_its_impulse() -> None:
     w = 1.0 + arm @ np.linalg.inv(INERTIA) @ arm
     impulse = -depth / w
     expected = np.concatenate([impulse * normal, np.linalg.inv(INERTIA) @ (impulse * arm)])
-    end = run("gauss_seidel", single, world)[0][0]
-    np.testing.assert_allclose(end, expected, rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(run("gauss_seidel", single, world)[0][0], expected, rtol=1e-5, atol=1e-9)
 
 
 def test_a_balanced_grasp_leaves_the_object_at_rest_without_nan() -> None:
@@ -124,8 +123,7 @@ def test_a_balanced_grasp_leaves_the_object_at_rest_without_nan() -> None:
 
 @EACH
 def test_the_one_sided_leak_only_draws_free_points_nearer(name: str) -> None:
-    rng = np.random.default_rng(5)
-    free = ring(rng, gap=5e-3, spread=1e-4)
+    free = ring(np.random.default_rng(5), gap=5e-3, spread=1e-4)
     one = run(name, free, WORLD, leak=0.1)[2]
     two = run(name, free, WORLD, leak=0.1, one_sided=False)[2]
     # Descending a positive dL/drho shortens the distance.

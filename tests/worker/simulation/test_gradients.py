@@ -147,8 +147,7 @@ def test_transpose_is_the_derivative_of_the_map_it_belongs_to(name: str) -> None
     model, data = rig(hand, ball(), capacity=1)
     data.set_state(state)
     record_placement(model, data).run()
-    points = apply(bodies_of(hand, state)[0], local)
-    wrench = np.concatenate([force, np.cross(points, force)], axis=1)
+    wrench = np.concatenate([force, np.cross(apply(bodies_of(hand, state)[0], local), force)], axis=1)
     data.wrench.assign(np.round(wrench[None] / wrenches.UNIT).astype(np.int64))
     wp.launch(kinematics.backward, 1, inputs=[model.hand.tree], outputs=[data.hands, data.gradient], device="cpu")
     # Sums of up to 23 float32 products of size 1.
@@ -214,8 +213,7 @@ def test_links_inside_links_are_parted_along_the_true_gradient(name: str) -> Non
             total += float((np.maximum(depth, 0) ** 2).sum())
         return total * REFERENCE_SELF_POINTS / len(points)
 
-    rng = np.random.default_rng(0)
-    draws = hand.lower + rng.random((20, 1, hand.dofs)) * (hand.upper - hand.lower)
+    draws = hand.lower + np.random.default_rng(0).random((20, 1, hand.dofs)) * (hand.upper - hand.lower)
     states = [HandState(np.array([[0.5, 0.0, 0.0]]), np.array([[1.0, 0.0, 0.0, 0.0]]), q) for q in draws]
     state = max(states, key=energy)
 

@@ -157,8 +157,7 @@ def test_wrenches_add_up_with_the_same_bits_in_any_order() -> None:
 
 @pytest.mark.parametrize("count", [1, 31, 32, 33, 95])
 def test_marked_points_get_the_slots_of_a_counter(count: int) -> None:
-    rng = np.random.default_rng(count)
-    mark = rng.integers(0, 3, (4, count)).astype(np.int32)
+    mark = np.random.default_rng(count).integers(0, 3, (4, count)).astype(np.int32)
     active = wp.array([1, 1, 0, 1], dtype=wp.int32)
     counts = [wp.zeros((4, -(-count // packing.CHUNK)), dtype=wp.int32) for _ in range(2)]
     marked, packed = allocate_contacts(4, count, marked=True), allocate_contacts(4, count)

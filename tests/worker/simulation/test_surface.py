@@ -88,8 +88,7 @@ def test_the_smoothed_distance_is_continuous_across_the_surface() -> None:
 
 def test_normals_of_a_fine_ball_point_outward_everywhere() -> None:
     obj = ball(0.035, subdivisions=4)
-    rng = np.random.default_rng(4)
-    points = np.concatenate([around(rng, 0.035, 0.003), obj.vertices[:20]])
+    points = np.concatenate([around(np.random.default_rng(4), 0.035, 0.003), obj.vertices[:20]])
     _, normals = probe(obj, points, alpha=0.5)
     radial = points / np.linalg.norm(points, axis=1, keepdims=True)
     # Faces of 2 mm on a ball of 35 mm turn by 0.06 rad from one to the next.

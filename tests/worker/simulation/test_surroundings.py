@@ -30,8 +30,7 @@ def test_distances_are_closed_forms_and_a_bound_beyond_edges() -> None:
     np.testing.assert_allclose(box.distance(points), [0.05, 0.1, -0.05, -0.01], atol=1e-12)
     box = Obstacle.box([0, 0, 0, 1, 0, 0, 0], [0.2, 0.2, 0.2])
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (500, 3))
-    outside = np.maximum(np.abs(points) - 0.1, 0.0)
-    true = np.linalg.norm(outside, axis=1)
+    true = np.linalg.norm(np.maximum(np.abs(points) - 0.1, 0.0), axis=1)
     assert (box.distance(points)[true > 0] <= true[true > 0] + 1e-12).all()
 
 
@@ -221,8 +220,7 @@ def test_no_hand_is_nearer_to_a_solid_than_it_says_by_mujoco(name: str) -> None:
     """Exact for links that are boxes or round (1e-5 m: MuJoCo's meshes are float32 and converge to 1e-6); for hulls a
     lower bound."""
     hand, rng = hand_from_path(name), np.random.default_rng(2)
-    corners = rng.normal(size=(40, 3)) * [0.03, 0.05, 0.04]
-    solid, _ = outer_solid(corners)
+    solid, _ = outer_solid(rng.normal(size=(40, 3)) * [0.03, 0.05, 0.04])
     postures = random_postures(hand, 60, rng)
     found = obstacle_room(hand, postures, [Environment((solid,), UP)])
     true = mujoco_distances(hand, postures, solid)

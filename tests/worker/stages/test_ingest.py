@@ -307,8 +307,7 @@ def test_an_archive_that_attacks_is_refused_at_the_door(archive: Callable[[], by
 def rough(segments: int) -> bytes:
     """A ball with noise on it: slow to simplify."""
     vertices, faces = sphere(0.04, segments)
-    noise = np.random.default_rng(0).normal(1.0, 0.003, (len(vertices), 1))
-    return stl((vertices * noise, faces))["m.stl"]
+    return stl((vertices * np.random.default_rng(0).normal(1.0, 0.003, (len(vertices), 1)), faces))["m.stl"]
 
 
 @pytest.mark.parametrize(

@@ -94,8 +94,7 @@ class Bench:
         return end.kind, end.message
 
     def last_attempt(self) -> tuple[str, bool]:
-        task = list(plan(self.job))[-1]
-        attempt = read_record(AttemptRecord, self.store, names.attempt(task.id, 1))
+        attempt = read_record(AttemptRecord, self.store, names.attempt(list(plan(self.job))[-1].id, 1))
         return attempt.kind, attempt.last
 
     def made(self, stage: Stage) -> Shard:

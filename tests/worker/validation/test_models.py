@@ -459,8 +459,7 @@ def test_a_model_with_other_pads_says_otherwise(tmp_path) -> None:
     # The other model's pads do not reach the object: they are 40 mm nearer to their joints.
     back, (foot, *pads) = np.array([0, 0, -0.04, 0, 0, 0, 0]), PADS_HAND.pieces
     moved = (dataclasses.replace(p, vertices=p.vertices + back[:3], pose=p.pose + back) for p in pads)
-    other = dataclasses.replace(PADS_HAND, name="shorter", pieces=(foot, *moved))
-    same = same_hand(PADS_HAND, other)
+    same = same_hand(PADS_HAND, dataclasses.replace(PADS_HAND, name="shorter", pieces=(foot, *moved)))
     row = evaluate(plates_case(), validation_hand=same, cache=tmp_path)
     assert row["foreign_held"] == {"both": 0, "nominal": 2, "foreign": 0, "neither": 1}
     assert (row["foreign_share"], row["agreement"]) == (0.0, pytest.approx(1 / 3))

@@ -270,8 +270,7 @@ def test_a_convex_object_is_one_piece_and_an_l_is_cut_and_kept(tmp_path) -> None
     assert len(pieces) == 1 and pieces.volume_ratio == pytest.approx(1.0, abs=1e-6)
     parts = [trimesh.creation.box((0.1, 0.02, 0.02)), trimesh.creation.box((0.02, 0.1, 0.02))]
     parts[1].apply_translation([0.04, 0.04, 0])
-    shape = object_from_mesh(trimesh.boolean.union(parts, engine="manifold"))
-    pieces = decompose(shape, cache=tmp_path)
+    pieces = decompose(object_from_mesh(trimesh.boolean.union(parts, engine="manifold")), cache=tmp_path)
     assert 2 <= len(pieces) <= 4 and pieces.volume_ratio == pytest.approx(1.0, abs=0.05)
     assert len(list(tmp_path.glob("*.npz"))) == 2
     cube = np.asarray(trimesh.creation.box((0.02, 0.02, 0.02)).vertices)
