@@ -35,15 +35,9 @@ from graspd.service.store.manifests import load_manifest, publish_shard
 from graspd.service.store.records import read_record
 from graspd.service.store.shards import json_attribute, read_shard
 from graspd.service.store.store import open_store
+from graspd.studies.cards import contents as card_contents
 from graspd.studies.cards.card import write_card
-from graspd.studies.cards.contents import (
-    AssetFacts,
-    Contents,
-    contents_of_folder,
-    contents_of_store,
-    pieces,
-    with_provenance,
-)
+from graspd.studies.cards.contents import AssetFacts, Contents, contents_of_folder, contents_of_store, with_provenance
 from graspd.studies.cards.findings import findings
 from graspd.studies.cards.numbers import numbers, share
 from graspd.studies.cards.page import head, render_card
@@ -99,7 +93,7 @@ def case(folder: Path, *, drawn: bool = True, **options: Any) -> Case:
 
 
 def undrawn(contents: Contents) -> dict[str, Any]:
-    return numbers(contents, tally_of(contents, pieces(contents)))
+    return numbers(contents, tally_of(contents, card_contents.pieces(contents)))
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,8 @@ from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.surface import piece_distance
 from tests.worker.commands_run import graspd, refused
-from tests.worker.models import object_from_mesh, pad_hand, posture
+from tests.worker.models import object_from_mesh
+from tests.worker.quality.helpers import pad_hand, posture
 
 CONTRACT = {"n", "protocol", "gsr", "osr", "sgs", "pd_mm", "spd_mm", "ca_cm2", "iv_cm3", "epsilon", "wrench_volume"}
 CONTRACT |= {"sd_cm", "diversity"}

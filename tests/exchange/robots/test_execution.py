@@ -18,7 +18,8 @@ from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.validation.decomposition import decompose
 from graspd.worker.validation.model import MujocoOptions, build
 from graspd.worker.validation.protocol import Test as Rollout
-from tests.worker.models import grasp_set, object_from_mesh, posture, two_finger_hand
+from tests.worker.models import object_from_mesh, two_finger_hand
+from tests.worker.quality.helpers import grasp_set, posture
 
 TOOL = tool_frame(None, "palm", {})
 

@@ -16,7 +16,7 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.quality.contact import finger_of_body
 from graspd.worker.quality.probe import NearestPoints, Probe
 from graspd.worker.quality.wrench_space import wrenches
-from tests.worker.models import choose_contacts
+from tests.worker.quality.helpers import choose_contacts
 
 
 def pregrasp(probe: Probe, grasp: Posture) -> Posture:

@@ -26,7 +26,8 @@ from graspd.worker.validation.decomposition import decompose
 from graspd.worker.validation.model import MujocoOptions, build
 from tests.worker.control import postures_reference as reference
 from tests.worker.hands.urdfs import gripper
-from tests.worker.models import object_from_mesh, on_one_dof, piece, placed_data, plate_hand, posture, two_finger_hand
+from tests.worker.models import object_from_mesh, on_one_dof, piece, two_finger_hand
+from tests.worker.quality.helpers import placed_data, plate_hand, posture
 
 BOX = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))
 PLATES = plate_hand()

@@ -9,20 +9,13 @@ from scipy.spatial import cKDTree
 
 from graspd.service.model.errors import HandError
 from graspd.service.model.transforms import IDENTITY_POSE, apply
-from graspd.worker.hands import primitives
+from graspd.worker.hands import primitives, surface
 from graspd.worker.hands.collisions import hull_distance
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path, load_hand
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.shapes import MAX_HULL_VERTICES, parts_of, reduce_hull
-from graspd.worker.hands.surface import (
-    BURIED_M,
-    COINCIDENT_M,
-    apportion,
-    farthest_points,
-    piece_distance,
-    sample_surface,
-)
+from graspd.worker.hands.surface import piece_distance, sample_surface
 from graspd.worker.objects.convex import union_volume
 from tests.worker.hands.urdfs import joint, link, load, robot
 
@@ -219,7 +212,7 @@ def test_a_point_inside_another_body_at_rest_is_dropped() -> None:
     finger = points.position[points.body == 1]
     world = apply(body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0, 1], finger)
     (palm,) = (piece for piece in hand.pieces if piece.body == 0)
-    assert len(finger) and piece_distance(palm, world).min() >= -BURIED_M
+    assert len(finger) and piece_distance(palm, world).min() >= -surface.BURIED_M
 
 
 @pytest.mark.parametrize("count", [16, 400, 2000])
@@ -250,7 +243,7 @@ def test_points_lie_on_the_surface_with_outward_unit_normals(name: str) -> None:
         if not mine.any():
             continue
         nearest = np.min([piece_distance(p, points.position[mine]) for p in pieces], axis=0)
-        outside = points.position[mine] + COINCIDENT_M * points.normal[mine]
+        outside = points.position[mine] + surface.COINCIDENT_M * points.normal[mine]
         above = np.min([piece_distance(p, outside) for p in pieces], axis=0)
         assert np.abs(nearest).max() < ON_SURFACE_M
         assert (above >= 0).all()
@@ -266,7 +259,7 @@ def test_points_spread_more_evenly_than_random_ones() -> None:
 
 
 def test_seats_follow_weights_and_farthest_points_are_distinct() -> None:
-    seats = apportion(np.array([3.0, 1.0, 0.0]), 8, np.array([100, 100, 100]))
+    seats = surface.apportion(np.array([3.0, 1.0, 0.0]), 8, np.array([100, 100, 100]))
     assert seats.tolist() == [6, 2, 0]
-    assert apportion(np.array([3.0, 1.0]), 8, np.array([2, 100])).tolist() == [2, 6]
-    assert len(set(farthest_points(np.random.default_rng(0).random((50, 3)), 50).tolist())) == 50
+    assert surface.apportion(np.array([3.0, 1.0]), 8, np.array([2, 100])).tolist() == [2, 6]
+    assert len(set(surface.farthest_points(np.random.default_rng(0).random((50, 3)), 50).tolist())) == 50

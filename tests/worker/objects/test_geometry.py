@@ -14,18 +14,11 @@ from graspd.service.model.errors import MeshError
 from graspd.service.model.states import AssetKind
 from graspd.service.store.assets import builtin_files, builtin_names
 from graspd.worker.grasps import GRID_M, GraspSet, Posture
+from graspd.worker.objects import mesh_geometry
 from graspd.worker.objects.check import check_object
 from graspd.worker.objects.convex import WorkLimitExceeded, coacd_parts
 from graspd.worker.objects.distance import MeshDistance, deviation, point_triangle_distance, sample_faces
-from graspd.worker.objects.mesh_geometry import (
-    centred,
-    corner_normals,
-    from_manifold,
-    mass_properties,
-    signed_volume,
-    to_centre,
-    to_file,
-)
+from graspd.worker.objects.mesh_geometry import corner_normals, mass_properties, signed_volume
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import from_bytes, load_object, object_from_path, simplify, to_bytes
 from graspd.worker.objects.topology import components, is_closed
@@ -116,7 +109,7 @@ def test_simplification_is_monotone_and_exact_at_zero() -> None:
     vertices, faces = sphere(segments=128)
     same = simplify(vertices, faces, 0.0)
     assert same[0] is vertices and same[1] is faces and same[2] == 0.0
-    vertices, faces = from_manifold(Manifold.cube((0.06, 0.05, 0.04), True).refine_to_length(0.002))
+    vertices, faces = mesh_geometry.from_manifold(Manifold.cube((0.06, 0.05, 0.04), True).refine_to_length(0.002))
     assert len(faces) > 5000
     assert len(simplify(vertices, faces, 1e-5)[1]) < 100
 
@@ -176,7 +169,7 @@ def test_an_object_keeps_its_place_and_a_scan_its_points() -> None:
     again = from_bytes(to_bytes(obj), name=obj.name, digest=obj.digest)
     assert (again.content, again.centred.content) == (obj.content, obj.centred.content)
     points = np.random.default_rng(0).uniform(-0.1, 0.1, (2000, 3)).astype(np.float32).astype(float)
-    found = centred(points)
+    found = mesh_geometry.centred(points)
     np.testing.assert_allclose(found.points + found.centre, points, atol=2e-9)
 
 
@@ -190,7 +183,7 @@ def test_poses_come_back_from_frame_of_file_with_the_same_bits(place: tuple[floa
     back = hands.moved(centre).moved(-centre)
     np.testing.assert_array_equal(back.grasp.hand_pose, hands.grasp.hand_pose)
     lying = hands.grasp.hand_pose
-    np.testing.assert_array_equal(to_centre(to_file(lying, centre), centre), lying)
+    np.testing.assert_array_equal(mesh_geometry.to_centre(mesh_geometry.to_file(lying, centre), centre), lying)
 
 
 @pytest.mark.parametrize(("place", "says"), [((0.3, 0, 0), False), (FAR, True), (UTM, True)])

@@ -22,7 +22,8 @@ from graspd.worker.simulation.data import Data, HandState
 from graspd.worker.simulation.environment import Obstacle, PlacedGrasps
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.prescreening import SLIPS, push_rollout
-from tests.worker.models import grasp_set, on_tables, posture, two_finger_hand
+from tests.worker.models import on_tables, two_finger_hand
+from tests.worker.quality.helpers import grasp_set, posture
 from tests.worker.simulation.rigs import ball
 
 QUICK = resolve_fidelity("draft").model_copy(update={"starts": 2, "finalists": 2})

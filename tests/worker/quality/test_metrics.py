@@ -30,15 +30,8 @@ from graspd.worker.quality.intervals import wilson, wilson_of_mean
 from graspd.worker.quality.probe import HAND_POINTS, REACH_M, Probe
 from graspd.worker.quality.table import measure
 from graspd.worker.quality.volume import VOXEL_M, Overlap, SharedVolume
-from tests.worker.models import (
-    choose_contacts,
-    grasp_set,
-    object_from_mesh,
-    pad_hand,
-    plate_hand,
-    posture,
-    two_finger_hand,
-)
+from tests.worker.models import object_from_mesh, two_finger_hand
+from tests.worker.quality.helpers import choose_contacts, grasp_set, pad_hand, plate_hand, posture
 from tests.worker.simulation.rigs import ball
 
 #: Single precision of coordinates around 0.1 m.

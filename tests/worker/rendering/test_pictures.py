@@ -18,21 +18,10 @@ from graspd.worker.grasps import Posture
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import load_hand
 from graspd.worker.hands.model import HandModel
-from graspd.worker.rendering import Extras, render
+from graspd.worker.rendering import Extras, render, sheets
 from graspd.worker.rendering.hands import DrawnHand, drawn_bodies, hand_parts, without_visuals
 from graspd.worker.rendering.pictures import THREE_SIDES, grasp_pictures
 from graspd.worker.rendering.scenery import TABLE, TABLE_SIZE, seen_share, slab_poses, slabs
-from graspd.worker.rendering.sheets import (
-    GAP,
-    MARGIN,
-    PAPER,
-    best,
-    contact_sheet,
-    depth_colours,
-    figures,
-    three_sides_sheet,
-    views_page,
-)
 from graspd.worker.rendering.trajectory_pictures import KINDS, PictureScenes, animation, way_pictures
 from graspd.worker.stages.models import hand_glb
 from tests.worker.commands_run import refused
@@ -90,9 +79,9 @@ def quality(count: int) -> dict[str, np.ndarray]:
 
 def test_best_have_the_largest_epsilon_and_captions_quote_5_mm() -> None:
     chosen = np.array([True, True, True, True, False])
-    assert best(quality(5), 3, chosen).tolist() == [3, 2, 1]
-    assert best(quality(5), 9, chosen).tolist() == [3, 2, 1, 0]
-    (told,) = figures(quality(5), np.array([3]))
+    assert sheets.best(quality(5), 3, chosen).tolist() == [3, 2, 1]
+    assert sheets.best(quality(5), 9, chosen).tolist() == [3, 2, 1, 0]
+    (told,) = sheets.figures(quality(5), np.array([3]))
     assert told == [("epsilon", "30.000"), ("contact", "30.0 cm^2"), ("depth", "0.25 mm")]
 
 
@@ -101,28 +90,28 @@ def opened(data: bytes) -> np.ndarray:
 
 
 def test_a_contact_sheet_holds_every_picture_unchanged(pictures):
-    sheet = opened(contact_sheet(pictures[:, 0], title="block", columns=2))
+    sheet = opened(sheets.contact_sheet(pictures[:, 0], title="block", columns=2))
     for picture in pictures[:, 0]:
         windows = np.lib.stride_tricks.sliding_window_view(sheet[..., 0], (4, 80))
         assert (windows == picture[30:34, :, 0]).all(axis=(2, 3)).any()
-    assert tuple(sheet[0, 0]) == PAPER
-    assert opened(three_sides_sheet(pictures, title="block")).shape[1] >= 3 * 80
+    assert tuple(sheet[0, 0]) == sheets.PAPER
+    assert opened(sheets.three_sides_sheet(pictures, title="block")).shape[1] >= 3 * 80
 
 
 @pytest.mark.parametrize(("stereo", "cells"), [(True, 5), (False, 4)])
 def test_a_views_page_has_a_row_per_placement_and_a_column_for_a_hand(block, stereo, cells):
     views = render(block, REST, views=2, stereo=stereo, width=64, height=48, seed=0, samples=2)
-    without = opened(views_page(views, title="block"))
+    without = opened(sheets.views_page(views, title="block"))
     assert without.shape[1] > cells * 64 and without.shape[0] > 2 * 48
     views["image/rgb_hand"] = np.full((len(views["image/rgb"]), 48, 64, 3), [255, 0, 255], np.uint8)
-    page = opened(views_page(views, title="block"))
-    assert page.shape[1] == without.shape[1] + 64 + GAP
+    page = opened(sheets.views_page(views, title="block"))
+    assert page.shape[1] == without.shape[1] + 64 + sheets.GAP
     shown = (page == [255, 0, 255]).all(axis=-1)
-    assert shown.sum() == 2 * 48 * 64 and not shown[:, : without.shape[1] - MARGIN].any()
+    assert shown.sum() == 2 * 48 * 64 and not shown[:, : without.shape[1] - sheets.MARGIN].any()
 
 
 def test_depth_colours_darken_with_distance_and_grey_is_nothing():
-    colours = depth_colours(np.array([0.2, 0.3, 0.4, 0.5, np.inf], np.float32), 0.2, 0.5).astype(int)
+    colours = sheets.depth_colours(np.array([0.2, 0.3, 0.4, 0.5, np.inf], np.float32), 0.2, 0.5).astype(int)
     lightness = colours[:4] @ [0.2126, 0.7152, 0.0722]
     assert np.all(np.diff(lightness) < -20)
     assert colours[4].tolist() == [214, 214, 214]

@@ -16,19 +16,9 @@ from graspd.service.model.transforms import apply, quat_from_axis_angle
 from graspd.service.store.shards import check_columns
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.rendering import Extras, render
+from graspd.worker.rendering import Extras, cameras, render
 from graspd.worker.rendering.annotate import parse_channels
-from graspd.worker.rendering.cameras import (
-    ELEVATION,
-    FIELD_OF_VIEW,
-    NEAREST_M,
-    Cameras,
-    GivenCameras,
-    intrinsics,
-    look_at,
-    read_cameras,
-    sample_hemisphere,
-)
+from graspd.worker.rendering.cameras import Cameras, GivenCameras, intrinsics, look_at, read_cameras, sample_hemisphere
 from graspd.worker.rendering.hands import DrawnHand
 from graspd.worker.rendering.scenery import TABLE_SIZE
 from graspd.worker.scenes import Neighbours
@@ -50,7 +40,7 @@ def shoot(obj: ObjectModel, poses: np.ndarray, **options) -> dict[str, np.ndarra
     return render(obj, poses, width=SIZE[0], height=SIZE[1], **options)
 
 
-def cameras(views: dict[str, np.ndarray]) -> Cameras:
+def cameras_of(views: dict[str, np.ndarray]) -> Cameras:
     height, width = views["image/depth"].shape[1:]
     return Cameras(width, height, views["camera/intrinsics"][0], views["camera/extrinsics"])
 
@@ -129,7 +119,9 @@ def test_depths_are_of_sphere_and_plane_and_infinite_elsewhere(ball_views, ball)
 
 
 def test_point_projected_by_cameras_matrices_lands_on_its_pixel(mug_views):
-    points = cameras(mug_views).unproject(np.where(np.isfinite(mug_views["image/depth"]), mug_views["image/depth"], 1))
+    points = cameras_of(mug_views).unproject(
+        np.where(np.isfinite(mug_views["image/depth"]), mug_views["image/depth"], 1)
+    )
     for view in range(len(points)):
         k, e = mug_views["camera/intrinsics"][view], mug_views["camera/extrinsics"][view]
         image = (points[view].reshape(-1, 3) @ e[:3, :3].T + e[:3, 3]) @ k.T
@@ -138,7 +130,7 @@ def test_point_projected_by_cameras_matrices_lands_on_its_pixel(mug_views):
 
 
 def test_the_right_eye_sees_every_point_shifted_by_its_disparity(mug_views):
-    cams = cameras(mug_views)
+    cams = cameras_of(mug_views)
     points = cams.unproject(np.where(np.isfinite(mug_views["image/depth"]), mug_views["image/depth"], 1))
     focal, baseline = cams.intrinsics[0, 0], mug_views["camera/stereo_baseline_m"][0]
     for left in np.flatnonzero(mug_views["camera/eye"] == 1):
@@ -241,7 +233,7 @@ CENTRE, OBJECT_RADIUS = np.array([0.05, -0.02, 0.04]), 0.07
 
 def sampled(seed: int, views: int = 12) -> Cameras:
     rng = np.random.default_rng(seed)
-    extrinsics = sample_hemisphere(CENTRE, OBJECT_RADIUS, views=views, field_of_view=FIELD_OF_VIEW, rng=rng)
+    extrinsics = sample_hemisphere(CENTRE, OBJECT_RADIUS, views=views, field_of_view=cameras.FIELD_OF_VIEW, rng=rng)
     return Cameras(320, 240, intrinsics(320, 240), np.stack(extrinsics))
 
 
@@ -252,7 +244,7 @@ def test_a_camera_looks_at_its_target_upright_in_its_field() -> None:
     np.testing.assert_allclose(pixels[0, :, 0], [160, 160], atol=1e-9)
     assert pixels[0, 0, 1] == pytest.approx(120) and pixels[0, 1, 1] < 120
     assert depth[0, 0] == pytest.approx(np.linalg.norm(CENTRE - [0.3, 0.2, 0.4]))
-    assert 2 * np.arctan(120 / k[1, 1]) == pytest.approx(FIELD_OF_VIEW)
+    assert 2 * np.arctan(120 / k[1, 1]) == pytest.approx(cameras.FIELD_OF_VIEW)
     top = pixel_rays(k, 320, 240)[0, 0]
     np.testing.assert_allclose(top, [-159.5 / k[0, 0], -119.5 / k[1, 1], 1.0])
 
@@ -263,8 +255,8 @@ def test_sampled_cameras_on_the_hemisphere_see_the_object(seed):
     away = camera.centre - CENTRE
     distance = np.linalg.norm(away, axis=1)
     elevation = np.arcsin(away[:, 2] / distance)
-    assert np.all((elevation > ELEVATION[0] - 1e-9) & (elevation < ELEVATION[1] + 1e-9))
-    assert np.all(distance >= NEAREST_M + OBJECT_RADIUS - 1e-12)
+    assert np.all((elevation > cameras.ELEVATION[0] - 1e-9) & (elevation < cameras.ELEVATION[1] + 1e-9))
+    assert np.all(distance >= cameras.NEAREST_M + OBJECT_RADIUS - 1e-12)
     directions = np.random.default_rng(seed).normal(size=(200, 3))
     ball = CENTRE + OBJECT_RADIUS * 0.8 * directions / np.linalg.norm(directions, axis=1, keepdims=True)
     pixels, _ = camera.project(ball)

@@ -17,16 +17,7 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.pinch_postures import oppositions_of
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.stages import hand_self_test
-from graspd.worker.stages.hand_self_test import (
-    OF_OPENING,
-    OF_REACH,
-    WIDTH_M,
-    SelfTest,
-    fitting_width,
-    plain_objects,
-    self_test,
-    tried_softly,
-)
+from graspd.worker.stages.hand_self_test import SelfTest, fitting_width, plain_objects, self_test, tried_softly
 from graspd.worker.validation.payload import Limit
 from tests.worker.hands.urdfs import OPENING, gripper, joint, link, robot
 
@@ -43,7 +34,7 @@ def held(count: int):
 
 def test_objects_are_as_wide_as_suits_the_opening() -> None:
     width = fitting_width(gripper())
-    assert width == pytest.approx(OF_OPENING * OPENING)
+    assert width == pytest.approx(hand_self_test.OF_OPENING * OPENING)
     for obj in plain_objects(width).values():
         # A sphere of triangles lies inside the true one by less than a hundredth.
         assert np.ptp(obj.vertices, axis=0).min() == pytest.approx(width, rel=0.01)
@@ -84,7 +75,7 @@ def test_a_finger_of_one_joint_reaches_to_its_pad() -> None:
     hand = three_fingers(approach=[0, 0, 1])
     assert jaws_of(hand) is None
     # Its joints lie 30 mm from the palm's middle, its pads beyond half of the 100 mm of a finger.
-    assert OF_REACH * 0.05 < fitting_width(hand) < OF_REACH * 0.11
+    assert hand_self_test.OF_REACH * 0.05 < fitting_width(hand) < hand_self_test.OF_REACH * 0.11
 
 
 def test_objects_are_no_thinner_than_opposed_pads_come_together(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -94,7 +85,7 @@ def test_objects_are_no_thinner_than_opposed_pads_come_together(monkeypatch: pyt
     thick = replace(known, width=known.width + 0.03)
     monkeypatch.setattr("graspd.worker.stages.hand_self_test.oppositions_of", lambda hand: thick)
     assert fitting_width(hand) == pytest.approx(thick.width[0])
-    assert width < thick.width[0] < WIDTH_M[1]
+    assert width < thick.width[0] < hand_self_test.WIDTH_M[1]
 
 
 def test_a_busy_machine_leaves_nothing_out(monkeypatch: pytest.MonkeyPatch) -> None:

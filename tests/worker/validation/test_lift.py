@@ -21,7 +21,8 @@ from graspd.worker.validation.prescreening import PHYSICS, SLIPS, LiftRollouts, 
 from graspd.worker.validation.protocol import MAX_DISPLACEMENT_M, STAGE_S
 from graspd.worker.validation.robust import robust
 from graspd.worker.validation.variant import NOMINAL, Models, Variant, VariantLift, motion_of, seen, upright
-from tests.worker.models import object_from_mesh, pad_hand, posture
+from tests.worker.models import object_from_mesh
+from tests.worker.quality.helpers import pad_hand, posture
 
 HALF, HEIGHT = 0.03, 0.05
 HAND = pad_hand()

@@ -37,19 +37,8 @@ from tests.studies.test_evaluation import HAND as PADS_HAND
 from tests.studies.test_evaluation import plates_case
 from tests.worker.hands.mjcfs import CLAW
 from tests.worker.hands.test_mjcf import load
-from tests.worker.models import (
-    BOX,
-    FAR,
-    PADS,
-    WHOLE,
-    many_grasps,
-    on_one_dof,
-    piece,
-    placed_data,
-    plate_hand,
-    posture,
-    two_finger_hand,
-)
+from tests.worker.models import on_one_dof, piece, two_finger_hand
+from tests.worker.quality.helpers import BOX, FAR, PADS, WHOLE, many_grasps, placed_data, plate_hand, posture
 
 
 def by_luck(monkeypatch: pytest.MonkeyPatch, odds: float = 0.7) -> None:

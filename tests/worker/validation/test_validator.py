@@ -31,21 +31,9 @@ from graspd.worker.validation.key import LEVEL_MOVES, MOVES, Level, verdict_key
 from graspd.worker.validation.model import MujocoOptions, blend, build, scene_of
 from graspd.worker.validation.protocol import HOLD_S, MAX_DISPLACEMENT_M, MAX_ROTATION, Outcome, Rollout, Test
 from graspd.worker.validation.validator import validate
-from tests.worker import models as helpers
-from tests.worker.models import (
-    BOX,
-    CONTACT,
-    FAR,
-    PADS,
-    WHOLE,
-    grasp_of,
-    many_grasps,
-    object_from_mesh,
-    on_one_dof,
-    placed_data,
-    posture,
-    two_finger_hand,
-)
+from tests.worker.models import object_from_mesh, on_one_dof, two_finger_hand
+from tests.worker.quality import helpers
+from tests.worker.quality.helpers import BOX, CONTACT, FAR, PADS, WHOLE, grasp_of, many_grasps, placed_data, posture
 
 
 def test_a_pressed_box_is_held_and_a_free_one_falls() -> None:

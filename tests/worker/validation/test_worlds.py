@@ -32,7 +32,7 @@ from graspd.worker.validation.prefilter import prefilter as screening
 from graspd.worker.validation.prefilter.prefilter import ROWS, PrefilterOutcomes, WorldPool
 from graspd.worker.validation.protocol import Outcome, ValidatedBy
 from graspd.worker.validation.validator import Verdicts, prefiltered, validate
-from tests.worker.models import BOX, PADS, WHOLE, grasp_of, many_grasps, posture
+from tests.worker.quality.helpers import BOX, PADS, WHOLE, grasp_of, many_grasps, posture
 
 
 class Stand:
