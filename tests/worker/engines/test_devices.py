@@ -35,9 +35,7 @@ def test_only_a_gpu_without_memory_is_out_of_memory() -> None:
 
 
 @pytest.mark.parametrize(("code", "lost"), [(0, False), (2, False), (700, True), (719, True)])
-def test_a_device_is_lost_by_any_error_but_want_of_memory(
-    monkeypatch: pytest.MonkeyPatch, code: int, lost: bool
-) -> None:
+def test_a_device_is_lost_by_any_error_but_want_of_memory(monkeypatch, code: int, lost: bool) -> None:
     def synchronize(device: str) -> None:
         if code:
             raise RuntimeError(f"Failed to synchronize device {device}: Warp CUDA error {code}: what happened")
