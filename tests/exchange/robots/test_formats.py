@@ -71,12 +71,6 @@ def test_isaac_names_prims_that_the_usd_export_has(tmp_path: Path) -> None:
         assert stage.GetPrimAtPath(isaac[name]).IsValid()
 
 
-def validated(shard: Path) -> list[bool]:
-    case = load_case(shard)
-    protocol = "dexgraspbench" if case.placed is None else "lift"
-    return [one["held"] for one in graspd(f"evaluate --protocol {protocol}", shard)["verdicts"]]
-
-
 @pytest.mark.parametrize("which", ["free_shard", "table_shard", "pressing_shard", "clutter_shard"])
 def test_a_mujoco_scene_replays_to_the_verdict_of_the_validator(which: str, request, tmp_path) -> None:
     shard = limp(request.getfixturevalue(which), tmp_path / "limp.h5")
@@ -84,7 +78,8 @@ def test_a_mujoco_scene_replays_to_the_verdict_of_the_validator(which: str, requ
     # A script that has only mujoco and numpy must do: -I keeps this checkout out of its reach.
     command = [sys.executable, "-I", str(tmp_path / "replay.py"), str(tmp_path / "scene.xml"), "--json"]
     found = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
-    verdicts = validated(shard)
+    protocol = "dexgraspbench" if load_case(shard).placed is None else "lift"
+    verdicts = [one["held"] for one in graspd(f"evaluate --protocol {protocol}", shard)["verdicts"]]
     assert len(found) == told["grasps"] and set(verdicts) == {True, False}
     for name, what in found.items():
         assert (what == "held") == verdicts[int(name.removeprefix("grasp_"))], name

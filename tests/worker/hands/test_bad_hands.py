@@ -20,11 +20,12 @@ from graspd.worker.hands.check import check_hand
 from graspd.worker.hands.load import load_hand
 from graspd.worker.hands.robot import MAX_LINKS
 from graspd.worker.hands.urdf import MAX_BYTES, read_urdf
+from tests.api.factories import zipped
 from tests.worker.hands.mjcfs import CLAW, FOUR_BAR
 from tests.worker.hands.urdfs import joint, link, report, robot
 from tests.worker.objects.shapes import damaged
 from tests.worker.objects.test_colours import BOMB, SCENE, dae
-from tests.worker.stages.test_ingest import bad_files, is_expected, upload, zipped
+from tests.worker.stages.test_ingest import bad_files, is_expected, upload
 
 
 @pytest.mark.parametrize(("kind", "report_of"), [("urdf", report_hand), ("mesh", report_object)])

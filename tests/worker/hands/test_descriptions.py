@@ -21,9 +21,9 @@ from graspd.worker.hands.check import check_hand
 from graspd.worker.hands.load import files_from_path, hand_from_path
 from graspd.worker.hands.xacro import expand
 from graspd.worker.stages.assets import load_hand_files
+from tests.api.factories import zipped
 from tests.worker.hands.mjcfs import CLAW
 from tests.worker.hands.urdfs import joint, link, robot
-from tests.worker.stages.test_ingest import zipped
 
 NOTES = {
     "urdf": "leap.urdf",

@@ -17,8 +17,8 @@ from graspd.worker.objects.check import check_object
 from graspd.worker.objects.formats import read_mesh
 from graspd.worker.objects.formats.bare import stl_bytes
 from graspd.worker.objects.formats.soup import MAX_FACES, triangulate
+from tests.api.factories import zipped
 from tests.worker.objects.shapes import Mesh, box, damaged
-from tests.worker.stages.test_ingest import zipped
 
 VOLUME = 0.06 * 0.05 * 0.04
 

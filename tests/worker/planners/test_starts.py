@@ -41,6 +41,7 @@ from tests.worker.simulation.rigs import ball, object_of
 #: A box that an Allegro hand spans in one direction only, and half of its width there [m].
 SIDES = (0.1, 0.24, 0.24)
 HALF = SIDES[0] / 2
+CUBE = object_of(trimesh.creation.box((0.06, 0.06, 0.06)))
 DRAFT = FIDELITIES["draft"]
 
 
@@ -131,18 +132,13 @@ def test_draws_are_those_of_each_generator_alone_and_look_at_the_object() -> Non
 
 
 @pytest.fixture(scope="module")
-def cube() -> ObjectModel:
-    return object_of(trimesh.creation.box((0.06, 0.06, 0.06)))
-
-
-@pytest.fixture(scope="module")
 def ring() -> HandModel:
     """Its six fingers stand side by side."""
     return ring_hand(6)
 
 
-def test_a_ring_of_six_has_a_place_only_when_it_opens(ring: HandModel, cube: ObjectModel) -> None:
-    model, generators = draft_model(ring, cube), [start_generator(5, 0, i, 0) for i in range(4)]
+def test_a_ring_of_six_has_a_place_only_when_it_opens(ring: HandModel) -> None:
+    model, generators = draft_model(ring, CUBE), [start_generator(5, 0, i, 0) for i in range(4)]
     state, depth = clear_starts(model, generators)
     assert (depth > NO_PLACE).all()
     opened = starts.open_further(model, generators, state, depth, np.array([True, True, True, False]))
@@ -151,8 +147,8 @@ def test_a_ring_of_six_has_a_place_only_when_it_opens(ring: HandModel, cube: Obj
     assert (state.q[:3, closed].mean(axis=1) < ring.preshape[closed].mean()).all()
 
 
-def test_a_hand_that_has_a_place_keeps_it(cube: ObjectModel) -> None:
-    model, generators = draft_model(hand_from_path("barrett"), cube), [start_generator(5, 0, i, 0) for i in range(4)]
+def test_a_hand_that_has_a_place_keeps_it() -> None:
+    model, generators = draft_model(hand_from_path("barrett"), CUBE), [start_generator(5, 0, i, 0) for i in range(4)]
     state, depth = clear_starts(model, generators)
     before = state.pivot.copy(), state.rotation.copy(), state.q.copy()
     assert not starts.open_further(model, generators, state, depth, np.ones(4, bool)).any()
@@ -160,9 +156,9 @@ def test_a_hand_that_has_a_place_keeps_it(cube: ObjectModel) -> None:
         np.testing.assert_array_equal(was, now)
 
 
-def test_a_grasp_that_opened_does_not_depend_on_its_batch(ring: HandModel, cube: ObjectModel) -> None:
+def test_a_grasp_that_opened_does_not_depend_on_its_batch(ring: HandModel) -> None:
     many, few = (
-        synthesize(ring, cube, PlanRequest(count, DRAFT, seed=3), ExecutionContext(threads=threads)).grasp
+        synthesize(ring, CUBE, PlanRequest(count, DRAFT, seed=3), ExecutionContext(threads=threads)).grasp
         for count, threads in ((5, 3), (2, 1))
     )
     np.testing.assert_array_equal(many.hand_pose[:2], few.hand_pose)

@@ -29,6 +29,7 @@ from tests.worker.hands.urdfs import joint, link, robot
 from tests.worker.models import object_from_mesh, two_finger_hand
 
 HAND = two_finger_hand()
+BLOCK = object_from_mesh(trimesh.creation.box((0.05, 0.04, 0.06)), "block")
 POSES = np.array([[0, 0, -0.06, 1.0, 0, 0, 0], [0, 0, 0.06, 0, 1.0, 0, 0]])
 JOINTS = np.array([[0.1, 0.1], [0.3, 0.3]])
 REST = np.array([[0, 0, 0.03, 1.0, 0, 0, 0]])
@@ -36,13 +37,8 @@ TABLE_SCENE = PictureScenes((HalfSpace(),), REST)
 
 
 @pytest.fixture(scope="module")
-def block():
-    return object_from_mesh(trimesh.creation.box((0.05, 0.04, 0.06)), "block")
-
-
-@pytest.fixture(scope="module")
-def pictures(block) -> np.ndarray:
-    return grasp_pictures(HAND, block, POSES, JOINTS, (80, 64), THREE_SIDES, samples=4)
+def pictures() -> np.ndarray:
+    return grasp_pictures(HAND, BLOCK, POSES, JOINTS, (80, 64), THREE_SIDES, samples=4)
 
 
 def coloured_pixels(picture: np.ndarray, low: int, high: int) -> np.ndarray:
@@ -63,10 +59,10 @@ def test_every_side_shows_object_and_fingertips_in_their_colours(pictures) -> No
         assert coloured_pixels(picture, 115, 135).sum() > 5, "teal fingertips"
 
 
-def test_grasp_looks_the_same_whatever_grasps_are_drawn_with_it(block, pictures):
-    alone = grasp_pictures(HAND, block, POSES[1:], JOINTS[1:], (80, 64), THREE_SIDES, samples=4)
+def test_grasp_looks_the_same_whatever_grasps_are_drawn_with_it(pictures):
+    alone = grasp_pictures(HAND, BLOCK, POSES[1:], JOINTS[1:], (80, 64), THREE_SIDES, samples=4)
     np.testing.assert_array_equal(alone[0], pictures[1])
-    none = grasp_pictures(HAND, block, np.zeros((0, 7)), np.zeros((0, 2)), (80, 64), THREE_SIDES)
+    none = grasp_pictures(HAND, BLOCK, np.zeros((0, 7)), np.zeros((0, 2)), (80, 64), THREE_SIDES)
     assert none.shape == (0, 3, 64, 80, 3)
 
 
@@ -99,8 +95,8 @@ def test_a_contact_sheet_holds_every_picture_unchanged(pictures):
 
 
 @pytest.mark.parametrize(("stereo", "cells"), [(True, 5), (False, 4)])
-def test_a_views_page_has_a_row_per_placement_and_a_column_for_a_hand(block, stereo, cells):
-    views = render(block, REST, views=2, stereo=stereo, width=64, height=48, seed=0, samples=2)
+def test_a_views_page_has_a_row_per_placement_and_a_column_for_a_hand(stereo, cells):
+    views = render(BLOCK, REST, views=2, stereo=stereo, width=64, height=48, seed=0, samples=2)
     without = opened(sheets.views_page(views, title="block"))
     assert without.shape[1] > cells * 64 and without.shape[0] > 2 * 48
     views["image/rgb_hand"] = np.full((len(views["image/rgb"]), 48, 64, 3), [255, 0, 255], np.uint8)
@@ -126,51 +122,51 @@ def at(name: str, height: float = 0.0) -> Waypoint:
     return Waypoint(name, DOWN + np.append(rise, np.zeros(4)), np.full(2, 0.1), rise)
 
 
-def grasped(block, scenes: PictureScenes, hand: HandModel = HAND, **options) -> np.ndarray:
-    return way_pictures(hand, block, [[at("grasp")]], scenes, (48, 48), samples=2, **options)[0, 0, 0]
+def grasped(scenes: PictureScenes, hand: HandModel = HAND, **options) -> np.ndarray:
+    return way_pictures(hand, BLOCK, [[at("grasp")]], scenes, (48, 48), samples=2, **options)[0, 0, 0]
 
 
-def test_every_posture_of_every_grasp_is_drawn_from_every_side(block):
+def test_every_posture_of_every_grasp_is_drawn_from_every_side():
     frames = [[at("grasp"), at("lift", 0.1)]] * 2
-    drawn = way_pictures(HAND, block, frames, TABLE_SCENE, (48, 36), sides=3, samples=2)
+    drawn = way_pictures(HAND, BLOCK, frames, TABLE_SCENE, (48, 36), sides=3, samples=2)
     assert drawn.shape == (2, 3, 2, 36, 48, 3)
     assert all(orange(picture).sum() > 10 for picture in drawn.reshape(-1, 36, 48, 3))
 
 
-def test_the_lifted_object_is_higher_in_the_picture(block):
+def test_the_lifted_object_is_higher_in_the_picture():
     frames = [[at("grasp"), at("lift", 0.1)]]
-    (low, high) = way_pictures(HAND, block, frames, TABLE_SCENE, (64, 64), samples=2)[0, 0]
+    (low, high) = way_pictures(HAND, BLOCK, frames, TABLE_SCENE, (64, 64), samples=2)[0, 0]
     assert np.argwhere(orange(high))[:, 0].mean() < np.argwhere(orange(low))[:, 0].mean() - 10
-    assert orange(grasped(block, PictureScenes())).sum() > 20, "a free grasp floats over a floor"
+    assert orange(grasped(PictureScenes())).sum() > 20, "a free grasp floats over a floor"
 
 
-def test_whole_hand_is_in_the_picture_where_that_is_asked_for(block):
+def test_whole_hand_is_in_the_picture_where_that_is_asked_for():
     frames = [[replace(at("", 0.5), carried=np.zeros(3)), at("grasp")]]
-    both = (way_pictures(HAND, block, frames, TABLE_SCENE, (48, 48), whole=w, samples=2) for w in (False, True))
+    both = (way_pictures(HAND, BLOCK, frames, TABLE_SCENE, (48, 48), whole=w, samples=2) for w in (False, True))
     near, whole = (seen[0, 0] for seen in both)
     # The camera steps back for the hand that is far above: the block is smaller, and what is drawn ends above the rim.
     assert 0 < orange(whole[1]).sum() < 0.5 * orange(near[1]).sum()
-    assert np.abs(whole[0][:2].astype(int) - grasped(block, TABLE_SCENE)[0, 0]).max() < 40
+    assert np.abs(whole[0][:2].astype(int) - grasped(TABLE_SCENE)[0, 0]).max() < 40
 
 
 @pytest.mark.parametrize("side", [0, 1, 2, 3])
-def test_no_wall_stands_between_the_object_and_the_camera(block, side):
+def test_no_wall_stands_between_the_object_and_the_camera(side):
     x, y = np.array([(0.1, 0), (0, 0.1), (-0.1, 0), (0, -0.1)])[side]
     size = (0.02, 0.5, 0.5) if x else (0.5, 0.02, 0.5)
     wall = Box(size=size, pose=(x, y, 0.25, 1, 0, 0, 0))
     around = PictureScenes((HalfSpace(), wall), REST)
-    assert orange(grasped(block, around)).sum() > 0.5 * orange(grasped(block, TABLE_SCENE)).sum()
+    assert orange(grasped(around)).sum() > 0.5 * orange(grasped(TABLE_SCENE)).sum()
 
 
-def test_each_grasp_stands_in_its_own_scene(block):
+def test_each_grasp_stands_in_its_own_scene():
     turned = np.array([[0, 0, 0.02, np.sqrt(0.5), np.sqrt(0.5), 0, 0]])
     around = PictureScenes((HalfSpace(),), np.concatenate([REST, turned]), np.array([0, 1]))
-    first, second = way_pictures(HAND, block, [[at("grasp")]] * 2, around, (48, 48), samples=2)[:, 0, 0]
-    np.testing.assert_array_equal(second, grasped(block, PictureScenes((HalfSpace(),), turned)))
+    first, second = way_pictures(HAND, BLOCK, [[at("grasp")]] * 2, around, (48, 48), samples=2)[:, 0, 0]
+    np.testing.assert_array_equal(second, grasped(PictureScenes((HalfSpace(),), turned)))
     assert (first != second).any()
 
 
-def test_links_above_root_are_drawn_at_the_angles_of_the_wrist(block):
+def test_links_above_root_are_drawn_at_the_angles_of_the_wrist():
     # A copy of the hand behind its root serves as a forearm with two wrist joints.
     back = np.array([0, 0, -0.12])
     forearm = replace(HAND, pieces=tuple(replace(p, vertices=p.vertices + back) for p in HAND.pieces))
@@ -178,7 +174,7 @@ def test_links_above_root_are_drawn_at_the_angles_of_the_wrist(block):
 
     def picture(hand, wrist) -> np.ndarray:
         where = replace(TABLE_SCENE, wrist=wrist if wrist is None else np.array([wrist]))
-        return grasped(block, where, hand, whole=True).astype(int)
+        return grasped(where, hand, whole=True).astype(int)
 
     bare, straight, bent = picture(mounted, None), picture(mounted, [0.0, 0.0]), picture(mounted, [0.9, 0.9])
     assert np.array_equal(bare, picture(HAND, None))
@@ -263,19 +259,19 @@ def test_a_box_keeps_its_size_and_hides_what_is_behind_it() -> None:
 
 
 @pytest.mark.parametrize("kind", ["bin", "shelf"])
-def test_every_camera_sees_the_object_past_walls_and_boards(block, kind):
+def test_every_camera_sees_the_object_past_walls_and_boards(kind):
     extras = Extras(supports=SPECS[kind], channels=("occlusion",))
-    views = render(block, REST, views=4, stereo=False, width=48, height=36, seed=3, samples=2, extras=extras)
+    views = render(BLOCK, REST, views=4, stereo=False, width=48, height=36, seed=3, samples=2, extras=extras)
     labels = np.asarray(views["image/segmentation"])
     assert ((labels == 2).sum(axis=(1, 2)) > 20).all()
     assert set(np.unique(labels)) <= {0, 1, 2}, "all supports are labelled as the table"
     assert (labels == 1).mean() > 0.2 and np.isfinite(views["box/occlusion_ratio"]).all()
 
 
-def test_a_table_looks_the_same_named_or_not(block):
+def test_a_table_looks_the_same_named_or_not():
     options = {"views": 1, "stereo": False, "width": 48, "height": 36, "seed": 3, "samples": 2}
-    named = render(block, REST, **options, extras=Extras(supports=SPECS["table"]))
-    np.testing.assert_array_equal(named["image/rgb"], render(block, REST, **options)["image/rgb"])
+    named = render(BLOCK, REST, **options, extras=Extras(supports=SPECS["table"]))
+    np.testing.assert_array_equal(named["image/rgb"], render(BLOCK, REST, **options)["image/rgb"])
 
 
 SHAPE = '<collision><geometry><box size="0.02 0.02 0.04"/></geometry></collision>'

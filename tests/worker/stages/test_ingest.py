@@ -30,6 +30,7 @@ from graspd.worker.process.runner import Runner
 from graspd.worker.stages import hand_self_test, ingest
 from graspd.worker.stages.context import StopReason, TaskContext
 from graspd.worker.stages.hand_self_test import SelfTest
+from tests.api.factories import zipped
 from tests.worker.hands.urdfs import gripper_urdf
 from tests.worker.objects.shapes import sphere, stl
 
@@ -168,14 +169,6 @@ def computed() -> float:
     """Processor time of this process and of the children it waited for [s]."""
     used = os.times()
     return used.user + used.system + used.children_user + used.children_system
-
-
-def zipped(files: dict[str, bytes]) -> bytes:
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-        for name, data in files.items():
-            archive.writestr(name, data)
-    return buffer.getvalue()
 
 
 def upload(store: Store, kind: AssetKind, filename: str, data: bytes, options: dict | None = None):

@@ -29,6 +29,7 @@ from tests.worker.models import attributes_of, object_from_mesh, quality_columns
 viser = pytest.importorskip("viser", reason="needs the extra: pip install graspd[view]")
 
 HAND = two_finger_hand()
+BLOCK = object_from_mesh(trimesh.creation.box((0.05, 0.04, 0.06)), "block")
 GRASPS = 3
 LIFT_M = 0.1
 
@@ -68,14 +69,9 @@ def viewing(hand: HandModel, obj: ObjectModel, columns: dict[str, np.ndarray]) -
 
 
 @pytest.fixture(scope="module")
-def viewer(block) -> Iterator:
-    with viewing(HAND, block, arrays(2)) as made:
+def viewer() -> Iterator:
+    with viewing(HAND, BLOCK, arrays(2)) as made:
         yield made
-
-
-@pytest.fixture(scope="module")
-def block():
-    return object_from_mesh(trimesh.creation.box((0.05, 0.04, 0.06)), "block")
 
 
 @pytest.fixture(autouse=True)
@@ -182,11 +178,11 @@ def test_the_command_tells_its_address_and_ends_with_ctrl_c(tmp_path):
         assert process.wait(60) == 0
 
 
-def test_links_above_the_root_are_drawn_at_each_grasps_wrist(block) -> None:
+def test_links_above_the_root_are_drawn_at_each_grasps_wrist() -> None:
     # A copy of the hand behind its root serves as a forearm with two wrist joints.
     forearm, mounted = HAND, replace(HAND, mounting=HAND)
     angles = np.array([[0.0, 0], [0.3, 0.6], [0.9, 0.1]])
-    with viewing(mounted, block, arrays(2) | {"grasp/wrist_positions": angles}) as made:
+    with viewing(mounted, BLOCK, arrays(2) | {"grasp/wrist_positions": angles}) as made:
         made.choose("all")
         own = len(drawn_bodies(HAND))
         assert len(made.models.bodies) == own + len(drawn_bodies(forearm))
