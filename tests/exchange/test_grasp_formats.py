@@ -1,4 +1,4 @@
-"""Grasps through the formats of others and back; files that would run code are refused."""
+"""Grasps through the formats of others and back; files that would run code, or are nested deep, are refused."""
 
 import os
 from pathlib import Path
@@ -7,14 +7,21 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from graspd.client.dataset_commands import read_spec
 from graspd.commands.exchange import read_sets
+from graspd.commands.studies import _read_maps as read_stability
 from graspd.exchange import dexgraspbench, published
+from graspd.exchange.bench_hand import _read as read_mapping
 from graspd.exchange.bench_scene import save_record
 from graspd.exchange.imported import Origin, joints_by_name, load_npy, scaled_object, verdicts
+from graspd.exchange.published import friction
 from graspd.exchange.scoring import write_scored
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import compose, quat_to_matrix
+from graspd.service.readers.trajectories import scene_spec_of
 from graspd.service.store.shards import Shard, read_shard
+from graspd.studies.cards.contents import Contents, with_provenance
+from graspd.worker.files.provenance import options_of
 from graspd.worker.hands.load import hand_from_path
 
 TINY = 1e-9  # positions and quaternions are only re-ordered, not computed with
@@ -194,3 +201,32 @@ def test_grasps_of_a_training_format_come_back(name: str, files: str, rounding: 
 def test_what_no_import_can_read_is_told(name: str, hand: str | None, says: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=says):
         read_sets(name, tmp_path, hand, "o", {"robot": "", "object_name": "", "number": 0})
+
+
+DEEP = "[" * 100_000 + "]" * 100_000
+
+
+@pytest.mark.parametrize(
+    ("name", "reader"),
+    [
+        ("spec.json", read_spec),
+        ("spec.toml", read_spec),
+        ("reference.json", friction),
+        ("hand_mapping.json", read_mapping),
+        ("stability.json", read_stability),
+        ("provenance.json", lambda path: with_provenance(Contents.__new__(Contents), path)),
+    ],
+)
+def test_a_file_that_is_nested_deep_is_refused_in_one_line(name: str, reader, tmp_path) -> None:
+    file = tmp_path / name
+    file.write_text(f"hands = {DEEP}" if name.endswith("toml") else f'{{"hands": {DEEP}}}')
+    with pytest.raises(InputError, match=name) as refused:
+        reader(file)
+    assert "\n" not in str(refused.value)
+
+
+def test_an_attribute_that_is_nested_deep_says_nothing() -> None:
+    assert options_of(DEEP) == {}
+    shard = Shard("base", {"scene": DEEP}, {})
+    with pytest.raises(InputError, match="is not a valid scene"):
+        scene_spec_of(shard)
