@@ -127,5 +127,4 @@ def test_relaxation_departs_from_hard_contact_as_its_weight_says() -> None:
     np.testing.assert_allclose(relaxed, hard, atol=0.02)
     for pull in (0.01, 0.04):
         relaxed, hard = settled(pull)
-        apart = (relaxed - hard)[..., 0]
-        np.testing.assert_allclose(apart, -pull / (2 * method.MISMATCH), atol=0.02)
+        np.testing.assert_allclose((relaxed - hard)[..., 0], -pull / (2 * method.MISMATCH), atol=0.02)

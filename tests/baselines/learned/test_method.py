@@ -100,8 +100,7 @@ def proposing(network: ProposalNetwork, found: Proposals, anchor: np.ndarray) ->
     """A network that proposes one grasp, whatever it sees; its noise is a tenth of a millimetre or milliradian."""
     rows = encode(found, anchor)[0].astype(np.float32)
     zero = {name: np.zeros_like(w) for name, w in network.weights.items() if name.startswith("flow.out")}
-    weights = network.weights | zero
-    return replace(network, weights=weights, mean=rows, std=np.full_like(rows, 1e-4))
+    return replace(network, weights=network.weights | zero, mean=rows, std=np.full_like(rows, 1e-4))
 
 
 def started(pair: Pair, network: ProposalNetwork, height: float, placed: PlacedGrasps) -> HandState:
@@ -312,8 +311,7 @@ def test_a_grasp_survives_its_row_and_a_bad_row_is_a_rotation() -> None:
     network = random_network(["a", "b", "c"])
     found = proposed(network, 5)
     np.testing.assert_allclose(np.linalg.norm(found.hand_pose[:, 3:], axis=1), 1, atol=1e-12)
-    back = net.decode(net.encode(found, [0.1, 0.2, 0.3]), [0.1, 0.2, 0.3])
-    assert_near(back, found, 1e-12)
+    assert_near(net.decode(net.encode(found, [0.1, 0.2, 0.3]), [0.1, 0.2, 0.3]), found, 1e-12)
     flat = np.zeros((3, network.numbers))
     flat[1, 3:9] = [0, 2, 0, 0, -1, 0]  # columns on one line
     flat[2, 3:9] = [3, 0, 0, 1, 2, 0]

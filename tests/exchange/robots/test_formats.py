@@ -94,8 +94,7 @@ def test_a_mujoco_scene_has_the_hands_names_and_key_frames(table_shard: Path, tm
     shard = read_shard(table_shard, kind="base")
     at = shard["scene/object_pose"][shard["grasp/scene_index"]]
     for row in range(len(case.grasps)):
-        key = model.key(f"grasp_{row:04}/grasp").id
-        mujoco.mj_resetDataKeyframe(model, data, key)
+        mujoco.mj_resetDataKeyframe(model, data, model.key(f"grasp_{row:04}/grasp").id)
         mujoco.mj_forward(model, data)
         pose = compose(at[row], case.grasps.grasp.hand_pose[row])
         bodies = body_poses(case.hand, pose, case.grasps.grasp.joint_positions[row])[0]

@@ -245,8 +245,7 @@ def test_pregrasp_backs_away_and_opens_no_further_than_it_must() -> None:
 
 def test_fingers_leave_along_the_contact_normals() -> None:
     """Plates slide only along their normal: the way back must be the same line, each by its own dof."""
-    before = pregrasp(PLATES, BOX, CLOSED)
-    opened = (CLOSED.joint_positions - before.joint_positions)[0]
+    opened = (CLOSED.joint_positions - pregrasp(PLATES, BOX, CLOSED).joint_positions)[0]
     assert opened[0] == pytest.approx(opened[1])
     # Gaps are closed to the next step of 50 mm, and clipped at the slide's end.
     assert (opened >= opening.CLEARANCE_M).all()
@@ -283,8 +282,7 @@ def test_squeeze_never_asks_more_than_the_hand_can() -> None:
 def test_squeeze_respects_a_coupling() -> None:
     hand = on_one_dof(two_finger_hand(), 0.5, 0.1)
     joints = hand.expand(np.array([[0.3]]))
-    command = squeeze(hand, BOX, posture(((0, 0, -0.095), tuple(joints[0]))))
-    moved = command.joint_positions - joints
+    moved = squeeze(hand, BOX, posture(((0, 0, -0.095), tuple(joints[0])))).joint_positions - joints
     assert moved[0, 1] == pytest.approx(0.5 * moved[0, 0])
 
 

@@ -66,8 +66,7 @@ def test_grasps_are_the_same_in_the_frame_of_the_file(made, scene: str) -> None:
 def test_the_object_stands_in_its_scenes_where_it_would(made) -> None:
     here, there = (made[at, "table"].arrays["scene/object_pose"] for at in ("origin", "far"))
     np.testing.assert_array_equal(there[:, 3:], here[:, 3:])
-    middle = apply(there, np.array(PLACES["far"]))
-    np.testing.assert_allclose(middle, here[:, :3], rtol=0, atol=1e-8)
+    np.testing.assert_allclose(apply(there, np.array(PLACES["far"])), here[:, :3], rtol=0, atol=1e-8)
 
 
 @SCENES

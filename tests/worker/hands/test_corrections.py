@@ -47,8 +47,7 @@ def same(one: HandModel, other: HandModel, *, palm: bool) -> bool:
 )
 def test_corrections_and_options_make_the_same_hand(said, options, palm: bool, tmp_path) -> None:
     (tmp_path / "claw.urdf").write_bytes(CLAW)
-    guessed = hand_from_path(tmp_path / "claw.urdf")
-    facts = facts_of(hand_glb(guessed))
+    facts = facts_of(hand_glb(hand_from_path(tmp_path / "claw.urdf")))
     there = corrected({"file": "claw.urdf"}, facts, HandCorrections.model_validate(said))
     named = load_hand({"claw.urdf": CLAW, "asset.json": json.dumps(there).encode()}, name="claw", digest="")
 

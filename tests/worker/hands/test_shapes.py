@@ -228,8 +228,7 @@ def test_samples_follow_their_seed_and_are_drawn_once_pre_shape() -> None:
     points = sample_surface(hand, 300)
     assert not np.array_equal(points.position, sample_surface(hand, 300, seed=4).position)
     assert sample_surface(replace(hand, closing=-hand.closing), 300) is points
-    bent = replace(hand, preshape=0.5 * (hand.lower + hand.upper))
-    assert sample_surface(bent, 300) is not points
+    assert sample_surface(replace(hand, preshape=0.5 * (hand.lower + hand.upper)), 300) is not points
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])

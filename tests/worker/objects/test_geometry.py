@@ -82,8 +82,7 @@ def test_distances_are_those_of_a_fine_grid_and_of_spheres() -> None:
 
 
 def test_mesh_distance_equals_the_minimum_over_all_triangles(shared_data) -> None:
-    path = shared_data / "objects" / "024_bowl" / "clean.stl"
-    model = object_from_path(path, 0.0)
+    model = object_from_path(shared_data / "objects" / "024_bowl" / "clean.stl", 0.0)
     faces = model.faces.astype(np.int64)
     points = sample_faces(model.vertices, faces, 60)[0] + np.random.default_rng(0).normal(scale=0.01, size=(60, 3))
     brute = point_triangle_distance(points[:, None], model.vertices[faces][None]).min(axis=1)
@@ -180,8 +179,7 @@ def test_poses_come_back_from_frame_of_file_with_the_same_bits(place: tuple[floa
     pose[:, 3:] /= np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
     centre = np.rint(np.array(place) / GRID_M) * GRID_M
     hands = GraspSet(*(Posture(pose, np.zeros((200, 1))) for _ in range(3)), np.zeros(200)).moved(np.zeros(3))
-    back = hands.moved(centre).moved(-centre)
-    np.testing.assert_array_equal(back.grasp.hand_pose, hands.grasp.hand_pose)
+    np.testing.assert_array_equal(hands.moved(centre).moved(-centre).grasp.hand_pose, hands.grasp.hand_pose)
     lying = hands.grasp.hand_pose
     np.testing.assert_array_equal(mesh_geometry.to_centre(mesh_geometry.to_file(lying, centre), centre), lying)
 

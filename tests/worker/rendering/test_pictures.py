@@ -108,8 +108,7 @@ def test_a_views_page_has_a_row_per_placement_and_a_column_for_a_hand(stereo, ce
 
 def test_depth_colours_darken_with_distance_and_grey_is_nothing():
     colours = sheets.depth_colours(np.array([0.2, 0.3, 0.4, 0.5, np.inf], np.float32), 0.2, 0.5).astype(int)
-    lightness = colours[:4] @ [0.2126, 0.7152, 0.0722]
-    assert np.all(np.diff(lightness) < -20)
+    assert np.all(np.diff(colours[:4] @ [0.2126, 0.7152, 0.0722]) < -20)
     assert colours[4].tolist() == [214, 214, 214]
 
 
@@ -152,8 +151,7 @@ def test_whole_hand_is_in_the_picture_where_that_is_asked_for():
 @pytest.mark.parametrize("side", [0, 1, 2, 3])
 def test_no_wall_stands_between_the_object_and_the_camera(side):
     x, y = np.array([(0.1, 0), (0, 0.1), (-0.1, 0), (0, -0.1)])[side]
-    size = (0.02, 0.5, 0.5) if x else (0.5, 0.02, 0.5)
-    wall = Box(size=size, pose=(x, y, 0.25, 1, 0, 0, 0))
+    wall = Box(size=(0.02, 0.5, 0.5) if x else (0.5, 0.02, 0.5), pose=(x, y, 0.25, 1, 0, 0, 0))
     around = PictureScenes((HalfSpace(), wall), REST)
     assert orange(grasped(around)).sum() > 0.5 * orange(grasped(TABLE_SCENE)).sum()
 
@@ -237,8 +235,7 @@ SPECS = {kind: supports_in(SceneSpec(kind=kind)) for kind in ("table", "bin", "s
 
 @pytest.mark.parametrize("normal", [(0, 0, 1), (1, 0, 0), (0, -2, 0), (1, 2, 3), (0, 0, -1)])
 def test_the_top_of_a_half_spaces_slab_is_its_plane(normal):
-    plane = HalfSpace(normal=normal, offset=0.12)
-    (pose,) = slab_poses([plane], np.array([0.1, 0.05, 0.2]), 0.7)
+    (pose,) = slab_poses([HalfSpace(normal=normal, offset=0.12)], np.array([0.1, 0.05, 0.2]), 0.7)
     unit = np.asarray(normal, float) / np.linalg.norm(normal)
     top = pose[:3] + quat_rotate(pose[3:], np.array([0.2, -0.3, TABLE_SIZE[2] / 2]))
     # Rounding of a handful of products near 1.

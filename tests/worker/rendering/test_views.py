@@ -245,8 +245,7 @@ def test_a_camera_looks_at_its_target_upright_in_its_field() -> None:
     assert pixels[0, 0, 1] == pytest.approx(120) and pixels[0, 1, 1] < 120
     assert depth[0, 0] == pytest.approx(np.linalg.norm(CENTRE - [0.3, 0.2, 0.4]))
     assert 2 * np.arctan(120 / k[1, 1]) == pytest.approx(cameras.FIELD_OF_VIEW)
-    top = pixel_rays(k, 320, 240)[0, 0]
-    np.testing.assert_allclose(top, [-159.5 / k[0, 0], -119.5 / k[1, 1], 1.0])
+    np.testing.assert_allclose(pixel_rays(k, 320, 240)[0, 0], [-159.5 / k[0, 0], -119.5 / k[1, 1], 1.0])
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -152,8 +152,7 @@ def test_neighbours_in_a_bin_stand_in_scenes_grasps_and_pictures(table: Bench) -
     first, base, views = shards
     assert base["scene/neighbour_pose"].shape == (1, 2, 7)
     np.testing.assert_array_equal(base["scene/neighbour_pose"], first["scene/neighbour_pose"])
-    scenes = placed_of_shard(base)
-    assert len(scenes.neighbours) == 2
+    assert len(placed_of_shard(base).neighbours) == 2
     assert table.store.exists(names.asset_model(AssetKind.OBJECT, beside[0]["digest"])), "viewers show it"
     alone = render_alone(bench, base)
     assert (views["image/depth"] != alone["image/depth"]).any(), "they are in the picture"

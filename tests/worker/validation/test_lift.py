@@ -50,8 +50,7 @@ def grasp(squeeze: float, way: np.ndarray | None = None) -> GraspSet:
     open_, touch, press = (posture(((0.0, 0.0, 0.0), (q, q))) for q in (TOUCH - 0.005, TOUCH, TOUCH + squeeze))
     approach = np.repeat(open_.hand_pose[:, None], 6, axis=1)
     approach[..., :3] += np.linspace(0.1, 0, 6)[:, None] * (np.array([0, 0, -1.0]) if way is None else way)
-    raised = press.hand_pose - np.array([0, 0, 0.1, 0, 0, 0, 0])
-    lift = Posture(raised, press.joint_positions)
+    lift = Posture(press.hand_pose - np.array([0, 0, 0.1, 0, 0, 0, 0]), press.joint_positions)
     found = GraspSet(touch, open_, press, np.full(1, np.nan))
     return dataclasses.replace(found, approach=approach, coming=open_.joint_positions, lift=lift)
 

@@ -97,8 +97,7 @@ def test_no_model_is_validated_after_the_share_is_sure(monkeypatch: pytest.Monke
 
 def test_the_weakest_axis_is_that_of_the_first_model_that_fails() -> None:
     held = np.array([[1, 0, 0], [1, 1, 1], [0, -1, -1], [-1, -1, -1]], np.int8)
-    axis = np.array([[1, 4, 5], [2, 3, 4], [7, 0, 0], [0, 0, 0]], np.uint8)
-    found = Robustness(held, axis, 0.9, 0.0)
+    found = Robustness(held, np.array([[1, 4, 5], [2, 3, 4], [7, 0, 0], [0, 0, 0]], np.uint8), 0.9, 0.0)
     assert found.weakest.tolist() == [4, 0, 7, 0]
     assert found.by_axis() == {
         Axis.SHAPES: (1, 1), Axis.JOINTS: (1, 1), Axis.COUPLINGS: (1, 1), Axis.FRICTION: (1, 2), Axis.MASS: (0, 1),
