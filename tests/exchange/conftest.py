@@ -1,6 +1,5 @@
 """A few real grasps for the formats to carry."""
 
-from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
@@ -9,10 +8,7 @@ import pytest
 from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.store.shards import Shard, read_shard, write_shard
 from graspd.worker.engines import backend
-from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.load import hand_from_path
-from graspd.worker.hands.model import HandModel
-from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import synthesize
 from graspd.worker.planners.port import PlanRequest
@@ -20,18 +16,18 @@ from tests.worker.commands_run import graspd
 
 
 @pytest.fixture(scope="session")
-def hand() -> HandModel:
+def hand():
     backend.start()
     return hand_from_path("barrett")
 
 
 @pytest.fixture(scope="session")
-def block() -> ObjectModel:
+def block():
     return object_from_path("block")
 
 
 @pytest.fixture(scope="session")
-def grasps(hand: HandModel, block: ObjectModel) -> GraspSet:
+def grasps(hand, block):
     return synthesize(hand, block, PlanRequest(count=4, fidelity=FIDELITIES["draft"], seed=5))
 
 
@@ -53,7 +49,7 @@ def on_tables(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def exported(on_tables: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+def exported(on_tables: Path, tmp_path_factory: pytest.TempPathFactory):
     """Folder of these in a training format."""
 
     @cache

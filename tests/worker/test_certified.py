@@ -20,8 +20,6 @@ from graspd.worker.files.provenance import base_attributes
 from graspd.worker.generation import ValidatedBatch, validated_grasps
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.load import hand_from_path
-from graspd.worker.hands.model import HandModel
-from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import PlanRequest
 from graspd.worker.quality.diversity import distances, hand_points
@@ -34,12 +32,12 @@ COUNT = 6
 
 
 @pytest.fixture(scope="module")
-def hand() -> HandModel:
+def hand():
     return hand_from_path("allegro")
 
 
 @pytest.fixture(scope="module")
-def block() -> ObjectModel:
+def block():
     return object_from_path("block")
 
 
@@ -48,7 +46,7 @@ def wish(**changes) -> JobRequest:
 
 
 @pytest.fixture(scope="module")
-def valid(hand: HandModel, block: ObjectModel) -> ValidatedBatch:
+def valid(hand, block) -> ValidatedBatch:
     return validated_grasps(hand, block, wish(rechecks=2), count=COUNT)
 
 
@@ -75,14 +73,14 @@ def judge(monkeypatch: pytest.MonkeyPatch, *pushes: Outcome, feasible: bool) -> 
     monkeypatch.setattr(generation, "passes", gate)
 
 
-def test_tries_count_up_to_the_last_grasp_that_is_kept(hand: HandModel, block: ObjectModel, monkeypatch) -> None:
+def test_tries_count_up_to_the_last_grasp_that_is_kept(hand, block, monkeypatch) -> None:
     judge(monkeypatch, Outcome.HELD, Outcome.DISPLACED, feasible=True)
     found = validated_grasps(hand, block, wish(rechecks=0), count=COUNT)
     # Six tries hold at 0, 2, 4; of the seven that promise to be enough the ones at 0, 2, 4 are.
     assert (found.candidates, found.planned, found.rejected["dropped"]) == (6 + 5, 6 + 7, 3 + 2)
 
 
-def test_what_the_validator_saw_of_each_try_is_counted(hand: HandModel, block: ObjectModel, monkeypatch) -> None:
+def test_what_the_validator_saw_of_each_try_is_counted(hand, block, monkeypatch) -> None:
     seen = (Outcome.HELD, Outcome.DISPLACED, Outcome.ROTATED, Outcome.LOST_WHILE_CLOSING, Outcome.PENETRATION)
     judge(monkeypatch, *seen, feasible=False)
     request, run = wish(rechecks=0, grasps=5, budget=1), ExecutionContext(threads=1)
@@ -113,7 +111,7 @@ def test_a_batch_that_is_stopped_is_what_was_validated_before(hand, block, monke
     assert len(found.grasps) == 1 and found.verdict_key is not None
 
 
-def test_a_grasp_like_one_that_is_kept_makes_room_for_another(hand: HandModel, block: ObjectModel, monkeypatch) -> None:
+def test_a_grasp_like_one_that_is_kept_makes_room_for_another(hand, block, monkeypatch) -> None:
     real = generation.synthesize
 
     def twins(*given, **named) -> GraspSet:
@@ -130,21 +128,21 @@ def test_a_grasp_like_one_that_is_kept_makes_room_for_another(hand: HandModel, b
     assert validated_grasps(hand, block, wish(**plain, min_distance=0), count=COUNT).rejected["alike"] == 0
 
 
-def test_candidate_grasps_are_all_kept_with_their_verdicts(hand: HandModel, block: ObjectModel) -> None:
+def test_candidate_grasps_are_all_kept_with_their_verdicts(hand, block) -> None:
     found = validated_grasps(hand, block, wish(want="candidates", rechecks=0), count=COUNT)
     assert (len(found.grasps), found.candidates, set(found.rejected.values())) == (COUNT, COUNT, {0})
     assert set(np.unique(found.columns["quality/success"])) <= {0, 1}
     assert ((found.columns["quality/valid"] == 1) <= (found.columns["quality/success"] == 1)).all()
 
 
-def test_without_a_validator_nobody_judges(hand: HandModel, block: ObjectModel) -> None:
+def test_without_a_validator_nobody_judges(hand, block) -> None:
     found = validated_grasps(hand, block, wish(validation="none"), count=COUNT)
     assert found.verdict_key is None and "quality/success" not in found.columns and len(found.grasps) == COUNT
     assert (found.columns["quality/feasible"] == 1).all(), "the budget is for feasible grasps then"
     assert not found.columns["quality/valid"].any()
 
 
-def test_the_methods_own_options_reach_it(hand: HandModel, block: ObjectModel) -> None:
+def test_the_methods_own_options_reach_it(hand, block) -> None:
     wanted = {"method": "autograsp", "want": "candidates", "validation": "none"}
     wishes = (wish(**wanted, options={"standoff_m": gap}) for gap in (0.0, 0.05))
     near, far = (validated_grasps(hand, block, one, count=2) for one in wishes)
@@ -153,7 +151,7 @@ def test_the_methods_own_options_reach_it(hand: HandModel, block: ObjectModel) -
         validated_grasps(hand, block, wish(**wanted, options={"speed": 3}), count=2)
 
 
-def test_a_budget_that_finds_nothing_ends_with_nothing(hand: HandModel, block: ObjectModel, monkeypatch) -> None:
+def test_a_budget_that_finds_nothing_ends_with_nothing(hand, block, monkeypatch) -> None:
     planned: list[int] = []
 
     def plan(_hand, _obj, wanted: PlanRequest, *_, **__) -> GraspSet:
@@ -170,7 +168,7 @@ def test_a_budget_that_finds_nothing_ends_with_nothing(hand: HandModel, block: O
     assert found.columns["quality/valid"].shape == (0,)
 
 
-def test_hands_that_are_no_numbers_are_dropped_and_counted(hand: HandModel, block: ObjectModel, monkeypatch) -> None:
+def test_hands_that_are_no_numbers_are_dropped_and_counted(hand, block, monkeypatch) -> None:
     whole = generation.synthesize
 
     def plan(*arguments, **options) -> GraspSet:
@@ -197,7 +195,7 @@ def test_rounds_end_with_enough_grasps_or_with_budget_used_up(wanted: int, facto
     assert valid >= wanted or candidates == budget
 
 
-def test_only_grasps_that_hold_in_enough_models_count(hand: HandModel, block: ObjectModel) -> None:
+def test_only_grasps_that_hold_in_enough_models_count(hand, block) -> None:
     found = validated_grasps(hand, block, wish(robust=0.75, robust_models=4, rechecks=0), count=3)
     share, weakest = found.columns["quality/robust_share"], found.columns["quality/robust_weakest"]
     assert len(found.grasps) == 3 and (share >= 0.75).all()
@@ -206,7 +204,7 @@ def test_only_grasps_that_hold_in_enough_models_count(hand: HandModel, block: Ob
     assert found.candidates == 3 + sum(found.rejected.values()) and "not_robust" in found.rejected
 
 
-def test_valid_grasps_that_hold_in_no_other_model_are_told_apart(hand, block: ObjectModel, monkeypatch) -> None:
+def test_valid_grasps_that_hold_in_no_other_model_are_told_apart(hand, block, monkeypatch) -> None:
     def nowhere(*args, held: np.ndarray, models: int, wanted: float, **kwargs) -> Robustness:
         verdicts = np.where(held[:, None], 0, -1).astype(np.int8) * np.ones((1, models), np.int8)
         return Robustness(verdicts, np.full(verdicts.shape, Axis.POSE, np.uint8), wanted, 0.0)

@@ -22,7 +22,6 @@ from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import BatchRequest, NoStartFound, PlanRequest
 from graspd.worker.pool.pool import MODULES, Pool
 from graspd.worker.rounds import SMALLEST_PART, parts_of
-from graspd.worker.simulation.environment import Scenes
 from graspd.worker.together import validated_batches
 from tests.worker.models import assert_same_batch, on_tables
 
@@ -37,7 +36,7 @@ def pair():
 
 
 @pytest.fixture(scope="module")
-def scenes(pair) -> Scenes:
+def scenes(pair):
     return on_tables(pair[1], count=3)
 
 
@@ -226,14 +225,14 @@ def test_a_run_in_this_process_makes_the_batches_of_a_job(pair) -> None:
 
 
 @pytest.fixture(scope="module")
-def own_scenes(pair) -> list[Scenes]:
+def own_scenes(pair):
     """Of each of three batches its own."""
     whole = on_tables(pair[1], count=6)
     return [replace(whole, object_pose=whole.object_pose[first : first + 2]) for first in (0, 2, 4)]
 
 
 @pytest.mark.parametrize("apart", [True, False])
-def test_waves_of_batches_in_scenes_are_the_same(pair, own_scenes: list[Scenes], apart: bool) -> None:
+def test_waves_of_batches_in_scenes_are_the_same(pair, own_scenes, apart: bool) -> None:
     wish = ASKED.model_copy(update={"budget": 3.0, "rechecks": 1})
     where, sizes = own_scenes if apart else own_scenes[0], [2, 2, 3]
     given = {"sizes": sizes, "scenes": where, "run": ExecutionContext(threads=2)}

@@ -8,7 +8,6 @@ import logging
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Iterator
 
 import pytest
 import warp as wp
@@ -99,7 +98,7 @@ FOUR = [Gpu(f"cuda:{k}", f"GPU-{k:04}", "H200") for k in range(4)]
 
 
 @pytest.fixture(autouse=True)
-def own_locks(tmp_path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def own_locks(tmp_path, monkeypatch: pytest.MonkeyPatch):
     """Locks of this test alone; a lock that is taken twice here is as one of two processes."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(devices, "_held", [])

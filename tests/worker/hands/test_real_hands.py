@@ -5,7 +5,6 @@ models of one hand: joints by name, bases by fit, fingertips as the validator.
 import dataclasses
 import functools
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +36,7 @@ FRAME_TOLERANCE = 1e-9
 
 
 @pytest.fixture(scope="module")
-def hands(shared_data: Path) -> Callable[..., HandModel]:
+def hands(shared_data: Path):
     return functools.cache(lambda name: hand_from_path(shared_data / "hands" / HANDS[name][0]))
 
 
@@ -52,7 +51,7 @@ def bare(shared_data: Path, name: str, **options: object) -> HandModel:
 
 
 @pytest.mark.parametrize("name", HANDS)
-def test_forward_kinematics_agrees_with_yourdfpy(name: str, hands: Callable[..., HandModel], shared_data: Path) -> None:
+def test_forward_kinematics_agrees_with_yourdfpy(name: str, hands, shared_data: Path) -> None:
     hand, path = hands(name), shared_data / "hands" / HANDS[name][0]
     oracle = yourdfpy.URDF.load(str(path), load_meshes=False, build_scene_graph=True)
     rng = np.random.default_rng(7)
@@ -68,7 +67,7 @@ def test_forward_kinematics_agrees_with_yourdfpy(name: str, hands: Callable[...,
 
 
 @pytest.mark.parametrize("name", HANDS)
-def test_every_real_hand_has_surface_palm_and_closes_to_a_point(name: str, hands: Callable[..., HandModel]) -> None:
+def test_every_real_hand_has_surface_palm_and_closes_to_a_point(name: str, hands) -> None:
     hand = hands(name)
     assert np.linalg.norm(hand.palm.approach) == pytest.approx(1.0)
     assert (hand.lower < hand.upper).all() and (hand.effort > 0).all() and (hand.masses > 0).all()
@@ -91,7 +90,7 @@ def test_every_real_hand_is_accepted_and_guessed_from_its_urdf_alone(name: str, 
     assert len(facts["dofs"]) == said["dof"] - (2 if name == "shadow" else 0)
 
 
-def test_allegros_masses_efforts_and_limits_without_zero(hands: Callable[..., HandModel], shared_data: Path) -> None:
+def test_allegros_masses_efforts_and_limits_without_zero(hands, shared_data: Path) -> None:
     hand, said = hands("allegro"), bare_files(shared_data, "allegro")[1]
     assert said["inertial_missing"] == ["palm", "wrist"]
     assert hand.masses.sum() == pytest.approx(said["total_mass_kg"], abs=2e-3) and (hand.masses > 0).all()

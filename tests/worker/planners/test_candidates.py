@@ -1,6 +1,5 @@
 """Which candidate of a grasp is taken after its trials."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -112,7 +111,7 @@ def placed(pair) -> PlacedGrasps:
 
 
 @pytest.fixture(scope="module")
-def in_scenes(pair, placed: PlacedGrasps) -> Callable[..., GraspSet]:
+def in_scenes(pair, placed: PlacedGrasps):
     """Four grasps on tables, chosen by a rollout."""
 
     def made(rollout=None, threads: int = 1) -> GraspSet:
@@ -171,7 +170,7 @@ def test_hand_that_nearly_lifts_squeezes_gently_where_that_helps(pair, in_scenes
 
 
 @pytest.fixture(scope="module")
-def free(pair) -> Callable[..., GraspSet]:
+def free(pair):
     """Six grasps of a free object, chosen by their trial, but for what is changed of the request."""
     rollout = push_rollout(*pair, lambda: ConvexPieces((pair[1].hull_vertices,), 1.0, 0.0, "block"))
     wanted = PlanRequest(6, QUICK, seed=4, rollout=rollout)

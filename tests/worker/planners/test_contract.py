@@ -7,7 +7,6 @@ from concurrent.futures import ProcessPoolExecutor
 from importlib import metadata
 from importlib.metadata import EntryPoint
 from multiprocessing import get_context
-from pathlib import Path
 
 import h5py
 import numpy as np
@@ -160,7 +159,7 @@ def test_entry_points_of_other_packages_are_methods_or_refused(monkeypatch, name
         method("magic")
 
 
-def test_the_documented_package_runs_as_a_method(tmp_path: Path) -> None:
+def test_the_documented_package_runs_as_a_method(tmp_path) -> None:
     """As installed: a module and its metadata beside each other on the path."""
     (tmp_path / "mine.py").write_text(PAGE.split("```python\n", 1)[1].split("```", 1)[0])
     metadata = tmp_path / "mine-0.1.dist-info"

@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -274,7 +273,7 @@ FINGERS, BALL = two_finger_hand(), ball(subdivisions=2)
 
 
 @pytest.fixture
-def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def own_cache(tmp_path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     return tmp_path / "graspd" / "coarse_grids"
 
@@ -288,7 +287,7 @@ def same(one: tuple[np.ndarray, ...], other: tuple[np.ndarray, ...]) -> bool:
     return all(np.array_equal(a, b) and a.dtype == b.dtype for a, b in zip(one, other, strict=True))
 
 
-def test_later_process_measures_with_what_the_first_one_computed(own_cache: Path, monkeypatch) -> None:
+def test_later_process_measures_with_what_the_first_one_computed(own_cache, monkeypatch) -> None:
     first = distances_of(Probe(FINGERS, BALL, hand_points=100, object_points=64))
     assert len(list(own_cache.iterdir())) == 1
 
@@ -305,7 +304,7 @@ def test_later_process_measures_with_what_the_first_one_computed(own_cache: Path
 
 
 @pytest.mark.parametrize("harm", ["shape", "kind", "name"])
-def test_an_entry_that_is_not_sound_is_made_again(own_cache: Path, harm: str) -> None:
+def test_an_entry_that_is_not_sound_is_made_again(own_cache, harm: str) -> None:
     first = distances_of(Probe(FINGERS, BALL, hand_points=100, object_points=64))
     (file,) = own_cache.iterdir()
     whole, grid = file.read_bytes(), first[0]
@@ -407,7 +406,7 @@ def test_fingers_that_touch_by_their_sides_are_a_lateral_grasp() -> None:
     assert found["quality/grasp_type"].tolist() == [GraspType.LATERAL]
 
 
-def test_published_fingertip_grasps_are_precision_grasps(shared_data: Path) -> None:
+def test_published_fingertip_grasps_are_precision_grasps(shared_data) -> None:
     """FRoGGeR plans with four fixed points on the fingertips, so whoever plans nothing else holds nothing else."""
     case = load_case(shared_data / "reference_grasps" / "frogger_allegro" / "056_tennis_ball.json")
     some = case.grasps.take(np.arange(6))

@@ -20,7 +20,6 @@ from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import ConvexPiece, HandModel
 from graspd.worker.hands.primitives import tessellate
-from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import synthesize
 from graspd.worker.planners.fast_graspd.candidates import posture_of
@@ -230,17 +229,17 @@ def shadow(shared_data) -> HandModel:
 
 
 @pytest.fixture(scope="module")
-def block() -> ObjectModel:
+def block():
     return object_from_path("block", face_error_m=QUICK.face_error_m)
 
 
 @pytest.fixture(scope="module")
-def table(block: ObjectModel) -> Scenes:
+def table(block) -> Scenes:
     return on_tables(block)
 
 
 @pytest.fixture(scope="module")
-def mounted(shadow: HandModel, block: ObjectModel, table: Scenes) -> GraspSet:
+def mounted(shadow: HandModel, block, table: Scenes) -> GraspSet:
     placed = table.placed(np.arange(8) % 2)
     found = synthesize(shadow, block, PlanRequest(count=8, fidelity=QUICK, seed=4, placed=placed))
     return replace(found, scene=placed.index)
@@ -252,7 +251,7 @@ def lowest(mounting: HandModel, poses: np.ndarray, wrist: np.ndarray) -> float:
     return min(float(apply(bodies[:, p.body, None], p.vertices)[..., 2].min()) for p in mounting.pieces)
 
 
-def test_starts_keep_the_forearm_off_the_table(shared_data, block: ObjectModel, table: Scenes) -> None:
+def test_starts_keep_the_forearm_off_the_table(shared_data, block, table: Scenes) -> None:
     # A wrist that is held bent forwards: behind a palm that faces down the forearm is lowest.
     held = {"root": "palm", "fix": {"WRJ1": 0.48, "WRJ2": 0.0}}
     shadow = hand_from_path(shared_data / "hands" / "shadow" / "shadow_hand_right.urdf", held)
@@ -311,7 +310,7 @@ def test_a_grasp_with_its_mounting_in_the_table_is_not_clear(shadow: HandModel, 
     assert (columns["quality/success"] == -1).all()
 
 
-def test_free_grasps_do_not_depend_on_the_mounting(shadow: HandModel, block: ObjectModel) -> None:
+def test_free_grasps_do_not_depend_on_the_mounting(shadow: HandModel, block) -> None:
     wanted = PlanRequest(count=2, fidelity=QUICK, seed=4)
     ours, bare = (synthesize(hand, block, wanted) for hand in (shadow, replace(shadow, mounting=None)))
     for one, other in ((ours.grasp, bare.grasp), (ours.pregrasp, bare.pregrasp), (ours.squeeze, bare.squeeze)):

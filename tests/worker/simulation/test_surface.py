@@ -1,7 +1,5 @@
 """Distances and normals of surfaces and pieces against closed forms, the mesh and NumPy; grids kept on disk."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import trimesh
@@ -229,13 +227,13 @@ BALL = ball(subdivisions=2)
 
 
 @pytest.fixture
-def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def own_cache(tmp_path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     return tmp_path / "graspd" / "object_grids"
 
 
 @pytest.fixture
-def computed(own_cache: Path, monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, ...]]:
+def computed(own_cache, monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, ...]]:
     """The shapes of the grids that were computed, not read."""
     shapes: list[tuple[int, ...]] = []
     sampled = grids._sampled
@@ -261,7 +259,7 @@ def same(one: Grid, other: Grid) -> bool:
     return all(one[name].dtype == other[name].dtype and np.array_equal(one[name], other[name]) for name in one)
 
 
-def test_a_later_process_reads_what_the_first_one_computed(computed: list, own_cache: Path) -> None:
+def test_a_later_process_reads_what_the_first_one_computed(computed: list, own_cache) -> None:
     first, second = kept_grid(), kept_grid()
     assert same(first, second) and len(first["face"]) > 0
     assert len(computed) == 1 and len(list(own_cache.iterdir())) == 1
@@ -291,7 +289,7 @@ def test_another_cell_faces_or_binary_is_another_grid(computed: list, monkeypatc
         ("field", None),
     ],
 )
-def test_an_entry_that_would_lead_kernels_astray_is_made_again(computed, own_cache: Path, name: str, change) -> None:
+def test_an_entry_that_would_lead_kernels_astray_is_made_again(computed, own_cache, name: str, change) -> None:
     first = kept_grid()
     (file,) = own_cache.iterdir()
     arrays = dict(disk_cache._read(file) or {})

@@ -2,7 +2,6 @@
 
 import json
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -102,7 +101,7 @@ class Bench:
 
 
 @pytest.fixture(scope="module")
-def table(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+def table(tmp_path_factory: pytest.TempPathFactory):
     bench = Bench(open_store(tmp_path_factory.mktemp("store").as_uri()))
     assert bench.run(**TABLE) == (EventKind.FINISHED, "")
     yield bench

@@ -6,7 +6,6 @@ The engine has the arrays of MuJoCo Warp and steps in MuJoCo itself: its verdict
 import dataclasses
 import enum
 import logging
-from collections.abc import Iterator
 from types import SimpleNamespace
 
 import mujoco
@@ -199,7 +198,7 @@ ON = ExecutionContext(prefilter="on", threads=1)
 
 
 @pytest.fixture(autouse=True)
-def stand_in(monkeypatch: pytest.MonkeyPatch) -> Iterator[Stand]:
+def stand_in(monkeypatch: pytest.MonkeyPatch):
     """MuJoCo itself as the engine; the pads pass for a hand, which grippers do not."""
     engine = Stand()
     monkeypatch.setattr(screening, "mujoco_warp", lambda: engine)
