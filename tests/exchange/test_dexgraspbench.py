@@ -29,6 +29,11 @@ from graspd.worker.simulation.environment import Obstacle, PlacedGrasps
 from tests.worker.commands_run import graspd
 
 PREFIX = "child-"
+#: Rounding of a pose in float64 through text of 12 digits [m].
+ROUNDING_M = 1e-8
+CONFIG, EXPERIMENT = "graspd_barrett", "graspd_tabletop"
+COUNT = 12
+LIMP = 3
 
 
 @dataclass
@@ -153,10 +158,6 @@ def _move(found: Loaded, a: np.ndarray, b: np.ndarray) -> None:
 
 def files_of(root: Path, config: str, experiment: str = "graspd") -> list[Path]:
     return sorted((root / "output" / f"{experiment}_{config}" / "graspdata").glob("**/*.npy"))
-
-
-#: Rounding of a pose in float64 through text of 12 digits [m].
-ROUNDING_M = 1e-8
 
 
 @pytest.fixture(scope="module")
@@ -330,11 +331,6 @@ def _chain(root: list[float], chain: list) -> str:
         inside += f'<body pos="{text(pos)}" quat="{text(quat)}"><joint axis="{text(axis)}"/>{geom}'
     inside += "</body>" * (len(chain) + 2)
     return f'<mujoco><compiler angle="radian"/><worldbody>{inside}</worldbody></mujoco>'
-
-
-CONFIG, EXPERIMENT = "graspd_barrett", "graspd_tabletop"
-COUNT = 12
-LIMP = 3
 
 
 @pytest.fixture(scope="module")

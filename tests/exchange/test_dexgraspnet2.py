@@ -39,6 +39,15 @@ from tests.worker.commands_run import graspd, refused
 MAX_POINT_DIS = 0.006
 #: Of GraspNet: what is farther from the box around the objects is cut off [m].
 OUTLIER = 0.02
+TRAIN, VAL = range(90), range(90, 100)
+#: Poses go through matrices in float64 and there and back between frames [m].
+ROUNDING_M = 1e-9
+#: Half a step of depth, 0.05 mm, along a ray that is at most 1.3 times as long [m].
+POINT_M = 8e-5
+DOWN = np.array([[0.0, 0, -1]])
+ABOVE = np.array([[0.0, 0, 0.1]])
+#: 100 px to a metre at a metre, a picture of 2 x 4.
+K = np.array([[100.0, 0, 1], [0, 100, 0.5], [0, 0, 1]])
 
 
 @dataclass
@@ -147,13 +156,6 @@ def graspness_at(place: np.ndarray, surface: np.ndarray, points: np.ndarray) -> 
     if squares[nearest] >= 0.015:
         return 0.0
     return float(sum(10 ** (-150 * np.linalg.norm(surface[nearest] - point)) for point in points))
-
-
-TRAIN, VAL = range(90), range(90, 100)
-#: Poses go through matrices in float64 and there and back between frames [m].
-ROUNDING_M = 1e-9
-#: Half a step of depth, 0.05 mm, along a ray that is at most 1.3 times as long [m].
-POINT_M = 8e-5
 
 
 @pytest.fixture(scope="module")
@@ -321,12 +323,6 @@ def test_what_shows_no_scene_or_no_clear_grasp_is_told(on_tables: Path, tmp_path
     lots = [SimpleNamespace(id="base")]
     with pytest.raises(InputError, match="no grasp is valid and clear"):
         dexgraspnet2.write(lots, cast(Pictures, None), tmp_path, frozenset())
-
-
-DOWN = np.array([[0.0, 0, -1]])
-ABOVE = np.array([[0.0, 0, 0.1]])
-#: 100 px to a metre at a metre, a picture of 2 x 4.
-K = np.array([[100.0, 0, 1], [0, 100, 0.5], [0, 0, 1]])
 
 
 @pytest.mark.parametrize(("degrees", "best"), [(4.5, 1), (5.5, 0)])

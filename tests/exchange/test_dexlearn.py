@@ -29,6 +29,12 @@ from graspd.service.readers.depth_noise import noise_of
 from graspd.worker.hands.kinematics import body_poses
 from tests.worker.commands_run import graspd
 
+NAME = "graspd_tabletop_graspd_barrett"
+#: A pose in float64 through a model in text of 12 digits [m].
+ROUNDING_M = 1e-8
+#: A point of a picture: depth in float32, and a surface met by a ray in float32 [m].
+POINT_M = 2e-5
+
 
 @dataclass
 class Sample:
@@ -107,13 +113,6 @@ def _glob(pattern: str) -> list[str]:
 def _matrices(quaternions: np.ndarray) -> np.ndarray:
     flat = Rotation.from_quat(quaternions.reshape(-1, 4), scalar_first=True).as_matrix()
     return np.asarray(flat.reshape(*quaternions.shape[:-1], 3, 3))
-
-
-NAME = "graspd_tabletop_graspd_barrett"
-#: A pose in float64 through a model in text of 12 digits [m].
-ROUNDING_M = 1e-8
-#: A point of a picture: depth in float32, and a surface met by a ray in float32 [m].
-POINT_M = 2e-5
 
 
 @pytest.fixture(scope="module")

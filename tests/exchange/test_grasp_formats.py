@@ -25,6 +25,7 @@ from graspd.worker.files.provenance import options_of
 from graspd.worker.hands.load import hand_from_path
 
 TINY = 1e-9  # positions and quaternions are only re-ordered, not computed with
+DEEP = "[" * 100_000 + "]" * 100_000
 
 
 class Bomb:
@@ -201,9 +202,6 @@ def test_grasps_of_a_training_format_come_back(name: str, files: str, rounding: 
 def test_what_no_import_can_read_is_told(name: str, hand: str | None, says: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=says):
         read_sets(name, tmp_path, hand, "o", {"robot": "", "object_name": "", "number": 0})
-
-
-DEEP = "[" * 100_000 + "]" * 100_000
 
 
 @pytest.mark.parametrize(

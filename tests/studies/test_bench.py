@@ -37,6 +37,7 @@ from tests.worker.commands_run import graspd, refused
 
 RUN_KEYS = {"fidelity", "batch", "processes", "hand_points", "faces", "iterations", "ms_per_iteration"}
 RUN_KEYS |= {"grasps_per_second", "peak_memory_mb"}
+PAGE = (REPOSITORY / "docs" / "explanation" / "modelling.md").read_text()
 
 
 def test_every_run_has_the_keys_of_the_contract_and_adds_up(tmp_path) -> None:
@@ -103,9 +104,6 @@ def test_both_methods_are_told_side_by_side(tmp_path, monkeypatch, capsys: pytes
     page = (tmp_path / "out" / "learned.md").read_text()
     assert learned.table(found["rows"]) in page and learned.table(found["rows"]) + "\n" == capsys.readouterr().out
     assert str(tmp_path) not in page
-
-
-PAGE = (REPOSITORY / "docs" / "explanation" / "modelling.md").read_text()
 
 
 def test_a_step_is_that_of_the_reference() -> None:

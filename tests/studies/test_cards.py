@@ -61,6 +61,8 @@ SECONDS = {Stage.SYNTHESIZE: 2.0, Stage.SCENE: 0.5, Stage.RENDER: 1.5}
 Array = NDArray[Any]
 #: May change a base shard's columns, by hand and object, before it is written.
 Change = Callable[[str, str, dict[str, Array]], None]
+CHECK = ("sha256sum", "-c", "--strict", "checksums.sha256")
+MANY = [f"object-{number:03}" for number in range(200)]
 
 
 @dataclass
@@ -183,9 +185,6 @@ def _base(rng: np.random.Generator, joints: tuple[str, ...], count: int, batch: 
     return columns
 
 
-CHECK = ("sha256sum", "-c", "--strict", "checksums.sha256")
-
-
 def test_the_page_its_links_and_figures_agree_with_the_card(kitchen: Case) -> None:
     head = yaml.safe_load(kitchen.page.split("---")[1])
     assert head["pretty_name"] == "kitchen" and head["license"] == "cc-by-4.0"
@@ -299,9 +298,6 @@ def test_a_mistake_is_one_line_and_exit_2(kitchen, tmp_path, monkeypatch, words:
     done = CliRunner().invoke(build(), [*f"datasets card {words} -o".split(), str(tmp_path / "out")])
     assert done.exit_code == 2 and len(done.stderr.strip().splitlines()) == 1
     assert says in done.stderr and not (tmp_path / "out").exists()
-
-
-MANY = [f"object-{number:03}" for number in range(200)]
 
 
 def matrix(valid: int) -> tuple[Contents, Tally]:

@@ -33,6 +33,13 @@ RUN_KEYS |= {"pd_mm", "end_to_end_per_second", "dexgraspbench", "hard", "robust"
 
 
 QUICK = "chart --quick --methods fast_graspd,autograsp --hands barrett --objects block"
+CROWDS = {
+    "beside each other": [(10.0, 0.98), (13.0, 0.95), (14.0, 0.93), (22.0, 0.94)],
+    "above each other": [(5.0, 0.50), (5.0, 0.52), (5.0, 0.54), (5.1, 0.48)],
+    "in the corners": [(1.0, 0.0), (100.0, 1.0), (1.0, 1.0), (100.0, 0.0)],
+    "at the same place": [(3.0, 0.3), (3.0, 0.3), (3.0, 0.3)],
+}
+ON_TABLE = f"{QUICK} --scene table"
 
 
 @pytest.fixture(scope="module")
@@ -168,14 +175,6 @@ def test_asking_for_distances_anew_changes_no_grasp() -> None:
     np.testing.assert_array_equal(shared.grasp.joint_positions, anew.grasp.joint_positions)
 
 
-CROWDS = {
-    "beside each other": [(10.0, 0.98), (13.0, 0.95), (14.0, 0.93), (22.0, 0.94)],
-    "above each other": [(5.0, 0.50), (5.0, 0.52), (5.0, 0.54), (5.1, 0.48)],
-    "in the corners": [(1.0, 0.0), (100.0, 1.0), (1.0, 1.0), (100.0, 0.0)],
-    "at the same place": [(3.0, 0.3), (3.0, 0.3), (3.0, 0.3)],
-}
-
-
 def drawn(points: list[tuple[float, float]]) -> tuple:
     figure = Figure(figsize=(5.0, 4.0), layout="constrained")
     axes = figure.subplots()
@@ -204,9 +203,6 @@ def test_a_word_alone_stands_close_to_its_point() -> None:
     axes, (word,) = drawn([(10.0, 0.5)])
     box, point = word.get_window_extent(), axes.transData.transform((10.0, 0.5))
     assert word.arrow_patch is None and 0 < box.x0 - point[0] < 15 and 0 < box.y0 - point[1] < 15
-
-
-ON_TABLE = f"{QUICK} --scene table"
 
 
 @pytest.fixture(scope="module")

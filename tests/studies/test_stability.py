@@ -41,6 +41,7 @@ from tests.worker.commands_run import graspd, refused
 from tests.worker.simulation.test_surroundings import mujoco_room
 
 FEW = MapOptions(4)
+FRICTION, MASS = "friction, relative to the model", "mass, relative to the model"
 
 
 @pytest.fixture(scope="module")
@@ -182,9 +183,6 @@ def test_palm_without_fingers_is_refused_and_three_of_them_hold() -> None:
     assert none.outcome == "refused" and three.value > 0
     driven = assets.hand_map(FEW, fingers=(3, 5), couplings=("one drive",)).cells
     assert [cell.outcome for cell in driven] == ["good", "good"]
-
-
-FRICTION, MASS = "friction, relative to the model", "mass, relative to the model"
 
 
 def validated(monkeypatch: pytest.MonkeyPatch, name: str, amounts: tuple[float, ...]) -> list[MapCell]:

@@ -29,6 +29,7 @@ from graspd.worker.validation.robust import Robustness
 from tests.worker.models import object_from_mesh, two_finger_hand
 
 COUNT = 6
+SOME, JOINTS = 3, 2
 
 
 @pytest.fixture(scope="module")
@@ -241,9 +242,6 @@ def test_a_quiet_part_tells_nothing_and_can_still_be_stopped() -> None:
 
 def test_without_number_of_threads_it_takes_the_cores_there_are() -> None:
     assert (ExecutionContext().cores, ExecutionContext(threads=3).cores) == (available_cores(), 3)
-
-
-SOME, JOINTS = 3, 2
 
 
 def postures(rng: np.random.Generator) -> Posture:

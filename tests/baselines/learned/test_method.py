@@ -36,6 +36,8 @@ from tests.worker.models import on_tables
 
 FEW = {"coarse_iterations": 20, "fine_iterations": 6, "polish_iterations": 2}
 QUICK = resolve_fidelity("draft").model_copy(update=FEW)
+POSE = np.concatenate([[0.2, -0.1, 0.05], quat_from_axis_angle(np.array([0.0, 0, 1]), np.asarray(0.7))])
+Floats = np.ndarray[Any, np.dtype[np.float64]]
 
 
 @pytest.fixture(scope="module")
@@ -182,9 +184,6 @@ def test_what_it_cannot_do_is_said_in_a_line(hand, block, network, tmp_path: Pat
         of_this_machine("learned", {"network": str(tmp_path / "none.npz")})
 
 
-POSE = np.concatenate([[0.2, -0.1, 0.05], quat_from_axis_angle(np.array([0.0, 0, 1]), np.asarray(0.7))])
-
-
 @pytest.fixture(scope="module")
 def mug() -> ObjectModel:
     return object_from_path("mug")
@@ -219,9 +218,6 @@ def test_cameras_stand_where_pictures_have_them(mug: ObjectModel) -> None:
     assert (elevation >= ELEVATION[0] - 1e-9).all() and (elevation <= ELEVATION[1] + 1e-9).all()
     assert (distance >= NEAREST_M + mug.radius - 1e-9).all() and (distance < 0.8).all()
     assert np.linalg.norm((out[:, :2] / distance[:, None]).mean(axis=0)) < 0.15  # from all sides
-
-
-Floats = np.ndarray[Any, np.dtype[np.float64]]
 
 
 def cloud(count: int = 64, seed: int = 1) -> tuple[Floats, Floats]:

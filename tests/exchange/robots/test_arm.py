@@ -17,12 +17,12 @@ from graspd.service.model.transforms import IDENTITY_POSE, compose, pose_from_ma
 from tests.exchange.robots.arms import JOINTS, write_arm
 from tests.worker.commands_run import graspd, refused
 
-pytest.importorskip("mink")
-
 MOUNT_POSE = "0 0 0.11 1 0 0 0"
 #: The search ends at 0.1 mm and 1 mrad; between two of its points, 5 mm apart, joints move straight.
 NEAR_M = 5e-4
 NAMES = [name for name, *_ in JOINTS]
+
+pytest.importorskip("mink")
 
 
 @pytest.fixture(scope="module")

@@ -29,6 +29,9 @@ BLOCK = next(Path(service.__file__).parent.glob("builtin/objects/block/*.stl"))
 GRASP = {"id", "pre_grasp_posture", "grasp_posture", "grasp_pose", "grasp_quality", "pre_grasp_approach"}
 GRASP |= {"post_grasp_retreat", "post_place_retreat", "max_contact_force", "allowed_touch_objects"}
 POINT = {"positions", "velocities", "accelerations", "effort", "time_from_start"}
+#: Positions in float32 and poses with seven digits [m].
+ROUNDING_M = 2e-6
+PAGE = (REPOSITORY / "docs" / "how-to" / "robots.md").read_text()
 
 
 def export(shard: Path, format_: str, folder: Path, *more: str) -> dict:
@@ -187,10 +190,6 @@ def test_a_mistake_is_one_line_and_writes_nothing(options: str, said: str, free_
     assert not (tmp_path / "out").exists()
 
 
-#: Positions in float32 and poses with seven digits [m].
-ROUNDING_M = 2e-6
-
-
 def expected(shard: Path, row: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Vertices of the hand's bodies in the frame of the scene or the object, and the object's matrix there."""
     case = load_case(shard)
@@ -256,9 +255,6 @@ def test_usd_opens_a_grasp_in_metres_that_moves_to_the_lift(table_shard: Path, t
 def test_without_usd_core_a_line_says_what_to_install(free_shard: Path, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "pxr", None)
     assert "pip install 'graspd[usd]'" in refused("export --format usd", free_shard, "-o", tmp_path)
-
-
-PAGE = (REPOSITORY / "docs" / "how-to" / "robots.md").read_text()
 
 
 def test_every_format_of_the_command_is_on_the_page() -> None:

@@ -34,6 +34,20 @@ from tests.worker.hands.urdfs import gripper
 from tests.worker.models import object_from_mesh, on_one_dof, piece, two_finger_hand
 from tests.worker.quality.helpers import choose_contacts, placed_data, plate_hand, posture
 
+BOX = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))
+PLATES = plate_hand()
+CLOSED = posture(((0, 0, 0), (0.065, 0.065)))
+#: Central differences of a smooth function at this step are good to its square.
+STEP, DIFFERENCES = 1e-5, 1e-8
+OBJ = object_from_path("mug", face_error_m=0.002)
+#: Room for the single precision of distances, which weigh the ways of fingers [rad and m].
+SINGLE = 1e-6
+BALL = object_from_mesh(trimesh.creation.icosphere(4, 0.02))
+#: The pads stand 0.5 mm off each side of the ball, as a planner leaves them. Housing below, ball between the fingers.
+GAP = 5e-4
+AT = np.array([[0, 0, -0.09, 1, 0, 0, 0]])
+TARGET = 10.0 * np.eye(23)[6]
+
 
 def opened_by_numpy(probe: Probe, grasp: Posture) -> Posture:
     """N postures from which the hand closes, as `worker.control.postures` wants them."""
@@ -184,13 +198,6 @@ def _balanced(
     return float(np.linalg.norm(share @ edge)), wanted / max(1.0, float((np.abs(wanted) / hand.effort).max()))
 
 
-BOX = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))
-PLATES = plate_hand()
-CLOSED = posture(((0, 0, 0), (0.065, 0.065)))
-#: Central differences of a smooth function at this step are good to its square.
-STEP, DIFFERENCES = 1e-5, 1e-8
-
-
 def rigid_plates() -> HandModel:
     """The plates with a drive that presses within its stroke."""
     return dataclasses.replace(PLATES, stiffness=np.full(2, 1000.0))
@@ -324,11 +331,6 @@ def test_a_finger_stands_off_that_is_near_and_does_not_touch() -> None:
     assert postures.standing_off(PLATES, BOX, grasps).tolist() == [False, False, True, True, False]
 
 
-OBJ = object_from_path("mug", face_error_m=0.002)
-#: Room for the single precision of distances, which weigh the ways of fingers [rad and m].
-SINGLE = 1e-6
-
-
 def around(hand: HandModel, count: int) -> Posture:
     """Half closed hands around the object: clear ones, touching ones, deep ones."""
     rng = np.random.default_rng(5)
@@ -377,12 +379,6 @@ def test_links_in_contact_are_counted_as_in_numpy(case: tuple[HandModel, Probe, 
     assert postures.touching_links(hand, OBJ, grasp).tolist() == wanted and len(set(wanted)) > 2
 
 
-BALL = object_from_mesh(trimesh.creation.icosphere(4, 0.02))
-#: The pads stand 0.5 mm off each side of the ball, as a planner leaves them. Housing below, ball between the fingers.
-GAP = 5e-4
-AT = np.array([[0, 0, -0.09, 1, 0, 0, 0]])
-
-
 def grasp_of(hand: HandModel) -> Posture:
     return Posture(AT, hand.expand(np.full((1, hand.dofs), 0.02 + GAP)))
 
@@ -427,9 +423,6 @@ def test_gripper_opens_for_way_in_and_squeezes_within_its_stroke() -> None:
     thin = object_from_mesh(trimesh.creation.box((0.004, 0.02, 0.03)))
     grasp = Posture(AT, hand.expand(np.full((1, 1), 0.002 + GAP)))
     assert squeeze(hand, thin, grasp).joint_positions.min() >= 0.0
-
-
-TARGET = 10.0 * np.eye(23)[6]
 
 
 def nonnegative_weights(matrix: np.ndarray, count: np.ndarray) -> np.ndarray:

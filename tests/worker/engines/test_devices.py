@@ -19,6 +19,7 @@ from graspd.worker.planners.threads import run_parts
 
 #: As Warp 1.19 says it.
 NO_MEMORY = "Failed to allocate 8589934592 bytes on device 'cuda:0'"
+FOUR = [Gpu(f"cuda:{k}", f"GPU-{k:04}", "H200") for k in range(4)]
 
 
 def test_only_a_gpu_without_memory_is_out_of_memory() -> None:
@@ -92,9 +93,6 @@ def test_one_grasp_without_room_and_other_errors_end_the_work() -> None:
     with pytest.raises(RuntimeError, match="700"):
         run_parts([range(32)], lost)
     assert tried == [range(32)]
-
-
-FOUR = [Gpu(f"cuda:{k}", f"GPU-{k:04}", "H200") for k in range(4)]
 
 
 @pytest.fixture(autouse=True)

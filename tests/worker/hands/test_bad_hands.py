@@ -27,6 +27,28 @@ from tests.worker.objects.shapes import damaged
 from tests.worker.objects.test_colours import BOMB, SCENE, dae
 from tests.worker.stages.test_ingest import bad_files, is_expected, upload
 
+LIMIT, MIMIC = '<limit lower="0" upper="0.04"/>', '<mimic joint="jl" multiplier="-1"/>'
+#: The claw without its mesh.
+PLAIN_CLAW = re.sub('<geom type="mesh" [^>]*/>|<mesh name="tip"[^>]*/>', "", CLAW)
+_THUMB = '<position joint="thumb" kp="5"/>'
+_SITES = '<site name="a"/><body name="thumb" pos="-0.02 0 0.01"><site name="b" pos="0 0 0.03"/>'
+_CORD = '<tendon><spatial name="cord"><site site="a"/><site site="b"/></spatial></tendon><actuator>'
+_PULL = {'<body name="thumb" pos="-0.02 0 0.01">': _SITES, _THUMB: '<motor name="pull" tendon="cord"/>'}
+_GLUE = '<equality><weld name="glue" body1="thumb" body2="base"/>'
+_TURNED = 'euler="10 20 30">'
+_AGAIN = '<equality><joint joint1="left_spread" joint2="right_curl" polycoef="0.2 -2 0 0 0"/>'
+_WRIST = '<joint name="wrist" axis="0 1 0" range="-30 30"/>'
+_LEG = (
+    '<body name="leg"><geom type="sphere" size="0.05"/><body name="knee"><joint name="knee" axis="0 1 0"/>'
+    '<geom fromto="0 0 0 0 0 0.3" size="0.01"/></body></body><body name="mount"'
+)
+EMPTY = '<limit lower="0" upper="0"/>'
+_ARM = link("world", "") + joint("arm", "world", "base")
+_FREE = '<link name="ball"/><joint name="loose" type="floating"><parent link="base"/><child link="ball"/></joint>'
+SOURCE = builtin_files(AssetKind.HAND, "barrett")
+WORDS = [b"nan", b"-1e308", b"inf", b"0", b"", b"<", b'"', b"&x;", b"../../", b"palm", b"finger_1_medial", b"\xff\xfe"]
+URDFS, ASSETS = (damaged(SOURCE[name], WORDS) for name in ("barrett.urdf", "asset.json"))
+
 
 @pytest.mark.parametrize(("kind", "report_of"), [("urdf", report_hand), ("mesh", report_object)])
 def test_every_bad_file_gets_a_verdict_that_names_the_defect(shared_data, kind: str, report_of) -> None:
@@ -62,9 +84,6 @@ def test_a_path_of_nothing_is_refused_with_the_names_there_are() -> None:
     assert report_hand("alegro")["message"].endswith("; did you mean allegro?")
     found = report_hand("no_such_hand")
     assert found["verdict"] == "refuse" and "allegro" in found["message"]
-
-
-LIMIT, MIMIC = '<limit lower="0" upper="0.04"/>', '<mimic joint="jl" multiplier="-1"/>'
 
 
 def jaws(follower: str = LIMIT, drive: str = LIMIT, *more: str) -> bytes:
@@ -107,10 +126,6 @@ def test_a_xacro_that_only_defines_macros_is_told_as_that() -> None:
     assert "expands to no link at all: it only defines macros" in message and "cycle" not in message
 
 
-#: The claw without its mesh.
-PLAIN_CLAW = re.sub('<geom type="mesh" [^>]*/>|<mesh name="tip"[^>]*/>', "", CLAW)
-
-
 def changed(text: str, changes: dict[str, str]) -> bytes:
     for old, new in changes.items():
         assert old in text
@@ -130,15 +145,6 @@ def test_a_loop_that_is_not_solved_is_told_as_that(old: str, new: str, told: str
     assert told in check_hand({"h.xml": FOUR_BAR.replace(old, new).encode()}, "h")["message"]
 
 
-_THUMB = '<position joint="thumb" kp="5"/>'
-_SITES = '<site name="a"/><body name="thumb" pos="-0.02 0 0.01"><site name="b" pos="0 0 0.03"/>'
-_CORD = '<tendon><spatial name="cord"><site site="a"/><site site="b"/></spatial></tendon><actuator>'
-_PULL = {'<body name="thumb" pos="-0.02 0 0.01">': _SITES, _THUMB: '<motor name="pull" tendon="cord"/>'}
-_GLUE = '<equality><weld name="glue" body1="thumb" body2="base"/>'
-_TURNED = 'euler="10 20 30">'
-_AGAIN = '<equality><joint joint1="left_spread" joint2="right_curl" polycoef="0.2 -2 0 0 0"/>'
-
-
 @pytest.mark.parametrize(
     ("text", "changes", "told"),
     [
@@ -154,13 +160,6 @@ def test_what_is_passed_over_in_a_model_is_told(text: str, changes: dict[str, st
     found = check_hand({"h.xml": changed(text, changes)}, "h")
     assert found["verdict"] == "accept" and any(told in note for note in found["facts"]["notes"])
     assert not any(told in note for note in check_hand({"h.xml": text.encode()}, "h")["facts"]["notes"])
-
-
-_WRIST = '<joint name="wrist" axis="0 1 0" range="-30 30"/>'
-_LEG = (
-    '<body name="leg"><geom type="sphere" size="0.05"/><body name="knee"><joint name="knee" axis="0 1 0"/>'
-    '<geom fromto="0 0 0 0 0 0.3" size="0.01"/></body></body><body name="mount"'
-)
 
 
 @pytest.mark.parametrize("root", [None, "palm"])
@@ -202,11 +201,6 @@ WITHOUT_MIMIC = jaws().replace(MIMIC.encode(), b"")
 
 def coupled(multiplier: float) -> dict:
     return {"couplings": {"jr": {"of": "jl", "multiplier": multiplier}}}
-
-
-EMPTY = '<limit lower="0" upper="0"/>'
-_ARM = link("world", "") + joint("arm", "world", "base")
-_FREE = '<link name="ball"/><joint name="loose" type="floating"><parent link="base"/><child link="ball"/></joint>'
 
 
 @pytest.mark.parametrize(
@@ -267,11 +261,6 @@ def test_a_bad_hand_is_refused_in_one_line_here_and_as_an_upload(files, says: st
     found = upload(open_store("memory://"), AssetKind.HAND, "hand.zip", zipped(files))
     assert found["verdict"] == "refuse" and says in found["message"] and "\n" not in found["message"]
     assert "root:" not in line + found["message"] and set(files) == {path.name for path in folder.iterdir()}
-
-
-SOURCE = builtin_files(AssetKind.HAND, "barrett")
-WORDS = [b"nan", b"-1e308", b"inf", b"0", b"", b"<", b'"', b"&x;", b"../../", b"palm", b"finger_1_medial", b"\xff\xfe"]
-URDFS, ASSETS = (damaged(SOURCE[name], WORDS) for name in ("barrett.urdf", "asset.json"))
 
 
 def answers(urdf: bytes, asset: bytes) -> None:

@@ -15,6 +15,13 @@ from tests.worker.hands.urdfs import joint, link, load, report, robot
 
 _PALM = '<collision><geometry><box size="0.09 0.02 0.09"/></geometry></collision>'
 _PHALANX = '<collision><origin xyz="0 0 0.02"/><geometry><box size="0.014 0.014 0.04"/></geometry></collision>'
+RADIUS = 0.045
+_PLATE_SHAPE = '<geometry><box size="0.16 0.1 0.02"/></geometry>'
+#: Axis, and angle [rad].
+TURNS = {"upright": ((1, 0, 0), 0), "on its side": ((1, 0, 0), np.pi / 2), "upside down": ((0, 1, 0), np.pi)}
+TURNS |= {"tilted": ((0.6, 0.8, 0), 0.5)}
+TURNS |= {f"{angle} degrees": (np.array([1, 2, 3]) / np.sqrt(14), np.deg2rad(angle)) for angle in (7, 20, 35, 100)}
+TURNS = {name: quat_from_axis_angle(np.array(axis, float), np.asarray(angle)) for name, (axis, angle) in TURNS.items()}
 
 
 def limit(lower: float, upper: float) -> str:
@@ -93,10 +100,6 @@ def test_a_wrist_that_stands_ahead_of_the_palm_is_not_the_palm() -> None:
     assert hand.palm.centre[0] == pytest.approx(0.005) and 0.05 < hand.palm.centre[2] < 0.1
 
 
-RADIUS = 0.045
-_PLATE_SHAPE = '<geometry><box size="0.16 0.1 0.02"/></geometry>'
-
-
 def rpy(matrix: Floats) -> str:
     pitch = np.arcsin(-np.clip(matrix[2, 0], -1, 1))
     return f"{np.arctan2(matrix[2, 1], matrix[2, 2]):.17g} {pitch:.17g} {np.arctan2(matrix[1, 0], matrix[0, 0]):.17g}"
@@ -129,13 +132,6 @@ def _at(point: Floats) -> str:
 def _bar(length: float) -> str:
     place = f'<origin xyz="0 0 {length / 2}"/>'
     return f'<collision>{place}<geometry><box size="0.016 0.018 {length}"/></geometry></collision>'
-
-
-#: Axis, and angle [rad].
-TURNS = {"upright": ((1, 0, 0), 0), "on its side": ((1, 0, 0), np.pi / 2), "upside down": ((0, 1, 0), np.pi)}
-TURNS |= {"tilted": ((0.6, 0.8, 0), 0.5)}
-TURNS |= {f"{angle} degrees": (np.array([1, 2, 3]) / np.sqrt(14), np.deg2rad(angle)) for angle in (7, 20, 35, 100)}
-TURNS = {name: quat_from_axis_angle(np.array(axis, float), np.asarray(angle)) for name, (axis, angle) in TURNS.items()}
 
 
 @pytest.mark.parametrize("fingers", [2, 3, 4, 5, 6])

@@ -32,6 +32,10 @@ NOTES = {
     "fingertips": {"one": "b"},
     "physical": {"torque_limit_Nm_measured": 0.95},
 }
+PAD = bytes(trimesh.creation.box((0.01, 0.02, 0.06)).export(file_type="stl"))
+POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:12\nsize 5\n"
+INCLUDES = b'<robot xmlns:xacro="u"><xacro:include filename="a.xacro"/></robot>'
+DECLARED = '<?xml version="1.0" encoding="{}"?>'
 
 
 @pytest.fixture
@@ -140,12 +144,6 @@ def test_nothing_out_of_package_or_above_a_plain_folder_is_read(tmp_path: Path) 
     assert set(files_from_path(urdf)[1]) == {"claw.urdf"}
     assert "outside" in report_hand(str(urdf))["message"]
     assert report_hand(str(tmp_path / "hand"))["verdict"] == "accept"
-
-
-PAD = bytes(trimesh.creation.box((0.01, 0.02, 0.06)).export(file_type="stl"))
-POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:12\nsize 5\n"
-INCLUDES = b'<robot xmlns:xacro="u"><xacro:include filename="a.xacro"/></robot>'
-DECLARED = '<?xml version="1.0" encoding="{}"?>'
 
 
 def claw(mesh: str = "") -> str:

@@ -22,6 +22,7 @@ from tests.worker.hands.mjcfs import CLAW, FOUR_BAR, TENDON_CLAW
 #: Both sides compute in float64; what is left is rounding over a chain of a dozen rotations [m, and entries of R].
 FK_TOLERANCE = 1e-6
 POSTURES = 200
+FINGERS = ("FF", "MF", "RF", "LF")
 
 
 def tip() -> bytes:
@@ -190,9 +191,6 @@ def test_a_model_brings_what_it_includes_and_reads_nothing_else(tmp_path) -> Non
     text = with_inside('<include file="parts/extra.xml"/>')
     text = text.replace('file="tip.stl"', 'file="Tip.STL"')
     assert report_of(text, **{"parts/extra.xml": part})["verdict"] == "accept"
-
-
-FINGERS = ("FF", "MF", "RF", "LF")
 
 
 def pulls(hand: HandModel) -> dict[str, dict[str, float]]:

@@ -29,6 +29,10 @@ from graspd.worker.validation.model import MujocoOptions, build
 from tests.worker.hands.urdfs import BOX, OPENING, gripper, joint, link, robot
 from tests.worker.models import object_from_mesh
 
+HEIGHT_M = 0.012
+#: The pads are planes, so points on them tell their distance to rounding.
+PLANE_M = 1e-9
+
 
 @pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
 def test_fingertips_lie_on_both_sides_of_the_middle(name: str) -> None:
@@ -52,9 +56,6 @@ def test_a_wide_hand_opposes_over_a_range_one_finger_nothing() -> None:
     hand = hand_from_path("barrett")
     alone = oppositions_of(replace(hand, name="alone", fingertips=hand.fingertips[:1]))
     assert len(alone) == 0 and alone.widest == 0.0
-
-
-HEIGHT_M = 0.012
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
@@ -132,10 +133,6 @@ def test_what_a_hand_can_hold_is_asked_once_on_a_machine(tmp_path, monkeypatch: 
     assert [oppositions._can_hold.__wrapped__(hand) for hand in (gripper(), pointer())] == [True, False]
     monkeypatch.setattr(oppositions, "opposes", lambda hand: pytest.fail("asked again"))
     assert [oppositions._can_hold.__wrapped__(hand) for hand in (gripper(), pointer())] == [True, False]
-
-
-#: The pads are planes, so points on them tell their distance to rounding.
-PLANE_M = 1e-9
 
 
 @pytest.mark.parametrize("coupled", [True, False], ids=["one drive", "two drives"])

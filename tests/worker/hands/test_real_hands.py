@@ -33,6 +33,11 @@ HANDS = {
 }
 #: Both sides compute in float64; link chains are a handful of rotations long.
 FRAME_TOLERANCE = 1e-9
+ALLEGRO = [f"{f}_{j}" for f in ("index", "middle", "ring") for j in ("abduction", "proximal", "middle", "distal")]
+ALLEGRO += ["thumb_rotation", "thumb_proximal", "thumb_middle", "thumb_distal"]
+HAND = hand_from_path("shadow")
+#: Where the other model's root link is, as seen from ours.
+BASE = np.concatenate([[0.013, -0.02, 0.034], quat_from_axis_angle(np.array([0.6, 0.0, 0.8]), np.array(2.0))])
 
 
 @pytest.fixture(scope="module")
@@ -128,10 +133,6 @@ def test_on_its_forearm_a_palm_faces_where_its_fingers_close(shared_data: Path) 
     assert [hand.closing[hand.dof_names.index(name)] for name in ("WRJ1", "WRJ2", "FFJ3")] == [0, 0, 1]
 
 
-ALLEGRO = [f"{f}_{j}" for f in ("index", "middle", "ring") for j in ("abduction", "proximal", "middle", "distal")]
-ALLEGRO += ["thumb_rotation", "thumb_proximal", "thumb_middle", "thumb_distal"]
-
-
 @pytest.mark.parametrize("name", builtin_names(AssetKind.HAND))
 def test_fingers_stand_out_from_the_palm_and_do_not_touch(name: str) -> None:
     hand = hand_from_path(name)
@@ -179,11 +180,6 @@ def test_frames_of_built_in_hands_are_those_of_the_maker(name: str, shared_data:
         assert np.linalg.norm(difference[:3]) < 2 * tolerance, joint
         # Fixed angles are given as -0.785398 and the like.
         assert abs(difference[3]) == pytest.approx(1, abs=1e-9), joint
-
-
-HAND = hand_from_path("shadow")
-#: Where the other model's root link is, as seen from ours.
-BASE = np.concatenate([[0.013, -0.02, 0.034], quat_from_axis_angle(np.array([0.6, 0.0, 0.8]), np.array(2.0))])
 
 
 def other_base(hand: HandModel) -> HandModel:

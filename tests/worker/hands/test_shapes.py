@@ -22,6 +22,15 @@ from tests.worker.hands.urdfs import joint, link, load, robot
 SIZES = {"box": (0.1, 0.06, 0.03), "sphere": (0.04,), "cylinder": (0.02, 0.1), "capsule": (0.02, 0.1)}
 #: Chords of a circle of 32 corners lose up to 0.5 % of the radius, so volumes lose up to 2 %.
 TESSELLATION = 0.03
+BESIDE = [((0.3, 0, 0), 0.1), ((0.3, 0.3, 0), 0.1 * np.sqrt(2)), ((0.1, 0.05, 0), 0.0)]
+#: A housing with a cavity inside: nothing gets there.
+HOUSING = trimesh.creation.box((0.06, 0.06, 0.06)) + trimesh.creation.box((0.04, 0.04, 0.04))
+FILLED = [trimesh.creation.box((0.02, 0.03, 0.04)), trimesh.creation.icosphere(2, 0.02), HOUSING]
+#: Area is measured by at least 30,000 random candidates: the standard error of a share p is sqrt(p (1-p) / 30000), here
+#: below 0.3 %; four of these.
+AREA_TOLERANCE = 0.012
+ON_SURFACE_M = 1e-9
+BALL, CUBE, SLAB = '<sphere radius="0.04"/>', '<box size="0.04 0.04 0.04"/>', '<box size="0.08 0.08 0.04"/>'
 
 
 @pytest.mark.parametrize("kind", sorted(SIZES))
@@ -61,9 +70,6 @@ def test_a_reduced_hull_keeps_its_volume_and_stays_close() -> None:
     outside = primitives.signed_distance("hull", (), vertices, faces, points).max()
     beyond = np.linalg.norm(vertices, axis=1).max() - 0.012
     assert outside < 0.06 * 0.012 and beyond < 0.06 * 0.012
-
-
-BESIDE = [((0.3, 0, 0), 0.1), ((0.3, 0.3, 0), 0.1 * np.sqrt(2)), ((0.1, 0.05, 0), 0.0)]
 
 
 @pytest.mark.parametrize(("offset", "expected"), BESIDE)
@@ -128,11 +134,6 @@ def test_a_fork_is_taken_apart_and_its_gap_is_empty() -> None:
     assert count > 1 and share == pytest.approx(1.0, abs=0.05)
 
 
-#: A housing with a cavity inside: nothing gets there.
-HOUSING = trimesh.creation.box((0.06, 0.06, 0.06)) + trimesh.creation.box((0.04, 0.04, 0.04))
-FILLED = [trimesh.creation.box((0.02, 0.03, 0.04)), trimesh.creation.icosphere(2, 0.02), HOUSING]
-
-
 @pytest.mark.parametrize("mesh", FILLED)
 def test_what_its_hull_shows_well_enough_stays_one_hull(mesh: trimesh.Trimesh) -> None:
     vertices = np.asarray(mesh.vertices, float)
@@ -154,12 +155,6 @@ def test_real_hands_keep_their_hulls_but_for_barretts_palm(shared_data) -> None:
         assert len(hand_from_path(shared_data / "hands" / file).pieces) == count, file
 
 
-#: Area is measured by at least 30,000 random candidates: the standard error of a share p is sqrt(p (1-p) / 30000), here
-#: below 0.3 %; four of these.
-AREA_TOLERANCE = 0.012
-ON_SURFACE_M = 1e-9
-
-
 def shape(geometry: str, xyz: str = "0 0 0") -> str:
     return f'<collision><origin xyz="{xyz}"/><geometry>{geometry}</geometry></collision>'
 
@@ -168,9 +163,6 @@ def hand_of(*palm_shapes: str, finger: str = shape('<sphere radius="0.01"/>', "0
     """A hand whose palm has the given shapes and whose only finger is a sphere far away."""
     urdf = robot(link("palm", "".join(palm_shapes)), link("a", finger), joint("j", "palm", "a"))
     return load_hand({"h.urdf": urdf}, name="h", digest="".join(palm_shapes) + finger)
-
-
-BALL, CUBE, SLAB = '<sphere radius="0.04"/>', '<box size="0.04 0.04 0.04"/>', '<box size="0.08 0.08 0.04"/>'
 
 
 def palm_area(hand: HandModel, count: int = 1500) -> float:

@@ -14,6 +14,8 @@ from graspd.worker.hands.mounting import wrist_positions
 from tests.worker.hands.urdfs import chain, joint, link, load, report, robot
 
 THREE = (joint("j1", "palm", "a"), joint("j2", "a", "b"), joint("j3", "b", "c"))
+_BOX = '<collision><geometry><box size="{} {} {}"/></geometry></collision>'
+FOREARM = '<collision><origin xyz="0.01 0 0.1"/>' + _BOX.format(0.05, 0.06, 0.2)[11:]
 
 
 def test_a_fixed_joint_merges_its_links_into_one_body() -> None:
@@ -102,9 +104,6 @@ def test_a_continuous_joint_turns_and_a_prismatic_one_slides() -> None:
     np.testing.assert_allclose(pose[:3], [0, 0.3, 0.04], atol=1e-12)
 
 
-_BOX = '<collision><geometry><box size="{} {} {}"/></geometry></collision>'
-
-
 def bone(name: str, length: float) -> str:
     return link(name, f'<collision><origin xyz="0 0 {length / 2}"/>' + _BOX.format(0.02, 0.02, length)[11:])
 
@@ -170,9 +169,6 @@ def test_fingers_without_shapes_are_named_prefixes_passed_over() -> None:
     assert "a, b have no collision shapes" in report(robot(*parts))["message"]
     urdf = humanoid("right").replace(b"</robot>", b'<drake:filter name="x"><drake:member/></drake:filter></robot>')
     assert report(urdf)["verdict"] == "accept"
-
-
-FOREARM = '<collision><origin xyz="0.01 0 0.1"/>' + _BOX.format(0.05, 0.06, 0.2)[11:]
 
 
 def limits(lower: float, upper: float) -> str:

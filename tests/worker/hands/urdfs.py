@@ -7,6 +7,12 @@ from graspd.worker.hands.load import load_hand
 from graspd.worker.hands.model import HandModel
 
 BOX = '<collision><origin xyz="0 0 0.02"/><geometry><box size="0.02 0.02 0.04"/></geometry></collision>'
+#: Opening [m], and what is left between the pads when closed.
+OPENING, CLOSED = 0.080, 0.0
+_HOUSING = '<collision><origin xyz="0 0 0.03"/><geometry><box size="0.14 0.06 0.06"/></geometry></collision>'
+#: A finger weighs with its carriage: MuJoCo's contacts are as stiff as what they move is heavy.
+_MASS = '<inertial><mass value="0.2"/></inertial>'
+_FINGER = '<collision><origin xyz="{x} 0 0.05"/><geometry><box size="0.01 0.02 0.04"/></geometry></collision>'
 
 
 def link(name: str, body: str = BOX) -> str:
@@ -46,14 +52,6 @@ def report(urdf: bytes, **options) -> dict:
 def chain(*joints: str, links: str = "abc") -> bytes:
     """Palm and links a, b, c with the given joints."""
     return robot(link("palm"), *(link(name) for name in links), *joints)
-
-
-#: Opening [m], and what is left between the pads when closed.
-OPENING, CLOSED = 0.080, 0.0
-_HOUSING = '<collision><origin xyz="0 0 0.03"/><geometry><box size="0.14 0.06 0.06"/></geometry></collision>'
-#: A finger weighs with its carriage: MuJoCo's contacts are as stiff as what they move is heavy.
-_MASS = '<inertial><mass value="0.2"/></inertial>'
-_FINGER = '<collision><origin xyz="{x} 0 0.05"/><geometry><box size="0.01 0.02 0.04"/></geometry></collision>'
 
 
 def gripper_urdf(*, zero_is_open: bool = False, coupled: bool = True, effort: float | None = 20.0) -> bytes:

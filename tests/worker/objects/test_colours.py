@@ -23,6 +23,11 @@ from tests.worker.objects.test_formats import pack_glb
 #: sRGB of a byte, rounded twice.
 STEP = 1.5 / 255
 PRIMARIES = np.array([[230, 20, 20], [230, 20, 20], [230, 20, 20], [230, 20, 20]], np.uint8).reshape(2, 2, 3)
+OUTSIDE = ["../../secret.png", "/etc/secret.png", "secret.stl", "..", "", "a\0.png", "file://"]
+BOMB = (
+    "".join(f'<node id="n{k}">' + f'<instance_node url="#n{k + 1}"/>' * 10 + "</node>" for k in range(12))
+    + '<node id="n12"><instance_geometry url="#g"/></node>'
+)
 
 
 def glb(material: trimesh.visual.material.PBRMaterial) -> bytes:
@@ -190,9 +195,6 @@ def test_a_change_of_a_picture_is_another_look() -> None:
     assert one != two
 
 
-OUTSIDE = ["../../secret.png", "/etc/secret.png", "secret.stl", "..", "", "a\0.png", "file://"]
-
-
 @pytest.mark.parametrize("reference", OUTSIDE)
 def test_names_lead_nowhere_else(reference: str) -> None:
     there = {"secret.png", "/etc/secret.png", "../secret.png", "m/secret.stl", "etc/secret.png"}
@@ -265,12 +267,6 @@ def test_a_mesh_that_trimesh_wrote_comes_back_ours_is_placed() -> None:
     soup = read_mesh("a.dae", bytes(mesh.export(file_type="dae")))
     # Its vertices stand in the file in single precision.
     np.testing.assert_allclose(soup.vertices[soup.faces], mesh.vertices[mesh.faces], atol=1e-7)
-
-
-BOMB = (
-    "".join(f'<node id="n{k}">' + f'<instance_node url="#n{k + 1}"/>' * 10 + "</node>" for k in range(12))
-    + '<node id="n12"><instance_geometry url="#g"/></node>'
-)
 
 
 @pytest.mark.parametrize(

@@ -25,6 +25,11 @@ from graspd.worker.objects.topology import components, is_closed
 from tests.worker.models import object_from_mesh
 from tests.worker.objects.shapes import box, cylinder, sphere, stl
 
+SIZE = (0.06, 0.05, 0.1)
+NEAR, FAR, UTM = (0.123456, 0.05, -0.2), (5.0, -3.0, 2.0), (500_000.0, 4_500_000.0, 300.0)
+PLACES = pytest.mark.parametrize("place", [NEAR, FAR, UTM], ids=["near", "6 m", "UTM"])
+_CORNERS, _FACES = np.eye(4, 3), np.array([[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]])
+
 
 def test_mass_properties_are_exact_anywhere_and_turn_with_body() -> None:
     x, y, z = 0.06, 0.05, 0.04
@@ -121,11 +126,6 @@ def test_the_model_of_a_box_has_its_hull_and_radius() -> None:
     assert signed_volume(model.hull_vertices, model.hull_faces) == pytest.approx(model.volume, rel=1e-6)
 
 
-SIZE = (0.06, 0.05, 0.1)
-NEAR, FAR, UTM = (0.123456, 0.05, -0.2), (5.0, -3.0, 2.0), (500_000.0, 4_500_000.0, 300.0)
-PLACES = pytest.mark.parametrize("place", [NEAR, FAR, UTM], ids=["near", "6 m", "UTM"])
-
-
 def box_at(place: tuple[float, ...], unit: float = 1.0) -> trimesh.Trimesh:
     box = trimesh.creation.box(SIZE)
     return trimesh.Trimesh((box.vertices + place) / unit, box.faces, process=False)
@@ -210,9 +210,6 @@ def test_file_whose_numbers_do_not_tell_its_points_apart_is_told(tell, place) ->
 def test_other_faults_are_not_laid_on_the_origin() -> None:
     flat = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], process=False)
     assert "origin" not in refused(stl_of(flat))
-
-
-_CORNERS, _FACES = np.eye(4, 3), np.array([[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]])
 
 
 def ending(code: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -40,6 +40,15 @@ from tests.fakes import message_for, request
 from tests.worker.models import object_from_mesh, two_finger_hand
 from tests.worker.objects.shapes import box, join, sphere, stl
 
+#: Two balls in one another: a repair to remember.
+BALLS = stl(join(sphere(segments=24), sphere(segments=24, at=(0.02, 0.0, 0.0))))
+BRICK = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))
+HAND = two_finger_hand()
+FILES = {"asset.json": b'{"file": "m.stl"}', **BALLS}
+DIGEST = digest_files(AssetKind.OBJECT, FILES)
+TOLERANCE_M = 5e-7  # positions are single precision: half a micrometre at half a metre
+OTHERS = [{"batch": 1}, {"stage": Stage.SCENE}, {"hand_digest": "d" * 32}, {"object_digest": "d" * 32}]
+
 
 @pytest.fixture(autouse=True)
 def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
@@ -75,10 +84,6 @@ def test_samples_are_those_of_a_process_without_a_cache() -> None:
         found, fresh = surface._kept.__wrapped__(shapes, 120, 2), surface._sample(shapes, 120, 2)
         assert all(np.array_equal(getattr(found, name), array) for name, array in vars(fresh).items())
         assert np.array_equal(sampling.object_samples(ball, 90, seed=1), sampling._sampled(ball, 90, 1))
-
-
-#: Two balls in one another: a repair to remember.
-BALLS = stl(join(sphere(segments=24), sphere(segments=24, at=(0.02, 0.0, 0.0))))
 
 
 def load_balls(files: dict[str, bytes] = BALLS, error: float = 3e-4, **options) -> ObjectModel:
@@ -145,10 +150,6 @@ def test_an_entry_that_is_none_is_made_again_and_replaced(own_cache: Path, built
     assert len(built) == 2
 
 
-BRICK = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))
-HAND = two_finger_hand()
-
-
 @pytest.mark.parametrize("model", [BRICK, HAND], ids=["object", "hand"])
 def test_whatever_differs_in_a_model_changes_its_content(model) -> None:
     for field in dataclasses.fields(model):
@@ -178,10 +179,6 @@ def test_no_cache_gives_one_mesh_of_a_file_for_another() -> None:
     assert rest_probability(cube, [0]) != rest_probability(plate, [0])
     again = probe_of(two_finger_hand(), dataclasses.replace(BRICK), hand_points=64, object_points=64)
     assert again is one, "an equal model that was loaded again"
-
-
-FILES = {"asset.json": b'{"file": "m.stl"}', **BALLS}
-DIGEST = digest_files(AssetKind.OBJECT, FILES)
 
 
 @pytest.fixture
@@ -217,9 +214,6 @@ def test_what_cannot_be_read_is_made_again(store: Store, data: bytes) -> None:
     assert same(prepared_object(spoilt, DIGEST, name="balls", face_error_m=3e-4), fresh)
 
 
-TOLERANCE_M = 5e-7  # positions are single precision: half a micrometre at half a metre
-
-
 @pytest.mark.parametrize("name", builtin_names(AssetKind.HAND))
 def test_a_hands_nodes_stand_where_kinematics_puts_its_bodies(name: str) -> None:
     hand = hand_from_path(name)
@@ -250,9 +244,6 @@ def test_a_model_is_published_once(tmp_path) -> None:
 
 def message(**changes) -> TaskMessage:
     return message_for(Stage.RENDER, scenes=1, views=1).model_copy(update=changes)
-
-
-OTHERS = [{"batch": 1}, {"stage": Stage.SCENE}, {"hand_digest": "d" * 32}, {"object_digest": "d" * 32}]
 
 
 @pytest.mark.parametrize("changes", [*OTHERS, {"request": request(seed=7)}])

@@ -17,6 +17,13 @@ from tests.worker.objects.shapes import Mesh, box, cylinder, join, sphere, stl
 
 #: Uploads are float32: seven digits of 0.1 m.
 ROUNDING = 1e-6
+#: One of each format and source; a handle, and what is thin.
+SOME = ("011_banana", "025_mug", "048_hammer", "koala")
+RADIUS = 0.008
+#: Where two cylinders of one radius cross at right angles they share 16/3 r^3 (Steinmetz).
+SHARED = 16 / 3 * RADIUS**3
+#: A circle of 24 corners has 1.1 % less area; bent along a curve the tube is no exact cylinder where it crosses itself.
+ROUGHLY = 0.04
 
 
 def check(mesh: Mesh, **options) -> dict:
@@ -109,10 +116,6 @@ def test_seams_are_welded_and_debris_without_volume_dropped() -> None:
     assert report["facts"]["volume_m3"] == pytest.approx(0.06 * 0.05 * 0.04, rel=1e-4)
 
 
-#: One of each format and source; a handle, and what is thin.
-SOME = ("011_banana", "025_mug", "048_hammer", "koala")
-
-
 @pytest.mark.parametrize("chosen", [SOME, pytest.param((), marks=pytest.mark.slow)], ids=["some", "all"])
 def test_published_scans_become_closed_solids(shared_data, chosen: tuple[str, ...]) -> None:
     known = sorted((shared_data / "objects").glob("*/raw.*"))
@@ -131,13 +134,6 @@ def test_unknown_keys_and_two_meshes_are_refused() -> None:
         load_object({**stl(box()), **wrong}, name="m", digest="", face_error_m=0)
     with pytest.raises(MeshError, match="name one"):
         load_object({**stl(box()), "n.stl": b"x"}, name="m", digest="", face_error_m=0)
-
-
-RADIUS = 0.008
-#: Where two cylinders of one radius cross at right angles they share 16/3 r^3 (Steinmetz).
-SHARED = 16 / 3 * RADIUS**3
-#: A circle of 24 corners has 1.1 % less area; bent along a curve the tube is no exact cylinder where it crosses itself.
-ROUGHLY = 0.04
 
 
 def crossing_tube(scale: float = 0.04, inside_out: bool = False) -> Mesh:

@@ -27,6 +27,7 @@ from tests.worker.simulation.rigs import ball
 
 QUICK = resolve_fidelity("draft").model_copy(update={"starts": 2, "finalists": 2})
 TABLE = (Obstacle.half_space([0, 0, 1], 0.0),)
+BAD = 2 * candidates.HOPEFUL
 
 
 def plain(hand, obj, state: HandState, losses: np.ndarray, placed: PlacedGrasps, *, device: str) -> GraspSet:
@@ -62,9 +63,6 @@ def taken(scores, monkeypatch, merit=None, infeasible=()) -> tuple[list[int], li
     rows = found.joined().stability_loss.astype(int).tolist()
     assert found.state.pivot[:, 0].tolist() == found.losses.tolist() == rows
     return rows, sorted(tries), sorted(seats)
-
-
-BAD = 2 * candidates.HOPEFUL
 
 
 @pytest.mark.parametrize(

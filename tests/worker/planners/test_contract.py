@@ -31,6 +31,11 @@ PEERS: dict[str, dict[str, object]] = {name: dict(method(name).quick) for name i
 PEERS["graspd2022"]["grid"] = 24
 ONE = ExecutionContext(threads=1)
 EACH = pytest.mark.parametrize("name", sorted(PEERS))
+#: Knobs that make a call short; the mesh, which is what the fidelities here differ in, stays theirs.
+SHORT = dict.fromkeys(("coarse_points", "fine_points", "object_points"), 64)
+SHORT |= {"starts": 1, "finalists": 1, "coarse_iterations": 3, "fine_iterations": 2, "polish_iterations": 1}
+PAIR = ("draft", "fine")
+PAGE = (REPOSITORY / "docs" / "how-to" / "planners.md").read_text()
 
 
 def grasps(name: str, count: int, *, run: ExecutionContext = ONE, seed=0, batch=0, hand="barrett") -> GraspSet:
@@ -63,13 +68,6 @@ def test_cancelling_stops_at_the_first_look(name: str) -> None:
     with pytest.raises(TaskCancelled):
         grasps(name, 2, run=run)
     assert len(calls) == 1
-
-
-#: Knobs that make a call short; the mesh, which is what the fidelities here differ in, stays theirs.
-SHORT = dict.fromkeys(("coarse_points", "fine_points", "object_points"), 64)
-SHORT |= {"starts": 1, "finalists": 1, "coarse_iterations": 3, "fine_iterations": 2, "polish_iterations": 1}
-PAIR = ("draft", "fine")
-PAGE = (REPOSITORY / "docs" / "how-to" / "planners.md").read_text()
 
 
 def egg() -> bytes:

@@ -20,6 +20,8 @@ from tests.worker.models import assert_same_grasps, on_tables
 
 DRAFT = FIDELITIES["draft"]
 QUICK = DRAFT.model_copy(update={"coarse_iterations": 20, "fine_iterations": 6, "polish_iterations": 2})
+FIDELITY = DRAFT.model_copy(update={"name": "custom", "finalists": 2, "coarse_iterations": 30})
+ONE = ExecutionContext(threads=1)
 
 
 def grasps(count: int, fidelity: Fidelity = QUICK, hand: str = "allegro", obj: str = "mug") -> GraspSet:
@@ -75,9 +77,6 @@ def test_the_other_contact_solvers_also_reach_the_object(solver: str) -> None:
     assert np.median(quality["quality/contact_links"]) >= 2
 
 
-FIDELITY = DRAFT.model_copy(update={"name": "custom", "finalists": 2, "coarse_iterations": 30})
-
-
 def parts(count: int) -> planner.LaunchPart:
     """The grasps of a batch as one part."""
     hand, obj = hand_from_path("allegro"), object_from_path("block", face_error_m=1e-3)
@@ -123,9 +122,6 @@ def test_memory_is_flat_over_a_thousand_batches() -> None:
 @pytest.fixture(scope="module")
 def pair():
     return hand_from_path("barrett"), object_from_path("block", face_error_m=QUICK.face_error_m)
-
-
-ONE = ExecutionContext(threads=1)
 
 
 def made(pair, wanted: list[PlanRequest], *runs: ExecutionContext) -> list[GraspSet | Exception]:

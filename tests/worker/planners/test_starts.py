@@ -43,6 +43,10 @@ SIDES = (0.1, 0.24, 0.24)
 HALF = SIDES[0] / 2
 CUBE = object_of(trimesh.creation.box((0.06, 0.06, 0.06)))
 DRAFT = FIDELITIES["draft"]
+UP = np.array([0.0, 0, 1])
+SIZE = np.array([0.05, 0.06, 0.08])
+BOX = object_from_mesh(trimesh.creation.box(SIZE))
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 
 
 def draft_model(hand: HandModel, obj: ObjectModel, scenes: Sequence[Environment] = ()) -> Model:
@@ -163,9 +167,6 @@ def test_a_grasp_that_opened_does_not_depend_on_its_batch(ring: HandModel) -> No
     )
     np.testing.assert_array_equal(many.hand_pose[:2], few.hand_pose)
     np.testing.assert_array_equal(many.joint_positions[:2], few.joint_positions)
-
-
-UP = np.array([0.0, 0, 1])
 
 
 def lying(obj) -> Environment:
@@ -337,11 +338,6 @@ def test_what_lies_flat_is_between_the_fingers_at_the_start(block, barrett) -> N
     low, high = thin.vertices.min(axis=0), thin.vertices.max(axis=0)
     between = ((line > low - 0.01) & (line < high + 0.01)).all(axis=-1).any(axis=1)
     assert between.mean() > 0.7
-
-
-SIZE = np.array([0.05, 0.06, 0.08])
-BOX = object_from_mesh(trimesh.creation.box(SIZE))
-UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 
 
 def beside_walls(gap: float, axes: tuple[int, ...]) -> Environment:

@@ -40,6 +40,11 @@ ONE_ROW = 0.03
 
 BOX = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))
 SMALL_PLATES = plate_hand((0.03, 0.03, 0.01))
+GOOD = {"penetration_depth_mm": 0.5, "self_penetration_depth_mm": 0.0, "contact_links": 3.0}
+HAND = plate_hand((0.05, 0.04, 0.01))
+EVERY = np.ones((1, len(HAND.pieces)), bool)
+FINGERS, BALL = two_finger_hand(), ball(subdivisions=2)
+FIRST, SECOND = np.array([0]), np.array([1])
 
 
 def closed_on_box(press: float) -> Posture:
@@ -205,9 +210,6 @@ def test_contacts_of_many_sets_are_those_chosen_one_set_at_time() -> None:
     assert (count[:, 0] == 0).all() and (count[:, 1] > 0).all() and (count[:, 1] <= 12).all()
 
 
-GOOD = {"penetration_depth_mm": 0.5, "self_penetration_depth_mm": 0.0, "contact_links": 3.0}
-
-
 def gate(**changes: float) -> bool:
     return bool(passes({f"quality/{name}": np.array([value]) for name, value in (GOOD | changes).items()})[0])
 
@@ -232,10 +234,6 @@ def test_bars_of_shares_and_means_cover_the_truth() -> None:
     for part, whole in ((0, 5), (3, 8), (8, 8), (41, 120)):
         assert wilson_of_mean(float(part), whole) == pytest.approx(wilson(part, whole), abs=1e-12)
     assert wilson(2, 8)[0] < wilson_of_mean(2.5, 8)[0] < wilson(3, 8)[0]
-
-
-HAND = plate_hand((0.05, 0.04, 0.01))
-EVERY = np.ones((1, len(HAND.pieces)), bool)
 
 
 def kept_and_shared(obj: ObjectModel, postures: Posture) -> tuple[np.ndarray, np.ndarray]:
@@ -267,9 +265,6 @@ def test_a_piece_in_the_object_and_an_object_in_a_piece_are_kept() -> None:
     crumb.apply_translation([-0.1, 0, 0])  # in the middle of the left plate
     kept, shared = kept_and_shared(object_from_mesh(crumb), at_rest)
     assert kept.tolist() == [[False, True, False]] and shared[0, 1] > 0
-
-
-FINGERS, BALL = two_finger_hand(), ball(subdivisions=2)
 
 
 @pytest.fixture
@@ -312,9 +307,6 @@ def test_an_entry_that_is_not_sound_is_made_again(own_cache, harm: str) -> None:
     disk_cache._write(file, harms[harm])
     assert same(distances_of(Probe(FINGERS, BALL, hand_points=100, object_points=64)), first)
     assert file.read_bytes() == whole
-
-
-FIRST, SECOND = np.array([0]), np.array([1])
 
 
 def moved(hand: HandModel, by: float) -> np.ndarray:

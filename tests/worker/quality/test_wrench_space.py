@@ -18,6 +18,10 @@ PRINTED = 1e-5
 JOGGLE = 1e-6
 ORIGIN = np.zeros(3)
 OCTAHEDRON = np.vstack([np.eye(3), -np.eye(3)])
+TETRAHEDRON = np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / math.sqrt(3)
+TRIPOD = np.array([[math.cos(a), math.sin(a), 0.0] for a in 2 * np.pi * np.arange(3) / 3])
+#: Both hulls joggle their points, ours by 1e-8; slivers between nearly coplanar points multiply that.
+JOGGLED = 1e-6
 
 
 def measure_space(edge_wrenches: np.ndarray) -> tuple[float, float]:
@@ -48,10 +52,6 @@ def test_spaces_of_closed_form() -> None:
     # Face centres of a cube.
     edges = wrenches(0.05 * OCTAHEDRON, -OCTAHEDRON, friction=0.5, centre=ORIGIN, radius=0.05 * math.sqrt(3))
     assert measure_space(edges) == pytest.approx((0.235702, 0.115207), abs=PRINTED)
-
-
-TETRAHEDRON = np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / math.sqrt(3)
-TRIPOD = np.array([[math.cos(a), math.sin(a), 0.0] for a in 2 * np.pi * np.arange(3) / 3])
 
 
 @pytest.mark.parametrize(
@@ -109,10 +109,6 @@ def test_published_frogger_grasps_have_their_ferrari_canny(shared_data) -> None:
     # Stored points and normals are rounded to 1e-7 m and 1e-6, the stored metric to 1e-8.
     stored = [max(0.0, grasp["ferrari_canny_L1_recomputed_here"]) for grasp in grasps]
     np.testing.assert_allclose(found, stored, rtol=0, atol=1e-6)
-
-
-#: Both hulls joggle their points, ours by 1e-8; slivers between nearly coplanar points multiply that.
-JOGGLED = 1e-6
 
 
 def contacts(count: int, friction: float = 1.0, seed: int = 0) -> np.ndarray:

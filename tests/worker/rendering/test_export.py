@@ -22,6 +22,7 @@ from tests.service.readers import box_scenes
 from tests.worker.models import object_from_mesh
 
 H, W = 6, 8
+DEPTH_M = 1e-4  # what a view promises of its depth [m]: tests/worker/rendering/test_views.py
 
 
 @pytest.fixture
@@ -97,9 +98,6 @@ def test_sidecar_tells_the_camera_and_a_second_export_is_refused(views, tmp_path
     assert [labels[k]["class"] for k in "0123"] == ["background", "table", "mug", "block"]
     with pytest.raises(InputError, match="exported views already"):
         export_images(views, tmp_path)
-
-
-DEPTH_M = 1e-4  # what a view promises of its depth [m]: tests/worker/rendering/test_views.py
 
 
 def test_points_of_a_rendered_object_lie_on_its_mesh(tmp_path: Path) -> None:

@@ -34,6 +34,16 @@ POSES = np.array([[0, 0, -0.06, 1.0, 0, 0, 0], [0, 0, 0.06, 0, 1.0, 0, 0]])
 JOINTS = np.array([[0.1, 0.1], [0.3, 0.3]])
 REST = np.array([[0, 0, 0.03, 1.0, 0, 0, 0]])
 TABLE_SCENE = PictureScenes((HalfSpace(),), REST)
+DOWN = np.array([0, 0, 0.06, 0, 1.0, 0, 0])
+SECONDS = [0.5, 0.05, 1.2]
+SPECS = {kind: supports_in(SceneSpec(kind=kind)) for kind in ("table", "bin", "shelf")}
+SHAPE = '<collision><geometry><box size="0.02 0.02 0.04"/></geometry></collision>'
+RED = '<material name="red"><color rgba="1 0 0 1"/></material>'
+SEEN = (
+    f'<visual><geometry><box size="0.06 0.06 0.01"/></geometry>{RED}</visual>'
+    '<visual><geometry><mesh filename="part.stl"/></geometry><material name="blue"/></visual>'
+    '<visual><geometry><mesh filename="missing.stl"/></geometry></visual>'
+)
 
 
 @pytest.fixture(scope="module")
@@ -112,9 +122,6 @@ def test_depth_colours_darken_with_distance_and_grey_is_nothing():
     assert colours[4].tolist() == [214, 214, 214]
 
 
-DOWN = np.array([0, 0, 0.06, 0, 1.0, 0, 0])
-
-
 def at(name: str, height: float = 0.0) -> Waypoint:
     """The hand over the block, both raised."""
     rise = np.array([0, 0, height])
@@ -185,9 +192,6 @@ def test_links_above_root_are_drawn_at_the_angles_of_the_wrist():
     assert (own[1, :, 2] < -10).all()
 
 
-SECONDS = [0.5, 0.05, 1.2]
-
-
 def colours() -> np.ndarray:
     return np.repeat(np.repeat(200 * np.eye(3, dtype=np.uint8)[:, None, None], 24, 1), 32, 2)
 
@@ -230,9 +234,6 @@ def test_the_object_is_carried_with_the_hand_from_where_it_rests():
     np.testing.assert_allclose(points[-1].carried, [0, 0, 0.25], atol=1e-12)
 
 
-SPECS = {kind: supports_in(SceneSpec(kind=kind)) for kind in ("table", "bin", "shelf")}
-
-
 @pytest.mark.parametrize("normal", [(0, 0, 1), (1, 0, 0), (0, -2, 0), (1, 2, 3), (0, 0, -1)])
 def test_the_top_of_a_half_spaces_slab_is_its_plane(normal):
     (pose,) = slab_poses([HalfSpace(normal=normal, offset=0.12)], np.array([0.1, 0.05, 0.2]), 0.7)
@@ -269,15 +270,6 @@ def test_a_table_looks_the_same_named_or_not():
     options = {"views": 1, "stereo": False, "width": 48, "height": 36, "seed": 3, "samples": 2}
     named = render(BLOCK, REST, **options, extras=Extras(supports=SPECS["table"]))
     np.testing.assert_array_equal(named["image/rgb"], render(BLOCK, REST, **options)["image/rgb"])
-
-
-SHAPE = '<collision><geometry><box size="0.02 0.02 0.04"/></geometry></collision>'
-RED = '<material name="red"><color rgba="1 0 0 1"/></material>'
-SEEN = (
-    f'<visual><geometry><box size="0.06 0.06 0.01"/></geometry>{RED}</visual>'
-    '<visual><geometry><mesh filename="part.stl"/></geometry><material name="blue"/></visual>'
-    '<visual><geometry><mesh filename="missing.stl"/></geometry></visual>'
-)
 
 
 @pytest.fixture(scope="module")

@@ -33,6 +33,7 @@ REST = np.array([[0.02, -0.01, RADIUS, 1.0, 0, 0, 0], [0.0, 0.03, RADIUS, 0, 1.0
 HALF_PRECISION = 5e-4
 #: Interpolated normals of the ball's 20 480 facets; float32 rays.
 FACET_NORMAL = 2e-3
+CENTRE, OBJECT_RADIUS = np.array([0.05, -0.02, 0.04]), 0.07
 
 
 def shoot(obj: ObjectModel, poses: np.ndarray, **options) -> dict[str, np.ndarray]:
@@ -226,9 +227,6 @@ def test_memory_stays_flat_over_repeated_renders(ball):
         shoot(ball, REST[:1], seed=seed)
     # One set of image buffers is 2 MiB; twelve leaked sets or stages would be ten times the bound.
     assert peak() - before < 4096
-
-
-CENTRE, OBJECT_RADIUS = np.array([0.05, -0.02, 0.04]), 0.07
 
 
 def sampled(seed: int, views: int = 12) -> Cameras:

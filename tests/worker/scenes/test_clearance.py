@@ -17,6 +17,9 @@ HAND = two_finger_hand()
 #: Tessellations lie inside round pieces by r (1 - cos(pi / 48)), and a sphere of 642 corners by 0.4 % of r.
 TESSELLATION_M = 6e-5
 IDENTITY = np.array([[0.0, 0, 0, 1, 0, 0, 0]])
+#: MuJoCo stores meshes in float32 and its GJK stops at 1e-6 of the size.
+ENGINE_M = 5e-6
+DOWN = np.concatenate([[0, 0, 0.25], quat_from_axis_angle(np.array([1.0, 0, 0]), np.asarray(np.pi))])
 
 
 def postures(rng: np.random.Generator, count: int) -> Posture:
@@ -96,11 +99,6 @@ def test_no_grasps_are_empty_too_many_are_refused() -> None:
         transfer(HAND, postures(rng, 2), postures(rng, 1), IDENTITY)
     with pytest.raises(InputError, match="1 to 8"):
         drop_together(box(0.05, 0.05, 0.05), [box(0.02, 0.02, 0.02)] * 9, count=1, seed=0)
-
-
-#: MuJoCo stores meshes in float32 and its GJK stops at 1e-6 of the size.
-ENGINE_M = 5e-6
-DOWN = np.concatenate([[0, 0, 0.25], quat_from_axis_angle(np.array([1.0, 0, 0]), np.asarray(np.pi))])
 
 
 def box(*size: float):

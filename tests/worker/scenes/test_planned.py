@@ -43,6 +43,8 @@ from tests.worker.simulation.test_surroundings import mujoco_distances, mujoco_r
 #: What a draft's finish may lack of a distance that it aims at exactly [m].
 DRAFT_M = 5e-4
 QUICK = resolve_fidelity("draft").model_copy(update={"starts": 2})
+TABLE = {"kind": "half_space"}
+UPRIGHT = (1.0, 0, 0, 0)
 
 
 @pytest.fixture(scope="module")
@@ -126,10 +128,6 @@ def test_what_is_of_free_objects_only_is_refused_in_scenes(tmp_path) -> None:
     graspd(f"synth -n 1 --want candidates --validation none --fidelity draft {pair}", out)
     assert "synth --scene" in refused("evaluate --protocol lift", out)
     assert "free objects only" in refused(f"synth --scene table --method dfc {pair}", out)
-
-
-TABLE = {"kind": "half_space"}
-UPRIGHT = (1.0, 0, 0, 0)
 
 
 def cube(side: float = 0.05, name: str = "cube"):

@@ -17,6 +17,9 @@ END_TOLERANCE = 2e-6  # float32 solves of 6 x 6 systems with condition numbers u
 COSINE = 0.97
 INERTIA = np.diag([8e-4, 6e-4, 4e-4])
 WORLD = World(inertia=INERTIA, gyration=float(np.sqrt(np.trace(INERTIA) / 3)))
+MOTIONS = initial_motions(7, WORLD.step, WORLD.gyration)
+run = partial(run_kernel, near_gap=NEAR_GAP, lane=5)
+EACH = pytest.mark.parametrize("name", SOLVERS)
 
 
 def ring(rng: np.random.Generator, count: int = 24, gap: float = -1e-4, spread: float = 2e-4) -> Contacts:
@@ -24,11 +27,6 @@ def ring(rng: np.random.Generator, count: int = 24, gap: float = -1e-4, spread: 
     normals = rng.normal(size=(count, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     return Contacts(0.04 * normals, normals, gap + spread * rng.normal(size=count), rng.uniform(0.5, 1.5, count))
-
-
-MOTIONS = initial_motions(7, WORLD.step, WORLD.gyration)
-run = partial(run_kernel, near_gap=NEAR_GAP, lane=5)
-EACH = pytest.mark.parametrize("name", SOLVERS)
 
 
 @EACH

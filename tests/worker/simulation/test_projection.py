@@ -34,6 +34,7 @@ HAND = two_finger_hand()
 BOX = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))
 HANDS = 6
 SINGLE = 2e-6  # distances, rows and poses are in single precision, so steps of millimetres are good to this
+FIDELITY = FIDELITIES["draft"].model_copy(update={"coarse_iterations": 20, "fine_iterations": 20})
 
 
 def pressing() -> HandState:
@@ -121,9 +122,6 @@ def test_hands_without_penetration_stay_where_they_are() -> None:
     assert not depth.any()
     np.testing.assert_array_equal(moved.pivot, state.pivot)
     np.testing.assert_array_equal(moved.q, state.q)
-
-
-FIDELITY = FIDELITIES["draft"].model_copy(update={"coarse_iterations": 20, "fine_iterations": 20})
 
 
 @wp.kernel

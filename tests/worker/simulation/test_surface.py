@@ -19,6 +19,11 @@ from graspd.worker.simulation.sampling import object_samples
 from tests.worker.simulation.rigs import ball, object_of
 
 FLOAT32 = 2e-8  # float32 coordinates of size 0.1 m
+#: float32 coordinates of size 0.1 m: both ways round differently.
+ROUNDED = 5e-8
+REACH = 0.03
+Grid = dict[str, np.ndarray]
+BALL = ball(subdivisions=2)
 
 
 @wp.kernel
@@ -126,11 +131,6 @@ def test_points_far_away_on_edges_and_vertices_are_finite() -> None:
     assert np.all(np.isfinite(distance)) and np.all(np.isfinite(normal))
 
 
-#: float32 coordinates of size 0.1 m: both ways round differently.
-ROUNDED = 5e-8
-REACH = 0.03
-
-
 @wp.kernel
 def ask(surface_in: surface.Surface, point_in: wp.array[wp.vec3], listed_out: wp.array[float], out: wp.array[float]):
     i = wp.tid()
@@ -220,10 +220,6 @@ def test_a_box_has_six_planes_however_it_is_triangulated() -> None:
     planes = face_planes(np.asarray(box.vertices), np.asarray(box.faces))
     assert len(planes) == 6
     np.testing.assert_allclose(np.sort(planes[:, 3]), [0.01, 0.01, 0.015, 0.015, 0.025, 0.025], atol=1e-12)
-
-
-Grid = dict[str, np.ndarray]
-BALL = ball(subdivisions=2)
 
 
 @pytest.fixture

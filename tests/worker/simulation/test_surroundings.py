@@ -20,6 +20,13 @@ from tests.worker.models import piece, two_finger_hand
 
 TILTED = np.array([0.1, -0.2, 0.3, 0.8, 0.2, -0.4, 0.4])
 TILTED[3:] /= np.linalg.norm(TILTED[3:])
+UP = np.array([0.0, 0.0, 1.0])
+BOX = Obstacle.box([0, 0, 0, 1, 0, 0, 0], [0.1, 0.1, 0.1])
+R, L = 0.01, 0.06
+EXACT = 2e-6  # float32 coordinates of 0.1 m, and the end of the search along an edge
+EDGE, CORNER = np.sqrt(2), np.sqrt(3)
+#: Turned by 45 degrees about y: a capsule points away from the edge at (0.05, y, 0.05), a box lies across it.
+ACROSS = (np.cos(np.pi / 8), 0, np.sin(np.pi / 8), 0)
 
 
 def test_distances_are_closed_forms_and_a_bound_beyond_edges() -> None:
@@ -151,12 +158,6 @@ def mujoco_distances(hand, postures: Posture, obstacle: Obstacle) -> np.ndarray:
     return np.array(least)
 
 
-UP = np.array([0.0, 0.0, 1.0])
-BOX = Obstacle.box([0, 0, 0, 1, 0, 0, 0], [0.1, 0.1, 0.1])
-R, L = 0.01, 0.06
-EXACT = 2e-6  # float32 coordinates of 0.1 m, and the end of the search along an edge
-
-
 def link(kind: str) -> HandModel:
     """A hand of one piece about the origin of its root."""
     base = two_finger_hand()
@@ -174,11 +175,6 @@ def distance(kind: str, at: tuple[float, ...], obstacle: Obstacle, turn: tuple[f
     quaternion = np.array(turn, float) / np.linalg.norm(turn)
     posture = Posture(np.array([[*at, *quaternion]]), np.zeros((1, 2)))
     return float(obstacle_room(link(kind), posture, [Environment((obstacle,), UP)])[0])
-
-
-EDGE, CORNER = np.sqrt(2), np.sqrt(3)
-#: Turned by 45 degrees about y: a capsule points away from the edge at (0.05, y, 0.05), a box lies across it.
-ACROSS = (np.cos(np.pi / 8), 0, np.sin(np.pi / 8), 0)
 
 
 @pytest.mark.parametrize(

@@ -36,6 +36,22 @@ from tests.worker.objects.shapes import sphere, stl
 
 TETRAHEDRON = """v 0 0 0\nv 0.05 0 0\nv 0 0.05 0\nv 0 0 0.05\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"""
 OBJECT = {"asset.json": b'{"file": "t.obj", "units": "m"}', "t.obj": TETRAHEDRON.encode()}
+UPLOAD_BYTES = 64 * 2**20
+DOOR_BYTES = 4 * 2**20  # the limit of archives that are refused before any of them is unpacked
+BOUND_S = 30.0  # what is promised for any upload, as time of computing [s]
+#: Children at a time: as many as the smallest machine has cores.
+TOGETHER = 2
+BALL = stl(sphere(segments=24))
+PLY_POINT = "property float x\nproperty float y\nproperty float z\n"
+#: One for each verdict on a hand and on a mesh; of all, without a child: tests/worker/hands/test_bad_hands.py.
+SOME = ("mimic_chain.urdf", "kinematic_loop.urdf", "open_shell.stl", "inverted_normals.stl", "quads_and_ngons.obj")
+#: Ten levels of ten: 10^10 characters once expanded.
+LEVELS = "".join(f'<!ENTITY e{i} "{f"&e{i - 1};" * 10}">' for i in range(1, 11))
+ENTITY_BOMB = f'<!DOCTYPE robot [<!ENTITY e0 "x">{LEVELS}]><robot name="&e10;"/>'.encode()
+EXTERNAL = b'<!DOCTYPE robot [<!ENTITY x SYSTEM "file:///etc/passwd">]><robot name="h"><link name="&x;"/></robot>'
+#: 4 10^9 faces of 50 bytes: 200 GB.
+HUGE_STL = b"promise".ljust(80) + struct.pack("<I", 4_000_000_000) + bytes(600)
+PLY_HEADER = f"ply\nformat binary_little_endian 1.0\nelement vertex 4000000000\n{PLY_POINT}end_header\n"
 
 
 @pytest.fixture
@@ -156,15 +172,6 @@ def test_finding_that_is_long_and_check_that_complains_are_told(context: TaskCon
     assert found["verdict"] == "accept" and model.startswith(b"glTF")
 
 
-UPLOAD_BYTES = 64 * 2**20
-DOOR_BYTES = 4 * 2**20  # the limit of archives that are refused before any of them is unpacked
-BOUND_S = 30.0  # what is promised for any upload, as time of computing [s]
-#: Children at a time: as many as the smallest machine has cores.
-TOGETHER = 2
-BALL = stl(sphere(segments=24))
-PLY_POINT = "property float x\nproperty float y\nproperty float z\n"
-
-
 def computed() -> float:
     """Processor time of this process and of the children it waited for [s]."""
     used = os.times()
@@ -198,10 +205,6 @@ def kind_of(filename: str) -> AssetKind:
     return AssetKind.HAND if filename.endswith(".urdf") else AssetKind.OBJECT
 
 
-#: One for each verdict on a hand and on a mesh; of all, without a child: tests/worker/hands/test_bad_hands.py.
-SOME = ("mimic_chain.urdf", "kinematic_loop.urdf", "open_shell.stl", "inverted_normals.stl", "quads_and_ngons.obj")
-
-
 @pytest.mark.parametrize("chosen", [SOME, pytest.param((), marks=pytest.mark.slow)], ids=["some", "all"])
 def test_a_bad_file_gets_its_verdict_from_the_checking_child(shared_data: Path, chosen: tuple[str, ...]) -> None:
     entries = [entry for entry in bad_files(shared_data) if not chosen or entry["file"] in chosen]
@@ -214,15 +217,6 @@ def test_a_bad_file_gets_its_verdict_from_the_checking_child(shared_data: Path, 
     with ThreadPoolExecutor(TOGETHER) as pool:
         wrong = [text for text in pool.map(validate, entries) if text]
     assert len(entries) >= (len(chosen) or 40) and not wrong
-
-
-#: Ten levels of ten: 10^10 characters once expanded.
-LEVELS = "".join(f'<!ENTITY e{i} "{f"&e{i - 1};" * 10}">' for i in range(1, 11))
-ENTITY_BOMB = f'<!DOCTYPE robot [<!ENTITY e0 "x">{LEVELS}]><robot name="&e10;"/>'.encode()
-EXTERNAL = b'<!DOCTYPE robot [<!ENTITY x SYSTEM "file:///etc/passwd">]><robot name="h"><link name="&x;"/></robot>'
-#: 4 10^9 faces of 50 bytes: 200 GB.
-HUGE_STL = b"promise".ljust(80) + struct.pack("<I", 4_000_000_000) + bytes(600)
-PLY_HEADER = f"ply\nformat binary_little_endian 1.0\nelement vertex 4000000000\n{PLY_POINT}end_header\n"
 
 
 @cache

@@ -47,6 +47,13 @@ from tests.fakes import job_record, message_for
 from tests.networks import LEARNED, network_files, random_network
 
 STAGES = {Stage.SCENE: scene.run, Stage.SYNTHESIZE: synthesize.run, Stage.RENDER: render.run}
+TABLE = {"grasps": 6, "fidelity": "draft", "seed": 3, "rechecks": 0, "scene": "table", "scenes": 2}
+TABLE |= {"views": 1, "width": 48, "height": 36}
+DOWN = [0, 0, 0, 1, 0, 0, 0]
+ASKEW = {"scene": {"supports": [{"kind": "half_space"}], "target": [0, 0, 0.045, 1, 0, 0, 0]}}
+ASKEW |= {"neighbours": [{"object": "mug", "pose": [0.02, 0, 0, 1, 0, 0, 0]}]}
+SIZE = 3  # batches as small as they can be, so that several take a few seconds
+small = pytest.mark.usefixtures("small_batches")
 
 
 def job_of(store: Store, span: int = 1, **request) -> JobRecord:
@@ -69,11 +76,6 @@ def end_of(store: Store, job: JobRecord) -> Event:
         if event.kind is not EventKind.FINISHED:
             break
     return event
-
-
-TABLE = {"grasps": 6, "fidelity": "draft", "seed": 3, "rechecks": 0, "scene": "table", "scenes": 2}
-TABLE |= {"views": 1, "width": 48, "height": 36}
-DOWN = [0, 0, 0, 1, 0, 0, 0]
 
 
 @dataclass
@@ -186,10 +188,6 @@ def test_payload_out_of_reach_fails_job_with_what_the_hand_lifts(table: Bench, s
     assert bench.last_attempt() == ("LoadError", True), "it is not tried again"
 
 
-ASKEW = {"scene": {"supports": [{"kind": "half_space"}], "target": [0, 0, 0.045, 1, 0, 0, 0]}}
-ASKEW |= {"neighbours": [{"object": "mug", "pose": [0.02, 0, 0, 1, 0, 0, 0]}]}
-
-
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
@@ -203,16 +201,10 @@ def test_what_only_a_worker_can_know_fails_the_job_in_a_line(table: Bench, chang
     assert kind is EventKind.FAILED and re.search(words, said)
 
 
-SIZE = 3  # batches as small as they can be, so that several take a few seconds
-
-
 @pytest.fixture
 def small_batches(monkeypatch: pytest.MonkeyPatch) -> None:
     for module in ("graspd.service.model.domain", "graspd.service.model.planning", "graspd.worker.stages.ranges"):
         monkeypatch.setattr(f"{module}.BATCH_SIZE", SIZE)
-
-
-small = pytest.mark.usefixtures("small_batches")
 
 
 def made(store: Store, span: int, **request) -> tuple[JobRecord, list[tuple]]:

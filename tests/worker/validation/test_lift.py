@@ -43,6 +43,14 @@ PLACED = PlacedGrasps(
 )
 #: Joint value at which the pads touch.
 TOUCH = 0.065
+#: Squeeze [m] whose two normal forces F = kp d hold a pull of 1 N by friction: 2 mu F = 1 N; the same for the pulls.
+NEWTON = 1 / (2 * PHYSICS.friction[0]) / float(HAND.stiffness[0])
+LEAST, LEAST_PUSHED = prescreening.HANGS_WHOLE * NEWTON, prescreening.PULL * NEWTON
+#: The same of what hangs at half the friction.
+LEAST_AT_HALF = 2 * prescreening.HANGS * NEWTON
+#: Of a push towards a corner what two pads must hold by friction, across their normals; the rest one of them carries.
+ACROSS = float(np.sqrt(2.0 / 3.0))
+LIFTED, TOUCHED, FELL = 1, 3, 5
 
 
 def grasp(squeeze: float, way: np.ndarray | None = None) -> GraspSet:
@@ -166,13 +174,6 @@ def test_a_neighbour_that_leans_or_slides_has_moved() -> None:
     assert test._neighbours_moved()
 
 
-#: Squeeze [m] whose two normal forces F = kp d hold a pull of 1 N by friction: 2 mu F = 1 N; the same for the pulls.
-NEWTON = 1 / (2 * PHYSICS.friction[0]) / float(HAND.stiffness[0])
-LEAST, LEAST_PUSHED = prescreening.HANGS_WHOLE * NEWTON, prescreening.PULL * NEWTON
-#: The same of what hangs at half the friction.
-LEAST_AT_HALF = 2 * prescreening.HANGS * NEWTON
-
-
 def scores(*squeezes: float, threads: int = 1) -> np.ndarray:
     grasps = joined([grasp(squeeze) for squeeze in squeezes])
     return LiftRollouts(HAND, BOX, lambda: WHOLE, threads=threads).scores(grasps, placed(len(squeezes)))
@@ -209,10 +210,6 @@ def test_threads_and_the_other_grasps_change_no_score() -> None:
     assert np.array_equal(scores(*squeezes, threads=3), scores(*squeezes))
     for score in (scores, pushed):
         assert np.array_equal(score(*squeezes)[1:2], score(squeezes[1]))
-
-
-#: Of a push towards a corner what two pads must hold by friction, across their normals; the rest one of them carries.
-ACROSS = float(np.sqrt(2.0 / 3.0))
 
 
 def pushed(*squeezes: float) -> np.ndarray:
@@ -353,9 +350,6 @@ def test_a_lift_of_anything_else_is_not_known(lifts: list[int], other: str) -> N
         )
     validate_lifts(HAND, BOX, grasps, where, pieces=WHOLE, hard=other == "friction", known=known)
     assert len(lifts) == 6
-
-
-LIFTED, TOUCHED, FELL = 1, 3, 5
 
 
 def numbered(count: int) -> GraspSet:

@@ -34,6 +34,8 @@ HAND = replace(two_finger_hand(), effort=np.full(2, TORQUE))
 #: The object's y is up: friction alone holds it.
 UPRIGHT = np.array([[0.0, 0.0, 0.03, np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0]])
 TABLE = PlacedGrasps((Obstacle.half_space((0, 0, 1), 0.0),), UPRIGHT, np.zeros(1, np.intp))
+BARRETT = "synth --hand barrett --object block --scene table --fidelity draft --seed 3"
+UP = np.array([[[0.0, 1.0, 0.0]]])
 
 
 def pinch() -> GraspSet:
@@ -116,9 +118,6 @@ def test_what_is_said_with_a_job_goes_over_what_the_file_says() -> None:
         BOX.weighing(density=1e7)
 
 
-BARRETT = "synth --hand barrett --object block --scene table --fidelity draft --seed 3"
-
-
 def test_whoever_says_the_weight_is_told_what_the_grasps_lift(tmp_path) -> None:
     keys = {"mass_kg", "lift_share", "lift_hard_share", "payload_kg"}
     words = f"{BARRETT} -n 1 --mass 0.37 -o"
@@ -137,9 +136,6 @@ def test_a_job_counts_grasps_that_lift_the_wanted_payload(tmp_path, least, kept:
     assert (shard["quality/payload_kg"] >= least).all()
     survive = shard["quality/shake_margin"] < 1
     assert told["shake_share"] == (survive.mean() if kept else None)
-
-
-UP = np.array([[[0.0, 1.0, 0.0]]])
 
 
 @pytest.mark.parametrize("friction", [0.01, 0.3, FRICTION, 1.0])

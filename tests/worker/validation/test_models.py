@@ -40,6 +40,8 @@ from tests.worker.hands.test_mjcf import load
 from tests.worker.models import on_one_dof, piece, two_finger_hand
 from tests.worker.quality.helpers import BOX, FAR, PADS, WHOLE, many_grasps, placed_data, plate_hand, posture
 
+RNG = np.random.default_rng(11)
+
 
 def by_luck(monkeypatch: pytest.MonkeyPatch, odds: float = 0.7) -> None:
     """Verdicts that follow from the grasp and the variant as a coin does."""
@@ -126,9 +128,6 @@ def test_a_grasp_meets_the_same_models_each_axis_once() -> None:
 def test_it_stops_when_it_is_told_to() -> None:
     with pytest.raises(TaskCancelled):
         robust(PADS, BOX, many_grasps(), pieces=WHOLE, run=ExecutionContext(cancelled=lambda: True))
-
-
-RNG = np.random.default_rng(11)
 
 
 def models(hand: HandModel = PADS, friction: tuple[float, float] = (0.6, 0.02)) -> Models:

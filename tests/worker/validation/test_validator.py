@@ -35,6 +35,12 @@ from tests.worker.models import object_from_mesh, on_one_dof, two_finger_hand
 from tests.worker.quality import helpers
 from tests.worker.quality.helpers import BOX, CONTACT, FAR, PADS, WHOLE, grasp_of, many_grasps, placed_data, posture
 
+#: Displacement or rotation over its limit by time [s].
+Motion = Callable[[float], float]
+SHORT_PADS, PLATES = helpers.pad_hand(), helpers.plate_hand()
+TABLE = Obstacle.half_space((0, 0, 1), -0.3)
+THUMB = ("joint_12.0", "joint_13.0", "joint_14.0", "joint_15.0")
+
 
 def test_a_pressed_box_is_held_and_a_free_one_falls() -> None:
     verdict = validate(PADS, BOX, grasp_of(), level="dexgraspbench", pieces=WHOLE)
@@ -320,10 +326,6 @@ def test_a_displacement_that_is_no_number_is_told_as_none(monkeypatch: pytest.Mo
     assert np.isnan(simulated_displacement_cm(PADS, BOX, grasp_of().grasp, pieces=WHOLE)[0])
 
 
-#: Displacement or rotation over its limit by time [s].
-Motion = Callable[[float], float]
-
-
 class Scripted(Test):
     """A push in which displacement and rotation, over their limits, follow functions of time [s]."""
 
@@ -373,10 +375,6 @@ def test_a_push_ends_once_it_is_decided(moved: Motion, turned: Motion, outcome: 
     assert seconds is None or push.elapsed == pytest.approx(seconds)
 
 
-SHORT_PADS, PLATES = helpers.pad_hand(), helpers.plate_hand()
-TABLE = Obstacle.half_space((0, 0, 1), -0.3)
-
-
 def test_a_model_is_compiled_once_for_all_that_moves_a_verdict() -> None:
     own = (SHORT_PADS, BOX, WHOLE, MujocoOptions())
     assert scene_of(*own) is scene_of(SHORT_PADS, replace(BOX, name="another name"), WHOLE, MujocoOptions())
@@ -403,9 +401,6 @@ def test_displacement_is_free_fall_without_hand_and_none_at_rest() -> None:
     rows = posture(((0, 0, 0), (0.0655, 0.0655)), ((0, 0, 0), (0.05, 0.05)))
     held, loose = simulated_displacement_cm(PLATES, BOX, rows, pieces=WHOLE)
     assert held < 1.0 < 10.0 < loose
-
-
-THUMB = ("joint_12.0", "joint_13.0", "joint_14.0", "joint_15.0")
 
 
 def test_a_published_grasp_without_its_thumb_is_refused(shared_data) -> None:

@@ -33,6 +33,9 @@ from graspd.worker.validation.protocol import Outcome, ValidatedBy
 from graspd.worker.validation.validator import Verdicts, prefiltered, validate
 from tests.worker.quality.helpers import BOX, PADS, WHOLE, grasp_of, many_grasps, posture
 
+ON = ExecutionContext(prefilter="on", threads=1)
+GRASPS = 84
+
 
 class Stand:
     """Stands in for the module `mujoco_warp`."""
@@ -194,9 +197,6 @@ def test_it_stops_when_told(monkeypatch: pytest.MonkeyPatch) -> None:
         pool(monkeypatch, Stand(), 4).validate(many_grasps(), ExecutionContext(cancelled=lambda: True))
 
 
-ON = ExecutionContext(prefilter="on", threads=1)
-
-
 @pytest.fixture(autouse=True)
 def stand_in(monkeypatch: pytest.MonkeyPatch):
     """MuJoCo itself as the engine; the pads pass for a hand, which grippers do not."""
@@ -319,9 +319,6 @@ def test_verdicts_that_were_asked_before_are_not_asked_twice(stand_in: Stand) ->
     assert stand_in.steps == launched > 0
     np.testing.assert_array_equal(again.outcome, made.outcome)
     np.testing.assert_array_equal(again.validated_by, made.validated_by)
-
-
-GRASPS = 84
 
 
 @pytest.mark.slow

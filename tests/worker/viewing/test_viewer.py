@@ -32,6 +32,7 @@ HAND = two_finger_hand()
 BLOCK = object_from_mesh(trimesh.creation.box((0.05, 0.04, 0.06)), "block")
 GRASPS = 3
 LIFT_M = 0.1
+SCENE = json_attribute(SceneSpec(kind="bin").model_dump(mode="json"))
 
 
 def arrays(joints: int) -> dict[str, np.ndarray]:
@@ -51,9 +52,6 @@ def arrays(joints: int) -> dict[str, np.ndarray]:
     made["scene/rest_probability"] = np.ones(2)
     made |= quality_columns(GRASPS)
     return made | {"quality/valid": np.array([0, 1, 0], np.uint8), "quality/success": np.array([0, 1, 0], np.int8)}
-
-
-SCENE = json_attribute(SceneSpec(kind="bin").model_dump(mode="json"))
 
 
 @contextmanager
