@@ -194,7 +194,6 @@ def test_a_file_is_read_with_its_scene_and_none_from_elsewhere(checkout, tmp_pat
     (found,) = dexgraspbench.read(file, hand="barrett", obj="block")
     assert found.placed is not None and found.scale == 0.5
     np.testing.assert_allclose(found.placed.object_pose[0], pose, atol=ROUNDING_M)
-
     for path in ("/etc/passwd", "assets/../../secret.npy", "other/scene.npy", "assets/none.npy"):
         bench_scene.save_record(tmp_path / "x.npy", record | {"scene_path": path})
         with pytest.raises(InputError, match="no folder above" if path == "assets/none.npy" else "below assets"):

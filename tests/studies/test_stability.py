@@ -278,7 +278,6 @@ def test_refused_scenes_are_cells_that_say_why_walls_stand_off(hand: HandModel) 
         for box in boxes:
             away = np.abs(box.pose[:2]) - np.array(box.size[:2]) / 2 - half
             assert away.max() == pytest.approx(0.02)
-
     # From a BarrettHand's data sheet: 335 mm at most, fingers stretched; the preshape is about two thirds open.
     assert 0.1 < scenes.span_of(hand) < 0.335
 

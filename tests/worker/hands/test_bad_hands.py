@@ -257,7 +257,6 @@ def test_a_bad_hand_is_refused_in_one_line_here_and_as_an_upload(files, says: st
     assert told.exit_code == 2 and told.stdout == ""
     (line,) = told.stderr.splitlines()
     assert line.startswith("graspd: refused: ") and says in line and len(line) < 400
-
     found = upload(open_store("memory://"), AssetKind.HAND, "hand.zip", zipped(files))
     assert found["verdict"] == "refuse" and says in found["message"] and "\n" not in found["message"]
     assert "root:" not in line + found["message"] and set(files) == {path.name for path in folder.iterdir()}

@@ -50,7 +50,6 @@ def test_corrections_and_options_make_the_same_hand(said, options, palm: bool, t
     facts = facts_of(hand_glb(hand_from_path(tmp_path / "claw.urdf")))
     there = corrected({"file": "claw.urdf"}, facts, HandCorrections.model_validate(said))
     named = load_hand({"claw.urdf": CLAW, "asset.json": json.dumps(there).encode()}, name="claw", digest="")
-
     written = tmp_path / "asset.json"
     graspd("hands check --no-self-test --write", written, tmp_path / "claw.urdf", *options)
     here = hand_from_path(tmp_path / "claw.urdf")

@@ -213,7 +213,6 @@ def test_links_inside_links_are_parted_along_the_true_gradient(name: str) -> Non
     draws = hand.lower + np.random.default_rng(0).random((20, 1, hand.dofs)) * (hand.upper - hand.lower)
     states = [HandState(np.array([[0.5, 0.0, 0.0]]), np.array([[1.0, 0.0, 0.0, 0.0]]), q) for q in draws]
     state = max(states, key=energy)
-
     simulation = rig(hand, ball(), capacity=1, options=replace(ALONE, self_margin=0.0))
     check_gradient(simulation, state, energy, least=1e-4, self_penetration=1.0)
 
