@@ -62,6 +62,22 @@ def exported(on_tables: Path, tmp_path_factory: pytest.TempPathFactory):
     return export
 
 
+def _exported(name: str, format_: str):
+    @pytest.fixture(scope="session", name=name)
+    def folder(exported) -> Path:
+        return exported(format_)
+
+    return folder
+
+
+checkout, data, folder = (
+    _exported("checkout", "dexlearn"),
+    _exported("data", "graspgen"),
+    _exported("folder", "huggingface"),
+)
+recorded, root = _exported("recorded", "lerobot"), _exported("root", "dexgraspnet2")
+
+
 @pytest.fixture(scope="session")
 def stored(on_tables: Path) -> Shard:
     return read_shard(on_tables / "block.h5", kind="base")

@@ -34,6 +34,26 @@ ROUNDING_M = 1e-8
 CONFIG, EXPERIMENT = "graspd_barrett", "graspd_tabletop"
 COUNT = 12
 LIMP = 3
+#: Index fingertip frame of the benchmark's Allegro, from its model: palm turned by the quaternion 0 1 0 1 in the world.
+_ALLEGRO_INDEX = [
+    ([0, 0.0435, -0.001542], [0.999048, -0.0436194, 0, 0], [0, 0, 1]), ([0, 0, 0.0164], [1, 0, 0, 0], [0, 1, 0]),
+    ([0, 0, 0.054], [1, 0, 0, 0], [0, 1, 0]), ([0, 0, 0.0384], [1, 0, 0, 0], [0, 1, 0]),
+]  # fmt: skip
+_ALLEGRO_THUMB = [
+    ([-0.0182, 0.019333, -0.045987], [0.477714, -0.521334, -0.521334, -0.477714], [-1, 0, 0]),
+    ([-0.027, 0.005, 0.0399], [1, 0, 0, 0], [0, 0, 1]), ([0, 0, 0.0177], [1, 0, 0, 0], [0, 1, 0]),
+    ([0, 0, 0.0514], [1, 0, 0, 0], [0, 1, 0]),
+]  # fmt: skip
+#: And of its Shadow hand: palm 34 mm above the world's origin.
+_SHADOW_INDEX = [
+    ([0.033, 0, 0.095], [1, 0, 0, 0], [0, -1, 0]), ([0, 0, 0], [1, 0, 0, 0], [1, 0, 0]),
+    ([0, 0, 0.045], [1, 0, 0, 0], [1, 0, 0]), ([0, 0, 0.025], [1, 0, 0, 0], [1, 0, 0]),
+]  # fmt: skip
+_SHADOW_THUMB = [
+    ([0.034, -0.00858, 0.029], [0.92388, 0, 0.382683, 0], [0, 0, -1]), ([0, 0, 0], [1, 0, 0, 0], [1, 0, 0]),
+    ([0, 0, 0.038], [1, 0, 0, 0], [1, 0, 0]), ([0, 0, 0], [1, 0, 0, 0], [0, -1, 0]),
+    ([0, 0, 0.032], [1, 0, 0, -1], [1, 0, 0]),
+]  # fmt: skip
 
 
 @dataclass
@@ -246,28 +266,6 @@ def test_a_hand_of_meshes_is_loaded_with_them(shared_data: Path, block, tmp_path
     meshes = {found.model.mesh(number).name for number in range(found.model.nmesh)}
     hulls = {f"{PREFIX}piece_{k:03}" for k, piece in enumerate(hand.pieces) if piece.kind == "hull"}
     assert hulls and hulls <= meshes
-
-
-#: Index fingertip frame of the benchmark's Allegro, from its model: palm turned by the quaternion 0 1 0 1 in the world.
-_ALLEGRO_INDEX = [
-    ([0, 0.0435, -0.001542], [0.999048, -0.0436194, 0, 0], [0, 0, 1]), ([0, 0, 0.0164], [1, 0, 0, 0], [0, 1, 0]),
-    ([0, 0, 0.054], [1, 0, 0, 0], [0, 1, 0]), ([0, 0, 0.0384], [1, 0, 0, 0], [0, 1, 0]),
-]  # fmt: skip
-_ALLEGRO_THUMB = [
-    ([-0.0182, 0.019333, -0.045987], [0.477714, -0.521334, -0.521334, -0.477714], [-1, 0, 0]),
-    ([-0.027, 0.005, 0.0399], [1, 0, 0, 0], [0, 0, 1]), ([0, 0, 0.0177], [1, 0, 0, 0], [0, 1, 0]),
-    ([0, 0, 0.0514], [1, 0, 0, 0], [0, 1, 0]),
-]  # fmt: skip
-#: And of its Shadow hand: palm 34 mm above the world's origin.
-_SHADOW_INDEX = [
-    ([0.033, 0, 0.095], [1, 0, 0, 0], [0, -1, 0]), ([0, 0, 0], [1, 0, 0, 0], [1, 0, 0]),
-    ([0, 0, 0.045], [1, 0, 0, 0], [1, 0, 0]), ([0, 0, 0.025], [1, 0, 0, 0], [1, 0, 0]),
-]  # fmt: skip
-_SHADOW_THUMB = [
-    ([0.034, -0.00858, 0.029], [0.92388, 0, 0.382683, 0], [0, 0, -1]), ([0, 0, 0], [1, 0, 0, 0], [1, 0, 0]),
-    ([0, 0, 0.038], [1, 0, 0, 0], [1, 0, 0]), ([0, 0, 0], [1, 0, 0, 0], [0, -1, 0]),
-    ([0, 0, 0.032], [1, 0, 0, -1], [1, 0, 0]),
-]  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -159,11 +159,6 @@ def graspness_at(place: np.ndarray, surface: np.ndarray, points: np.ndarray) -> 
 
 
 @pytest.fixture(scope="module")
-def root(exported) -> Path:
-    return exported("dexgraspnet2")
-
-
-@pytest.fixture(scope="module")
 def split(root: Path) -> range:
     """Where the block's scenes are, for one of the two objects is held out."""
     return TRAIN if next((root / "data" / "dex_grasps_new" / "scene_0000").rglob("*.npz")).stem == "block" else VAL

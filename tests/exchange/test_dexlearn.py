@@ -115,11 +115,6 @@ def _matrices(quaternions: np.ndarray) -> np.ndarray:
     return np.asarray(flat.reshape(*quaternions.shape[:-1], 3, 3))
 
 
-@pytest.fixture(scope="module")
-def checkout(exported) -> Path:
-    return exported("dexlearn")
-
-
 def test_all_that_may_be_drawn_is_there(checkout: Path) -> None:
     data = Data(checkout, NAME)
     assert data.config["joint_num"] == 8 and data.config["traj_length"] == 3

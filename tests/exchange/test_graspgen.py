@@ -30,11 +30,6 @@ from tests.worker.hands.urdfs import OPENING, gripper
 ROUNDING_M = 1e-12
 
 
-@pytest.fixture(scope="module")
-def data(exported) -> Path:
-    return exported("graspgen")
-
-
 def record_of(data: Path, uuid: str) -> dict:
     """As its reader finds it: the index names the shard, the shard is searched for the key."""
     folder = data / "grasps" / "barrett"

@@ -29,11 +29,6 @@ pq = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed; pi
 ROUNDING_M = 1e-12
 
 
-@pytest.fixture(scope="module")
-def folder(exported) -> Path:
-    return exported("huggingface")
-
-
 def configs(folder: Path) -> dict[str, dict[str, list[Path]]]:
     """What `load_dataset` finds: the card's configurations, their splits, and the files that the patterns match."""
     head = yaml.safe_load((folder / "README.md").read_text().split("---")[1])
@@ -128,16 +123,11 @@ pq = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed; pi
 FLOAT32_M = 1e-6
 
 
-@pytest.fixture(scope="module")
-def root(exported) -> Path:
-    return exported("lerobot")
-
-
-def frames(root: Path) -> list[dict]:
+def frames(recorded: Path) -> list[dict]:
     """All frames in the order of their files, as the reader joins them, cast to the features of `info.json`."""
-    info = json.loads((root / "meta" / "info.json").read_text())
+    info = json.loads((recorded / "meta" / "info.json").read_text())
     rows = []
-    for file in sorted((root / "data").glob("*/*.parquet")):
+    for file in sorted((recorded / "data").glob("*/*.parquet")):
         table = pq.read_table(file)
         assert set(table.column_names) == set(info["features"])
         rows += table.to_pylist()
@@ -152,31 +142,31 @@ def frames(root: Path) -> list[dict]:
     return rows
 
 
-def episodes(root: Path) -> list[dict]:
-    files = sorted((root / "meta" / "episodes").glob("*/*.parquet"))
+def episodes(recorded: Path) -> list[dict]:
+    files = sorted((recorded / "meta" / "episodes").glob("*/*.parquet"))
     rows = [row for file in files for row in pq.read_table(file).to_pylist()]
     return sorted(rows, key=lambda row: row["episode_index"])
 
 
-def test_info_says_what_is_there_and_pandas_finds_the_tasks(root: Path) -> None:
-    info = json.loads((root / "meta" / "info.json").read_text())
+def test_info_says_what_is_there_and_pandas_finds_the_tasks(recorded: Path) -> None:
+    info = json.loads((recorded / "meta" / "info.json").read_text())
     assert info["codebase_version"] == "v3.0" and info["fps"] > 0 and info["chunks_size"] > 0
-    assert info["total_frames"] == len(frames(root)) and info["total_episodes"] == len(episodes(root)) == 16
+    assert info["total_frames"] == len(frames(recorded)) and info["total_episodes"] == len(episodes(recorded)) == 16
     ends = {name: [int(end) for end in span.split(":")] for name, span in info["splits"].items()}
     assert ends["train"][0] == 0 and ends["train"][1] == ends["test"][0] and ends["test"][1] == 16
     assert not any("/" in name for name in info["features"])  # it takes / for a level of statistics
-    told = json.loads(pq.read_schema(root / "meta" / "tasks.parquet").metadata[b"pandas"])
+    told = json.loads(pq.read_schema(recorded / "meta" / "tasks.parquet").metadata[b"pandas"])
     assert told["index_columns"] == ["task"]
     assert {column["field_name"] for column in told["columns"]} == {"task", "task_index"}
 
 
-def test_each_episode_lies_where_the_list_says(root: Path) -> None:
-    info, rows = json.loads((root / "meta" / "info.json").read_text()), frames(root)
-    tasks = {row["task_index"]: row["task"] for row in pq.read_table(root / "meta" / "tasks.parquet").to_pylist()}
-    for episode in episodes(root):
+def test_each_episode_lies_where_the_list_says(recorded: Path) -> None:
+    info, rows = json.loads((recorded / "meta" / "info.json").read_text()), frames(recorded)
+    tasks = {row["task_index"]: row["task"] for row in pq.read_table(recorded / "meta" / "tasks.parquet").to_pylist()}
+    for episode in episodes(recorded):
         some = rows[episode["dataset_from_index"] : episode["dataset_to_index"]]
         place = {"chunk_index": episode["data/chunk_index"], "file_index": episode["data/file_index"]}
-        assert (root / info["data_path"].format(**place)).is_file()
+        assert (recorded / info["data_path"].format(**place)).is_file()
         assert [row["episode_index"] for row in some] == [episode["episode_index"]] * episode["length"]
         assert [row["index"] for row in some] == list(range(episode["dataset_from_index"], episode["dataset_to_index"]))
         assert [row["frame_index"] for row in some] == list(range(episode["length"]))
@@ -185,9 +175,9 @@ def test_each_episode_lies_where_the_list_says(root: Path) -> None:
         assert {tasks[row["task_index"]] for row in some} == set(episode["tasks"])
 
 
-def test_statistics_are_those_of_the_frames(root: Path) -> None:
-    stats, rows = json.loads((root / "meta" / "stats.json").read_text()), frames(root)
-    info = json.loads((root / "meta" / "info.json").read_text())
+def test_statistics_are_those_of_the_frames(recorded: Path) -> None:
+    stats, rows = json.loads((recorded / "meta" / "stats.json").read_text()), frames(recorded)
+    info = json.loads((recorded / "meta" / "info.json").read_text())
     assert set(stats) == set(info["features"])
     for name in ("action", "observation.state"):
         values = np.array([row[name] for row in rows], float)
@@ -200,10 +190,10 @@ def test_statistics_are_those_of_the_frames(root: Path) -> None:
     np.testing.assert_allclose(picture[:, 0, 0], mean, atol=0.02)  # of a tenth of the pixels
 
 
-def test_an_episode_is_the_way_of_its_grasp(root: Path, on_tables: Path, hand, stored) -> None:
+def test_an_episode_is_the_way_of_its_grasp(recorded: Path, on_tables: Path, hand, stored) -> None:
     pictures = [one for one in Pictures(open_shards(on_tables)) if one["object"] == "block"]
-    rows, tip = frames(root), hand.fingertips[0]
-    mine = [episode for episode in episodes(root) if episode["tasks"] == ["lift the block"]]
+    rows, tip = frames(recorded), hand.fingertips[0]
+    mine = [episode for episode in episodes(recorded) if episode["tasks"] == ["lift the block"]]
     assert sorted(episode["graspd/row"] for episode in mine) == list(range(8))
     for episode in mine:
         some = rows[episode["dataset_from_index"] : episode["dataset_to_index"]]
@@ -225,23 +215,23 @@ def test_an_episode_is_the_way_of_its_grasp(root: Path, on_tables: Path, hand, s
         assert any(np.array_equal(some[0]["observation.images.scene"], one) for one in seen)
 
 
-def test_grasps_come_back_with_their_ways(root: Path, stored) -> None:
-    (back,) = lerobot.read(root, hand="barrett", obj="block", object_name="block")
+def test_grasps_come_back_with_their_ways(recorded: Path, stored) -> None:
+    (back,) = lerobot.read(recorded, hand="barrett", obj="block", object_name="block")
     assert back.grasps.approach is not None and back.grasps.lift is not None
     np.testing.assert_allclose(back.grasps.approach[..., :3], stored["grasp/approach"][..., :3], atol=FLOAT32_M)
     np.testing.assert_allclose(back.grasps.lift.hand_pose[:, :3], stored["grasp/lift"][:, :3], atol=FLOAT32_M)
 
 
-def test_a_data_set_of_somebody_else_is_told(root: Path, tmp_path: Path) -> None:
+def test_a_data_set_of_somebody_else_is_told(recorded: Path, tmp_path: Path) -> None:
     other = tmp_path / "other"
-    shutil.copytree(root, other)
+    shutil.copytree(recorded, other)
     info = json.loads((other / "meta" / "info.json").read_text())
     info["features"]["observation.state"]["names"] = ["shoulder", "elbow"]
     (other / "meta" / "info.json").write_text(json.dumps(info))
     with pytest.raises(InputError, match="was not exported by graspd"):
         lerobot.read(other, hand="barrett", obj="block", object_name="block")
     with pytest.raises(InputError, match="lift the block, lift the mug"):
-        lerobot.read(root, hand="barrett", obj="block", object_name="cup")
+        lerobot.read(recorded, hand="barrett", obj="block", object_name="cup")
 
 
 def test_grasps_without_pictures_are_no_episodes(on_tables: Path, tmp_path: Path) -> None:

@@ -42,6 +42,20 @@ from tests.worker.simulation.test_surroundings import mujoco_room
 
 FEW = MapOptions(4)
 FRICTION, MASS = "friction, relative to the model", "mass, relative to the model"
+#: What of a variant stands for an error's amount.
+AMOUNTS = {
+    "collision shapes of the hand grown by [mm]": (Axis.SHAPES, lambda v: 1e3 * v.grown_m),
+    FRICTION: (Axis.FRICTION, lambda v: v.friction),
+    MASS: (Axis.MASS, lambda v: v.mass),
+    "gains, relative to the model": (Axis.JOINTS, lambda v: v.gain),
+    "armature [1e-4 kg m²]": (Axis.JOINTS, lambda v: 1e4 * (v.armature or 0.0)),
+    "dry friction of joints [N m]": (Axis.JOINTS, lambda v: v.dry_friction or 0.0),
+    "object displaced by [mm]": (Axis.POSE, lambda v: 1e3 * np.linalg.norm(v.object_shift_m)),
+    "object rotated by [°]": (Axis.POSE, lambda v: np.degrees(np.linalg.norm(v.object_turn))),
+    "hand displaced by [mm]": (Axis.CALIBRATION, lambda v: 1e3 * np.linalg.norm(v.hand_shift_m)),
+    "centre of mass displaced by [mm]": (Axis.CENTRE, lambda v: 1e3 * np.linalg.norm(v.centre_m)),
+    "last finger delayed by [share of closing]": (Axis.ORDER, lambda v: max(v.lags)),
+}
 
 
 @pytest.fixture(scope="module")
@@ -196,22 +210,6 @@ def test_the_models_friction_keeps_what_holds_ice_keeps_nothing(monkeypatch: pyt
     ice, own = validated(monkeypatch, FRICTION, (0.01, 1.0))
     assert (own.value, own.outcome, own.reached) == (1.0, "good", True)
     assert (ice.value, ice.outcome, ice.reached) == (0.0, "broken", False)
-
-
-#: What of a variant stands for an error's amount.
-AMOUNTS = {
-    "collision shapes of the hand grown by [mm]": (Axis.SHAPES, lambda v: 1e3 * v.grown_m),
-    FRICTION: (Axis.FRICTION, lambda v: v.friction),
-    MASS: (Axis.MASS, lambda v: v.mass),
-    "gains, relative to the model": (Axis.JOINTS, lambda v: v.gain),
-    "armature [1e-4 kg m²]": (Axis.JOINTS, lambda v: 1e4 * (v.armature or 0.0)),
-    "dry friction of joints [N m]": (Axis.JOINTS, lambda v: v.dry_friction or 0.0),
-    "object displaced by [mm]": (Axis.POSE, lambda v: 1e3 * np.linalg.norm(v.object_shift_m)),
-    "object rotated by [°]": (Axis.POSE, lambda v: np.degrees(np.linalg.norm(v.object_turn))),
-    "hand displaced by [mm]": (Axis.CALIBRATION, lambda v: 1e3 * np.linalg.norm(v.hand_shift_m)),
-    "centre of mass displaced by [mm]": (Axis.CENTRE, lambda v: 1e3 * np.linalg.norm(v.centre_m)),
-    "last finger delayed by [share of closing]": (Axis.ORDER, lambda v: max(v.lags)),
-}
 
 
 @pytest.mark.parametrize("name", ERRORS)

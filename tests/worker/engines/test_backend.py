@@ -14,6 +14,21 @@ from tests.conftest import PACKAGES, REPOSITORY
 from tests.shell import completed
 from tests.waiting import PATIENCE_S
 
+MODULE = "graspd.worker.simulation.kernels.optimizers"
+START = """
+import importlib, warp as wp
+from graspd.worker.engines import backend
+backend.start()
+print(wp.config.kernel_cache_dir)
+"""
+LOAD = START + f"wp.load_module(importlib.import_module({MODULE!r}), device='cpu')"
+BAKE = f"""
+from graspd.worker.engines import backend
+from tests.conftest import PACKAGES, REPOSITORY
+backend.start()
+backend.bake([{MODULE!r}], architectures=[90])
+"""
+
 
 def test_the_default_device_of_one_thread_is_not_that_of_another() -> None:
     backend.start()
@@ -36,22 +51,6 @@ def test_the_default_device_of_one_thread_is_not_that_of_another() -> None:
     thread.join()
     runtime.default_device = first
     assert seen == ["a GPU"]
-
-
-MODULE = "graspd.worker.simulation.kernels.optimizers"
-START = """
-import importlib, warp as wp
-from graspd.worker.engines import backend
-backend.start()
-print(wp.config.kernel_cache_dir)
-"""
-LOAD = START + f"wp.load_module(importlib.import_module({MODULE!r}), device='cpu')"
-BAKE = f"""
-from graspd.worker.engines import backend
-from tests.conftest import PACKAGES, REPOSITORY
-backend.start()
-backend.bake([{MODULE!r}], architectures=[90])
-"""
 
 
 def run(code: str, **places: str) -> str:

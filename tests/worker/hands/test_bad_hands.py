@@ -48,6 +48,18 @@ _FREE = '<link name="ball"/><joint name="loose" type="floating"><parent link="ba
 SOURCE = builtin_files(AssetKind.HAND, "barrett")
 WORDS = [b"nan", b"-1e308", b"inf", b"0", b"", b"<", b'"', b"&x;", b"../../", b"palm", b"finger_1_medial", b"\xff\xfe"]
 URDFS, ASSETS = (damaged(SOURCE[name], WORDS) for name in ("barrett.urdf", "asset.json"))
+XACRO = '<robot name="x" xmlns:xacro="http://www.ros.org/wiki/xacro">{}</robot>'
+INCLUDES = CLAW.replace('<light pos="0 0 1"/>', '<include file="/etc/passwd"/>').encode()
+PART_MESH = '<collision><geometry><mesh filename="part.dae"/></geometry></collision>'
+PARTS = robot(link("palm", PART_MESH), link("a", PART_MESH), joint("j", "palm", "a"))
+BOMB_DAE = dae(SCENE.replace("<library_nodes>", f"<library_nodes>{BOMB}").replace("#part", "#n0"))
+#: The first file is the description; what the refusal says.
+HANDS: list[tuple[dict[str, bytes], str]] = [
+    ({"runs.xacro": XACRO.format("""<a b="${__import__('os').system('touch ran')}"/>""").encode()}, "__import__"),
+    ({"reads.xacro": XACRO.format('<xacro:include filename="/etc/passwd"/>').encode()}, "outside the hand's folder"),
+    ({"includes.xml": INCLUDES}, "outside the hand's folder"),
+    ({"bomb.urdf": PARTS, "part.dae": BOMB_DAE}, "too deep"),
+]
 
 
 @pytest.mark.parametrize(("kind", "report_of"), [("urdf", report_hand), ("mesh", report_object)])
@@ -230,20 +242,6 @@ def test_a_flat_mesh_is_told_with_its_link() -> None:
     data = jaws().replace(b'<link name="left">', mesh.encode())
     files = {"h.urdf": data, "pad.stl": bytes(flat.export(file_type="stl"))}
     assert "collision mesh 'pad.stl' of link 'left': " in check_hand(files, "h")["message"]
-
-
-XACRO = '<robot name="x" xmlns:xacro="http://www.ros.org/wiki/xacro">{}</robot>'
-INCLUDES = CLAW.replace('<light pos="0 0 1"/>', '<include file="/etc/passwd"/>').encode()
-PART_MESH = '<collision><geometry><mesh filename="part.dae"/></geometry></collision>'
-PARTS = robot(link("palm", PART_MESH), link("a", PART_MESH), joint("j", "palm", "a"))
-BOMB_DAE = dae(SCENE.replace("<library_nodes>", f"<library_nodes>{BOMB}").replace("#part", "#n0"))
-#: The first file is the description; what the refusal says.
-HANDS: list[tuple[dict[str, bytes], str]] = [
-    ({"runs.xacro": XACRO.format("""<a b="${__import__('os').system('touch ran')}"/>""").encode()}, "__import__"),
-    ({"reads.xacro": XACRO.format('<xacro:include filename="/etc/passwd"/>').encode()}, "outside the hand's folder"),
-    ({"includes.xml": INCLUDES}, "outside the hand's folder"),
-    ({"bomb.urdf": PARTS, "part.dae": BOMB_DAE}, "too deep"),
-]
 
 
 @pytest.mark.parametrize(("files", "says"), HANDS, ids=[next(iter(files)) for files, _ in HANDS])

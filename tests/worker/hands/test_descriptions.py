@@ -36,6 +36,35 @@ PAD = bytes(trimesh.creation.box((0.01, 0.02, 0.06)).export(file_type="stl"))
 POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:12\nsize 5\n"
 INCLUDES = b'<robot xmlns:xacro="u"><xacro:include filename="a.xacro"/></robot>'
 DECLARED = '<?xml version="1.0" encoding="{}"?>'
+MACROS = """<?xml version="1.0"?>
+<robot name="claw" xmlns:xacro="http://www.ros.org/wiki/xacro">
+  <xacro:arg name="stroke" default="0.04"/>
+  <xacro:property name="size" value="${xacro.load_yaml('$(find claw_description)/config/size.yaml')}"/>
+  <xacro:include filename="$(find claw_description)/urdf/parts.xacro"/>
+  <link name="palm"><collision><geometry><box size="0.1 0.04 0.04"/></geometry></collision></link>
+  <xacro:finger name="left" side="1"><origin xyz="0.045 0 0.02"/></xacro:finger>
+  <xacro:finger name="right" side="-1"><origin xyz="${-0.09 / 2} 0 0.02"/></xacro:finger>
+</robot>
+"""
+PARTS = """<robot xmlns:xacro="http://www.ros.org/wiki/xacro">
+  <xacro:macro name="finger" params="name side *pose">
+    <link name="${name}">
+      <collision><origin xyz="0 0 0.03"/>
+        <geometry><box size="0.01 ${size['width']} ${[0.06 for i in range(1)][0]}"/></geometry></collision>
+    </link>
+    <joint name="${name}_joint" type="prismatic">
+      <parent link="palm"/><child link="${name}"/><xacro:insert_block name="pose"/>
+      <axis xyz="${-side} 0 0"/><limit lower="0" upper="$(arg stroke)" effort="20" velocity="0.1"/>
+    </joint>
+  </xacro:macro>
+</robot>
+"""
+FILES = {
+    "package.xml": b"<package><name>claw_description</name></package>",
+    "urdf/claw.urdf.xacro": MACROS.encode(),
+    "urdf/parts.xacro": PARTS.encode(),
+    "config/size.yaml": b"width: 0.02\n",
+}
 
 
 @pytest.fixture
@@ -272,37 +301,6 @@ def test_a_part_of_a_xacro_file_is_not_taken_for_the_hand(tmp_path: Path) -> Non
 def test_a_pointer_among_the_files_of_a_hand_is_told(files: dict[str, bytes], pointer: str, tmp_path: Path) -> None:
     for told in verdicts(files, next(iter(files)), tmp_path):
         assert f"{pointer} is a Git LFS pointer, not the file itself: git lfs pull" in told
-
-
-MACROS = """<?xml version="1.0"?>
-<robot name="claw" xmlns:xacro="http://www.ros.org/wiki/xacro">
-  <xacro:arg name="stroke" default="0.04"/>
-  <xacro:property name="size" value="${xacro.load_yaml('$(find claw_description)/config/size.yaml')}"/>
-  <xacro:include filename="$(find claw_description)/urdf/parts.xacro"/>
-  <link name="palm"><collision><geometry><box size="0.1 0.04 0.04"/></geometry></collision></link>
-  <xacro:finger name="left" side="1"><origin xyz="0.045 0 0.02"/></xacro:finger>
-  <xacro:finger name="right" side="-1"><origin xyz="${-0.09 / 2} 0 0.02"/></xacro:finger>
-</robot>
-"""
-PARTS = """<robot xmlns:xacro="http://www.ros.org/wiki/xacro">
-  <xacro:macro name="finger" params="name side *pose">
-    <link name="${name}">
-      <collision><origin xyz="0 0 0.03"/>
-        <geometry><box size="0.01 ${size['width']} ${[0.06 for i in range(1)][0]}"/></geometry></collision>
-    </link>
-    <joint name="${name}_joint" type="prismatic">
-      <parent link="palm"/><child link="${name}"/><xacro:insert_block name="pose"/>
-      <axis xyz="${-side} 0 0"/><limit lower="0" upper="$(arg stroke)" effort="20" velocity="0.1"/>
-    </joint>
-  </xacro:macro>
-</robot>
-"""
-FILES = {
-    "package.xml": b"<package><name>claw_description</name></package>",
-    "urdf/claw.urdf.xacro": MACROS.encode(),
-    "urdf/parts.xacro": PARTS.encode(),
-    "config/size.yaml": b"width: 0.02\n",
-}
 
 
 @pytest.fixture

@@ -38,6 +38,18 @@ ALLEGRO += ["thumb_rotation", "thumb_proximal", "thumb_middle", "thumb_distal"]
 HAND = hand_from_path("shadow")
 #: Where the other model's root link is, as seen from ours.
 BASE = np.concatenate([[0.013, -0.02, 0.034], quat_from_axis_angle(np.array([0.6, 0.0, 0.8]), np.array(2.0))])
+_PARTS = {"spread": "prox", "medial": "med", "distal": "dist"}
+#: The maker's file and names of our joints; the tolerance [m]. The facts are written with 4 to 6 decimals; the maker's
+#: fingers of the Barrett hand differ by 0.41 mm among each other, and ours are all alike.
+MAKERS = {
+    "allegro": ("allegro/allegro_hand_right.urdf", lambda joint: f"joint_{ALLEGRO.index(joint)}.0", 2e-5),
+    "barrett": (
+        "barrett/bhand_model.urdf",
+        lambda joint: f"{joint.rpartition('_')[0]}_{_PARTS[joint.rpartition('_')[2]]}_joint",
+        0.5e-3,
+    ),
+    "shadow": ("shadow/shadow_hand_right.urdf", str, 2e-5),
+}
 
 
 @pytest.fixture(scope="module")
@@ -152,20 +164,6 @@ def frames_of(name: str | Path, joints: dict[str, float]) -> dict[str, np.ndarra
     values = np.array([joints[joint] for joint in hand.joint_names])
     poses = body_poses(hand, IDENTITY_POSE, values)[0]
     return {joint: poses[body] for joint, body in zip(hand.joint_names, hand.joint_body, strict=True)}
-
-
-_PARTS = {"spread": "prox", "medial": "med", "distal": "dist"}
-#: The maker's file and names of our joints; the tolerance [m]. The facts are written with 4 to 6 decimals; the maker's
-#: fingers of the Barrett hand differ by 0.41 mm among each other, and ours are all alike.
-MAKERS = {
-    "allegro": ("allegro/allegro_hand_right.urdf", lambda joint: f"joint_{ALLEGRO.index(joint)}.0", 2e-5),
-    "barrett": (
-        "barrett/bhand_model.urdf",
-        lambda joint: f"{joint.rpartition('_')[0]}_{_PARTS[joint.rpartition('_')[2]]}_joint",
-        0.5e-3,
-    ),
-    "shadow": ("shadow/shadow_hand_right.urdf", str, 2e-5),
-}
 
 
 @pytest.mark.parametrize("name", MAKERS)

@@ -43,6 +43,7 @@ from tests.worker.simulation.test_surroundings import mujoco_distances, mujoco_r
 #: What a draft's finish may lack of a distance that it aims at exactly [m].
 DRAFT_M = 5e-4
 QUICK = resolve_fidelity("draft").model_copy(update={"starts": 2})
+BLOCK = object_from_path("block", face_error_m=QUICK.face_error_m)
 TABLE = {"kind": "half_space"}
 UPRIGHT = (1.0, 0, 0, 0)
 
@@ -227,19 +228,14 @@ def shadow(shared_data) -> HandModel:
 
 
 @pytest.fixture(scope="module")
-def block():
-    return object_from_path("block", face_error_m=QUICK.face_error_m)
+def table() -> Scenes:
+    return on_tables(BLOCK)
 
 
 @pytest.fixture(scope="module")
-def table(block) -> Scenes:
-    return on_tables(block)
-
-
-@pytest.fixture(scope="module")
-def mounted(shadow: HandModel, block, table: Scenes) -> GraspSet:
+def mounted(shadow: HandModel, table: Scenes) -> GraspSet:
     placed = table.placed(np.arange(8) % 2)
-    found = synthesize(shadow, block, PlanRequest(count=8, fidelity=QUICK, seed=4, placed=placed))
+    found = synthesize(shadow, BLOCK, PlanRequest(count=8, fidelity=QUICK, seed=4, placed=placed))
     return replace(found, scene=placed.index)
 
 
@@ -249,20 +245,20 @@ def lowest(mounting: HandModel, poses: np.ndarray, wrist: np.ndarray) -> float:
     return min(float(apply(bodies[:, p.body, None], p.vertices)[..., 2].min()) for p in mounting.pieces)
 
 
-def test_starts_keep_the_forearm_off_the_table(shared_data, block, table: Scenes) -> None:
+def test_starts_keep_the_forearm_off_the_table(shared_data, table: Scenes) -> None:
     # A wrist that is held bent forwards: behind a palm that faces down the forearm is lowest.
     held = {"root": "palm", "fix": {"WRJ1": 0.48, "WRJ2": 0.0}}
     shadow = hand_from_path(shared_data / "hands" / "shadow" / "shadow_hand_right.urdf", held)
     placed, each = table.placed(np.arange(16) % 2), 4
-    obstacles = DeviceObstacles.create(shadow, placed.scenes, block.centre_of_mass, "cpu")
-    model = pair_of(shadow, block, QUICK, "cpu", in_scenes=True)
+    obstacles = DeviceObstacles.create(shadow, placed.scenes, BLOCK.centre_of_mass, "cpu")
+    model = pair_of(shadow, BLOCK, QUICK, "cpu", in_scenes=True)
     coarse = model.model(model.coarse, obstacles)
     generators = [start_generator(3, 0, i, k) for i in range(16) for k in range(each)]
-    ways = [free_ways(scene, block) for scene in placed.scenes]
+    ways = [free_ways(scene, BLOCK) for scene in placed.scenes]
     state, depth = clear_scene_starts(coarse, generators, each=each, placed=placed, ways=ways)
     clear = np.flatnonzero(depth <= CLEAR)
     assert len(clear) > 40
-    poses = posture_of(shadow, block, state).hand_pose[clear][:, None]
+    poses = posture_of(shadow, BLOCK, state).hand_pose[clear][:, None]
     _, room = mounting_room(shadow, poses, placed.scenes, np.repeat(placed.index, each)[clear])
     assert room.min() >= MARGIN_M
 
@@ -282,8 +278,8 @@ def test_the_wrist_is_bent_no_farther_than_the_table_asks(shadow: HandModel, tab
     assert lowest(shadow.mounting, level[None], np.zeros(2)) < MARGIN_M
 
 
-def test_valid_grasps_have_their_forearm_above_the_table(shadow: HandModel, block, table: Scenes, mounted) -> None:
-    found, columns = scene_verdicts(shadow, block, mounted, table, level="lift", pieces=None, run=DEFAULT_CONTEXT)
+def test_valid_grasps_have_their_forearm_above_the_table(shadow: HandModel, table: Scenes, mounted) -> None:
+    found, columns = scene_verdicts(shadow, BLOCK, mounted, table, level="lift", pieces=None, run=DEFAULT_CONTEXT)
     assert found.wrist is not None and found.wrist.shape == (8, 2) and found.approach is not None
     assert shadow.mounting is not None and found.lift is not None and found.scene is not None
     clear = np.flatnonzero(columns["quality/clearance_m"] >= MARGIN_M)
@@ -296,21 +292,21 @@ def test_valid_grasps_have_their_forearm_above_the_table(shadow: HandModel, bloc
     assert again.wrist is not None and np.array_equal(again.wrist, found.wrist)
 
 
-def test_a_grasp_with_its_mounting_in_the_table_is_not_clear(shadow: HandModel, block, table, mounted) -> None:
+def test_a_grasp_with_its_mounting_in_the_table_is_not_clear(shadow: HandModel, table, mounted) -> None:
     assert mounted.scene is not None and shadow.mounting is not None
-    bare = plan_way(replace(shadow, mounting=None), block, mounted, table.placed(mounted.scene))
+    bare = plan_way(replace(shadow, mounting=None), BLOCK, mounted, table.placed(mounted.scene))
     assert bare.clear.any() and bare.wrist.shape == (8, 0)
     # A mounting as large as this reaches down to the table from anywhere.
     vertices, faces = tessellate("sphere", (1.0,))
     ball = ConvexPiece(2, "sphere", (1.0,), IDENTITY_POSE, vertices, faces, "forearm")
     hand = replace(shadow, mounting=replace(shadow.mounting, pieces=(ball,)))
-    _, columns = scene_verdicts(hand, block, mounted, table, level="lift", pieces=None, run=DEFAULT_CONTEXT)
+    _, columns = scene_verdicts(hand, BLOCK, mounted, table, level="lift", pieces=None, run=DEFAULT_CONTEXT)
     assert (columns["quality/success"] == -1).all()
 
 
-def test_free_grasps_do_not_depend_on_the_mounting(shadow: HandModel, block) -> None:
+def test_free_grasps_do_not_depend_on_the_mounting(shadow: HandModel) -> None:
     wanted = PlanRequest(count=2, fidelity=QUICK, seed=4)
-    ours, bare = (synthesize(hand, block, wanted) for hand in (shadow, replace(shadow, mounting=None)))
+    ours, bare = (synthesize(hand, BLOCK, wanted) for hand in (shadow, replace(shadow, mounting=None)))
     for one, other in ((ours.grasp, bare.grasp), (ours.pregrasp, bare.pregrasp), (ours.squeeze, bare.squeeze)):
         assert np.array_equal(one.hand_pose, other.hand_pose)
         assert np.array_equal(one.joint_positions, other.joint_positions)
