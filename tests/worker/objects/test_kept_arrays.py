@@ -50,7 +50,7 @@ TOLERANCE_M = 5e-7  # positions are single precision: half a micrometre at half 
 OTHERS = [{"batch": 1}, {"stage": Stage.SCENE}, {"hand_digest": "d" * 32}, {"object_digest": "d" * 32}]
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture
 def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     return tmp_path / "graspd"
@@ -76,7 +76,7 @@ def test_entries_differ_with_terms_and_code_bad_ones_are_remade(own_cache: Path)
     assert arrays_kept_or_made("things", ("x", 1), (disk_cache,), lambda: made(4))["a"][0, 0] == 4
 
 
-def test_samples_are_those_of_a_process_without_a_cache() -> None:
+def test_samples_are_those_of_a_process_without_a_cache(own_cache: Path) -> None:
     hand = two_finger_hand()
     ball = load_object(stl(sphere(segments=24)), name="ball", digest="", face_error_m=0.0)
     shapes = surface._Shapes(hand.pieces, body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0])
@@ -94,7 +94,7 @@ def load_balls(files: dict[str, bytes] = BALLS, error: float = 3e-4, **options) 
 
 
 @pytest.fixture
-def built(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+def built(own_cache: Path, monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """The bounds to which objects were prepared, not read."""
     bounds: list[float] = []
     build = prepare.build
@@ -160,7 +160,7 @@ def test_whatever_differs_in_a_model_changes_its_content(model) -> None:
         content_of(dataclasses.replace(BRICK, repairs=object()))  # type: ignore[arg-type]
 
 
-def test_no_cache_gives_one_mesh_of_a_file_for_another() -> None:
+def test_no_cache_gives_one_mesh_of_a_file_for_another(own_cache: Path) -> None:
     # As many corners and faces, the same digest of the file: only what was prepared differs.
     other = dataclasses.replace(object_from_mesh(trimesh.creation.box((0.02, 0.04, 0.05))), digest=BRICK.digest)
     one, two = (probe_of(HAND, obj, hand_points=64, object_points=64) for obj in (BRICK, other))
