@@ -11,15 +11,13 @@ from scipy.spatial.transform import Rotation
 
 from graspd.exchange import replicator, webdataset
 from graspd.service.model.errors import InputError
-from graspd.service.pipeline.backends import Services
 from graspd.service.readers import Pictures, Shards, open_shards
 from graspd.service.settings import Settings
 from graspd.service.store.shards import Shard
 from graspd.service.store.store import open_store
 from graspd.worker.rendering.annotate import box_corners
 from tests.api import factories
-from tests.indexes import empty_index
-from tests.memory_queue import MemoryQueue
+from tests.indexes import open_services
 
 H, W = 24, 32
 K = np.array([[30.0, 0, 17], [0, 28, 11], [0, 0, 1]])
@@ -92,19 +90,13 @@ def test_2d_boxes_are_whole_pixels_of_what_is_in_view(views: Shard, tmp_path) ->
     assert len(np.load(tmp_path / "unseen" / "bounding_box_2d_tight_0000.npy")) == 0
 
 
-@pytest.fixture
-def shards(tmp_path) -> Shards:
-    settings = Settings(data_dir=tmp_path)
-    services = Services(settings, open_store("memory://"), empty_index(settings.resolved_index_url), MemoryQueue())
+def test_every_picture_is_one_sample_with_its_grasps(tmp_path) -> None:
+    services = open_services(Settings(data_dir=tmp_path), open_store("memory://"))
     factories.add_builtins(services)
     record = factories.add_job(services, scenes=2, views=2, width=W, height=H)
     factories.finish_all(services, record)
-    found = open_shards(services.store, job=record.id, cache=tmp_path / "cache")
+    shards = open_shards(services.store, job=record.id, cache=tmp_path / "cache")
     services.close()
-    return found
-
-
-def test_every_picture_is_one_sample_with_its_grasps(shards: Shards, tmp_path) -> None:
     written = webdataset.write(shards, tmp_path / "tars", pictures_a_file=3)
     members: list[str] = []
     for path in written:

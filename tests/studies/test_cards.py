@@ -34,7 +34,6 @@ from graspd.service.settings import Settings
 from graspd.service.store.manifests import load_manifest, publish_shard
 from graspd.service.store.records import read_record
 from graspd.service.store.shards import json_attribute, read_shard
-from graspd.service.store.store import open_store
 from graspd.studies.cards import contents as card_contents
 from graspd.studies.cards.card import write_card
 from graspd.studies.cards.contents import AssetFacts, Contents, contents_of_folder, contents_of_store, with_provenance
@@ -47,8 +46,7 @@ from graspd.worker.hands.load import hand_from_path
 from graspd.worker.stages.context import Output, shard_of
 from tests.api import factories
 from tests.fakes import fail_task, plan_all
-from tests.indexes import empty_index
-from tests.memory_queue import MemoryQueue
+from tests.indexes import open_services
 from tests.shell import completed
 from tests.worker.commands_run import graspd
 
@@ -119,8 +117,7 @@ def unchanged(hand: str, obj: str, columns: dict[str, Array]) -> None: ...
 
 def dataset(folder: Path, change: Change = unchanged, fails: Any = None, grasps: int = 40, **options: Any) -> Services:
     """Two hands x two objects, two batches each, with scenes and pictures; of the cell `fails` the first task fails."""
-    store, index = open_store((folder / "store").as_uri()), empty_index(f"sqlite:///{folder / 'index.sqlite'}")
-    services = Services(Settings(data_dir=folder), store, index, MemoryQueue())
+    services = open_services(Settings(data_dir=folder))
     factories.add_builtins(services)
     given = {"scenes": 2, "views": 1, "width": 24, "height": 16, "stereo": False, **options}
     wanted = {"name": NAME, "hands": HANDS, "objects": OBJECTS, "grasps": grasps, **given}

@@ -3,6 +3,7 @@
 import logging
 import threading
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,30 @@ from rq.serializers import JSONSerializer
 from graspd.service.model.messages import TaskMessage
 from graspd.service.model.states import Priority, Stage
 from graspd.service.queue.port import EventKind
-from graspd.worker.process.main import GraspWorker
+from graspd.service.settings import Settings
+from graspd.worker.process import engine
+from graspd.worker.process.main import GraspWorker, run_worker
+from graspd.worker.process.runner import Runner
 from graspd.worker.stages.context import TaskContext
-from tests.fakes import fake_synthesize, message_for
+from tests.fakes import engine_of, fake_synthesize, message_for
 from tests.waiting import until
+from tests.worker.process.test_runner import broken
+
+
+@pytest.fixture
+def work(rq_queue, redis_server: str, tmp_path):
+    """Runs a worker with a table of stages, until no task waits; whether it ended well."""
+    settings = Settings(redis_url=redis_server, data_dir=tmp_path, device="cpu")
+
+    def run(table, **options) -> bool:
+        return run_worker(settings, start=engine_of(table), **{"burst": True} | options)
+
+    return run
+
+
+@pytest.fixture
+def kinds(rq_queue):
+    return lambda: [event.kind for _, event in rq_queue.tail("0", limit=100, wait_s=0)]
 
 
 def _waits(redis: Any, entry: str | bytes) -> None:
@@ -102,3 +123,14 @@ def test_the_end_of_a_task_waits_until_redis_takes_writes(rq_queue, work, kinds)
         refuse(0)
     assert rq_queue.leases() == [] and not rq_queue.connection.keys("rq:job:*")
     assert kinds()[:2] == [EventKind.STARTED, EventKind.FINISHED]
+
+
+def test_the_worker_ends_and_leaves_the_other_tasks(rq_queue, work, kinds, tmp_path, monkeypatch, caplog) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(engine, "Runner", partial(Runner, check_device=broken))
+    rq_queue.enqueue([message_for(), message_for(seed=1)], Priority.BULK)
+    with caplog.at_level(logging.ERROR):
+        assert not work({Stage.SYNTHESIZE: fake_synthesize}, burst=False), "its supervisor should know"
+    assert kinds()[:2] == [EventKind.STARTED, EventKind.RETURNED] and kinds().count(EventKind.STARTED) == 1
+    assert rq_queue.leases() == []
+    assert any(line.startswith("this worker ends: CUDA error 700") for line in caplog.messages)

@@ -1,7 +1,5 @@
 """What becomes of a task, whatever its stage does or when its GPU breaks down, with which the process ends."""
 
-import logging
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -9,7 +7,7 @@ import pytest
 from graspd.service.model import names
 from graspd.service.model.errors import InputError, MeshError, QueueUnavailable, StoreUnavailable, TaskRefused
 from graspd.service.model.messages import TaskMessage
-from graspd.service.model.states import Priority, Stage
+from graspd.service.model.states import Stage
 from graspd.service.queue.port import Event, EventKind
 from graspd.service.store.manifests import load_manifest, shard_exists
 from graspd.service.store.records import task_attempts
@@ -18,7 +16,6 @@ from graspd.service.store.store import Store, open_store
 from graspd.worker.engines.devices import DeviceLost
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.pool.pool import ProcessLost
-from graspd.worker.process import engine
 from graspd.worker.process.runner import Runner
 from graspd.worker.stages import scene
 from graspd.worker.stages.context import StopReason, TaskContext
@@ -284,13 +281,3 @@ def test_a_task_over_which_a_process_beside_the_worker_ended_goes_back_once_and_
 def test_a_device_that_works_is_not_blamed() -> None:
     bench = Bench(check_device=lambda device: None)
     assert (bench.run(message_for(), GARBLED).kind, bench.runner.device_lost) == (EventKind.FAILED, "")
-
-
-def test_the_worker_ends_and_leaves_the_other_tasks(rq_queue, work, kinds, monkeypatch, caplog) -> None:
-    monkeypatch.setattr(engine, "Runner", partial(Runner, check_device=broken))
-    rq_queue.enqueue([message_for(), message_for(seed=1)], Priority.BULK)
-    with caplog.at_level(logging.ERROR):
-        assert not work({Stage.SYNTHESIZE: fake_synthesize}, burst=False), "its supervisor should know"
-    assert kinds()[:2] == [EventKind.STARTED, EventKind.RETURNED] and kinds().count(EventKind.STARTED) == 1
-    assert rq_queue.leases() == []
-    assert any(line.startswith("this worker ends: CUDA error 700") for line in caplog.messages)

@@ -62,11 +62,6 @@ def ball() -> ObjectModel:
 
 
 @pytest.fixture(scope="module")
-def ball_views(ball) -> dict[str, np.ndarray]:
-    return shoot(ball, REST[:1])
-
-
-@pytest.fixture(scope="module")
 def mug(shared_data) -> ObjectModel:
     return object_from_mesh(trimesh.load_mesh(shared_data / "objects" / "025_mug" / "clean.stl"), "mug")
 
@@ -95,7 +90,8 @@ def points(views: dict[str, np.ndarray], view: int) -> np.ndarray:
     return origin + np.where(np.isfinite(depth), depth, np.nan)[..., None] * rays
 
 
-def test_depths_are_of_sphere_and_plane_and_infinite_elsewhere(ball_views, ball) -> None:
+def test_depths_are_of_sphere_and_plane_and_infinite_elsewhere(ball) -> None:
+    ball_views = shoot(ball, REST[:1])
     for view in range(4):
         origin, rays = world_rays(ball_views, view)
         to_centre = REST[0, :3] - origin

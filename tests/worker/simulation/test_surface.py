@@ -6,7 +6,6 @@ import trimesh
 import warp as wp
 
 from graspd.worker.hands.load import hand_from_path
-from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.surface import piece_distance
 from graspd.worker.objects import disk_cache
 from graspd.worker.objects.model import ObjectModel
@@ -138,13 +137,6 @@ def ask(surface_in: surface.Surface, point_in: wp.array[wp.vec3], listed_out: wp
     out[i] = surface.mesh_distance(surface_in, point_in[i], REACH).distance
 
 
-def near_points(obj: ObjectModel, count: int = 1200) -> np.ndarray:
-    """Points within some millimetres of the surface on both sides, and some at edges and corners."""
-    rng = np.random.default_rng(0)
-    samples = object_samples(obj, count)
-    return np.concatenate([samples + rng.normal(scale=0.004, size=samples.shape), obj.vertices]) - obj.centre_of_mass
-
-
 def winding_number(obj: ObjectModel, points: np.ndarray) -> np.ndarray:
     """(P,) solid angle of the mesh over 4 pi, in float64 (van Oosterom & Strackee 1983): 1 inside, 0 outside."""
     corner = (obj.vertices - obj.centre_of_mass)[obj.faces]
@@ -160,7 +152,10 @@ def winding_number(obj: ObjectModel, points: np.ndarray) -> np.ndarray:
 def test_lists_of_faces_give_the_distances_and_signs_of_the_tree() -> None:
     for obj in (object_from_path("mug"), object_of(trimesh.creation.box((0.06, 0.04, 0.001)))):
         device = device_object(obj, alpha=0.0, cell=0.005)
-        points = near_points(obj)
+        # Within some millimetres of the surface on both sides, and some at edges and corners.
+        samples = object_samples(obj, 1200)
+        points = samples + np.random.default_rng(0).normal(scale=0.004, size=samples.shape)
+        points = np.concatenate([points, obj.vertices]) - obj.centre_of_mass
         with wp.ScopedDevice("cpu"):
             at, outputs = wp.array(points, dtype=wp.vec3), [wp.zeros(len(points)), wp.zeros(len(points))]
             wp.launch(ask, len(points), inputs=[device.surface, at], outputs=outputs)
@@ -189,25 +184,20 @@ def ask_piece(pieces_in: pieces.Pieces, piece_in: int, point_in: wp.array(dtype=
     out[i] = pieces.piece_distance(pieces_in, piece_in, local)
 
 
-def distances_from(hand: HandModel, index: int, points: np.ndarray) -> np.ndarray:
-    device = DeviceHand.create(hand, "cpu")
-    with wp.ScopedDevice("cpu"):
-        out = wp.zeros(len(points), dtype=wp.vec4)
-        wp.launch(ask_piece, len(points), inputs=[device.pieces, index, wp.array(points, dtype=wp.vec3)], outputs=[out])
-        return out.numpy().astype(float)
-
-
 @pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
 def test_depths_inside_every_piece_agree_with_float64_distance(name: str) -> None:
     kernels.load("cpu")
     hand = hand_from_path(name)
     rng = np.random.default_rng(0)
-    checked = 0
+    checked, device = 0, DeviceHand.create(hand, "cpu")
     for index, piece in enumerate(hand.pieces):
         low, high = piece.vertices.min(axis=0), piece.vertices.max(axis=0)
         points = rng.uniform(low, high, (200, 3))
         expected = piece_distance(piece, points)
-        found = distances_from(hand, index, points)[:, 3]
+        with wp.ScopedDevice("cpu"):
+            out, at = wp.zeros(len(points), dtype=wp.vec4), wp.array(points, dtype=wp.vec3)
+            wp.launch(ask_piece, len(points), inputs=[device.pieces, index, at], outputs=[out])
+        found = out.numpy()[:, 3].astype(float)
         inside = expected < -1e-6
         np.testing.assert_allclose(found[inside], expected[inside], atol=5e-8)
         assert np.all(found[expected > 1e-6] > 0)

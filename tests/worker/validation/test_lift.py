@@ -179,15 +179,11 @@ def scores(*squeezes: float, threads: int = 1) -> np.ndarray:
     return LiftRollouts(HAND, BOX, lambda: WHOLE, threads=threads).scores(grasps, placed(len(squeezes)))
 
 
-def fallen() -> float:
-    """Score of a box that nothing holds: how far it falls from rest until a stage's end finds it gone, over 5 cm."""
-    fall = 0.5 * prescreening.HANGS_WHOLE * ACCELERATION * (STAGE_S * np.arange(1, 10)) ** 2 / MAX_DISPLACEMENT_M
-    return float(fall[fall >= prescreening.GONE][0])
-
-
 def test_the_box_falls_by_what_friction_does_not_carry() -> None:
     nobody, weak, firm = np.subtract(scores(-0.005, 0.9 * LEAST, 1.05 * LEAST), SLIPS)
-    assert nobody == pytest.approx(fallen(), rel=0.05)
+    # How far it falls from rest until a stage's end finds it gone, over 5 cm.
+    fall = 0.5 * prescreening.HANGS_WHOLE * ACCELERATION * (STAGE_S * np.arange(1, 10)) ** 2 / MAX_DISPLACEMENT_M
+    assert nobody == pytest.approx(float(fall[fall >= prescreening.GONE][0]), rel=0.05)
     # What slips slowly is less than 5 cm down when the test ends, and would be farther in 2 s.
     assert weak > prescreening.GONE and 0.0 <= firm < 0.05
 
