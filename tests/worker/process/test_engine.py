@@ -184,7 +184,7 @@ class Deaf(Link):
         self.killed = True
 
 
-def test_an_engine_whose_task_takes_too_long_is_stopped_then_ended(rq_queue, redis_server, monkeypatch) -> None:
+def test_an_engine_with_too_long_a_task_is_stopped_then_ended(rq_queue, redis_server, monkeypatch) -> None:
     monkeypatch.setattr(main, "STUCK_AFTER_S", 0.2)
     deaf = Deaf()
     heart = Heartbeat(redis_server, beat_of(), lease_s=LEASE_S)
