@@ -32,7 +32,7 @@ def main(folder: Path, older_index: str) -> None:
     from graspd.service.store.manifests import load_manifest
     from graspd.studies.cards.page import quality_table
     from tests.api.conftest import BASE_URL
-    from tests.studies.cards.conftest import case
+    from tests.studies.test_cards import case
 
     def measured(hand: str, obj: str, columns: dict[str, Any]) -> None:
         columns[ROW.path] = np.linspace(0, 20, len(columns["quality/valid"]))

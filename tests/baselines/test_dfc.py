@@ -123,8 +123,7 @@ def test_annealing_ends_at_a_lower_energy_than_it_began() -> None:
 
 
 def test_starts_look_at_the_hull_from_the_given_distance() -> None:
-    hand = two_finger_hand()
-    found = sample_starts(hand, BOX, seed=0, batch=0, indices=range(40))
+    found = sample_starts(two_finger_hand(), BOX, seed=0, batch=0, indices=range(40))
     signed = trimesh.proximity.signed_distance(trimesh.creation.box((0.05, 0.05, 0.05)), found.pivot)
     assert np.all(-signed <= DISTANCE[1] + 1e-9)
     # Tilted by 30 degrees, the palm is at least cos 30 of the least distance off the face.

@@ -1,7 +1,6 @@
 """Grasp'D (2022): its distance grid, its contact forces, and what its relaxation relaxes."""
 
 from functools import cache
-from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +23,7 @@ SAGITTA = RADIUS - float(np.linalg.norm(SPHERE.vertices[SPHERE.faces].mean(axis=
 
 
 @cache
-def grid_of_sphere(cells: int) -> Any:
+def grid_of_sphere(cells: int):
     return distance_grid(ground_of(two_finger_hand(), SPHERE, "cpu", kernels).fine.obj, cells)
 
 
@@ -39,7 +38,7 @@ def _probe(
     out[2, i] = kernels.force_slope(physics, -sample.distance, sample.normal, speed)
 
 
-def probed(points: np.ndarray, velocity: tuple[float, ...] = (0, 0, 0), grid: Any = None) -> tuple[np.ndarray, ...]:
+def probed(points: np.ndarray, velocity: tuple[float, ...] = (0, 0, 0), grid=None) -> tuple[np.ndarray, ...]:
     """Distance, force and slope at points by a grid, by default of the sphere."""
     found = wp.zeros((3, len(points)), dtype=wp.vec3, device="cpu")
     at = wp.array(points, dtype=wp.vec3, device="cpu")
@@ -128,5 +127,4 @@ def test_relaxation_departs_from_hard_contact_as_its_weight_says() -> None:
     np.testing.assert_allclose(relaxed, hard, atol=0.02)
     for pull in (0.01, 0.04):
         relaxed, hard = settled(pull)
-        apart = (relaxed - hard)[..., 0]
-        np.testing.assert_allclose(apart, -pull / (2 * method.MISMATCH), atol=0.02)
+        np.testing.assert_allclose((relaxed - hard)[..., 0], -pull / (2 * method.MISMATCH), atol=0.02)

@@ -1,6 +1,5 @@
 """A few real grasps for the formats to carry."""
 
-from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
@@ -9,10 +8,7 @@ import pytest
 from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.store.shards import Shard, read_shard, write_shard
 from graspd.worker.engines import backend
-from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.load import hand_from_path
-from graspd.worker.hands.model import HandModel
-from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import synthesize
 from graspd.worker.planners.port import PlanRequest
@@ -20,18 +16,18 @@ from tests.worker.commands_run import graspd
 
 
 @pytest.fixture(scope="session")
-def hand() -> HandModel:
+def hand():
     backend.start()
     return hand_from_path("barrett")
 
 
 @pytest.fixture(scope="session")
-def block() -> ObjectModel:
+def block():
     return object_from_path("block")
 
 
 @pytest.fixture(scope="session")
-def grasps(hand: HandModel, block: ObjectModel) -> GraspSet:
+def grasps(hand, block):
     return synthesize(hand, block, PlanRequest(count=4, fidelity=FIDELITIES["draft"], seed=5))
 
 
@@ -53,18 +49,33 @@ def on_tables(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def exported(on_tables: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+def exported(on_tables: Path, tmp_path_factory: pytest.TempPathFactory):
     """Folder of these in a training format."""
 
     @cache
     def export(format_: str) -> Path:
         folder = tmp_path_factory.mktemp(format_) / "data"
         every = "" if format_ in ("dexgraspnet2", "graspgen") else "--all "
-        told = graspd(f"export --format {format_} {every}-o", folder, on_tables)
-        assert told["grasps"] == 16
+        assert graspd(f"export --format {format_} {every}-o", folder, on_tables)["grasps"] == 16
         return folder
 
     return export
+
+
+def _exported(name: str, format_: str):
+    @pytest.fixture(scope="session", name=name)
+    def folder(exported) -> Path:
+        return exported(format_)
+
+    return folder
+
+
+checkout, data, folder = (
+    _exported("checkout", "dexlearn"),
+    _exported("data", "graspgen"),
+    _exported("folder", "huggingface"),
+)
+recorded, root = _exported("recorded", "lerobot"), _exported("root", "dexgraspnet2")
 
 
 @pytest.fixture(scope="session")

@@ -1,13 +1,19 @@
-"""A folder that DexGraspBench's evaluator takes, of free grasps and of grasps on tables, read by `bench_loader`;
-its tabletop test says what ours says, and grasps come back as they were."""
+"""A folder that DexGraspBench's evaluator takes, of free grasps and of grasps on tables; grasps come back as they were.
+
+Its loader is rebuilt here: what it does was read in its source (evaluation, base class of the tests, hand and object
+specs). MuJoCo loads what it would load, and its tabletop test says what ours says.
+"""
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
+import yaml
+from scipy.spatial.transform import Rotation, Slerp
 
 from graspd.exchange import dexgraspbench
 from graspd.exchange.bench_hand import body_names
@@ -19,17 +25,163 @@ from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
-from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.environment import Obstacle, PlacedGrasps
-from tests.exchange.bench_loader import PREFIX, files_of, load, tabletop_test
 from tests.worker.commands_run import graspd
 
+PREFIX = "child-"
 #: Rounding of a pose in float64 through text of 12 digits [m].
 ROUNDING_M = 1e-8
+CONFIG, EXPERIMENT = "graspd_barrett", "graspd_tabletop"
+COUNT = 12
+LIMP = 3
+#: Index fingertip frame of the benchmark's Allegro, from its model: palm turned by the quaternion 0 1 0 1 in the world.
+_ALLEGRO_INDEX = [
+    ([0, 0.0435, -0.001542], [0.999048, -0.0436194, 0, 0], [0, 0, 1]), ([0, 0, 0.0164], [1, 0, 0, 0], [0, 1, 0]),
+    ([0, 0, 0.054], [1, 0, 0, 0], [0, 1, 0]), ([0, 0, 0.0384], [1, 0, 0, 0], [0, 1, 0]),
+]  # fmt: skip
+_ALLEGRO_THUMB = [
+    ([-0.0182, 0.019333, -0.045987], [0.477714, -0.521334, -0.521334, -0.477714], [-1, 0, 0]),
+    ([-0.027, 0.005, 0.0399], [1, 0, 0, 0], [0, 0, 1]), ([0, 0, 0.0177], [1, 0, 0, 0], [0, 1, 0]),
+    ([0, 0, 0.0514], [1, 0, 0, 0], [0, 1, 0]),
+]  # fmt: skip
+#: And of its Shadow hand: palm 34 mm above the world's origin.
+_SHADOW_INDEX = [
+    ([0.033, 0, 0.095], [1, 0, 0, 0], [0, -1, 0]), ([0, 0, 0], [1, 0, 0, 0], [1, 0, 0]),
+    ([0, 0, 0.045], [1, 0, 0, 0], [1, 0, 0]), ([0, 0, 0.025], [1, 0, 0, 0], [1, 0, 0]),
+]  # fmt: skip
+_SHADOW_THUMB = [
+    ([0.034, -0.00858, 0.029], [0.92388, 0, 0.382683, 0], [0, 0, -1]), ([0, 0, 0], [1, 0, 0, 0], [1, 0, 0]),
+    ([0, 0, 0.038], [1, 0, 0, 0], [1, 0, 0]), ([0, 0, 0], [1, 0, 0, 0], [0, -1, 0]),
+    ([0, 0, 0.032], [1, 0, 0, -1], [1, 0, 0]),
+]  # fmt: skip
+
+
+@dataclass
+class Loaded:
+    """One grasp as the evaluator holds it."""
+
+    grasp: dict[str, Any]
+    hand: dict[str, Any]
+    model: Any
+    data: Any
+
+    def at(self, qpos: np.ndarray) -> None:
+        """Hand and object where the evaluator puts them: hand first, object last."""
+        self.data.qpos[: len(qpos)] = qpos
+        self.data.qpos[-7:] = self.grasp["obj_pose"]
+        mujoco.mj_forward(self.model, self.data)
+
+    def controls(self, qpos: np.ndarray) -> np.ndarray:
+        dense = np.zeros((self.model.nu, self.model.nv))
+        data = self.data
+        mujoco.mju_sparse2dense(dense, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind)
+        return dense[:, 6:-6] @ qpos[7:]
+
+
+def load(root: Path, npy: Path, config: str, *, mass: float = 0.1, tabletop: bool = False) -> Loaded:
+    """As the evaluator does, in a checkout at `root`: all paths in the files are relative to it.
+
+    `tabletop` is its setting of that name: a floor at z = 0.
+    """
+    grasp = np.load(npy, allow_pickle=True).item()
+    info = json.loads((root / grasp["obj_path"] / "info" / "simplified.json").read_text())
+    volume = info["mass"] / (info["density"] * info["scale"] ** 3)
+    density = mass / (volume * grasp["obj_scale"] ** 3)
+    hand = yaml.safe_load((root / "config" / "hand" / f"{config}.yaml").read_text())
+    spec = mujoco.MjSpec()
+    spec.meshdir = str(root)
+    option = spec.option
+    option.timestep, option.integrator = 0.004, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.cone, option.impratio, option.noslip_iterations = mujoco.mjtCone.mjCONE_ELLIPTIC, 10, 2
+    # Off in 3.3.2, the version that it pins.
+    later = int(mujoco.mjtDisableBit.mjDSBL_MULTICCD) | int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
+    option.disableflags = int(mujoco.mjtDisableBit.mjDSBL_GRAVITY) | later
+    _add_hand(spec, root, hand["xml_path"])
+    if tabletop:
+        plane = mujoco.mjtGeom.mjGEOM_PLANE
+        spec.worldbody.add_geom(name="object_collision_floor", type=plane, size=[0, 0, 1.0])
+    _add_object(spec, root / grasp["obj_path"] / "urdf" / "meshes", grasp["obj_scale"], density)
+    for geom in spec.geoms:
+        geom.condim = 4
+        geom.friction[:2] = [0.6, 0.02]
+    model = spec.compile()
+    return Loaded(grasp, hand, model, mujoco.MjData(model))
+
+
+def _add_hand(spec: Any, root: Path, file: str) -> None:
+    child = mujoco.MjSpec.from_file(str(root / file))
+    for mesh in child.meshes:
+        mesh.file = str(Path(file).parent / child.meshdir / mesh.file)
+    child.meshdir = spec.meshdir
+    for geom in child.geoms:
+        geom.solimp[:3], geom.solref[:2] = [0.5, 0.99, 0.0001], [0.005, 1]
+    base = spec.worldbody.add_frame().attach_body(child.worldbody, PREFIX, "")
+    base.add_freejoint(name="hand_freejoint")
+    spec.worldbody.add_body(name="mocap_body", mocap=True)
+    hold = np.zeros(mujoco.mjNEQDATA)
+    hold[10] = 1
+    spec.add_equality(
+        type=mujoco.mjtEq.mjEQ_WELD,
+        objtype=mujoco.mjtObj.mjOBJ_BODY,
+        name1="mocap_body",
+        name2=f"{PREFIX}world",
+        data=hold,
+        solimp=[0.9, 0.95, 0.001, 0.5, 2],
+    )
+
+
+def _add_object(spec: Any, pieces: Path, scale: float, density: float) -> None:
+    body = spec.worldbody.add_body(name="object")
+    body.add_freejoint(name="obj_freejoint")
+    for file in pieces.iterdir():
+        name = file.name.replace(".obj", "")
+        spec.add_mesh(name=name, file=str(file), scale=[scale] * 3)
+        number = name.replace("convex_piece_", "")
+        geom: dict[str, Any] = {"type": mujoco.mjtGeom.mjGEOM_MESH, "meshname": name}
+        body.add_geom(name=f"object_visual_{number}", density=0, contype=0, conaffinity=0, **geom)
+        body.add_geom(name=f"object_collision_{number}", density=density, **geom)
+
+
+def tabletop_test(found: Loaded) -> tuple[bool, float, float]:
+    """Its verdict on a grasp in its setting `tabletop` with a flying hand; way [m] and turn [deg] at its end."""
+    model, data, grasp = found.model, found.data, found.grasp
+    start, *rest = (grasp[f"{name}_qpos"] for name in ("pregrasp", "grasp", "squeeze"))
+    data.mocap_pos[0], data.mocap_quat[0], data.ctrl[:] = start[:3], start[3:7], 0
+    found.at(start)
+    data.ctrl[:] = found.controls(start)
+    mujoco.mj_forward(model, data)
+    # World, floor and hand count as the hand, the object is the last body: what the evaluator compares.
+    if any(contact.dist < -0.010 for contact in data.contact):
+        return False, 100.0, 100.0
+    aim = data.qpos[-7:].copy()
+    aim[2] += 0.1
+    data.xfrc_applied[-1] = [0, 0, -1.0, 0, 0, 0]
+    raised = rest[-1].copy()
+    raised[2] += 0.1
+    for a, b in ((start, rest[0]), (rest[0], rest[1]), (rest[1], raised)):
+        _move(found, a, b)
+    moved = float(np.linalg.norm(data.qpos[-7:-4] - aim[:3]))
+    turn = Rotation.from_quat(data.qpos[-4:], scalar_first=True) * Rotation.from_quat(aim[3:], scalar_first=True).inv()
+    turned = float(np.degrees(turn.magnitude()))
+    return moved < 0.05 and turned < 15, moved, turned
+
+
+def _move(found: Loaded, a: np.ndarray, b: np.ndarray) -> None:
+    rotations = Slerp([0, 1], Rotation.from_quat([a[3:7], b[3:7]], scalar_first=True))
+    begin, end = found.controls(a), found.controls(b)
+    for share in np.linspace(0, 1, 11)[1:]:
+        found.data.mocap_pos[0] = (1 - share) * a[:3] + share * b[:3]
+        found.data.mocap_quat[0] = rotations(share).as_quat(scalar_first=True)
+        found.data.ctrl[:] = (1 - share) * begin + share * end
+        mujoco.mj_step(found.model, found.data, nstep=10)
+
+
+def files_of(root: Path, config: str, experiment: str = "graspd") -> list[Path]:
+    return sorted((root / "output" / f"{experiment}_{config}" / "graspdata").glob("**/*.npy"))
 
 
 @pytest.fixture(scope="module")
-def bench(hand: HandModel, block: ObjectModel, grasps: GraspSet, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def bench(hand: HandModel, block, grasps: GraspSet, tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("bench")
     dexgraspbench.write(hand, block, grasps, range(len(grasps)), root)
     return root
@@ -54,7 +206,7 @@ def test_a_grasp_has_each_field_that_is_read(bench: Path, hand: HandModel, grasp
     assert json.loads((bench / "assets/object/graspd/valid_split/all.json").read_text()) == ["block"]
 
 
-def test_the_object_weighs_what_the_evaluator_wants(bench: Path, block: ObjectModel) -> None:
+def test_the_object_weighs_what_the_evaluator_wants(bench: Path, block) -> None:
     found = load(bench, files_of(bench, "graspd_barrett")[0], "graspd_barrett")
     number = found.model.body("object").id
     assert found.model.body_mass[number] == pytest.approx(0.1, rel=1e-4)  # float32 of MuJoCo's meshes
@@ -64,7 +216,7 @@ def test_the_object_weighs_what_the_evaluator_wants(bench: Path, block: ObjectMo
     assert info["mass"] == pytest.approx(info["density"] * block.volume, rel=0.05)  # the pieces' against the mesh's
 
 
-def test_every_file_beside_the_pieces_is_a_piece_also_later(bench, hand, block: ObjectModel, grasps: GraspSet) -> None:
+def test_every_file_beside_the_pieces_is_a_piece_also_later(bench, hand, block, grasps: GraspSet) -> None:
     pieces = bench / np.load(files_of(bench, "graspd_barrett")[0], allow_pickle=True).item()["obj_path"] / "urdf/meshes"
     (pieces / "convex_piece_099.obj").write_text("of another decomposition")
     dexgraspbench.write(hand, block, grasps, [0], bench)
@@ -72,18 +224,19 @@ def test_every_file_beside_the_pieces_is_a_piece_also_later(bench, hand, block: 
 
 
 @pytest.mark.parametrize("name", ["barrett", "allegro", "shadow"])
-def test_the_evaluators_hand_stands_where_ours_does(name: str, block: ObjectModel, tmp_path: Path) -> None:
+def test_the_evaluators_hand_stands_where_ours_does(name: str, block, tmp_path: Path) -> None:
     hand = hand_from_path(name)
     grasps = random_postures(hand)
-    files = dexgraspbench.write(hand, block, grasps, [0, 1], tmp_path)
-    found = load(tmp_path, files[1], f"graspd_{name}")
+    found = load(tmp_path, dexgraspbench.write(hand, block, grasps, [0, 1], tmp_path)[1], f"graspd_{name}")
     assert found.model.nq == 7 + len(hand.joint_names) + 7
     for posture in dexgraspbench.POSTURES:
         found.at(found.grasp[f"{posture}_qpos"])
         ours = getattr(grasps, posture)
         poses = body_poses(hand, ours.hand_pose[1:2], ours.joint_positions[1:2])[0]
         for body, pose in zip(body_names(hand), poses, strict=True):
-            assert_at(found.data.body(PREFIX + body), pose)
+            placed = found.data.body(PREFIX + body)
+            np.testing.assert_allclose(placed.xpos, pose[:3], atol=ROUNDING_M)
+            np.testing.assert_allclose(placed.xmat.reshape(3, 3), quat_to_matrix(pose[3:]), atol=1e-7)
 
 
 def test_evaluators_bodies_and_actuators_are_those_of_the_hand(bench: Path, hand: HandModel) -> None:
@@ -105,7 +258,7 @@ def test_evaluators_bodies_and_actuators_are_those_of_the_hand(bench: Path, hand
         assert any(name.startswith(prefix) for name in said["valid_body_name"])
 
 
-def test_a_hand_of_meshes_is_loaded_with_them(shared_data: Path, block: ObjectModel, tmp_path, monkeypatch) -> None:
+def test_a_hand_of_meshes_is_loaded_with_them(shared_data: Path, block, tmp_path, monkeypatch) -> None:
     hand = hand_from_path(shared_data / "hands" / "allegro" / "allegro_hand_right.urdf")
     (file,) = dexgraspbench.write(hand, block, random_postures(hand), [0], tmp_path)
     monkeypatch.chdir(tmp_path)  # nothing may depend on where the export was written
@@ -113,28 +266,6 @@ def test_a_hand_of_meshes_is_loaded_with_them(shared_data: Path, block: ObjectMo
     meshes = {found.model.mesh(number).name for number in range(found.model.nmesh)}
     hulls = {f"{PREFIX}piece_{k:03}" for k, piece in enumerate(hand.pieces) if piece.kind == "hull"}
     assert hulls and hulls <= meshes
-
-
-#: Index fingertip frame of the benchmark's Allegro, from its model: palm turned by the quaternion 0 1 0 1 in the world.
-_ALLEGRO_INDEX = [
-    ([0, 0.0435, -0.001542], [0.999048, -0.0436194, 0, 0], [0, 0, 1]), ([0, 0, 0.0164], [1, 0, 0, 0], [0, 1, 0]),
-    ([0, 0, 0.054], [1, 0, 0, 0], [0, 1, 0]), ([0, 0, 0.0384], [1, 0, 0, 0], [0, 1, 0]),
-]  # fmt: skip
-_ALLEGRO_THUMB = [
-    ([-0.0182, 0.019333, -0.045987], [0.477714, -0.521334, -0.521334, -0.477714], [-1, 0, 0]),
-    ([-0.027, 0.005, 0.0399], [1, 0, 0, 0], [0, 0, 1]), ([0, 0, 0.0177], [1, 0, 0, 0], [0, 1, 0]),
-    ([0, 0, 0.0514], [1, 0, 0, 0], [0, 1, 0]),
-]  # fmt: skip
-#: And of its Shadow hand: palm 34 mm above the world's origin.
-_SHADOW_INDEX = [
-    ([0.033, 0, 0.095], [1, 0, 0, 0], [0, -1, 0]), ([0, 0, 0], [1, 0, 0, 0], [1, 0, 0]),
-    ([0, 0, 0.045], [1, 0, 0, 0], [1, 0, 0]), ([0, 0, 0.025], [1, 0, 0, 0], [1, 0, 0]),
-]  # fmt: skip
-_SHADOW_THUMB = [
-    ([0.034, -0.00858, 0.029], [0.92388, 0, 0.382683, 0], [0, 0, -1]), ([0, 0, 0], [1, 0, 0, 0], [1, 0, 0]),
-    ([0, 0, 0.038], [1, 0, 0, 0], [1, 0, 0]), ([0, 0, 0], [1, 0, 0, 0], [0, -1, 0]),
-    ([0, 0, 0.032], [1, 0, 0, -1], [1, 0, 0]),
-]  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -165,7 +296,7 @@ def test_benchmarks_hand_is_mapped_to_its_model(shared_data, block, tmp_path, co
     assert [ours for _, ours in mapping["joints"]][first + len(chain) - 1] == tip
 
 
-def test_grasps_for_benchmarks_own_model_come_back_as_they_were(block: ObjectModel, tmp_path: Path) -> None:
+def test_grasps_for_benchmarks_own_model_come_back_as_they_were(block, tmp_path: Path) -> None:
     hand = hand_from_path("shadow")
     grasps = random_postures(hand)
     dexgraspbench.write(hand, block, grasps, [0, 1], tmp_path)
@@ -188,12 +319,7 @@ def random_postures(hand: HandModel) -> GraspSet:
     return GraspSet(drawn(), drawn(), drawn(), np.full(2, np.nan))
 
 
-def assert_at(body: Any, pose: np.ndarray) -> None:
-    np.testing.assert_allclose(body.xpos, pose[:3], atol=ROUNDING_M)
-    np.testing.assert_allclose(body.xmat.reshape(3, 3), quat_to_matrix(pose[3:]), atol=1e-7)
-
-
-def _chain(root: list[float], chain: list[Any]) -> str:
+def _chain(root: list[float], chain: list) -> str:
     def text(values: list[float]) -> str:
         return " ".join(map(str, values))
 
@@ -203,11 +329,6 @@ def _chain(root: list[float], chain: list[Any]) -> str:
         inside += f'<body pos="{text(pos)}" quat="{text(quat)}"><joint axis="{text(axis)}"/>{geom}'
     inside += "</body>" * (len(chain) + 2)
     return f'<mujoco><compiler angle="radian"/><worldbody>{inside}</worldbody></mujoco>'
-
-
-CONFIG, EXPERIMENT = "graspd_barrett", "graspd_tabletop"
-COUNT = 12
-LIMP = 3
 
 
 @pytest.fixture(scope="module")
@@ -285,7 +406,7 @@ def test_its_loader_puts_hand_and_object_where_they_stand(tabletop: Path, hand: 
     assert lowest == pytest.approx(found.model.geom_pos[floor, 2], abs=1e-6)
 
 
-def geom_bottom(found: Any, geom: int) -> float:
+def geom_bottom(found, geom: int) -> float:
     model, data = found.model, found.data
     mesh = model.geom_dataid[geom]
     first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
@@ -336,7 +457,7 @@ def test_an_import_is_validated_by_its_lift(tabletop: Path, candidates: Shard, t
     assert {"grasp/approach", "grasp/lift", "quality/lift_hard", "scene/object_pose"} <= set(found.arrays)
 
 
-def test_free_grasps_and_grasps_on_tables_do_not_mix(tabletop, hand, block: ObjectModel, grasps: GraspSet) -> None:
+def test_free_grasps_and_grasps_on_tables_do_not_mix(tabletop, hand, block, grasps: GraspSet) -> None:
     dexgraspbench.write(hand, block, grasps, [0], tabletop)
     assert len(files_of(tabletop, CONFIG)) == 1 and len(files_of(tabletop, CONFIG, EXPERIMENT)) == COUNT
     sets = dexgraspbench.read(tabletop, hand="barrett", obj="block")

@@ -1,18 +1,26 @@
-"""A folder that DexGraspNet 2.0 trains on: each field as its loader reads it, and the grasps as they were."""
+"""A folder that DexGraspNet 2.0 trains on: each field as its loader reads it, grasps as they were. The loader is
+rebuilt here from its source, without its draws of chance, its sparse tensors and torch.
 
+yl-wang996/DexGraspNet2, src/utils/dataset.py at cc03dc65505ab47482582d4641d81b4159e8aa1d (`GraspNetDataset`), with
+configs/network/train_dex_ours.yaml there. How a depth picture becomes points, and which are taken, is its
+src/utils/pc.py, how graspness is made src/preprocess/dex_graspness.py, both as zcyqyq/DexTouch-sim2real has them at
+7824d859a8da1d942bc38709a9d217dfb548db5d.
+"""
+
+import random
 import shutil
 import tracemalloc
 import zipfile
-from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import pytest
 import scipy.io
 import trimesh
+from PIL import Image
 
 from graspd.exchange import dexgraspnet2
 from graspd.exchange.dexgraspnet2 import SceneGraspness, lines_of_sight, load_npz, pointed_at, summed, surface_samples
@@ -24,22 +32,130 @@ from graspd.service.store.shards import Shard, read_shard, write_shard
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.jaws import fingertip_pad
 from graspd.worker.hands.kinematics import body_poses
-from graspd.worker.hands.model import HandModel
-from graspd.worker.objects.model import ObjectModel
 from graspd.worker.rendering.annotate import TABLE
-from tests.exchange.dexgraspnet2_loader import graspness_at, pointed, sample, some_views
 from tests.worker.commands_run import graspd, refused
 
+#: Of its configuration: how far a grasp's point may be from the cloud [m].
+MAX_POINT_DIS = 0.006
+#: Of GraspNet: what is farther from the box around the objects is cut off [m].
+OUTLIER = 0.02
 TRAIN, VAL = range(90), range(90, 100)
 #: Poses go through matrices in float64 and there and back between frames [m].
 ROUNDING_M = 1e-9
 #: Half a step of depth, 0.05 mm, along a ray that is at most 1.3 times as long [m].
 POINT_M = 8e-5
+DOWN = np.array([[0.0, 0, -1]])
+ABOVE = np.array([[0.0, 0, 0.1]])
+#: 100 px to a metre at a metre, a picture of 2 x 4.
+K = np.array([[100.0, 0, 1], [0, 100, 0.5], [0, 0, 1]])
 
 
-@pytest.fixture(scope="module")
-def root(exported: Callable[[str], Path]) -> Path:
-    return exported("dexgraspnet2")
+@dataclass
+class Sample:
+    """Of one view of a scene, in the camera's frame: all of it, where the loader draws."""
+
+    point_clouds: np.ndarray
+    seg: np.ndarray
+    rot: np.ndarray
+    """(N, 3, 3)"""
+    trans: np.ndarray
+    qpos: np.ndarray
+    """(N, J) in the order of the joint names given"""
+    point: np.ndarray
+    """(N, 3)"""
+    near: np.ndarray
+    """(N,) whether the grasp's point is near a point of the cloud: others are not taken"""
+    graspness: np.ndarray
+    """logarithms, of each point of the cloud"""
+    has_graspness: bool
+
+
+def views_of(split: range) -> list[tuple[str, int]]:
+    return [(f"scene_{number:04}", view) for number in split for view in range(256)]
+
+
+def some_views(root: Path, split: range, count: int, seed: int) -> list[tuple[str, int]]:
+    """Views that are drawn and are there; a scene that is missing makes it draw again."""
+    draw = random.Random(seed)
+    there = [view for view in views_of(split) if (root / "data" / "scenes" / view[0]).is_dir()]
+    return draw.sample(there, count)
+
+
+def sample(root: Path, scene: str, view: int, robot: str, joint_names: list[str]) -> Sample:
+    path = root / "data" / "scenes" / scene / "realsense"
+    with Image.open(path / "depth_gt" / f"{view:04}.png") as file:
+        depth = np.array(file)
+    with Image.open(path / "label_gt" / f"{view:04}.png") as file:
+        seg = np.array(file)
+    meta = scipy.io.loadmat(path / "meta" / f"{view:04}.mat")
+    poses, align = np.load(path / "camera_poses.npy"), np.load(path / "cam0_wrt_table.npy")
+    cloud = _points(depth, meta["intrinsic_matrix"], meta["factor_depth"])
+    assert seg.any(), "a view without objects is drawn anew"
+    mask = (depth > 0) & _workspace(cloud, seg, align @ poses[view])
+    cloud, seg = cloud[mask], seg[mask]
+    parts = [np.load(file) for file in sorted((root / "data" / "dex_grasps_new" / scene / robot).iterdir())]
+    grasps = {key: np.concatenate([part[key] for part in parts]) for key in parts[0].files}
+    turn, place = poses[view][:3, :3], poses[view][:3, 3]
+    point = (grasps["point"] - place) @ turn
+    values = root / "data" / "dex_graspness_new" / scene / "realsense" / f"{view:04}.npy"
+    graspness = np.zeros(len(cloud), np.float32)
+    if values.exists():
+        graspness = np.log(np.load(values).reshape(-1) + 1e-3)
+        # It draws points by number and takes the same numbers here: another length is another cloud.
+        assert len(graspness) == len(cloud)
+    return Sample(
+        cloud,
+        seg,
+        np.einsum("ji,njk->nik", turn, grasps["rotation"]),
+        (grasps["translation"] - place) @ turn,
+        np.stack([grasps[name] for name in joint_names], axis=-1),
+        point,
+        np.linalg.norm(cloud[None] - point[:, None], axis=2).min(axis=1) <= MAX_POINT_DIS,
+        graspness,
+        values.exists(),
+    )
+
+
+def _points(depth: np.ndarray, intrinsics: np.ndarray, factor: np.ndarray) -> np.ndarray:
+    u, v = np.meshgrid(np.arange(depth.shape[1]), np.arange(depth.shape[0]))
+    z = depth / factor
+    x, y = ((at - intrinsics[k, 2]) * z / intrinsics[k, k] for k, at in enumerate((u, v)))
+    return np.stack([x, y, z], axis=-1)
+
+
+def _workspace(cloud: np.ndarray, seg: np.ndarray, trans: np.ndarray) -> np.ndarray:
+    """The box around what is labelled, in the table's frame."""
+    flat = np.concatenate([cloud.reshape(-1, 3), np.ones((seg.size, 1))], axis=-1)
+    there = np.einsum("ab,nb->na", trans, flat)[:, :3].reshape(cloud.shape)
+    low, high = there[seg > 0].min(axis=0) - OUTLIER, there[seg > 0].max(axis=0) + OUTLIER
+    return ((there > low) & (there < high)).all(axis=-1)
+
+
+def pointed(palm: np.ndarray, middle: np.ndarray, surface: np.ndarray) -> int:
+    """Of its script: which point (S, 3) of the object a grasp points at, from its palm and between its fingers."""
+    line = (middle - palm) / np.linalg.norm(middle - palm)
+    seen = {}
+    for number, place in enumerate(surface):
+        height = float((place - palm) @ line)
+        angle = np.degrees(np.arccos(abs(height) / np.linalg.norm(place - palm)))
+        if height > 0 and angle < 30:
+            seen[number] = (height, angle)
+    least = min(height for height, _ in seen.values())
+    weight = {
+        number: np.exp(-np.log(2) * (angle / 10 + (height - least) / 0.015))
+        for number, (height, angle) in seen.items()
+        if height - least < 0.02
+    }
+    return max(weight, key=lambda number: weight[number])
+
+
+def graspness_at(place: np.ndarray, surface: np.ndarray, points: np.ndarray) -> float:
+    """Of its script: graspness of one point of the cloud on the object, whose grasps point at `points` (K, 3)."""
+    squares = ((surface - place) ** 2).sum(axis=1)
+    nearest = int(squares.argmin())
+    if squares[nearest] >= 0.015:
+        return 0.0
+    return float(sum(10 ** (-150 * np.linalg.norm(surface[nearest] - point)) for point in points))
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +164,7 @@ def split(root: Path) -> range:
     return TRAIN if next((root / "data" / "dex_grasps_new" / "scene_0000").rglob("*.npz")).stem == "block" else VAL
 
 
-def test_every_view_that_may_be_drawn_can_be_read(root: Path, hand: HandModel) -> None:
+def test_every_view_that_may_be_drawn_can_be_read(root: Path, hand) -> None:
     for split in (TRAIN, VAL):
         for scene, view in some_views(root, split, 6, seed=3):
             found = sample(root, scene, view, "barrett", list(hand.joint_names))
@@ -75,14 +191,13 @@ def test_a_fingertip_stands_where_ours_does_in_the_camera(root, split, hand, sto
         assert len(rows)
 
 
-def test_the_object_of_the_cloud_is_where_grasps_mean_it(root, split, hand: HandModel, block: ObjectModel) -> None:
+def test_the_object_of_the_cloud_is_where_grasps_mean_it(root, split, hand, block) -> None:
     mesh = trimesh.Trimesh(block.vertices, block.faces, process=False)
     for scene, view in some_views(root, split, 4, seed=5):
         found = sample(root, scene, view, "barrett", list(hand.joint_names))
         path = root / "data" / "scenes" / scene / "realsense"
         first = dexgraspnet2._object_pose(root / "data" / "dex_grasps_new" / scene / "barrett" / "block.npz", 0)
-        camera = pose_from_matrix(np.linalg.inv(np.load(path / "camera_poses.npy")[view]))
-        there = compose(camera, first)
+        there = compose(pose_from_matrix(np.linalg.inv(np.load(path / "camera_poses.npy")[view])), first)
         points = found.point_clouds[found.seg == 1]
         local = (points - there[:3]) @ trimesh.transformations.quaternion_matrix(there[3:])[:3, :3]
         assert np.abs(trimesh.proximity.closest_point(mesh, local)[1]).max() < POINT_M
@@ -98,7 +213,7 @@ def placed(root: Path, scene: str, view: int, points: np.ndarray) -> np.ndarray:
     return np.asarray(points @ pose[:, :3].T + pose[:, 3])
 
 
-def test_a_grasp_points_where_its_script_says(root, split, hand: HandModel, stored: Shard, block: ObjectModel) -> None:
+def test_a_grasp_points_where_its_script_says(root, split, hand, stored: Shard, block) -> None:
     surface, names = surface_samples(block), list(hand.joint_names)
     pads = [fingertip_pad(hand, tip).centre for tip in hand.fingertips]
     (scene, view), *_ = some_views(root, split, 1, seed=6)
@@ -114,7 +229,7 @@ def test_a_grasp_points_where_its_script_says(root, split, hand: HandModel, stor
     assert len(rows)
 
 
-def test_graspness_is_that_of_its_script(root: Path, split: range, hand: HandModel, block: ObjectModel) -> None:
+def test_graspness_is_that_of_its_script(root: Path, split: range, hand, block) -> None:
     surface = surface_samples(block)
     for scene, view in some_views(root, split, 3, seed=7):
         found = sample(root, scene, view, "barrett", list(hand.joint_names))
@@ -128,14 +243,14 @@ def test_graspness_is_that_of_its_script(root: Path, split: range, hand: HandMod
         assert found.graspness.max() > np.log(0.5)
 
 
-def test_graspness_belongs_to_cloud_that_a_depth_camera_tells(on_tables: Path, hand: HandModel, tmp_path: Path) -> None:
+def test_graspness_belongs_to_cloud_that_a_depth_camera_tells(on_tables: Path, hand, tmp_path: Path) -> None:
     graspd("export --format dexgraspnet2 --noise stereo -o", tmp_path, on_tables)
     for scene, view in some_views(tmp_path, TRAIN, 4, seed=8):
         found = sample(tmp_path, scene, view, "barrett", list(hand.joint_names))
         assert found.has_graspness and (found.graspness[found.seg == 1] > np.log(1e-3)).any()
 
 
-def test_a_view_of_nothing_has_no_cloud_and_no_graspness(on_tables: Path, hand: HandModel, tmp_path: Path) -> None:
+def test_a_view_of_nothing_has_no_cloud_and_no_graspness(on_tables: Path, hand, tmp_path: Path) -> None:
     views = read_shard(on_tables / "block-views.h5", kind="views")
     labels = np.array(views["image/segmentation"])
     labels[::2] = np.minimum(labels[::2], TABLE)
@@ -200,15 +315,9 @@ def test_what_shows_no_scene_or_no_clear_grasp_is_told(on_tables: Path, tmp_path
     assert "no picture shows" in said
     none = PictureReference(0, "base", "views", 0, np.eye(4), IDENTITY_POSE, np.zeros(0, np.intp))
     monkeypatch.setattr(dexgraspnet2, "by_scene", lambda pictures: [[none]])
-    lots: list[Any] = [SimpleNamespace(id="base")]
+    lots = [SimpleNamespace(id="base")]
     with pytest.raises(InputError, match="no grasp is valid and clear"):
         dexgraspnet2.write(lots, cast(Pictures, None), tmp_path, frozenset())
-
-
-DOWN = np.array([[0.0, 0, -1]])
-ABOVE = np.array([[0.0, 0, 0.1]])
-#: 100 px to a metre at a metre, a picture of 2 x 4.
-K = np.array([[100.0, 0, 1], [0, 100, 0.5], [0, 0, 1]])
 
 
 @pytest.mark.parametrize(("degrees", "best"), [(4.5, 1), (5.5, 0)])
@@ -236,7 +345,7 @@ def test_pixels_of_the_object_take_what_is_nearest() -> None:
     assert not scene.of_view(depth, labels, K, np.eye(4), ahead + np.array([0, 0, 0.13, 0, 0, 0, 0])).any()
 
 
-def test_a_hand_looks_between_its_thumb_and_its_fingers(hand: HandModel, grasps: GraspSet) -> None:
+def test_a_hand_looks_between_its_thumb_and_its_fingers(hand, grasps: GraspSet) -> None:
     palm, line = lines_of_sight(hand, grasps.grasp)
     np.testing.assert_allclose(np.linalg.norm(line, axis=1), 1)
     assert palm.shape == (len(grasps.grasp), 3)
@@ -247,7 +356,7 @@ def test_a_hand_looks_between_its_thumb_and_its_fingers(hand: HandModel, grasps:
     assert lines_of_sight(hand, still)[1] @ hand.palm.approach > 0.9
 
 
-def test_many_grasps_take_no_more_memory(block: ObjectModel) -> None:
+def test_many_grasps_take_no_more_memory(block) -> None:
     surface = surface_samples(block)
 
     def most(count: int) -> int:

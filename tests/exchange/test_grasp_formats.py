@@ -1,33 +1,37 @@
-"""Grasps through the formats of others and back; files that would run code are refused."""
+"""Grasps through the formats of others and back; files that would run code, or are nested deep, are refused."""
 
 import os
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from graspd.client.dataset_commands import read_spec
 from graspd.commands.exchange import read_sets
+from graspd.commands.studies import _read_maps as read_stability
 from graspd.exchange import dexgraspbench, published
+from graspd.exchange.bench_hand import _read as read_mapping
 from graspd.exchange.bench_scene import save_record
 from graspd.exchange.imported import Origin, joints_by_name, load_npy, scaled_object, verdicts
+from graspd.exchange.published import friction
 from graspd.exchange.scoring import write_scored
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import compose, quat_to_matrix
+from graspd.service.readers.trajectories import scene_spec_of
 from graspd.service.store.shards import Shard, read_shard
-from graspd.worker.grasps import GraspSet
+from graspd.studies.cards.contents import Contents, with_provenance
+from graspd.worker.files.provenance import options_of
 from graspd.worker.hands.load import hand_from_path
-from graspd.worker.hands.model import HandModel
-from graspd.worker.objects.model import ObjectModel
 
 TINY = 1e-9  # positions and quaternions are only re-ordered, not computed with
+DEEP = "[" * 100_000 + "]" * 100_000
 
 
 class Bomb:
     """Runs a command when it is unpickled."""
 
-    def __reduce__(self) -> Any:
+    def __reduce__(self):
         return os.mkdir, ("bomb-went-off",)
 
 
@@ -43,7 +47,7 @@ def test_a_file_that_would_run_code_is_refused_and_does_not(tmp_path: Path, monk
             load_npy(Path("x.npy"))
 
 
-def test_a_grasp_of_dexgraspbench_moves_with_its_object(hand, block: ObjectModel, grasps: GraspSet, tmp_path) -> None:
+def test_a_grasp_of_dexgraspbench_moves_with_its_object(hand, block, grasps, tmp_path) -> None:
     (path, *_) = dexgraspbench.write(hand, block, grasps, [0], tmp_path)
     row = load_npy(path)
     moved = np.array([0.3, -0.2, 0.7, *Rotation.from_euler("xyz", [0.3, 1.1, -2.0]).as_quat(scalar_first=True)])
@@ -56,7 +60,7 @@ def test_a_grasp_of_dexgraspbench_moves_with_its_object(hand, block: ObjectModel
     np.testing.assert_allclose(turn, quat_to_matrix(grasps.grasp.hand_pose[0, 3:]), atol=TINY)
 
 
-def test_dexgraspbench_scales_are_sets_and_another_hand_is_told(hand, block, grasps: GraspSet, tmp_path) -> None:
+def test_dexgraspbench_scales_are_sets_and_another_hand_is_told(hand, block, grasps, tmp_path) -> None:
     paths = dexgraspbench.write(hand, block, grasps, range(2), tmp_path)
     save_record(paths[0], load_npy(paths[0]) | {"obj_scale": 0.5})
     sets = dexgraspbench.read(tmp_path, hand="barrett", obj="block")
@@ -77,7 +81,7 @@ def test_dexgraspnets_angles_turn_about_the_fixed_axes(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.grasps.grasp.hand_pose[0, :3], [0.1, 0.2, -0.3])
 
 
-def test_dexgraspnets_joints_are_one_number_more_its_scale_meshs(tmp_path: Path, block: ObjectModel) -> None:
+def test_dexgraspnets_joints_are_one_number_more_its_scale_meshs(tmp_path: Path, block) -> None:
     qpos = dict.fromkeys(("WRJTx", "WRJTy", "WRJTz", "WRJRx", "WRJRy", "WRJRz"), 0.0)
     path = _dexgraspnet(tmp_path, qpos | {"robot0:THJ4": 0.37}, 1.0)
     (found,) = published.read_dexgraspnet(path, hand="shadow", obj="block")
@@ -101,7 +105,7 @@ def test_columns_and_rotating_axes_are_scipys_rotations() -> None:
         np.testing.assert_allclose(quat_to_matrix(found), matrices, atol=1e-12)
 
 
-def test_multidex_gives_the_grasps_of_one_robot_on_one_object(hand: HandModel, tmp_path: Path) -> None:
+def test_multidex_gives_the_grasps_of_one_robot_on_one_object(hand, tmp_path: Path) -> None:
     torch = pytest.importorskip("torch", reason="torch is not installed; `pip install torch` runs this test")
     joints = len(hand.joint_names)
     q = torch.cat([torch.tensor([0.1, 0.2, 0.3, 1.0, 0, 0, 0, 1, 0]), torch.full((joints,), 0.4)])
@@ -113,7 +117,7 @@ def test_multidex_gives_the_grasps_of_one_robot_on_one_object(hand: HandModel, t
     np.testing.assert_allclose(found.grasps.grasp.joint_positions, 0.4, atol=1e-6)
 
 
-def test_ddgcs_quaternion_and_joints_are_put_in_our_order(hand: HandModel, tmp_path: Path) -> None:
+def test_ddgcs_quaternion_and_joints_are_put_in_our_order(hand, tmp_path: Path) -> None:
     place = np.array([[0.1, 0.2, 0.3, 0.0, 0.0, np.sin(0.5), np.cos(0.5)]])
     angles = np.array([[0.1, 0.2, 0.3, 0.1, 0.5, 0.6, 0.7, 0.8]])
     for name, values in (("translation", place), ("representation", angles)):
@@ -127,7 +131,7 @@ def test_ddgcs_quaternion_and_joints_are_put_in_our_order(hand: HandModel, tmp_p
     assert abs(joints["finger_2_distal"]) == pytest.approx(0.6)
 
 
-def test_imported_grasps_are_scored_and_say_where_they_come_from(hand, block, grasps: GraspSet, tmp_path) -> None:
+def test_imported_grasps_are_scored_and_say_where_they_come_from(hand, block, grasps, tmp_path) -> None:
     dexgraspbench.write(hand, block, grasps, range(len(grasps)), tmp_path / "bench")
     (found,) = dexgraspbench.read(tmp_path / "bench", hand="barrett", obj="block")
     origin = Origin("dexgraspbench", "a test", "CC0-1.0")
@@ -198,3 +202,29 @@ def test_grasps_of_a_training_format_come_back(name: str, files: str, rounding: 
 def test_what_no_import_can_read_is_told(name: str, hand: str | None, says: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=says):
         read_sets(name, tmp_path, hand, "o", {"robot": "", "object_name": "", "number": 0})
+
+
+@pytest.mark.parametrize(
+    ("name", "reader"),
+    [
+        ("spec.json", read_spec),
+        ("spec.toml", read_spec),
+        ("reference.json", friction),
+        ("hand_mapping.json", read_mapping),
+        ("stability.json", read_stability),
+        ("provenance.json", lambda path: with_provenance(Contents.__new__(Contents), path)),
+    ],
+)
+def test_a_file_that_is_nested_deep_is_refused_in_one_line(name: str, reader, tmp_path) -> None:
+    file = tmp_path / name
+    file.write_text(f"hands = {DEEP}" if name.endswith("toml") else f'{{"hands": {DEEP}}}')
+    with pytest.raises(InputError, match=name) as refused:
+        reader(file)
+    assert "\n" not in str(refused.value)
+
+
+def test_an_attribute_that_is_nested_deep_says_nothing() -> None:
+    assert options_of(DEEP) == {}
+    shard = Shard("base", {"scene": DEEP}, {})
+    with pytest.raises(InputError, match="is not a valid scene"):
+        scene_spec_of(shard)

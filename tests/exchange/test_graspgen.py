@@ -10,9 +10,7 @@ import io
 import json
 import re
 import tarfile
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -24,23 +22,15 @@ from graspd.exchange import graspgen
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import IDENTITY_POSE
 from graspd.service.store import validity
-from graspd.service.store.shards import Shard
 from graspd.worker.hands.kinematics import body_poses
-from graspd.worker.hands.model import HandModel
-from graspd.worker.objects.model import ObjectModel
 from tests.worker.commands_run import refused
-from tests.worker.hands.grippers import OPENING, gripper
+from tests.worker.hands.urdfs import OPENING, gripper
 
 #: JSON gives float64 back as it was; what is left is a quaternion made a matrix [m].
 ROUNDING_M = 1e-12
 
 
-@pytest.fixture(scope="module")
-def data(exported: Callable[[str], Path]) -> Path:
-    return exported("graspgen")
-
-
-def record_of(data: Path, uuid: str) -> dict[str, Any]:
+def record_of(data: Path, uuid: str) -> dict:
     """As its reader finds it: the index names the shard, the shard is searched for the key."""
     folder = data / "grasps" / "barrett"
     number = json.loads((folder / "uuid_index.json").read_text())[uuid]
@@ -56,7 +46,7 @@ def record_of(data: Path, uuid: str) -> dict[str, Any]:
     return dict(found[0])
 
 
-def read_back(record: dict[str, Any], folder: Path) -> Any:
+def read_back(record: dict, folder: Path):
     (folder / "block.json").write_text(json.dumps(record))
     return graspgen.read(folder / "block.json", hand="barrett", obj="block")
 
@@ -70,7 +60,7 @@ def test_every_object_of_a_split_has_a_record_and_a_mesh(data: Path) -> None:
         assert (data / "objects" / paths[uuid]).is_file()
 
 
-def test_its_grasps_are_ours_with_their_verdicts(data, hand: HandModel, block: ObjectModel, stored: Shard) -> None:
+def test_its_grasps_are_ours_with_their_verdicts(data, hand, block, stored) -> None:
     record = record_of(data, "block")
     poses, mask = np.array(record["grasps"]["transforms"]), np.array(record["grasps"]["object_in_gripper"])
     assert poses.shape == (8, 4, 4) and mask.dtype == bool
@@ -86,7 +76,7 @@ def test_its_grasps_are_ours_with_their_verdicts(data, hand: HandModel, block: O
     np.testing.assert_allclose(mesh.bounds, [block.vertices.min(0), block.vertices.max(0)], atol=1e-8)
 
 
-def test_hands_are_turned_into_its_convention_and_jaws_close_along_x(data: Path, hand: HandModel) -> None:
+def test_hands_are_turned_into_its_convention_and_jaws_close_along_x(data: Path, hand) -> None:
     said = yaml.safe_load((data / "grippers" / "barrett.yaml").read_text())
     place, turn = said["transform_offset_from_asset_to_graspgen_convention"]
     matrix = Rotation.from_quat(turn).as_matrix()  # x y z w, as SciPy has it
@@ -100,7 +90,7 @@ def test_hands_are_turned_into_its_convention_and_jaws_close_along_x(data: Path,
     assert 0.07 < said["depth"] < 0.11
 
 
-def test_of_grasps_without_joints_fingers_close_until_they_touch(data: Path, hand: HandModel, tmp_path: Path) -> None:
+def test_of_grasps_without_joints_fingers_close_until_they_touch(data: Path, hand, tmp_path: Path) -> None:
     record = record_of(data, "block")
     del record["gripper"]
     (back,) = read_back(record, tmp_path)
@@ -129,7 +119,7 @@ def test_what_nobody_validated_has_no_label(on_tables: Path, tmp_path: Path) -> 
         ({"squeeze_pose": [[0, 0, 0, 1, 0, 0, 0]]}, "numbers of pregrasps"),
     ],
 )
-def test_a_record_that_is_wrong_is_told(data: Path, tmp_path: Path, change: dict[str, Any], said: str) -> None:
+def test_a_record_that_is_wrong_is_told(data: Path, tmp_path: Path, change: dict, said: str) -> None:
     record = record_of(data, "block")
     record["grasps"] |= change
     with pytest.raises(InputError, match=said):

@@ -3,7 +3,6 @@
 import io
 import json
 import tarfile
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,15 +11,13 @@ from scipy.spatial.transform import Rotation
 
 from graspd.exchange import replicator, webdataset
 from graspd.service.model.errors import InputError
-from graspd.service.pipeline.backends import Services
 from graspd.service.readers import Pictures, Shards, open_shards
 from graspd.service.settings import Settings
 from graspd.service.store.shards import Shard
 from graspd.service.store.store import open_store
 from graspd.worker.rendering.annotate import box_corners
 from tests.api import factories
-from tests.indexes import empty_index
-from tests.memory_queue import MemoryQueue
+from tests.indexes import open_services
 
 H, W = 24, 32
 K = np.array([[30.0, 0, 17], [0, 28, 11], [0, 0, 1]])
@@ -60,7 +57,7 @@ def views() -> Shard:
     return Shard("views", {"object": "mug"}, arrays)
 
 
-def test_3d_box_of_replicators_layout_has_the_corners_of_ours(views: Shard, tmp_path: Path) -> None:
+def test_3d_box_of_replicators_layout_has_the_corners_of_ours(views: Shard, tmp_path) -> None:
     replicator.write(views, tmp_path)
     (row,) = np.load(tmp_path / "bounding_box_3d_0000.npy")
     local = box_corners(np.array([[row[f"{axis}_{end}"] for axis in "xyz"] for end in ("min", "max")], float))
@@ -69,7 +66,7 @@ def test_3d_box_of_replicators_layout_has_the_corners_of_ours(views: Shard, tmp_
     np.testing.assert_allclose(corners, views["box/bounding_box_3d"][0], atol=1e-6)  # float32 of the file
 
 
-def test_usds_matrices_put_a_point_on_the_same_pixel(views: Shard, tmp_path: Path) -> None:
+def test_usds_matrices_put_a_point_on_the_same_pixel(views: Shard, tmp_path) -> None:
     replicator.write(views, tmp_path)
     said = json.loads((tmp_path / "camera_params_0000.json").read_text())
     view, projection = (np.reshape(said[f"camera{name}"], (4, 4)) for name in ("ViewTransform", "Projection"))
@@ -81,7 +78,7 @@ def test_usds_matrices_put_a_point_on_the_same_pixel(views: Shard, tmp_path: Pat
     np.testing.assert_allclose(pixels, in_camera[:, :2] / in_camera[:, 2:], atol=1e-9)
 
 
-def test_2d_boxes_are_whole_pixels_of_what_is_in_view(views: Shard, tmp_path: Path) -> None:
+def test_2d_boxes_are_whole_pixels_of_what_is_in_view(views: Shard, tmp_path) -> None:
     replicator.write(views, tmp_path)
     (row,) = np.load(tmp_path / "bounding_box_2d_tight_0000.npy")
     assert [int(row[name]) for name in ("x_min", "y_min", "x_max", "y_max")] == [3, 4, 20, 15]
@@ -93,19 +90,13 @@ def test_2d_boxes_are_whole_pixels_of_what_is_in_view(views: Shard, tmp_path: Pa
     assert len(np.load(tmp_path / "unseen" / "bounding_box_2d_tight_0000.npy")) == 0
 
 
-@pytest.fixture
-def shards(tmp_path: Path) -> Shards:
-    settings = Settings(data_dir=tmp_path)
-    services = Services(settings, open_store("memory://"), empty_index(settings.resolved_index_url), MemoryQueue())
+def test_every_picture_is_one_sample_with_its_grasps(tmp_path) -> None:
+    services = open_services(Settings(data_dir=tmp_path), open_store("memory://"))
     factories.add_builtins(services)
     record = factories.add_job(services, scenes=2, views=2, width=W, height=H)
     factories.finish_all(services, record)
-    found = open_shards(services.store, job=record.id, cache=tmp_path / "cache")
+    shards = open_shards(services.store, job=record.id, cache=tmp_path / "cache")
     services.close()
-    return found
-
-
-def test_every_picture_is_one_sample_with_its_grasps(shards: Shards, tmp_path: Path) -> None:
     written = webdataset.write(shards, tmp_path / "tars", pictures_a_file=3)
     members: list[str] = []
     for path in written:

@@ -3,8 +3,6 @@
 import json
 import re
 import time
-from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
@@ -39,9 +37,10 @@ from tests.worker.commands_run import graspd, refused
 
 RUN_KEYS = {"fidelity", "batch", "processes", "hand_points", "faces", "iterations", "ms_per_iteration"}
 RUN_KEYS |= {"grasps_per_second", "peak_memory_mb"}
+PAGE = (REPOSITORY / "docs" / "explanation" / "modelling.md").read_text()
 
 
-def test_every_run_has_the_keys_of_the_contract_and_adds_up(tmp_path: Path) -> None:
+def test_every_run_has_the_keys_of_the_contract_and_adds_up(tmp_path) -> None:
     words = "bench --hand barrett --object block --fidelity draft --batch 1 --batch 4 --join 1 --join 2 --threads 1"
     found = graspd(f"{words} --repeats 1 --out", tmp_path)
     assert found["device"]
@@ -72,7 +71,7 @@ def test_kernels_are_no_time_of_the_host_and_their_shares_add_up() -> None:
     assert (clock_of("cpu"), clock_of("cuda:0")) == (time.process_time, time.perf_counter)
 
 
-def test_unknown_fidelities_and_no_networks_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_unknown_fidelities_and_no_networks_are_told(tmp_path, capsys: pytest.CaptureFixture[str]) -> None:
     refused("bench --fidelity superb")
     (tmp_path / "net.npz").write_bytes(b"no network")
     assert learned.main(["--network", str(tmp_path / "net.npz")]) == 2
@@ -88,7 +87,7 @@ def test_a_study_plans_the_grasps_of_a_job() -> None:
     assert np.array_equal(found.squeeze.joint_positions, made.squeeze.joint_positions)
 
 
-def test_both_methods_are_told_side_by_side(tmp_path: Path, monkeypatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_both_methods_are_told_side_by_side(tmp_path, monkeypatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(learned, "BUDGET", 2.0)
     hand = hand_from_path("barrett")
     save(random_network(hand.joint_names, hand=hand.name, digest=hand.digest), tmp_path / "net.npz")
@@ -105,9 +104,6 @@ def test_both_methods_are_told_side_by_side(tmp_path: Path, monkeypatch, capsys:
     page = (tmp_path / "out" / "learned.md").read_text()
     assert learned.table(found["rows"]) in page and learned.table(found["rows"]) + "\n" == capsys.readouterr().out
     assert str(tmp_path) not in page
-
-
-PAGE = (REPOSITORY / "docs" / "explanation" / "modelling.md").read_text()
 
 
 def test_a_step_is_that_of_the_reference() -> None:
@@ -150,7 +146,7 @@ def test_convex_objects_fall_as_their_hull_forearms_end_below() -> None:
     np.testing.assert_allclose(slope, [-1, 1, 0], atol=1e-12)
 
 
-def test_pages_recipe_finds_point_of_the_mesh_behind_each_pixel(tmp_path: Path) -> None:
+def test_pages_recipe_finds_point_of_the_mesh_behind_each_pixel(tmp_path) -> None:
     obj = object_from_path("block")
     poses = drop(obj, count=1, seed=2)["scene/object_pose"]
     small = {"views": 1, "stereo": False, "width": 40, "height": 30, "samples": 2}
@@ -159,7 +155,7 @@ def test_pages_recipe_finds_point_of_the_mesh_behind_each_pixel(tmp_path: Path) 
     with h5py.File(tmp_path / "scenes.h5", "w") as file:
         file["scene/object_pose"] = poses
     (recipe,) = re.findall(r"```python\n(.*?)```", PAGE, re.S)
-    names: dict[str, Any] = {}
+    names = {}
     exec(recipe, names)
     points = names["object_points"](tmp_path / "views.h5", tmp_path / "scenes.h5", 0)
     seen = points[arrays["image/segmentation"][0] == 2]

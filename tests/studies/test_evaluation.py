@@ -1,7 +1,6 @@
 """`graspd evaluate`: what it reads, what it says."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -34,7 +33,7 @@ def plates_case(**kwargs: object) -> Case:
     return Case("plates", HAND, BOX, grasps, **kwargs)  # type: ignore[arg-type]
 
 
-def test_row_has_the_contract_s_keys_and_counts_what_holds(tmp_path: Path) -> None:
+def test_row_has_the_contract_s_keys_and_counts_what_holds(tmp_path) -> None:
     row = evaluate(plates_case(seconds=1.0), cache=tmp_path)
     assert set(row) >= CONTRACT and (row["n"], row["gsr"], row["osr"]) == (3, pytest.approx(2 / 3), 1.0)
     assert row["sgs"] < row["sgs_without_validation"] == pytest.approx(2.0)
@@ -46,7 +45,7 @@ def test_row_has_the_contract_s_keys_and_counts_what_holds(tmp_path: Path) -> No
     assert last == {"row": 2, "held": False, "outcomes": outcomes, "reason": "displaced under +x"}
 
 
-def test_what_holds_is_validated_in_other_models_when_asked(tmp_path: Path) -> None:
+def test_what_holds_is_validated_in_other_models_when_asked(tmp_path) -> None:
     row = evaluate(plates_case(), models=3, cache=tmp_path)
     assert (row["robust_models"], row["robust_n"]) == (3, 2)
     shares = [one["robust_share"] for one in row["verdicts"]]
@@ -63,7 +62,7 @@ def test_what_holds_is_validated_in_other_models_when_asked(tmp_path: Path) -> N
     assert "robust_share" not in evaluate(plates_case(), cache=tmp_path)
 
 
-def test_published_results_agree_where_they_are_known(tmp_path: Path) -> None:
+def test_published_results_agree_where_they_are_known(tmp_path) -> None:
     row = evaluate(plates_case(), protocol="displacement", cache=tmp_path)
     assert row["gsr"] is None and row["sd_cm"] < 1.0
     row = evaluate(plates_case(published=np.array([1, 0, -1], np.int8)), cache=tmp_path)
@@ -72,7 +71,7 @@ def test_published_results_agree_where_they_are_known(tmp_path: Path) -> None:
     assert whole["agreement_published"] == pytest.approx((2 * 0.5 + 6 * 0.0) / 8)
 
 
-def test_several_objects_are_weighed_and_seconds_add_up(tmp_path: Path) -> None:
+def test_several_objects_are_weighed_and_seconds_add_up(tmp_path) -> None:
     row = evaluate(plates_case(), cache=tmp_path)
     whole = combine([row, {**row, "n": 1, "gsr": 0.0, "osr": 0.0}])
     assert (whole["n"], whole["gsr"], whole["osr"]) == (4, pytest.approx(0.5), 0.5)
@@ -89,7 +88,7 @@ def test_several_objects_are_weighed_and_seconds_add_up(tmp_path: Path) -> None:
     assert whole["level"] == "standard"
 
 
-def test_what_holds_no_grasps_is_refused_by_its_name(tmp_path: Path) -> None:
+def test_what_holds_no_grasps_is_refused_by_its_name(tmp_path) -> None:
     with pytest.raises(InputError, match="no shards"):
         expand(tmp_path)
     with pytest.raises(NotFoundError, match=r"nothing\.h5 does not exist"):
@@ -103,7 +102,7 @@ def test_what_holds_no_grasps_is_refused_by_its_name(tmp_path: Path) -> None:
         load_case(other)
 
 
-def test_published_contacts_lie_on_fingertips_as_we_pose_them(shared_data: Path) -> None:
+def test_published_contacts_lie_on_fingertips_as_we_pose_them(shared_data) -> None:
     found = expand(shared_data / "reference_grasps")
     assert len(found) == 8
     file = next(file for file in found if file.name == "056_tennis_ball.json")
@@ -118,7 +117,7 @@ def test_published_contacts_lie_on_fingertips_as_we_pose_them(shared_data: Path)
             assert nearest < 5e-4
 
 
-def test_the_command_prints_json_or_a_table(shared_data: Path) -> None:
+def test_the_command_prints_json_or_a_table(shared_data) -> None:
     file = shared_data / "reference_grasps" / "frogger_allegro" / "056_tennis_ball.json"
     row = graspd("evaluate --level fast", file)
     assert set(row) >= CONTRACT and row["level"] == "fast"

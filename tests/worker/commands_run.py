@@ -1,14 +1,13 @@
 """Commands of graspd as a test runs them."""
 
 import json
-from typing import Any
 
 from typer.testing import CliRunner
 
 from graspd.cli import build
 
 
-def graspd(words: str, *more: object, code: int = 0) -> dict[str, Any]:
+def graspd(words: str, *more: object, code: int = 0) -> dict:
     """What a command tells with --json; `words` are cut at spaces, `more` are whole arguments."""
     result = CliRunner().invoke(build(), [*words.split(), *(str(word) for word in more), "--json"])
     assert result.exit_code == code, result.output

@@ -1,16 +1,23 @@
 """Small hands and objects for tests of the parts that only read them; comparison of grasps bit for bit."""
 
+import io
+from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import trimesh
 
+from graspd.service import user_cache
+from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.store.shards import json_attribute
 from graspd.worker.generation import ValidatedBatch
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import ConvexPiece, HandModel, PalmFrame
 from graspd.worker.objects.mesh_geometry import corner_normals
 from graspd.worker.objects.model import ObjectModel
+from graspd.worker.scenes.kinds import rest_poses, supports_of
+from graspd.worker.simulation.environment import Scenes
 
 
 def object_from_mesh(mesh: trimesh.Trimesh, name: str = "thing") -> ObjectModel:
@@ -91,6 +98,12 @@ def on_one_dof(hand: HandModel, rate: float = 1.0, offset: float = 0.0) -> HandM
     return replace(hand, digest="1" * 32, dof=dof, multiplier=multiplier, offset=offsets, **first)
 
 
+def on_tables(obj: ObjectModel, *, count: int = 2, seed: int = 1) -> Scenes:
+    """So many scenes of an object at rest on a table."""
+    table = SceneSpec(kind="table")
+    return Scenes(supports_of(table), rest_poses(table, obj, count=count, seed=seed)["scene/object_pose"])
+
+
 def quality_columns(count: int) -> dict[str, np.ndarray]:
     """Measures of valid grasps for a base shard; they rise from 0.1 to 0.3."""
     rising = np.linspace(0.1, 0.3, count)
@@ -124,3 +137,10 @@ def assert_same_batch(one: ValidatedBatch, other: ValidatedBatch) -> None:
     assert one.columns.keys() == other.columns.keys()
     for name, values in other.columns.items():
         np.testing.assert_array_equal(one.columns[name], values, err_msg=name)
+
+
+def keep_arrays(file: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """An entry of the user's cache, written anew."""
+    whole = io.BytesIO()
+    np.savez(whole, **arrays)
+    user_cache.keep(file, whole.getvalue())

@@ -2,7 +2,6 @@
 
 from collections import Counter
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,8 +20,6 @@ from graspd.worker.files.provenance import base_attributes
 from graspd.worker.generation import ValidatedBatch, validated_grasps
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.load import hand_from_path
-from graspd.worker.hands.model import HandModel
-from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import PlanRequest
 from graspd.worker.quality.diversity import distances, hand_points
@@ -32,25 +29,22 @@ from graspd.worker.validation.robust import Robustness
 from tests.worker.models import object_from_mesh, two_finger_hand
 
 COUNT = 6
+BLOCK = object_from_path("block")
+SOME, JOINTS = 3, 2
 
 
 @pytest.fixture(scope="module")
-def hand() -> HandModel:
+def hand():
     return hand_from_path("allegro")
 
 
-@pytest.fixture(scope="module")
-def block() -> ObjectModel:
-    return object_from_path("block")
-
-
-def wish(**changes: Any) -> JobRequest:
+def wish(**changes) -> JobRequest:
     return JobRequest(**{"hand": "allegro", "object": "block", "grasps": COUNT, "fidelity": "draft", **changes})
 
 
 @pytest.fixture(scope="module")
-def valid(hand: HandModel, block: ObjectModel) -> ValidatedBatch:
-    return validated_grasps(hand, block, wish(rechecks=2), count=COUNT)
+def valid(hand) -> ValidatedBatch:
+    return validated_grasps(hand, BLOCK, wish(rechecks=2), count=COUNT)
 
 
 def test_a_batch_of_valid_grasps_holds_nothing_else(valid: ValidatedBatch) -> None:
@@ -65,7 +59,7 @@ def test_a_batch_of_valid_grasps_holds_nothing_else(valid: ValidatedBatch) -> No
 def judge(monkeypatch: pytest.MonkeyPatch, *pushes: Outcome, feasible: bool) -> None:
     """Verdicts repeat these outcomes of the third push, and the gate passes all grasps or none."""
 
-    def verdicts(_hand: Any, _obj: Any, grasps: GraspSet, **__: Any) -> SimpleNamespace:
+    def verdicts(_hand, _obj, grasps: GraspSet, **__) -> SimpleNamespace:
         outcome = np.full((len(grasps), 6), Outcome.HELD, np.uint8)
         outcome[:, 2] = np.resize(pushes, len(grasps))
         held = (outcome[:, 2] == Outcome.HELD).astype(np.int8)
@@ -76,28 +70,28 @@ def judge(monkeypatch: pytest.MonkeyPatch, *pushes: Outcome, feasible: bool) -> 
     monkeypatch.setattr(generation, "passes", gate)
 
 
-def test_tries_count_up_to_the_last_grasp_that_is_kept(hand: HandModel, block: ObjectModel, monkeypatch) -> None:
+def test_tries_count_up_to_the_last_grasp_that_is_kept(hand, monkeypatch) -> None:
     judge(monkeypatch, Outcome.HELD, Outcome.DISPLACED, feasible=True)
-    found = validated_grasps(hand, block, wish(rechecks=0), count=COUNT)
+    found = validated_grasps(hand, BLOCK, wish(rechecks=0), count=COUNT)
     # Six tries hold at 0, 2, 4; of the seven that promise to be enough the ones at 0, 2, 4 are.
     assert (found.candidates, found.planned, found.rejected["dropped"]) == (6 + 5, 6 + 7, 3 + 2)
 
 
-def test_what_the_validator_saw_of_each_try_is_counted(hand: HandModel, block: ObjectModel, monkeypatch) -> None:
+def test_what_the_validator_saw_of_each_try_is_counted(hand, monkeypatch) -> None:
     seen = (Outcome.HELD, Outcome.DISPLACED, Outcome.ROTATED, Outcome.LOST_WHILE_CLOSING, Outcome.PENETRATION)
     judge(monkeypatch, *seen, feasible=False)
     request, run = wish(rechecks=0, grasps=5, budget=1), ExecutionContext(threads=1)
-    found = validated_grasps(hand, block, request, count=5, run=run)
+    found = validated_grasps(hand, BLOCK, request, count=5, run=run)
     ends = Counter("gate" if name.startswith("gate_") else name for name in Counter(found.outcomes).elements())
     assert ends == {"slipped": 1, "turned": 1, "lost_while_closing": 1, "penetration": 1, "gate": 1}
     assert (found.rejected["dropped"], found.rejected["gate"], found.candidates) == (4, 1, 5)
 
 
 @pytest.mark.parametrize("after", [0, 1])
-def test_a_batch_that_is_stopped_is_what_was_validated_before(hand, block, monkeypatch, after: int) -> None:
+def test_a_batch_that_is_stopped_is_what_was_validated_before(hand, monkeypatch, after: int) -> None:
     rounds, real = [], generation.Batch.made
 
-    def counted(*given: Any) -> Any:
+    def counted(*given):
         if len(rounds) == after:
             raise TaskCancelled("stopped")
         rounds.append(real(*given))
@@ -108,57 +102,56 @@ def test_a_batch_that_is_stopped_is_what_was_validated_before(hand, block, monke
     monkeypatch.setattr(generation.Batch, "made", counted)
     if not after:
         with pytest.raises(TaskCancelled):
-            validated_grasps(hand, block, wish(rechecks=0), count=COUNT, partial=True)
+            validated_grasps(hand, BLOCK, wish(rechecks=0), count=COUNT, partial=True)
         return
-    found = validated_grasps(hand, block, wish(rechecks=0), count=COUNT, partial=True)
+    found = validated_grasps(hand, BLOCK, wish(rechecks=0), count=COUNT, partial=True)
     assert len(found.grasps) == 1 and found.verdict_key is not None
 
 
-def test_a_grasp_like_one_that_is_kept_makes_room_for_another(hand: HandModel, block: ObjectModel, monkeypatch) -> None:
+def test_a_grasp_like_one_that_is_kept_makes_room_for_another(hand, monkeypatch) -> None:
     real = generation.synthesize
 
-    def twins(*given: Any, **named: Any) -> GraspSet:
+    def twins(*given, **named) -> GraspSet:
         found = real(*given, **named)
         return found.take(np.arange(len(found)) // 2 * 2)  # each grasp twice
 
     monkeypatch.setattr(generation, "synthesize", twins)
     plain = {"validation": "none", "fidelity": "draft", "budget": 8}
-    found = validated_grasps(hand, block, wish(**plain), count=COUNT)
+    found = validated_grasps(hand, BLOCK, wish(**plain), count=COUNT)
     points = hand_points(hand, found.grasps.grasp)
     rows, others = np.triu_indices(len(points), 1)
     assert len(found.grasps) == COUNT and distances(points, rows, others).min() >= MIN_DISTANCE_M
     assert found.rejected["alike"] >= COUNT - 1
-    assert validated_grasps(hand, block, wish(**plain, min_distance=0), count=COUNT).rejected["alike"] == 0
+    assert validated_grasps(hand, BLOCK, wish(**plain, min_distance=0), count=COUNT).rejected["alike"] == 0
 
 
-def test_candidate_grasps_are_all_kept_with_their_verdicts(hand: HandModel, block: ObjectModel) -> None:
-    found = validated_grasps(hand, block, wish(want="candidates", rechecks=0), count=COUNT)
+def test_candidate_grasps_are_all_kept_with_their_verdicts(hand) -> None:
+    found = validated_grasps(hand, BLOCK, wish(want="candidates", rechecks=0), count=COUNT)
     assert (len(found.grasps), found.candidates, set(found.rejected.values())) == (COUNT, COUNT, {0})
     assert set(np.unique(found.columns["quality/success"])) <= {0, 1}
     assert ((found.columns["quality/valid"] == 1) <= (found.columns["quality/success"] == 1)).all()
 
 
-def test_without_a_validator_nobody_judges(hand: HandModel, block: ObjectModel) -> None:
-    found = validated_grasps(hand, block, wish(validation="none"), count=COUNT)
-    assert found.verdict_key is None and "quality/success" not in found.columns
-    assert len(found.grasps) == COUNT
+def test_without_a_validator_nobody_judges(hand) -> None:
+    found = validated_grasps(hand, BLOCK, wish(validation="none"), count=COUNT)
+    assert found.verdict_key is None and "quality/success" not in found.columns and len(found.grasps) == COUNT
     assert (found.columns["quality/feasible"] == 1).all(), "the budget is for feasible grasps then"
     assert not found.columns["quality/valid"].any()
 
 
-def test_the_methods_own_options_reach_it(hand: HandModel, block: ObjectModel) -> None:
+def test_the_methods_own_options_reach_it(hand) -> None:
     wanted = {"method": "autograsp", "want": "candidates", "validation": "none"}
     wishes = (wish(**wanted, options={"standoff_m": gap}) for gap in (0.0, 0.05))
-    near, far = (validated_grasps(hand, block, one, count=2) for one in wishes)
+    near, far = (validated_grasps(hand, BLOCK, one, count=2) for one in wishes)
     assert not np.allclose(near.grasps.grasp.hand_pose, far.grasps.grasp.hand_pose)
     with pytest.raises(InputError, match="its options: standoff_m"):
-        validated_grasps(hand, block, wish(**wanted, options={"speed": 3}), count=2)
+        validated_grasps(hand, BLOCK, wish(**wanted, options={"speed": 3}), count=2)
 
 
-def test_a_budget_that_finds_nothing_ends_with_nothing(hand: HandModel, block: ObjectModel, monkeypatch) -> None:
+def test_a_budget_that_finds_nothing_ends_with_nothing(hand, monkeypatch) -> None:
     planned: list[int] = []
 
-    def plan(_hand: Any, _obj: Any, wanted: PlanRequest, *_: Any, **__: Any) -> GraspSet:
+    def plan(_hand, _obj, wanted: PlanRequest, *_, **__) -> GraspSet:
         count = wanted.count
         planned.append(wanted.batch)
         posture = Posture(np.tile([0.0, 0, 1, 1, 0, 0, 0], (count, 1)), np.zeros((count, len(hand.joint_names))))
@@ -166,22 +159,22 @@ def test_a_budget_that_finds_nothing_ends_with_nothing(hand: HandModel, block: O
 
     monkeypatch.setattr(generation, "synthesize", plan)
     judge(monkeypatch, Outcome.DISPLACED, feasible=True)
-    found = validated_grasps(hand, block, wish(budget=3.0), count=COUNT)
+    found = validated_grasps(hand, BLOCK, wish(budget=3.0), count=COUNT)
     assert (len(found.grasps), found.candidates) == (0, 3 * COUNT)
     assert len(set(planned)) == len(planned), "each round draws other grasps"
     assert found.columns["quality/valid"].shape == (0,)
 
 
-def test_hands_that_are_no_numbers_are_dropped_and_counted(hand: HandModel, block: ObjectModel, monkeypatch) -> None:
+def test_hands_that_are_no_numbers_are_dropped_and_counted(hand, monkeypatch) -> None:
     whole = generation.synthesize
 
-    def plan(*arguments: Any, **options: Any) -> GraspSet:
+    def plan(*arguments, **options) -> GraspSet:
         made = whole(*arguments, **options)
         made.grasp.hand_pose[::2] = np.nan
         return made
 
     monkeypatch.setattr(generation, "synthesize", plan)
-    found = validated_grasps(hand, block, wish(want="candidates", validation="none"), count=COUNT)
+    found = validated_grasps(hand, BLOCK, wish(want="candidates", validation="none"), count=COUNT)
     assert (len(found.grasps), found.candidates, found.rejected["diverged"]) == (COUNT // 2, COUNT, COUNT // 2)
     assert np.isfinite(found.grasps.grasp.hand_pose).all()
 
@@ -199,8 +192,8 @@ def test_rounds_end_with_enough_grasps_or_with_budget_used_up(wanted: int, facto
     assert valid >= wanted or candidates == budget
 
 
-def test_only_grasps_that_hold_in_enough_models_count(hand: HandModel, block: ObjectModel) -> None:
-    found = validated_grasps(hand, block, wish(robust=0.75, robust_models=4, rechecks=0), count=3)
+def test_only_grasps_that_hold_in_enough_models_count(hand) -> None:
+    found = validated_grasps(hand, BLOCK, wish(robust=0.75, robust_models=4, rechecks=0), count=3)
     share, weakest = found.columns["quality/robust_share"], found.columns["quality/robust_weakest"]
     assert len(found.grasps) == 3 and (share >= 0.75).all()
     assert weakest.dtype == np.uint8 and ((weakest == 0) | (share < 1)).all()
@@ -208,15 +201,15 @@ def test_only_grasps_that_hold_in_enough_models_count(hand: HandModel, block: Ob
     assert found.candidates == 3 + sum(found.rejected.values()) and "not_robust" in found.rejected
 
 
-def test_valid_grasps_that_hold_in_no_other_model_are_told_apart(hand, block: ObjectModel, monkeypatch) -> None:
-    def nowhere(*args: Any, held: np.ndarray, models: int, wanted: float, **kwargs: Any) -> Robustness:
+def test_valid_grasps_that_hold_in_no_other_model_are_told_apart(hand, monkeypatch) -> None:
+    def nowhere(*args, held: np.ndarray, models: int, wanted: float, **kwargs) -> Robustness:
         verdicts = np.where(held[:, None], 0, -1).astype(np.int8) * np.ones((1, models), np.int8)
         return Robustness(verdicts, np.full(verdicts.shape, Axis.POSE, np.uint8), wanted, 0.0)
 
     monkeypatch.setattr(generation, "robust", nowhere)
-    none = validated_grasps(hand, block, wish(robust=0.5, budget=1, rechecks=0), count=4)
+    none = validated_grasps(hand, BLOCK, wish(robust=0.5, budget=1, rechecks=0), count=4)
     assert len(none.grasps) == 0 and none.rejected["not_robust"] > 0
-    raw = validated_grasps(hand, block, wish(robust=0.5, want="candidates", rechecks=0), count=4)
+    raw = validated_grasps(hand, BLOCK, wish(robust=0.5, want="candidates", rechecks=0), count=4)
     held = raw.columns["quality/success"] == 1
     assert (raw.columns["quality/robust_share"][held] == 0).all() and len(raw.grasps) == 4
     assert (raw.columns["quality/robust_weakest"][held] == Axis.POSE).all()
@@ -245,9 +238,6 @@ def test_a_quiet_part_tells_nothing_and_can_still_be_stopped() -> None:
 
 def test_without_number_of_threads_it_takes_the_cores_there_are() -> None:
     assert (ExecutionContext().cores, ExecutionContext(threads=3).cores) == (available_cores(), 3)
-
-
-SOME, JOINTS = 3, 2
 
 
 def postures(rng: np.random.Generator) -> Posture:

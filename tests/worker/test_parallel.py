@@ -4,7 +4,6 @@ import threading
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +11,6 @@ import pytest
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import MeshError, TaskCancelled
 from graspd.service.model.fidelity import resolve_fidelity
-from graspd.service.model.scene_spec import SceneSpec
 from graspd.worker import generation, together
 from graspd.worker.engines.joins import batches_at_once, fitting
 from graspd.worker.execution_context import CoreSharing, ExecutionContext, parallel_map
@@ -24,14 +22,11 @@ from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import BatchRequest, NoStartFound, PlanRequest
 from graspd.worker.pool.pool import MODULES, Pool
 from graspd.worker.rounds import SMALLEST_PART, parts_of
-from graspd.worker.scenes.kinds import rest_poses, supports_of
-from graspd.worker.simulation.environment import Scenes
 from graspd.worker.together import validated_batches
-from tests.worker.models import assert_same_batch
+from tests.worker.models import assert_same_batch, on_tables
 
 REQUEST = JobOptions(fidelity=resolve_fidelity("draft"), rechecks=2, seed=3)
 ASKED = REQUEST.model_copy(update={"rechecks": 0, "grasps": 6, "seed": 0})
-TABLE = SceneSpec(kind="table")
 COUNT = 2 * SMALLEST_PART
 
 
@@ -41,8 +36,8 @@ def pair():
 
 
 @pytest.fixture(scope="module")
-def scenes(pair) -> Scenes:
-    return Scenes(supports_of(TABLE), rest_poses(TABLE, pair[1], count=3, seed=1)["scene/object_pose"])
+def scenes(pair):
+    return on_tables(pair[1], count=3)
 
 
 def noted(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int, int]]:
@@ -50,7 +45,7 @@ def noted(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int, int]]:
     calls: list[tuple[int, int, int]] = []
     whole = generation.synthesize
 
-    def plan(hand: Any, obj: Any, wanted: PlanRequest, *rest: Any, **named: Any) -> GraspSet:
+    def plan(hand, obj, wanted: PlanRequest, *rest, **named) -> GraspSet:
         calls.append((wanted.batch // generation.ROUND_STRIDE, wanted.first, wanted.count))
         return whole(hand, obj, wanted, *rest, **named)
 
@@ -72,7 +67,7 @@ def test_a_round_ends_as_soon_as_enough_are_found(pair, monkeypatch: pytest.Monk
     """A round has eight grasps at least; the first few of it are often enough, and the others are never planned."""
     whole = generation.validate
 
-    def strict(hand: Any, obj: Any, grasps: GraspSet, **named: Any) -> Any:
+    def strict(hand, obj, grasps: GraspSet, **named):
         verdicts = whole(hand, obj, grasps, **named)
         return replace(verdicts, success=verdicts.success * (verdicts.margin < np.median(margins)).astype(np.int8))
 
@@ -93,7 +88,7 @@ def test_lane_without_a_place_ends_blocked_where_another_has_one(pair, scenes, m
     whole = generation.synthesize
     refused: list[int] = []
 
-    def narrow(hand: Any, obj: Any, wanted: PlanRequest, *rest: Any, **named: Any) -> GraspSet:
+    def narrow(hand, obj, wanted: PlanRequest, *rest, **named) -> GraspSet:
         if wanted.first in without and not wanted.others_have_place:
             refused.append(wanted.first)
             raise NoStartFound("no place")
@@ -197,7 +192,7 @@ def assert_same(batches, others) -> None:
 def test_joined_batches_of_a_job_are_the_same_from_plan_to_verdict(pair, alone, monkeypatch) -> None:
     launches, whole = list[list[int]](), together.synthesize_batches
 
-    def noted(hand: Any, obj: Any, asked: Sequence[BatchRequest], **named: Any) -> Any:
+    def noted(hand, obj, asked: Sequence[BatchRequest], **named):
         launches.append([one.wanted.batch for one in asked])
         return whole(hand, obj, asked, **named)
 
@@ -230,14 +225,14 @@ def test_a_run_in_this_process_makes_the_batches_of_a_job(pair) -> None:
 
 
 @pytest.fixture(scope="module")
-def own_scenes(pair) -> list[Scenes]:
+def own_scenes(pair):
     """Of each of three batches its own."""
-    poses = rest_poses(TABLE, pair[1], count=6, seed=1)["scene/object_pose"]
-    return [Scenes(supports_of(TABLE), poses[first : first + 2]) for first in (0, 2, 4)]
+    whole = on_tables(pair[1], count=6)
+    return [replace(whole, object_pose=whole.object_pose[first : first + 2]) for first in (0, 2, 4)]
 
 
 @pytest.mark.parametrize("apart", [True, False])
-def test_waves_of_batches_in_scenes_are_the_same(pair, own_scenes: list[Scenes], apart: bool) -> None:
+def test_waves_of_batches_in_scenes_are_the_same(pair, own_scenes, apart: bool) -> None:
     wish = ASKED.model_copy(update={"budget": 3.0, "rechecks": 1})
     where, sizes = own_scenes if apart else own_scenes[0], [2, 2, 3]
     given = {"sizes": sizes, "scenes": where, "run": ExecutionContext(threads=2)}
@@ -251,13 +246,13 @@ def test_waves_of_batches_in_scenes_are_the_same(pair, own_scenes: list[Scenes],
 def test_a_batch_without_a_place_has_no_grasps_but_for_the_first(pair, own_scenes, monkeypatch, refused) -> None:
     whole = together.synthesize_batches
 
-    def narrow(hand: Any, obj: Any, asked: Sequence[BatchRequest], **named: Any) -> Any:
+    def narrow(hand, obj, asked: Sequence[BatchRequest], **named):
         made = whole(hand, obj, asked, **named)
         return [NoStartFound("no way in") if k == refused else grasps for k, grasps in enumerate(made)]
 
     monkeypatch.setattr(together, "synthesize_batches", narrow)
     wish = ASKED.model_copy(update={"validation": "none", "want": "candidates"})
-    asked: dict[str, Any] = {"sizes": [2, 2], "scenes": own_scenes[:2], "join": 2, "empty_on": (NoStartFound,)}
+    asked = {"sizes": [2, 2], "scenes": own_scenes[:2], "join": 2, "empty_on": (NoStartFound,)}
     with nullcontext() if refused else pytest.raises(NoStartFound, match="no way in"):
         made = validated_batches(*pair, wish, **asked, run=ExecutionContext(threads=2))
         assert [len(one.grasps) for one in made] == [2, 0]

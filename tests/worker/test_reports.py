@@ -1,8 +1,5 @@
 """Inputs that users of such tools report, each tried as its report says: `data/reports` beside the checkout."""
 
-from pathlib import Path
-from typing import Any
-
 import pytest
 import trimesh
 
@@ -40,7 +37,7 @@ RADIAL |= {"closing": dict.fromkeys(("jf0_prox", "jf1_prox", "jf2_prox"), 1)}
         ("O17_git_lfs_pointer/mug.stl", {}, True, ["mug.stl is a Git LFS pointer", "git lfs pull"], {}),
     ],
 )
-def test_a_report_comes_out_as_it_should(shared_data, file, options, is_refused, words, facts: dict[str, Any]) -> None:
+def test_a_report_comes_out_as_it_should(shared_data, file, options, is_refused, words, facts: dict) -> None:
     check = report_hand if file.startswith("H") else report_object
     found = check(str(shared_data / "reports" / file), options)
     assert (found["verdict"] == "refuse") is is_refused, found["message"]
@@ -49,7 +46,7 @@ def test_a_report_comes_out_as_it_should(shared_data, file, options, is_refused,
 
 
 @pytest.mark.parametrize("file", ["O02_concave_ngon/u_channel.obj", "O12_far_from_origin/box_5m.obj"])
-def test_reported_meshes_are_grasped(shared_data: Path, tmp_path: Path, file: str) -> None:
+def test_reported_meshes_are_grasped(shared_data, tmp_path, file: str) -> None:
     mesh = shared_data / "reports" / file
     words = "synth --hand barrett --fidelity draft -n 4 --object"
     assert graspd(words, mesh, "-o", tmp_path / "g.h5")["valid"] == 4

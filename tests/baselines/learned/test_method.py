@@ -14,7 +14,6 @@ from graspd.baselines.learned.method import ELEVATION, NEAREST_M, RETREATS, Seed
 from graspd.baselines.learned.network import Proposals, encode, save
 from graspd.service.model.errors import InputError
 from graspd.service.model.fidelity import resolve_fidelity
-from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.transforms import apply, compose, quat_from_axis_angle, quat_from_matrix, quat_rotate
 from graspd.service.store.network_file import ProposalNetwork
 from graspd.worker.execution_context import ExecutionContext
@@ -29,15 +28,18 @@ from graspd.worker.planners.fast_graspd.scene_starts import ROOM, free_ways
 from graspd.worker.planners.fast_graspd.starts import CLEAR, Probe, start_generator
 from graspd.worker.planners.known_networks import keep_file
 from graspd.worker.planners.registry import of_this_machine
-from graspd.worker.scenes.kinds import rest_poses, supports_of
 from graspd.worker.simulation.data import HandState
 from graspd.worker.simulation.environment import Obstacle, PlacedGrasps
 from graspd.worker.simulation.obstacles import DeviceObstacles
 from tests.networks import random_network
+from tests.worker.models import on_tables
 
 FEW = {"coarse_iterations": 20, "fine_iterations": 6, "polish_iterations": 2}
 QUICK = resolve_fidelity("draft").model_copy(update=FEW)
-TABLE = SceneSpec(kind="table")
+MUG = object_from_path("mug")
+BLOCK = object_from_path("block", face_error_m=QUICK.face_error_m)
+POSE = np.concatenate([[0.2, -0.1, 0.05], quat_from_axis_angle(np.array([0.0, 0, 1]), np.asarray(0.7))])
+Floats = np.ndarray[Any, np.dtype[np.float64]]
 
 
 @pytest.fixture(scope="module")
@@ -46,18 +48,12 @@ def hand() -> HandModel:
 
 
 @pytest.fixture(scope="module")
-def block() -> ObjectModel:
-    return object_from_path("block", face_error_m=QUICK.face_error_m)
-
-
-@pytest.fixture(scope="module")
 def network(hand: HandModel) -> ProposalNetwork:
     return random_network(hand.joint_names, hand=hand.name, digest=hand.digest)
 
 
 def on_table(obj: ObjectModel, count: int, seed: int = 0) -> PlacedGrasps:
-    poses = rest_poses(TABLE, obj, count=2, seed=seed)["scene/object_pose"]
-    return PlacedGrasps(supports_of(TABLE), poses, np.arange(count) % 2)
+    return on_tables(obj, seed=seed).placed(np.arange(count) % 2)
 
 
 def keep(network: ProposalNetwork) -> str:
@@ -79,33 +75,31 @@ def assert_same(one: GraspSet, other: GraspSet) -> None:
 
 
 @pytest.mark.slow
-def test_a_grasp_depends_on_seed_and_index_alone(hand, block, network) -> None:
-    small, large = made(hand, block, network, 2), made(hand, block, network, 8, threads=2)
+def test_a_grasp_depends_on_seed_and_index_alone(hand, network) -> None:
+    small, large = made(hand, BLOCK, network, 2), made(hand, BLOCK, network, 8, threads=2)
     assert_same(small, large.take(slice(0, 2)))
-    other = made(hand, block, network, 2, seed=2)
-    assert not np.allclose(small.grasp.hand_pose, other.grasp.hand_pose)
+    assert not np.allclose(small.grasp.hand_pose, made(hand, BLOCK, network, 2, seed=2).grasp.hand_pose)
     q = hand.reduce(large.grasp.joint_positions)
     assert (q >= hand.lower - 1e-5).all() and (q <= hand.upper + 1e-5).all()
 
 
-def test_joined_batches_are_those_of_separate_launches(hand, block, network) -> None:
+def test_joined_batches_are_those_of_separate_launches(hand, network) -> None:
     options = {"network": keep(network), "starts": 2}
-    wanted = [PlanRequest(2, QUICK, 1, batch, placed=on_table(block, 2)) for batch in (0, 1)]
+    wanted = [PlanRequest(2, QUICK, 1, batch, placed=on_table(BLOCK, 2)) for batch in (0, 1)]
     joins = method("learned").joined
     assert joins is not None
     asked = [BatchRequest(one, ExecutionContext(threads=1)) for one in wanted]
-    found = joins(method("learned").options(**options))(hand, block, asked)
+    found = joins(method("learned").options(**options))(hand, BLOCK, asked)
     for one, alone in zip(found, wanted, strict=True):
         assert isinstance(one, GraspSet)
-        assert_same(one, synthesize(hand, block, alone, ExecutionContext(threads=1), method="learned", options=options))
+        assert_same(one, synthesize(hand, BLOCK, alone, ExecutionContext(threads=1), method="learned", options=options))
 
 
 def proposing(network: ProposalNetwork, found: Proposals, anchor: np.ndarray) -> ProposalNetwork:
     """A network that proposes one grasp, whatever it sees; its noise is a tenth of a millimetre or milliradian."""
     rows = encode(found, anchor)[0].astype(np.float32)
     zero = {name: np.zeros_like(w) for name, w in network.weights.items() if name.startswith("flow.out")}
-    weights = network.weights | zero
-    return replace(network, weights=weights, mean=rows, std=np.full_like(rows, 1e-4))
+    return replace(network, weights=network.weights | zero, mean=rows, std=np.full_like(rows, 1e-4))
 
 
 def started(pair: Pair, network: ProposalNetwork, height: float, placed: PlacedGrasps) -> HandState:
@@ -136,18 +130,18 @@ def down(hand: HandModel, height: float) -> Proposals:
     return Proposals(np.concatenate([root, turn])[None], way, joints, joints, joints)
 
 
-def test_hands_set_out_as_proposed_backed_off_until_clear(hand, block, network) -> None:
-    pair, placed = pair_of(hand, block, QUICK, "cpu"), on_table(block, 2)
+def test_hands_set_out_as_proposed_backed_off_until_clear(hand, network) -> None:
+    pair, placed = pair_of(hand, BLOCK, QUICK, "cpu"), on_table(BLOCK, 2)
     state = started(pair, network, 0.1, placed)
     for row, scene in enumerate(np.repeat(placed.index, 2)):
         pose = placed.object_pose[scene]
-        palm = quat_rotate(pose[3:], state.pivot[row] + block.centre_of_mass) + pose[:3]
+        palm = quat_rotate(pose[3:], state.pivot[row] + BLOCK.centre_of_mass) + pose[:3]
         looks = quat_rotate(pose[3:], quat_rotate(state.rotation[row], hand.palm.approach))
         np.testing.assert_allclose(looks, [0, 0, -1], atol=2e-3)
         np.testing.assert_allclose(state.q[row], hand.preshape, atol=2e-3)
         # The anchor is the mean of what is seen: within the block, above half of its height on the camera's side.
-        assert 0.1 < palm[2] < 0.1 + 2 * block.radius
-        assert np.linalg.norm(palm[:2] - compose(pose, np.array([*block.centre_of_mass, 1, 0, 0, 0]))[:2]) < 0.03
+        assert 0.1 < palm[2] < 0.1 + 2 * BLOCK.radius
+        assert np.linalg.norm(palm[:2] - compose(pose, np.array([*BLOCK.centre_of_mass, 1, 0, 0, 0]))[:2]) < 0.03
     # From within the block it comes out the way it came, no farther than it must.
     deeper = started(pair, network, 0.0, placed)
     up = np.array([s.up for s in placed.scenes])[np.repeat(placed.index, 2)]
@@ -157,26 +151,26 @@ def test_hands_set_out_as_proposed_backed_off_until_clear(hand, block, network) 
 
 
 @pytest.mark.parametrize("height", [-0.5, 1e30])
-def test_with_no_proposal_clear_hands_set_out_without_a_network(hand, block, network, height) -> None:
-    pair, placed = pair_of(hand, block, QUICK, "cpu"), on_table(block, 2)
+def test_with_no_proposal_clear_hands_set_out_without_a_network(hand, network, height) -> None:
+    pair, placed = pair_of(hand, BLOCK, QUICK, "cpu"), on_table(BLOCK, 2)
     state = started(pair, network, height, placed)
-    assert (np.linalg.norm(state.pivot, axis=1) < block.radius + 0.15).all()
+    assert (np.linalg.norm(state.pivot, axis=1) < BLOCK.radius + 0.15).all()
 
 
-def test_what_it_cannot_do_is_said_in_a_line(hand, block, network, tmp_path: Path) -> None:
+def test_what_it_cannot_do_is_said_in_a_line(hand, network, tmp_path: Path) -> None:
     def refused(words: str, **given: Any) -> None:
         with pytest.raises(InputError, match=words) as error:
-            made(given.pop("hand", hand), block, given.pop("network", network), 1, **given)
+            made(given.pop("hand", hand), BLOCK, given.pop("network", network), 1, **given)
         assert "\n" not in str(error.value)
 
     refused("in scenes only", placed=None)
     refused("proposes grasps of barrett .*, not of allegro", hand=hand_from_path("allegro"))
     refused("not of barrett", network=replace(network, hand_digest="f" * 32))
     board = Obstacle.box([0, 0, -0.01, 1, 0, 0, 0], [1, 1, 0.02])
-    refused("has none, choose fast_graspd", placed=replace(on_table(block, 1), supports=(board,)))
+    refused("has none, choose fast_graspd", placed=replace(on_table(BLOCK, 1), supports=(board,)))
     with pytest.raises(InputError, match="not known here"):
         plan = planner("learned", {"network": "e" * 32}, in_scenes=True)
-        plan(hand, block, PlanRequest(1, QUICK), ExecutionContext())
+        plan(hand, BLOCK, PlanRequest(1, QUICK), ExecutionContext())
     # A worker that is told a path reads no file.
     save(network, tmp_path / "net.npz")
     with pytest.raises(InputError, match="option of learned: network"):
@@ -187,17 +181,9 @@ def test_what_it_cannot_do_is_said_in_a_line(hand, block, network, tmp_path: Pat
         of_this_machine("learned", {"network": str(tmp_path / "none.npz")})
 
 
-POSE = np.concatenate([[0.2, -0.1, 0.05], quat_from_axis_angle(np.array([0.0, 0, 1]), np.asarray(0.7))])
-
-
-@pytest.fixture(scope="module")
-def mug() -> ObjectModel:
-    return object_from_path("mug")
-
-
-def test_points_lie_on_the_surface_and_are_seen_by_the_camera(mug: ObjectModel) -> None:
-    seen, rng = SurfaceView.of(mug), np.random.default_rng(3)
-    mesh = trimesh.Trimesh(apply(POSE, mug.vertices), mug.faces, process=False)
+def test_points_lie_on_the_surface_and_are_seen_by_the_camera() -> None:
+    seen, rng = SurfaceView.of(MUG), np.random.default_rng(3)
+    mesh = trimesh.Trimesh(apply(POSE, MUG.vertices), MUG.faces, process=False)
     for _ in range(3):
         camera = seen.camera(POSE, rng)
         points, normals = seen.cloud(POSE, camera, 400, rng)
@@ -215,23 +201,19 @@ def test_points_lie_on_the_surface_and_are_seen_by_the_camera(mug: ObjectModel) 
     assert points.shape == (8192, 3) and np.isfinite(points).all()
 
 
-def test_cameras_stand_where_pictures_have_them(mug: ObjectModel) -> None:
-    seen, rng = SurfaceView.of(mug), np.random.default_rng(0)
-    middle = apply(POSE, mug.centre_of_mass)
+def test_cameras_stand_where_pictures_have_them() -> None:
+    seen, rng = SurfaceView.of(MUG), np.random.default_rng(0)
+    middle = apply(POSE, MUG.centre_of_mass)
     out = np.array([seen.camera(POSE, rng) - middle for _ in range(200)])
     distance = np.linalg.norm(out, axis=1)
     elevation = np.arcsin(out[:, 2] / distance)
     assert (elevation >= ELEVATION[0] - 1e-9).all() and (elevation <= ELEVATION[1] + 1e-9).all()
-    assert (distance >= NEAREST_M + mug.radius - 1e-9).all() and (distance < 0.8).all()
+    assert (distance >= NEAREST_M + MUG.radius - 1e-9).all() and (distance < 0.8).all()
     assert np.linalg.norm((out[:, :2] / distance[:, None]).mean(axis=0)) < 0.15  # from all sides
 
 
-Floats = np.ndarray[Any, np.dtype[np.float64]]
-
-
 def cloud(count: int = 64, seed: int = 1) -> tuple[Floats, Floats]:
-    rng = np.random.default_rng(seed)
-    normals = rng.normal(size=(count, 3))
+    normals = np.random.default_rng(seed).normal(size=(count, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     return 0.05 * normals + [0.3, -0.2, 0.5], normals
 
@@ -317,8 +299,7 @@ def test_a_grasp_survives_its_row_and_a_bad_row_is_a_rotation() -> None:
     network = random_network(["a", "b", "c"])
     found = proposed(network, 5)
     np.testing.assert_allclose(np.linalg.norm(found.hand_pose[:, 3:], axis=1), 1, atol=1e-12)
-    back = net.decode(net.encode(found, [0.1, 0.2, 0.3]), [0.1, 0.2, 0.3])
-    assert_near(back, found, 1e-12)
+    assert_near(net.decode(net.encode(found, [0.1, 0.2, 0.3]), [0.1, 0.2, 0.3]), found, 1e-12)
     flat = np.zeros((3, network.numbers))
     flat[1, 3:9] = [0, 2, 0, 0, -1, 0]  # columns on one line
     flat[2, 3:9] = [3, 0, 0, 1, 2, 0]

@@ -1,7 +1,6 @@
 """Real grasps, of a free block and of a bottle on a table, as shards that robots are to carry out."""
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -18,7 +17,7 @@ def engine() -> None:
     backend.start()
 
 
-def _shard(name: str, words: str) -> Any:
+def _shard(name: str, words: str):
     @pytest.fixture(scope="session", name=name)
     def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
         file = tmp_path_factory.mktemp(name) / "grasps.h5"

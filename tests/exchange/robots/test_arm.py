@@ -4,7 +4,6 @@ import csv
 import re
 import sys
 from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -18,12 +17,12 @@ from graspd.service.model.transforms import IDENTITY_POSE, compose, pose_from_ma
 from tests.exchange.robots.arms import JOINTS, write_arm
 from tests.worker.commands_run import graspd, refused
 
-pytest.importorskip("mink")
-
 MOUNT_POSE = "0 0 0.11 1 0 0 0"
 #: The search ends at 0.1 mm and 1 mrad; between two of its points, 5 mm apart, joints move straight.
 NEAR_M = 5e-4
 NAMES = [name for name, *_ in JOINTS]
+
+pytest.importorskip("mink")
 
 
 @pytest.fixture(scope="module")
@@ -31,13 +30,13 @@ def arm(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_arm(tmp_path_factory.mktemp("arm"))
 
 
-def export(shard: Path, arm: Path, folder: Path, format_: str = "csv", base: str = "-0.45 0 0 1 0 0 0") -> Any:
+def export(shard: Path, arm: Path, folder: Path, format_: str = "csv", base: str = "-0.45 0 0 1 0 0 0"):
     carried = ["--arm", arm, "--mount-pose", MOUNT_POSE, "--base", base]
     return graspd(f"export --format {format_} --all --mount flange -o", folder, shard, *carried)
 
 
 @pytest.fixture(scope="module")
-def carried(table_shard: Path, arm: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path]:
+def carried(table_shard: Path, arm: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[dict, Path]:
     folder = tmp_path_factory.mktemp("carried")
     return export(table_shard, arm, folder), folder
 
@@ -47,7 +46,7 @@ def rows(folder: Path, table: str = "trajectories") -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def test_the_share_of_grasps_that_the_arm_reaches_is_told(carried: tuple[dict[str, Any], Path]) -> None:
+def test_the_share_of_grasps_that_the_arm_reaches_is_told(carried: tuple[dict, Path]) -> None:
     told, folder = carried
     assert told["candidates"] == 6 and told["grasps"] == len({row["grasp"] for row in rows(folder)}) >= 2
     assert told["reach_share"] == pytest.approx(told["grasps"] / told["candidates"], abs=1e-4)
@@ -66,7 +65,7 @@ def test_the_arm_holds_the_hand_where_the_grasp_has_it_all_along(carried, arm: P
         assert abs(root[3:] @ told[3:]) > np.cos(0.005)
 
 
-def test_joints_stay_within_their_limits_of_place_and_speed(carried: tuple[dict[str, Any], Path]) -> None:
+def test_joints_stay_within_their_limits_of_place_and_speed(carried: tuple[dict, Path]) -> None:
     by_grasp: dict[str, list[dict[str, str]]] = {}
     for row in rows(carried[1]):
         by_grasp.setdefault(row["grasp"], []).append(row)

@@ -36,11 +36,6 @@ def free(free_shard: Path) -> Executions:
     return of_shard(free_shard)
 
 
-@pytest.fixture(scope="module")
-def on_table(table_shard: Path) -> Executions:
-    return of_shard(table_shard)
-
-
 def test_a_free_grasp_is_reached_and_left_over_ten_centimetres(free: Executions) -> None:
     for start, end in (("standoff", "arrival"), ("squeeze", "lift")):
         way = free.postures[end].hand_pose[:, :3] - free.postures[start].hand_pose[:, :3]
@@ -75,8 +70,8 @@ def test_grasps_without_a_free_way_are_left_out_none_is_refused() -> None:
         executions(hand, ball, caught, rows=np.zeros(1, int), placed=None, tool=TOOL, quality={})
 
 
-def test_in_scene_ways_of_shard_are_kept_in_frame_of_the_scene(table_shard: Path, on_table: Executions) -> None:
-    shard = read_shard(table_shard, kind="base")
+def test_in_scene_ways_of_shard_are_kept_in_frame_of_the_scene(table_shard: Path) -> None:
+    shard, on_table = read_shard(table_shard, kind="base"), of_shard(table_shard)
     at = shard["scene/object_pose"][shard["grasp/scene_index"]]
     np.testing.assert_array_equal(on_table.object_pose, at)
     back = compose(invert(at), on_table.postures["standoff"].hand_pose)

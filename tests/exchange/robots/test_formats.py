@@ -2,12 +2,9 @@
 
 import csv
 import json
-import re
-import shlex
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree
 
 import mujoco
@@ -25,7 +22,6 @@ from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.rendering.hands import hand_parts
 from tests.conftest import REPOSITORY
-from tests.exchange.robots.arms import write_arm
 from tests.exchange.robots.conftest import COMMON
 from tests.worker.commands_run import graspd, refused
 
@@ -33,9 +29,12 @@ BLOCK = next(Path(service.__file__).parent.glob("builtin/objects/block/*.stl"))
 GRASP = {"id", "pre_grasp_posture", "grasp_posture", "grasp_pose", "grasp_quality", "pre_grasp_approach"}
 GRASP |= {"post_grasp_retreat", "post_place_retreat", "max_contact_force", "allowed_touch_objects"}
 POINT = {"positions", "velocities", "accelerations", "effort", "time_from_start"}
+#: Positions in float32 and poses with seven digits [m].
+ROUNDING_M = 2e-6
+PAGE = (REPOSITORY / "docs" / "how-to" / "robots.md").read_text()
 
 
-def export(shard: Path, format_: str, folder: Path, *more: str) -> dict[str, Any]:
+def export(shard: Path, format_: str, folder: Path, *more: str) -> dict:
     return graspd(f"export --format {format_} --all -o", folder, shard, *more)
 
 
@@ -75,12 +74,6 @@ def test_isaac_names_prims_that_the_usd_export_has(tmp_path: Path) -> None:
         assert stage.GetPrimAtPath(isaac[name]).IsValid()
 
 
-def validated(shard: Path) -> list[bool]:
-    case = load_case(shard)
-    protocol = "dexgraspbench" if case.placed is None else "lift"
-    return [one["held"] for one in graspd(f"evaluate --protocol {protocol}", shard)["verdicts"]]
-
-
 @pytest.mark.parametrize("which", ["free_shard", "table_shard", "pressing_shard", "clutter_shard"])
 def test_a_mujoco_scene_replays_to_the_verdict_of_the_validator(which: str, request, tmp_path) -> None:
     shard = limp(request.getfixturevalue(which), tmp_path / "limp.h5")
@@ -88,7 +81,8 @@ def test_a_mujoco_scene_replays_to_the_verdict_of_the_validator(which: str, requ
     # A script that has only mujoco and numpy must do: -I keeps this checkout out of its reach.
     command = [sys.executable, "-I", str(tmp_path / "replay.py"), str(tmp_path / "scene.xml"), "--json"]
     found = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
-    verdicts = validated(shard)
+    protocol = "dexgraspbench" if load_case(shard).placed is None else "lift"
+    verdicts = [one["held"] for one in graspd(f"evaluate --protocol {protocol}", shard)["verdicts"]]
     assert len(found) == told["grasps"] and set(verdicts) == {True, False}
     for name, what in found.items():
         assert (what == "held") == verdicts[int(name.removeprefix("grasp_"))], name
@@ -103,8 +97,7 @@ def test_a_mujoco_scene_has_the_hands_names_and_key_frames(table_shard: Path, tm
     shard = read_shard(table_shard, kind="base")
     at = shard["scene/object_pose"][shard["grasp/scene_index"]]
     for row in range(len(case.grasps)):
-        key = model.key(f"grasp_{row:04}/grasp").id
-        mujoco.mj_resetDataKeyframe(model, data, key)
+        mujoco.mj_resetDataKeyframe(model, data, model.key(f"grasp_{row:04}/grasp").id)
         mujoco.mj_forward(model, data)
         pose = compose(at[row], case.grasps.grasp.hand_pose[row])
         bodies = body_poses(case.hand, pose, case.grasps.grasp.joint_positions[row])[0]
@@ -197,10 +190,6 @@ def test_a_mistake_is_one_line_and_writes_nothing(options: str, said: str, free_
     assert not (tmp_path / "out").exists()
 
 
-#: Positions in float32 and poses with seven digits [m].
-ROUNDING_M = 2e-6
-
-
 def expected(shard: Path, row: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Vertices of the hand's bodies in the frame of the scene or the object, and the object's matrix there."""
     case = load_case(shard)
@@ -266,30 +255,6 @@ def test_usd_opens_a_grasp_in_metres_that_moves_to_the_lift(table_shard: Path, t
 def test_without_usd_core_a_line_says_what_to_install(free_shard: Path, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "pxr", None)
     assert "pip install 'graspd[usd]'" in refused("export --format usd", free_shard, "-o", tmp_path)
-
-
-PAGE = (REPOSITORY / "docs" / "how-to" / "robots.md").read_text()
-
-
-def commands() -> list[list[str]]:
-    blocks = re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL)
-    return [shlex.split(line, comments=True) for block in blocks for line in block.splitlines() if line.strip()]
-
-
-@pytest.mark.slow
-def test_every_command_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("mink")
-    pytest.importorskip("pxr")
-    monkeypatch.chdir(tmp_path)
-    write_arm(tmp_path).rename("arm.urdf")
-    assert len(commands()) >= 12
-    for program, *arguments in commands():
-        if program == "python":
-            subprocess.run([sys.executable, "-I", *arguments], check=True, capture_output=True)
-            continue
-        assert program == "graspd"
-        graspd("", *arguments)
-        assert Path(arguments[arguments.index("-o") + 1]).exists()
 
 
 def test_every_format_of_the_command_is_on_the_page() -> None:

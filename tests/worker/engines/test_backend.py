@@ -1,7 +1,6 @@
 """Warp as it is started: its default device, kernels compiled ahead, and where compiled ones are kept."""
 
 import os
-import subprocess
 import sys
 import threading
 from pathlib import Path
@@ -12,7 +11,23 @@ from graspd.service import user_cache
 from graspd.worker.engines import backend
 from graspd.worker.engines.backend import kernel_cache
 from tests.conftest import PACKAGES, REPOSITORY
+from tests.shell import completed
 from tests.waiting import PATIENCE_S
+
+MODULE = "graspd.worker.simulation.kernels.optimizers"
+START = """
+import importlib, warp as wp
+from graspd.worker.engines import backend
+backend.start()
+print(wp.config.kernel_cache_dir)
+"""
+LOAD = START + f"wp.load_module(importlib.import_module({MODULE!r}), device='cpu')"
+BAKE = f"""
+from graspd.worker.engines import backend
+from tests.conftest import PACKAGES, REPOSITORY
+backend.start()
+backend.bake([{MODULE!r}], architectures=[90])
+"""
 
 
 def test_the_default_device_of_one_thread_is_not_that_of_another() -> None:
@@ -38,26 +53,8 @@ def test_the_default_device_of_one_thread_is_not_that_of_another() -> None:
     assert seen == ["a GPU"]
 
 
-MODULE = "graspd.worker.simulation.kernels.optimizers"
-START = """
-import importlib, warp as wp
-from graspd.worker.engines import backend
-backend.start()
-print(wp.config.kernel_cache_dir)
-"""
-LOAD = START + f"wp.load_module(importlib.import_module({MODULE!r}), device='cpu')"
-BAKE = f"""
-from graspd.worker.engines import backend
-from tests.conftest import PACKAGES, REPOSITORY
-backend.start()
-backend.bake([{MODULE!r}], architectures=[90])
-"""
-
-
 def run(code: str, **places: str) -> str:
-    done = subprocess.run(
-        [sys.executable, "-c", code], env={**os.environ, **places}, capture_output=True, text=True, check=False
-    )
+    done = completed([sys.executable, "-c", code], env={**os.environ, **places})
     assert done.returncode == 0 and "Traceback" not in done.stderr, done.stderr
     return done.stdout.strip()
 
@@ -122,9 +119,7 @@ def blocked(tmp_path: Path) -> Path:
     return tmp_path / "file" / "cache"
 
 
-def test_kernels_go_where_warp_has_them_or_the_user_can_write(
-    blocked: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_kernels_go_where_warp_has_them_or_the_user_can_write(blocked: Path, tmp_path, monkeypatch, caplog) -> None:
     monkeypatch.setenv("WARP_CACHE_PATH", str(tmp_path / "kernels"))
     assert kernel_cache() is None
     monkeypatch.setenv("WARP_CACHE_PATH", str(blocked))
@@ -135,7 +130,5 @@ def test_kernels_go_where_warp_has_them_or_the_user_can_write(
 
 def test_warp_starts_where_the_user_can_write_nowhere(blocked: Path, tmp_path: Path) -> None:
     (tmp_path / "tmp").mkdir()
-    at = str(blocked)
-    assert run(START, HOME=at, XDG_CACHE_HOME="", WARP_CACHE_PATH=at, TMPDIR=str(tmp_path / "tmp")).startswith(
-        str(tmp_path / "tmp")
-    )
+    at, free = str(blocked), str(tmp_path / "tmp")
+    assert run(START, HOME=at, XDG_CACHE_HOME="", WARP_CACHE_PATH=at, TMPDIR=free).startswith(free)

@@ -2,7 +2,6 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -22,25 +21,25 @@ from tests.worker.models import quality_columns
 COUNT = 40
 
 
-def columns(seed: int) -> dict[str, Any]:
+def columns(seed: int) -> dict:
     """40 valid grasps, three in four of type power."""
     rng = np.random.default_rng(seed)
     pose = np.concatenate([rng.normal(0, 0.1, (COUNT, 3)), np.tile([1.0, 0, 0, 0], (COUNT, 1))], axis=1)
-    found: dict[str, Any] = quality_columns(COUNT) | {"quality/epsilon": np.repeat(rng.random((COUNT, 1)), 2, axis=1)}
+    found = quality_columns(COUNT) | {"quality/epsilon": np.repeat(rng.random((COUNT, 1)), 2, axis=1)}
     for posture in ("grasp", "pregrasp", "squeeze"):
         found |= {f"{posture}/hand_pose": pose, f"{posture}/joint_positions": rng.random((COUNT, 2))}
     found["quality/grasp_type"] = np.where(np.arange(COUNT) % 4 < 3, 1, 2).astype(np.int32)
     return found | {"quality/approach_cell": rng.integers(0, 2, COUNT).astype(np.int32)}
 
 
-def shard(path: Path, number: int, obj: str = "mug", batch: int = 0, **changes: Any) -> Path:
+def shard(path: Path, number: int, obj: str = "mug", batch: int = 0, **changes) -> Path:
     said = {"hand": "allegro", "object": obj, "batch": batch, "shard_id": f"{number:032x}", "seed": 0, **changes}
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(write_shard("base", columns(number), said))
     return path
 
 
-def run(*words: str | Path) -> Any:
+def run(*words: str | Path):
     return CliRunner().invoke(app, [str(word) for word in words])
 
 
@@ -110,8 +109,7 @@ UNVALIDATED = base_of([0, 0], [1, 0], None)
 
 
 def test_valid_grasps_are_taken_unless_others_are_asked_for() -> None:
-    assert choose(VALIDATED)[0].tolist() == [True, False, False]
-    assert choose(VALIDATED, every=True)[0].all()
+    assert choose(VALIDATED)[0].tolist() == [True, False, False] and choose(VALIDATED, every=True)[0].all()
     assert choose(UNVALIDATED, unvalidated=True)[0].tolist() == [True, False]
     words = [choose(VALIDATED)[1], choose(UNVALIDATED, unvalidated=True)[1], choose(VALIDATED, every=True)[1]]
     assert words == ["valid grasps", "feasible grasps that are not validated", "grasps of any kind"]

@@ -2,7 +2,6 @@
 
 import io
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -54,7 +53,7 @@ def file_of(found: SynthesisResult, path: Path) -> Path:
 
 
 @SCENES
-def test_grasps_are_the_same_in_the_frame_of_the_file(made: Any, scene: str) -> None:
+def test_grasps_are_the_same_in_the_frame_of_the_file(made, scene: str) -> None:
     here, there = made["origin", scene].arrays, made["far", scene].arrays
     ways = [name for name in here if name.endswith("hand_pose") or name in ("grasp/approach", "grasp/lift")]
     for name in ways:
@@ -64,16 +63,15 @@ def test_grasps_are_the_same_in_the_frame_of_the_file(made: Any, scene: str) -> 
         np.testing.assert_array_equal(there[name], here[name], err_msg=name)
 
 
-def test_the_object_stands_in_its_scenes_where_it_would(made: Any) -> None:
+def test_the_object_stands_in_its_scenes_where_it_would(made) -> None:
     here, there = (made[at, "table"].arrays["scene/object_pose"] for at in ("origin", "far"))
     np.testing.assert_array_equal(there[:, 3:], here[:, 3:])
-    middle = apply(there, np.array(PLACES["far"]))
-    np.testing.assert_allclose(middle, here[:, :3], rtol=0, atol=1e-8)
+    np.testing.assert_allclose(apply(there, np.array(PLACES["far"])), here[:, :3], rtol=0, atol=1e-8)
 
 
 @SCENES
-def test_an_evaluation_says_the_same(made: Any, tmp_path: Path, scene: str) -> None:
-    protocol: Any = "lift" if scene == "table" else "dexgraspbench"
+def test_an_evaluation_says_the_same(made, tmp_path: Path, scene: str) -> None:
+    protocol = "lift" if scene == "table" else "dexgraspbench"
     rows = []
     for at in ("origin", "far"):
         row = evaluate(load_case(file_of(made[at, scene], tmp_path / f"{at}.h5")), protocol=protocol)
@@ -82,7 +80,7 @@ def test_an_evaluation_says_the_same(made: Any, tmp_path: Path, scene: str) -> N
     assert rows[0] == rows[1]
 
 
-def test_pictures_are_the_same(made: Any, boxes: dict[str, Path], tmp_path: Path) -> None:
+def test_pictures_are_the_same(made, boxes: dict[str, Path], tmp_path: Path) -> None:
     seen = []
     for at in ("origin", "far"):
         hand = load_case(file_of(made[at, "free"], tmp_path / f"{at}.h5")).hand
@@ -91,7 +89,7 @@ def test_pictures_are_the_same(made: Any, boxes: dict[str, Path], tmp_path: Path
     np.testing.assert_array_equal(*seen)
 
 
-def test_views_of_scenes_are_the_same(made: Any, tmp_path: Path) -> None:
+def test_views_of_scenes_are_the_same(made, tmp_path: Path) -> None:
     seen = []
     for at in ("origin", "far"):
         shard, views = file_of(made[at, "table"], tmp_path / f"{at}.h5"), tmp_path / f"{at}-views.h5"

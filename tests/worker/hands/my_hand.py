@@ -6,11 +6,10 @@ from typing import Final
 
 from graspd.service.model.states import AssetKind
 from graspd.service.store.assets import builtin_files
-from tests.worker.hands.grippers import gripper_urdf
 from tests.worker.hands.mjcfs import FOUR_BAR
 from tests.worker.hands.test_descriptions import package
 from tests.worker.hands.test_tree import humanoid
-from tests.worker.hands.urdfs import joint, link, robot
+from tests.worker.hands.urdfs import gripper_urdf, joint, link, robot
 
 #: Names of the built-in hand that stands for the reader's own, and of that.
 _RENAMED: Final = {"thumb_rotation": "joint_12.0", "index_proximal": "joint_1.0", '"palm"': '"base_link"'}

@@ -2,8 +2,6 @@
 
 import re
 from functools import partial
-from pathlib import Path
-from typing import Any
 
 import pytest
 import trimesh
@@ -22,22 +20,57 @@ from graspd.worker.hands.check import check_hand
 from graspd.worker.hands.load import load_hand
 from graspd.worker.hands.robot import MAX_LINKS
 from graspd.worker.hands.urdf import MAX_BYTES, read_urdf
+from tests.api.factories import zipped
 from tests.worker.hands.mjcfs import CLAW, FOUR_BAR
 from tests.worker.hands.urdfs import joint, link, report, robot
 from tests.worker.objects.shapes import damaged
 from tests.worker.objects.test_colours import BOMB, SCENE, dae
-from tests.worker.stages.test_ingest import bad_files, is_expected, upload, zipped
+from tests.worker.stages.test_ingest import bad_files, is_expected, upload
+
+LIMIT, MIMIC = '<limit lower="0" upper="0.04"/>', '<mimic joint="jl" multiplier="-1"/>'
+#: The claw without its mesh.
+PLAIN_CLAW = re.sub('<geom type="mesh" [^>]*/>|<mesh name="tip"[^>]*/>', "", CLAW)
+_THUMB = '<position joint="thumb" kp="5"/>'
+_SITES = '<site name="a"/><body name="thumb" pos="-0.02 0 0.01"><site name="b" pos="0 0 0.03"/>'
+_CORD = '<tendon><spatial name="cord"><site site="a"/><site site="b"/></spatial></tendon><actuator>'
+_PULL = {'<body name="thumb" pos="-0.02 0 0.01">': _SITES, _THUMB: '<motor name="pull" tendon="cord"/>'}
+_GLUE = '<equality><weld name="glue" body1="thumb" body2="base"/>'
+_TURNED = 'euler="10 20 30">'
+_AGAIN = '<equality><joint joint1="left_spread" joint2="right_curl" polycoef="0.2 -2 0 0 0"/>'
+_WRIST = '<joint name="wrist" axis="0 1 0" range="-30 30"/>'
+_LEG = (
+    '<body name="leg"><geom type="sphere" size="0.05"/><body name="knee"><joint name="knee" axis="0 1 0"/>'
+    '<geom fromto="0 0 0 0 0 0.3" size="0.01"/></body></body><body name="mount"'
+)
+EMPTY = '<limit lower="0" upper="0"/>'
+_ARM = link("world", "") + joint("arm", "world", "base")
+_FREE = '<link name="ball"/><joint name="loose" type="floating"><parent link="base"/><child link="ball"/></joint>'
+SOURCE = builtin_files(AssetKind.HAND, "barrett")
+WORDS = [b"nan", b"-1e308", b"inf", b"0", b"", b"<", b'"', b"&x;", b"../../", b"palm", b"finger_1_medial", b"\xff\xfe"]
+URDFS, ASSETS = (damaged(SOURCE[name], WORDS) for name in ("barrett.urdf", "asset.json"))
+XACRO = '<robot name="x" xmlns:xacro="http://www.ros.org/wiki/xacro">{}</robot>'
+INCLUDES = CLAW.replace('<light pos="0 0 1"/>', '<include file="/etc/passwd"/>').encode()
+PART_MESH = '<collision><geometry><mesh filename="part.dae"/></geometry></collision>'
+PARTS = robot(link("palm", PART_MESH), link("a", PART_MESH), joint("j", "palm", "a"))
+BOMB_DAE = dae(SCENE.replace("<library_nodes>", f"<library_nodes>{BOMB}").replace("#part", "#n0"))
+#: The first file is the description; what the refusal says.
+HANDS: list[tuple[dict[str, bytes], str]] = [
+    ({"runs.xacro": XACRO.format("""<a b="${__import__('os').system('touch ran')}"/>""").encode()}, "__import__"),
+    ({"reads.xacro": XACRO.format('<xacro:include filename="/etc/passwd"/>').encode()}, "outside the hand's folder"),
+    ({"includes.xml": INCLUDES}, "outside the hand's folder"),
+    ({"bomb.urdf": PARTS, "part.dae": BOMB_DAE}, "too deep"),
+]
 
 
 @pytest.mark.parametrize(("kind", "report_of"), [("urdf", report_hand), ("mesh", report_object)])
-def test_every_bad_file_gets_a_verdict_that_names_the_defect(shared_data: Path, kind: str, report_of: Any) -> None:
+def test_every_bad_file_gets_a_verdict_that_names_the_defect(shared_data, kind: str, report_of) -> None:
     entries = [entry for entry in bad_files(shared_data) if entry["kind"].startswith(kind)]
     assert len(entries) >= 20
     found = [(entry, report_of(str(shared_data / "bad" / entry["file"]))) for entry in entries]
     assert not [(entry, told["verdict"], told["message"]) for entry, told in found if not is_expected(told, entry)]
 
 
-def test_mesh_behind_symbolic_link_out_of_the_folder_is_not_read(tmp_path: Path) -> None:
+def test_mesh_behind_symbolic_link_out_of_the_folder_is_not_read(tmp_path) -> None:
     outside = tmp_path / "outside.stl"
     outside.write_bytes(b"secret")
     folder = tmp_path / "hand"
@@ -63,9 +96,6 @@ def test_a_path_of_nothing_is_refused_with_the_names_there_are() -> None:
     assert report_hand("alegro")["message"].endswith("; did you mean allegro?")
     found = report_hand("no_such_hand")
     assert found["verdict"] == "refuse" and "allegro" in found["message"]
-
-
-LIMIT, MIMIC = '<limit lower="0" upper="0.04"/>', '<mimic joint="jl" multiplier="-1"/>'
 
 
 def jaws(follower: str = LIMIT, drive: str = LIMIT, *more: str) -> bytes:
@@ -108,10 +138,6 @@ def test_a_xacro_that_only_defines_macros_is_told_as_that() -> None:
     assert "expands to no link at all: it only defines macros" in message and "cycle" not in message
 
 
-#: The claw without its mesh.
-PLAIN_CLAW = re.sub('<geom type="mesh" [^>]*/>|<mesh name="tip"[^>]*/>', "", CLAW)
-
-
 def changed(text: str, changes: dict[str, str]) -> bytes:
     for old, new in changes.items():
         assert old in text
@@ -131,15 +157,6 @@ def test_a_loop_that_is_not_solved_is_told_as_that(old: str, new: str, told: str
     assert told in check_hand({"h.xml": FOUR_BAR.replace(old, new).encode()}, "h")["message"]
 
 
-_THUMB = '<position joint="thumb" kp="5"/>'
-_SITES = '<site name="a"/><body name="thumb" pos="-0.02 0 0.01"><site name="b" pos="0 0 0.03"/>'
-_CORD = '<tendon><spatial name="cord"><site site="a"/><site site="b"/></spatial></tendon><actuator>'
-_PULL = {'<body name="thumb" pos="-0.02 0 0.01">': _SITES, _THUMB: '<motor name="pull" tendon="cord"/>'}
-_GLUE = '<equality><weld name="glue" body1="thumb" body2="base"/>'
-_TURNED = 'euler="10 20 30">'
-_AGAIN = '<equality><joint joint1="left_spread" joint2="right_curl" polycoef="0.2 -2 0 0 0"/>'
-
-
 @pytest.mark.parametrize(
     ("text", "changes", "told"),
     [
@@ -155,13 +172,6 @@ def test_what_is_passed_over_in_a_model_is_told(text: str, changes: dict[str, st
     found = check_hand({"h.xml": changed(text, changes)}, "h")
     assert found["verdict"] == "accept" and any(told in note for note in found["facts"]["notes"])
     assert not any(told in note for note in check_hand({"h.xml": text.encode()}, "h")["facts"]["notes"])
-
-
-_WRIST = '<joint name="wrist" axis="0 1 0" range="-30 30"/>'
-_LEG = (
-    '<body name="leg"><geom type="sphere" size="0.05"/><body name="knee"><joint name="knee" axis="0 1 0"/>'
-    '<geom fromto="0 0 0 0 0 0.3" size="0.01"/></body></body><body name="mount"'
-)
 
 
 @pytest.mark.parametrize("root", [None, "palm"])
@@ -201,13 +211,8 @@ def test_a_joint_above_a_named_root_does_not_matter_and_is_told(fault: str) -> N
 WITHOUT_MIMIC = jaws().replace(MIMIC.encode(), b"")
 
 
-def coupled(multiplier: float) -> dict[str, Any]:
+def coupled(multiplier: float) -> dict:
     return {"couplings": {"jr": {"of": "jl", "multiplier": multiplier}}}
-
-
-EMPTY = '<limit lower="0" upper="0"/>'
-_ARM = link("world", "") + joint("arm", "world", "base")
-_FREE = '<link name="ball"/><joint name="loose" type="floating"><parent link="base"/><child link="ball"/></joint>'
 
 
 @pytest.mark.parametrize(
@@ -227,7 +232,7 @@ _FREE = '<link name="ball"/><joint name="loose" type="floating"><parent link="ba
         (jaws(LIMIT, LIMIT, _FREE), {}, "joint 'loose': type 'floating' cannot be used"),
     ],
 )
-def test_what_is_wrong_with_a_urdf_is_told_by_name(data: bytes, options: dict[str, Any], told: str) -> None:
+def test_what_is_wrong_with_a_urdf_is_told_by_name(data: bytes, options: dict, told: str) -> None:
     assert told in report(data, **options)["message"]
 
 
@@ -237,20 +242,6 @@ def test_a_flat_mesh_is_told_with_its_link() -> None:
     data = jaws().replace(b'<link name="left">', mesh.encode())
     files = {"h.urdf": data, "pad.stl": bytes(flat.export(file_type="stl"))}
     assert "collision mesh 'pad.stl' of link 'left': " in check_hand(files, "h")["message"]
-
-
-XACRO = '<robot name="x" xmlns:xacro="http://www.ros.org/wiki/xacro">{}</robot>'
-INCLUDES = CLAW.replace('<light pos="0 0 1"/>', '<include file="/etc/passwd"/>').encode()
-PART_MESH = '<collision><geometry><mesh filename="part.dae"/></geometry></collision>'
-PARTS = robot(link("palm", PART_MESH), link("a", PART_MESH), joint("j", "palm", "a"))
-BOMB_DAE = dae(SCENE.replace("<library_nodes>", f"<library_nodes>{BOMB}").replace("#part", "#n0"))
-#: The first file is the description; what the refusal says.
-HANDS: list[tuple[dict[str, bytes], str]] = [
-    ({"runs.xacro": XACRO.format("""<a b="${__import__('os').system('touch ran')}"/>""").encode()}, "__import__"),
-    ({"reads.xacro": XACRO.format('<xacro:include filename="/etc/passwd"/>').encode()}, "outside the hand's folder"),
-    ({"includes.xml": INCLUDES}, "outside the hand's folder"),
-    ({"bomb.urdf": PARTS, "part.dae": BOMB_DAE}, "too deep"),
-]
 
 
 @pytest.mark.parametrize(("files", "says"), HANDS, ids=[next(iter(files)) for files, _ in HANDS])
@@ -264,15 +255,9 @@ def test_a_bad_hand_is_refused_in_one_line_here_and_as_an_upload(files, says: st
     assert told.exit_code == 2 and told.stdout == ""
     (line,) = told.stderr.splitlines()
     assert line.startswith("graspd: refused: ") and says in line and len(line) < 400
-
     found = upload(open_store("memory://"), AssetKind.HAND, "hand.zip", zipped(files))
     assert found["verdict"] == "refuse" and says in found["message"] and "\n" not in found["message"]
     assert "root:" not in line + found["message"] and set(files) == {path.name for path in folder.iterdir()}
-
-
-SOURCE = builtin_files(AssetKind.HAND, "barrett")
-WORDS = [b"nan", b"-1e308", b"inf", b"0", b"", b"<", b'"', b"&x;", b"../../", b"palm", b"finger_1_medial", b"\xff\xfe"]
-URDFS, ASSETS = (damaged(SOURCE[name], WORDS) for name in ("barrett.urdf", "asset.json"))
 
 
 def answers(urdf: bytes, asset: bytes) -> None:

@@ -15,6 +15,13 @@ from tests.worker.hands.urdfs import joint, link, load, report, robot
 
 _PALM = '<collision><geometry><box size="0.09 0.02 0.09"/></geometry></collision>'
 _PHALANX = '<collision><origin xyz="0 0 0.02"/><geometry><box size="0.014 0.014 0.04"/></geometry></collision>'
+RADIUS = 0.045
+_PLATE_SHAPE = '<geometry><box size="0.16 0.1 0.02"/></geometry>'
+#: Axis, and angle [rad].
+TURNS = {"upright": ((1, 0, 0), 0), "on its side": ((1, 0, 0), np.pi / 2), "upside down": ((0, 1, 0), np.pi)}
+TURNS |= {"tilted": ((0.6, 0.8, 0), 0.5)}
+TURNS |= {f"{angle} degrees": (np.array([1, 2, 3]) / np.sqrt(14), np.deg2rad(angle)) for angle in (7, 20, 35, 100)}
+TURNS = {name: quat_from_axis_angle(np.array(axis, float), np.asarray(angle)) for name, (axis, angle) in TURNS.items()}
 
 
 def limit(lower: float, upper: float) -> str:
@@ -50,8 +57,7 @@ def opposing_thumb(bends: str) -> list[str]:
 
 
 def hand_of(text: bytes, **options: object) -> HandModel:
-    said = {"approach": [0, 1, 0], **options}
-    return load(text, **said)
+    return load(text, **{"approach": [0, 1, 0], **options})
 
 
 def closing_of(hand: HandModel) -> dict[str, int]:
@@ -94,10 +100,6 @@ def test_a_wrist_that_stands_ahead_of_the_palm_is_not_the_palm() -> None:
     assert hand.palm.centre[0] == pytest.approx(0.005) and 0.05 < hand.palm.centre[2] < 0.1
 
 
-RADIUS = 0.045
-_PLATE_SHAPE = '<geometry><box size="0.16 0.1 0.02"/></geometry>'
-
-
 def rpy(matrix: Floats) -> str:
     pitch = np.arcsin(-np.clip(matrix[2, 0], -1, 1))
     return f"{np.arctan2(matrix[2, 1], matrix[2, 2]):.17g} {pitch:.17g} {np.arctan2(matrix[1, 0], matrix[0, 0]):.17g}"
@@ -132,13 +134,6 @@ def _bar(length: float) -> str:
     return f'<collision>{place}<geometry><box size="0.016 0.018 {length}"/></geometry></collision>'
 
 
-#: Axis, and angle [rad].
-TURNS = {"upright": ((1, 0, 0), 0), "on its side": ((1, 0, 0), np.pi / 2), "upside down": ((0, 1, 0), np.pi)}
-TURNS |= {"tilted": ((0.6, 0.8, 0), 0.5)}
-TURNS |= {f"{angle} degrees": (np.array([1, 2, 3]) / np.sqrt(14), np.deg2rad(angle)) for angle in (7, 20, 35, 100)}
-TURNS = {name: quat_from_axis_angle(np.array(axis, float), np.asarray(angle)) for name, (axis, angle) in TURNS.items()}
-
-
 @pytest.mark.parametrize("fingers", [2, 3, 4, 5, 6])
 @pytest.mark.parametrize("turn", TURNS)
 def test_the_palm_faces_along_the_fingers_and_all_of_them_close(fingers: int, turn: str) -> None:
@@ -154,8 +149,7 @@ def test_the_palm_faces_along_the_fingers_and_all_of_them_close(fingers: int, tu
 def test_fingers_that_meet_at_zero_close_to_it_unless_stated() -> None:
     outwards = claw(3, TURNS["upright"], lower=0.0).replace(b'axis xyz="0 -1 0"', b'axis xyz="0 1 0"')
     hand = load(outwards, approach=[0, 0, 1])
-    assert hand.closing.tolist() == [-1, -1, -1]
-    assert hand.preshape == pytest.approx(0.75 * hand.upper)
+    assert hand.closing.tolist() == [-1, -1, -1] and hand.preshape == pytest.approx(0.75 * hand.upper)
     assert load(outwards, approach=[0, 0, 1], closing={"ja0": 1}).closing.tolist() == [1, -1, -1]
 
 
@@ -192,8 +186,7 @@ def test_rounding_turns_neither_palm_nor_jaws_nor_closing() -> None:
         np.testing.assert_allclose(load(claw(3, TURNS["upright"], noise=noise)).palm.approach, [0, 0, 1], atol=1e-9)
     for noise in (1e-17, -1e-17):
         line = np.array([noise, 1.0, -noise])
-        assert sign_of(line) == 1 and sign_of(-line) == -1
-        assert sign_of(np.array([1.0, -1.0 - noise, 0])) == 1
+        assert sign_of(line) == 1 and sign_of(-line) == -1 and sign_of(np.array([1.0, -1.0 - noise, 0])) == 1
     for lower in ("-0.7", "-0.7000001", "-0.6999999"):
         assert (load(claw(3, TURNS["upright"]).replace(b'"-0.4"', f'"{lower}"'.encode())).closing == 1).all()
 

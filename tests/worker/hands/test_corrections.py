@@ -1,7 +1,6 @@
 """What is corrected in the browser is what the command line says and writes: the same hand comes of it."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,8 +11,7 @@ from graspd.worker.hands.load import hand_from_path, load_hand
 from graspd.worker.hands.model import HandModel
 from graspd.worker.stages.models import hand_glb
 from tests.worker.commands_run import graspd
-from tests.worker.hands.grippers import gripper
-from tests.worker.hands.urdfs import BOX, joint, link, robot
+from tests.worker.hands.urdfs import BOX, gripper, joint, link, robot
 
 CLAW = robot(
     link("palm", BOX),
@@ -47,13 +45,11 @@ def same(one: HandModel, other: HandModel, *, palm: bool) -> bool:
         ({"palm": {"link": "mount"}}, ["--palm", "mount"], True),
     ],
 )
-def test_corrections_and_options_make_the_same_hand(said, options, palm: bool, tmp_path: Path) -> None:
+def test_corrections_and_options_make_the_same_hand(said, options, palm: bool, tmp_path) -> None:
     (tmp_path / "claw.urdf").write_bytes(CLAW)
-    guessed = hand_from_path(tmp_path / "claw.urdf")
-    facts = facts_of(hand_glb(guessed))
+    facts = facts_of(hand_glb(hand_from_path(tmp_path / "claw.urdf")))
     there = corrected({"file": "claw.urdf"}, facts, HandCorrections.model_validate(said))
     named = load_hand({"claw.urdf": CLAW, "asset.json": json.dumps(there).encode()}, name="claw", digest="")
-
     written = tmp_path / "asset.json"
     graspd("hands check --no-self-test --write", written, tmp_path / "claw.urdf", *options)
     here = hand_from_path(tmp_path / "claw.urdf")

@@ -6,7 +6,6 @@ import subprocess
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import pytest
 import trimesh
@@ -22,9 +21,9 @@ from graspd.worker.hands.check import check_hand
 from graspd.worker.hands.load import files_from_path, hand_from_path
 from graspd.worker.hands.xacro import expand
 from graspd.worker.stages.assets import load_hand_files
+from tests.api.factories import zipped
 from tests.worker.hands.mjcfs import CLAW
 from tests.worker.hands.urdfs import joint, link, robot
-from tests.worker.stages.test_ingest import zipped
 
 NOTES = {
     "urdf": "leap.urdf",
@@ -32,6 +31,39 @@ NOTES = {
     "palm_normal_in_palm_link": [0, 0, -1],
     "fingertips": {"one": "b"},
     "physical": {"torque_limit_Nm_measured": 0.95},
+}
+PAD = bytes(trimesh.creation.box((0.01, 0.02, 0.06)).export(file_type="stl"))
+POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:12\nsize 5\n"
+INCLUDES = b'<robot xmlns:xacro="u"><xacro:include filename="a.xacro"/></robot>'
+DECLARED = '<?xml version="1.0" encoding="{}"?>'
+MACROS = """<?xml version="1.0"?>
+<robot name="claw" xmlns:xacro="http://www.ros.org/wiki/xacro">
+  <xacro:arg name="stroke" default="0.04"/>
+  <xacro:property name="size" value="${xacro.load_yaml('$(find claw_description)/config/size.yaml')}"/>
+  <xacro:include filename="$(find claw_description)/urdf/parts.xacro"/>
+  <link name="palm"><collision><geometry><box size="0.1 0.04 0.04"/></geometry></collision></link>
+  <xacro:finger name="left" side="1"><origin xyz="0.045 0 0.02"/></xacro:finger>
+  <xacro:finger name="right" side="-1"><origin xyz="${-0.09 / 2} 0 0.02"/></xacro:finger>
+</robot>
+"""
+PARTS = """<robot xmlns:xacro="http://www.ros.org/wiki/xacro">
+  <xacro:macro name="finger" params="name side *pose">
+    <link name="${name}">
+      <collision><origin xyz="0 0 0.03"/>
+        <geometry><box size="0.01 ${size['width']} ${[0.06 for i in range(1)][0]}"/></geometry></collision>
+    </link>
+    <joint name="${name}_joint" type="prismatic">
+      <parent link="palm"/><child link="${name}"/><xacro:insert_block name="pose"/>
+      <axis xyz="${-side} 0 0"/><limit lower="0" upper="$(arg stroke)" effort="20" velocity="0.1"/>
+    </joint>
+  </xacro:macro>
+</robot>
+"""
+FILES = {
+    "package.xml": b"<package><name>claw_description</name></package>",
+    "urdf/claw.urdf.xacro": MACROS.encode(),
+    "urdf/parts.xacro": PARTS.encode(),
+    "config/size.yaml": b"width: 0.02\n",
 }
 
 
@@ -48,13 +80,13 @@ def urdf(tmp_path: Path) -> Path:
     return folder / "leap.urdf"
 
 
-def facts(report: dict[str, Any]) -> tuple[str, list[float], list[str], list[float]]:
+def facts(report: dict) -> tuple[str, list[float], list[str], list[float]]:
     assert report["verdict"] == "accept", report["message"]
     said = report["facts"]
     return said["root"], said["palm_approach"], said["fingertips"], list(said["effort"].values())
 
 
-def added(path: Path) -> dict[str, Any]:
+def added(path: Path) -> dict:
     """The report of the files that the service gets from `hands add`."""
     with upload_of(path) as (upload, main):
         said = json.dumps({"file": main}) if main else ""
@@ -143,12 +175,6 @@ def test_nothing_out_of_package_or_above_a_plain_folder_is_read(tmp_path: Path) 
     assert report_hand(str(tmp_path / "hand"))["verdict"] == "accept"
 
 
-PAD = bytes(trimesh.creation.box((0.01, 0.02, 0.06)).export(file_type="stl"))
-POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:12\nsize 5\n"
-INCLUDES = b'<robot xmlns:xacro="u"><xacro:include filename="a.xacro"/></robot>'
-DECLARED = '<?xml version="1.0" encoding="{}"?>'
-
-
 def claw(mesh: str = "") -> str:
     """Two fingers that bend towards each other; the left one touches with a mesh as well."""
     box = '<collision><geometry><box size="0.08 0.04 0.02"/></geometry></collision>'
@@ -173,7 +199,7 @@ def verdicts(files: Mapping[str, bytes], main: str, folder: Path) -> list[str]:
         uploaded = check_hand(files_of_upload(AssetKind.HAND, "h.zip", packed, limit_bytes=1 << 22), "h")
     except InputError as error:
         uploaded = {"verdict": "refuse", "message": str(error)}
-    found: list[dict[str, Any]] = [report_hand(str(folder / main)), report_hand(str(folder)), uploaded]
+    found: list[dict] = [report_hand(str(folder / main)), report_hand(str(folder)), uploaded]
     return ["accept" if one["verdict"] == "accept" else one["message"] for one in found]
 
 
@@ -217,8 +243,7 @@ def test_a_urdf_that_is_none_is_told_why(data: bytes, told: str) -> None:
 def test_macros_are_found_in_any_encoding(coding: str, name: str, tmp_path: Path) -> None:
     text = claw("meshes/pad.stl").replace("<robot", '<robot xmlns:xacro="http://www.ros.org/wiki/xacro"', 1)
     text = DECLARED.format("UTF-16") + text.replace('"0.08 0.04 0.02"', '"${2 * 0.04} 0.04 0.02"')
-    files = {name: text.encode(coding), "meshes/pad.stl": PAD}
-    assert verdicts(files, name, tmp_path) == ["accept"] * 3
+    assert verdicts({name: text.encode(coding), "meshes/pad.stl": PAD}, name, tmp_path) == ["accept"] * 3
 
 
 @pytest.mark.parametrize(
@@ -246,8 +271,7 @@ def test_a_mesh_is_found_however_it_is_written(written: str, there: str, tmp_pat
 @pytest.mark.parametrize("written", ["../{}", "package://any/../../{}", "/{}", "file:///../{}", "%2e%2e/{}", "C:\\{}"])
 def test_a_mesh_outside_the_folder_is_read_by_no_spelling(written: str, tmp_path: Path) -> None:
     (tmp_path / "secret.stl").write_bytes(PAD)
-    files = {"h.urdf": claw(written.format("secret.stl")).encode()}
-    found = verdicts(files, "h.urdf", tmp_path / "h")
+    found = verdicts({"h.urdf": claw(written.format("secret.stl")).encode()}, "h.urdf", tmp_path / "h")
     assert all("outside" in one or "not there" in one for one in found)
 
 
@@ -277,37 +301,6 @@ def test_a_part_of_a_xacro_file_is_not_taken_for_the_hand(tmp_path: Path) -> Non
 def test_a_pointer_among_the_files_of_a_hand_is_told(files: dict[str, bytes], pointer: str, tmp_path: Path) -> None:
     for told in verdicts(files, next(iter(files)), tmp_path):
         assert f"{pointer} is a Git LFS pointer, not the file itself: git lfs pull" in told
-
-
-MACROS = """<?xml version="1.0"?>
-<robot name="claw" xmlns:xacro="http://www.ros.org/wiki/xacro">
-  <xacro:arg name="stroke" default="0.04"/>
-  <xacro:property name="size" value="${xacro.load_yaml('$(find claw_description)/config/size.yaml')}"/>
-  <xacro:include filename="$(find claw_description)/urdf/parts.xacro"/>
-  <link name="palm"><collision><geometry><box size="0.1 0.04 0.04"/></geometry></collision></link>
-  <xacro:finger name="left" side="1"><origin xyz="0.045 0 0.02"/></xacro:finger>
-  <xacro:finger name="right" side="-1"><origin xyz="${-0.09 / 2} 0 0.02"/></xacro:finger>
-</robot>
-"""
-PARTS = """<robot xmlns:xacro="http://www.ros.org/wiki/xacro">
-  <xacro:macro name="finger" params="name side *pose">
-    <link name="${name}">
-      <collision><origin xyz="0 0 0.03"/>
-        <geometry><box size="0.01 ${size['width']} ${[0.06 for i in range(1)][0]}"/></geometry></collision>
-    </link>
-    <joint name="${name}_joint" type="prismatic">
-      <parent link="palm"/><child link="${name}"/><xacro:insert_block name="pose"/>
-      <axis xyz="${-side} 0 0"/><limit lower="0" upper="$(arg stroke)" effort="20" velocity="0.1"/>
-    </joint>
-  </xacro:macro>
-</robot>
-"""
-FILES = {
-    "package.xml": b"<package><name>claw_description</name></package>",
-    "urdf/claw.urdf.xacro": MACROS.encode(),
-    "urdf/parts.xacro": PARTS.encode(),
-    "config/size.yaml": b"width: 0.02\n",
-}
 
 
 @pytest.fixture

@@ -2,8 +2,6 @@
 
 import re
 from dataclasses import dataclass, field, fields, make_dataclass
-from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -24,6 +22,7 @@ from tests.worker.hands.mjcfs import CLAW, FOUR_BAR, TENDON_CLAW
 #: Both sides compute in float64; what is left is rounding over a chain of a dozen rotations [m, and entries of R].
 FK_TOLERANCE = 1e-6
 POSTURES = 200
+FINGERS = ("FF", "MF", "RF", "LF")
 
 
 def tip() -> bytes:
@@ -35,7 +34,7 @@ def load(text: str = CLAW, **options: object) -> HandModel:
     return load_hand(files, name="claw", digest="0" * 32, options=options)
 
 
-def report_of(text: str = CLAW, **others: bytes) -> dict[str, Any]:
+def report_of(text: str = CLAW, **others: bytes) -> dict:
     return check_hand({"h.xml": text.encode(), "meshes/tip.stl": tip(), **others}, "h")
 
 
@@ -89,8 +88,7 @@ def test_joints_on_tendons_and_servos_go_as_far_as_limits_let() -> None:
     assert hand.dof_names == ("left", "right")
     q = dict(zip(hand.joint_names, hand.expand(np.array([0.6, 0.4])), strict=True))
     # left - 2 left_end keeps its length; the right end would have to bend to -0.4, and its range begins at 0.
-    assert q["left_end"] == pytest.approx(0.3)
-    assert "right_end" not in q and "right_tip" not in q
+    assert q["left_end"] == pytest.approx(0.3) and "right_end" not in q and "right_tip" not in q
     # 20 (u - q) with u to 0.7; and 0.2 u - 20 q with u to 70. The joints alone would go to 1.4.
     assert hand.upper.tolist() == pytest.approx([0.7, 0.7])
 
@@ -168,7 +166,7 @@ def test_bad_model_is_refused_in_one_line_that_names_the_defect(text: str, named
     assert "\n" not in report["message"] and len(report["message"]) < 400
 
 
-def test_nothing_but_the_upload_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_but_the_upload_is_read(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
     # MuJoCo would find these on the disk: the reader must not let it look.
     monkeypatch.chdir(tmp_path)
     (tmp_path / "meshes").mkdir()
@@ -179,7 +177,7 @@ def test_nothing_but_the_upload_is_read(tmp_path: Path, monkeypatch: pytest.Monk
             load(text)
 
 
-def test_a_model_brings_what_it_includes_and_reads_nothing_else(tmp_path: Path) -> None:
+def test_a_model_brings_what_it_includes_and_reads_nothing_else(tmp_path) -> None:
     (tmp_path / "meshes").mkdir()
     (tmp_path / "meshes" / "tip.stl").write_bytes(tip())
     (tmp_path / "meshes" / "other.stl").write_bytes(tip())
@@ -193,9 +191,6 @@ def test_a_model_brings_what_it_includes_and_reads_nothing_else(tmp_path: Path) 
     text = with_inside('<include file="parts/extra.xml"/>')
     text = text.replace('file="tip.stl"', 'file="Tip.STL"')
     assert report_of(text, **{"parts/extra.xml": part})["verdict"] == "accept"
-
-
-FINGERS = ("FF", "MF", "RF", "LF")
 
 
 def pulls(hand: HandModel) -> dict[str, dict[str, float]]:
@@ -221,8 +216,7 @@ def test_a_command_of_torques_pulls_jaws_keep_their_ratio() -> None:
     assert tendon.gain(stiffness) * length[0] == pytest.approx(pull)
     text = re.sub('<joint joint="left_curl" coef="0.5"/>', '<joint joint="right_slide" coef="0.5"/>', CLAW)
     hand = load(re.sub('<position joint="right_slide"[^>]*>', "", text))
-    assert not hand.tendons
-    assert "right_slide" not in hand.dof_names
+    assert not hand.tendons and "right_slide" not in hand.dof_names
 
 
 def test_asset_json_puts_joints_on_a_tendon_and_takes_it_away() -> None:
@@ -243,7 +237,7 @@ def test_asset_json_puts_joints_on_a_tendon_and_takes_it_away() -> None:
         ({"t": {"left_bend": 1, "left_curl": 1}, "u": {"left_curl": 1, "left_spread": 1}}, "'left_curl' is on two"),
     ],
 )
-def test_a_tendon_that_cannot_be_is_refused_in_one_line(tendons: dict[str, Any], says: str) -> None:
+def test_a_tendon_that_cannot_be_is_refused_in_one_line(tendons: dict, says: str) -> None:
     with pytest.raises(HandError, match=says) as error:
         load(tendons=tendons)
     assert "\n" not in str(error.value)
@@ -260,7 +254,7 @@ def test_what_a_hand_does_not_have_does_not_change_its_content() -> None:
     assert {f.name for f in fields(HandModel) if "told_if_set" in f.metadata} == {"tendons", "drag", "mounting"}
 
 
-def test_a_shadow_urdf_has_the_tendons_that_urdf_cannot_say(shared_data: Path) -> None:
+def test_a_shadow_urdf_has_the_tendons_that_urdf_cannot_say(shared_data) -> None:
     path = shared_data / "hands/shadow/shadow_hand_right.urdf"
     hand = hand_from_path(path)
     assert pulls(hand) == {f"{f}J0": {f"{f}J2": 1.0, f"{f}J1": 1.0} for f in FINGERS}

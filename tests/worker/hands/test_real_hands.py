@@ -1,23 +1,27 @@
-"""The four reference hands: kinematics against yourdfpy, and each quirk that their notes name; the built-in hands."""
+"""The four reference hands: kinematics against yourdfpy, and each quirk that their notes name; the built-in hands; two
+models of one hand: joints by name, bases by fit, fingertips as the validator.
+"""
 
+import dataclasses
 import functools
 import json
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import yourdfpy
 
+from graspd.exchange.bench_hand import write_hand
+from graspd.service.model.errors import InputError
 from graspd.service.model.states import AssetKind
-from graspd.service.model.transforms import IDENTITY_POSE, compose, invert, pose_to_matrix
+from graspd.service.model.transforms import IDENTITY_POSE, compose, invert, pose_to_matrix, quat_from_axis_angle
 from graspd.service.store.assets import builtin_asset, builtin_names
 from graspd.worker.hands.check import check_hand
 from graspd.worker.hands.collisions import touching_bodies
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import files_from_path, hand_from_path, load_hand
 from graspd.worker.hands.model import HandModel
+from graspd.worker.hands.same_hand import same_hand
 from graspd.worker.hands.surface import piece_distance
 
 #: Description, root and direction out of the palm.
@@ -29,14 +33,31 @@ HANDS = {
 }
 #: Both sides compute in float64; link chains are a handful of rotations long.
 FRAME_TOLERANCE = 1e-9
+ALLEGRO = [f"{f}_{j}" for f in ("index", "middle", "ring") for j in ("abduction", "proximal", "middle", "distal")]
+ALLEGRO += ["thumb_rotation", "thumb_proximal", "thumb_middle", "thumb_distal"]
+HAND = hand_from_path("shadow")
+#: Where the other model's root link is, as seen from ours.
+BASE = np.concatenate([[0.013, -0.02, 0.034], quat_from_axis_angle(np.array([0.6, 0.0, 0.8]), np.array(2.0))])
+_PARTS = {"spread": "prox", "medial": "med", "distal": "dist"}
+#: The maker's file and names of our joints; the tolerance [m]. The facts are written with 4 to 6 decimals; the maker's
+#: fingers of the Barrett hand differ by 0.41 mm among each other, and ours are all alike.
+MAKERS = {
+    "allegro": ("allegro/allegro_hand_right.urdf", lambda joint: f"joint_{ALLEGRO.index(joint)}.0", 2e-5),
+    "barrett": (
+        "barrett/bhand_model.urdf",
+        lambda joint: f"{joint.rpartition('_')[0]}_{_PARTS[joint.rpartition('_')[2]]}_joint",
+        0.5e-3,
+    ),
+    "shadow": ("shadow/shadow_hand_right.urdf", str, 2e-5),
+}
 
 
 @pytest.fixture(scope="module")
-def hands(shared_data: Path) -> Callable[..., HandModel]:
+def hands(shared_data: Path):
     return functools.cache(lambda name: hand_from_path(shared_data / "hands" / HANDS[name][0]))
 
 
-def bare_files(shared_data: Path, name: str) -> tuple[dict[str, bytes], dict[str, Any]]:
+def bare_files(shared_data: Path, name: str) -> tuple[dict[str, bytes], dict]:
     """The files of a hand without the notes beside them, and these."""
     _, files, _ = files_from_path(shared_data / "hands" / HANDS[name][0])
     return files, json.loads(files.pop("hand.json"))
@@ -47,7 +68,7 @@ def bare(shared_data: Path, name: str, **options: object) -> HandModel:
 
 
 @pytest.mark.parametrize("name", HANDS)
-def test_forward_kinematics_agrees_with_yourdfpy(name: str, hands: Callable[..., HandModel], shared_data: Path) -> None:
+def test_forward_kinematics_agrees_with_yourdfpy(name: str, hands, shared_data: Path) -> None:
     hand, path = hands(name), shared_data / "hands" / HANDS[name][0]
     oracle = yourdfpy.URDF.load(str(path), load_meshes=False, build_scene_graph=True)
     rng = np.random.default_rng(7)
@@ -63,7 +84,7 @@ def test_forward_kinematics_agrees_with_yourdfpy(name: str, hands: Callable[...,
 
 
 @pytest.mark.parametrize("name", HANDS)
-def test_every_real_hand_has_surface_palm_and_closes_to_a_point(name: str, hands: Callable[..., HandModel]) -> None:
+def test_every_real_hand_has_surface_palm_and_closes_to_a_point(name: str, hands) -> None:
     hand = hands(name)
     assert np.linalg.norm(hand.palm.approach) == pytest.approx(1.0)
     assert (hand.lower < hand.upper).all() and (hand.effort > 0).all() and (hand.masses > 0).all()
@@ -86,7 +107,7 @@ def test_every_real_hand_is_accepted_and_guessed_from_its_urdf_alone(name: str, 
     assert len(facts["dofs"]) == said["dof"] - (2 if name == "shadow" else 0)
 
 
-def test_allegros_masses_efforts_and_limits_without_zero(hands: Callable[..., HandModel], shared_data: Path) -> None:
+def test_allegros_masses_efforts_and_limits_without_zero(hands, shared_data: Path) -> None:
     hand, said = hands("allegro"), bare_files(shared_data, "allegro")[1]
     assert said["inertial_missing"] == ["palm", "wrist"]
     assert hand.masses.sum() == pytest.approx(said["total_mass_kg"], abs=2e-3) and (hand.masses > 0).all()
@@ -124,10 +145,6 @@ def test_on_its_forearm_a_palm_faces_where_its_fingers_close(shared_data: Path) 
     assert [hand.closing[hand.dof_names.index(name)] for name in ("WRJ1", "WRJ2", "FFJ3")] == [0, 0, 1]
 
 
-ALLEGRO = [f"{f}_{j}" for f in ("index", "middle", "ring") for j in ("abduction", "proximal", "middle", "distal")]
-ALLEGRO += ["thumb_rotation", "thumb_proximal", "thumb_middle", "thumb_distal"]
-
-
 @pytest.mark.parametrize("name", builtin_names(AssetKind.HAND))
 def test_fingers_stand_out_from_the_palm_and_do_not_touch(name: str) -> None:
     hand = hand_from_path(name)
@@ -149,20 +166,6 @@ def frames_of(name: str | Path, joints: dict[str, float]) -> dict[str, np.ndarra
     return {joint: poses[body] for joint, body in zip(hand.joint_names, hand.joint_body, strict=True)}
 
 
-_PARTS = {"spread": "prox", "medial": "med", "distal": "dist"}
-#: The maker's file and names of our joints; the tolerance [m]. The facts are written with 4 to 6 decimals; the maker's
-#: fingers of the Barrett hand differ by 0.41 mm among each other, and ours are all alike.
-MAKERS = {
-    "allegro": ("allegro/allegro_hand_right.urdf", lambda joint: f"joint_{ALLEGRO.index(joint)}.0", 2e-5),
-    "barrett": (
-        "barrett/bhand_model.urdf",
-        lambda joint: f"{joint.rpartition('_')[0]}_{_PARTS[joint.rpartition('_')[2]]}_joint",
-        0.5e-3,
-    ),
-    "shadow": ("shadow/shadow_hand_right.urdf", str, 2e-5),
-}
-
-
 @pytest.mark.parametrize("name", MAKERS)
 def test_frames_of_built_in_hands_are_those_of_the_maker(name: str, shared_data: Path) -> None:
     file, theirs, tolerance = MAKERS[name]
@@ -175,3 +178,58 @@ def test_frames_of_built_in_hands_are_those_of_the_maker(name: str, shared_data:
         assert np.linalg.norm(difference[:3]) < 2 * tolerance, joint
         # Fixed angles are given as -0.785398 and the like.
         assert abs(difference[3]) == pytest.approx(1, abs=1e-9), joint
+
+
+def other_base(hand: HandModel) -> HandModel:
+    """The same hand with another frame on its root: what hangs on it, and its shapes, are told in that frame."""
+    moved = invert(BASE)
+    origin = hand.origin.copy()
+    hangs = np.flatnonzero(hand.parent == 0)
+    origin[hangs] = compose(moved, origin[hangs])
+    return dataclasses.replace(hand, name="other", origin=origin)
+
+
+def named(hand: HandModel, names: list[str]) -> HandModel:
+    return dataclasses.replace(hand, joint_names=tuple(names))
+
+
+def test_another_base_is_found_another_hand_is_refused() -> None:
+    found = same_hand(HAND, other_base(HAND))
+    # Double precision, and a least-squares fit that ends at steps of 1e-15.
+    assert found.base[:3] == pytest.approx(BASE[:3], abs=1e-8)
+    assert abs(float(found.base[3:] @ BASE[3:])) == pytest.approx(1.0, abs=1e-12)
+    assert found.fingertips_m < 1e-8
+    axis = HAND.axis.copy()
+    bend = HAND.joint_body[HAND.joint_names.index("MFJ3")]
+    axis[bend] *= -1
+    with pytest.raises(InputError, match=r"fingertip 'MF_distal' is up to \d+\.\d+ mm .* 1 mm are allowed") as error:
+        same_hand(HAND, dataclasses.replace(HAND, name="mirrored", axis=axis))
+    assert "\n" not in str(error.value)
+
+
+def test_neither_order_nor_case_nor_prefix_of_names_counts() -> None:
+    other = named(HAND, [f"robot0:{name.lower()}" for name in HAND.joint_names])
+    assert same_hand(HAND, other).joints.tolist() == list(range(len(HAND.joint_names)))
+    order = np.arange(len(HAND.joint_names))[::-1]
+    names, body = [HAND.joint_names[k] for k in order], HAND.joint_body[order]
+    other = dataclasses.replace(named(HAND, names), joint_body=body)
+    assert same_hand(HAND, other).joints.tolist() == order.tolist()
+
+
+def test_a_joint_of_another_name_is_named_and_can_be_said() -> None:
+    names = ["bend" if name == "FFJ3" else name for name in HAND.joint_names]
+    with pytest.raises(InputError, match=r"shadow has FFJ3; shadow has bend; .*--joint-map OURS=THEIRS"):
+        same_hand(HAND, named(HAND, names))
+    assert same_hand(HAND, named(HAND, names), {"FFJ3": "bend"}).fingertips_m < 1e-8
+    with pytest.raises(InputError, match="joint 'curl', which shadow does not have"):
+        same_hand(HAND, named(HAND, names), {"FFJ3": "curl"})
+
+
+def test_a_urdf_and_the_mjcf_that_is_written_of_it_are_one_hand(tmp_path) -> None:
+    back = hand_from_path(tmp_path / write_hand(HAND, "shadow", tmp_path))
+    # Twelve digits are written.
+    assert same_hand(HAND, back).fingertips_m < 1e-9
+    assert {t.coefficients for t in back.tendons} == {(1.0, 1.0)} and len(back.tendons) == 4
+    for ours, theirs in zip(HAND.tendons, back.tendons, strict=True):
+        assert theirs.gain(back.stiffness) == pytest.approx(ours.gain(HAND.stiffness))
+        assert theirs.limit(back.effort) == pytest.approx(ours.limit(HAND.effort))

@@ -1,7 +1,6 @@
 """Convex pieces, meshes that become several, and samples of their surface."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,26 +9,28 @@ from scipy.spatial import cKDTree
 
 from graspd.service.model.errors import HandError
 from graspd.service.model.transforms import IDENTITY_POSE, apply
-from graspd.worker.hands import primitives
+from graspd.worker.hands import primitives, surface
 from graspd.worker.hands.collisions import hull_distance
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path, load_hand
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.shapes import MAX_HULL_VERTICES, parts_of, reduce_hull
-from graspd.worker.hands.surface import (
-    BURIED_M,
-    COINCIDENT_M,
-    apportion,
-    farthest_points,
-    piece_distance,
-    sample_surface,
-)
+from graspd.worker.hands.surface import piece_distance, sample_surface
 from graspd.worker.objects.convex import union_volume
 from tests.worker.hands.urdfs import joint, link, load, robot
 
 SIZES = {"box": (0.1, 0.06, 0.03), "sphere": (0.04,), "cylinder": (0.02, 0.1), "capsule": (0.02, 0.1)}
 #: Chords of a circle of 32 corners lose up to 0.5 % of the radius, so volumes lose up to 2 %.
 TESSELLATION = 0.03
+BESIDE = [((0.3, 0, 0), 0.1), ((0.3, 0.3, 0), 0.1 * np.sqrt(2)), ((0.1, 0.05, 0), 0.0)]
+#: A housing with a cavity inside: nothing gets there.
+HOUSING = trimesh.creation.box((0.06, 0.06, 0.06)) + trimesh.creation.box((0.04, 0.04, 0.04))
+FILLED = [trimesh.creation.box((0.02, 0.03, 0.04)), trimesh.creation.icosphere(2, 0.02), HOUSING]
+#: Area is measured by at least 30,000 random candidates: the standard error of a share p is sqrt(p (1-p) / 30000), here
+#: below 0.3 %; four of these.
+AREA_TOLERANCE = 0.012
+ON_SURFACE_M = 1e-9
+BALL, CUBE, SLAB = '<sphere radius="0.04"/>', '<box size="0.04 0.04 0.04"/>', '<box size="0.08 0.08 0.04"/>'
 
 
 @pytest.mark.parametrize("kind", sorted(SIZES))
@@ -58,8 +59,7 @@ def test_samples_of_round_solids_are_uniform_in_area(kind: str) -> None:
 
 
 def test_a_reduced_hull_keeps_its_volume_and_stays_close() -> None:
-    rng = np.random.default_rng(3)
-    points = rng.normal(size=(800, 3))
+    points = np.random.default_rng(3).normal(size=(800, 3))
     points *= 0.012 / np.linalg.norm(points, axis=1, keepdims=True)
     vertices, faces = reduce_hull(points)
     assert len(vertices) <= MAX_HULL_VERTICES and len(faces) <= 2 * MAX_HULL_VERTICES - 4
@@ -70,9 +70,6 @@ def test_a_reduced_hull_keeps_its_volume_and_stays_close() -> None:
     outside = primitives.signed_distance("hull", (), vertices, faces, points).max()
     beyond = np.linalg.norm(vertices, axis=1).max() - 0.012
     assert outside < 0.06 * 0.012 and beyond < 0.06 * 0.012
-
-
-BESIDE = [((0.3, 0, 0), 0.1), ((0.3, 0.3, 0), 0.1 * np.sqrt(2)), ((0.1, 0.05, 0), 0.0)]
 
 
 @pytest.mark.parametrize(("offset", "expected"), BESIDE)
@@ -137,11 +134,6 @@ def test_a_fork_is_taken_apart_and_its_gap_is_empty() -> None:
     assert count > 1 and share == pytest.approx(1.0, abs=0.05)
 
 
-#: A housing with a cavity inside: nothing gets there.
-HOUSING = trimesh.creation.box((0.06, 0.06, 0.06)) + trimesh.creation.box((0.04, 0.04, 0.04))
-FILLED = [trimesh.creation.box((0.02, 0.03, 0.04)), trimesh.creation.icosphere(2, 0.02), HOUSING]
-
-
 @pytest.mark.parametrize("mesh", FILLED)
 def test_what_its_hull_shows_well_enough_stays_one_hull(mesh: trimesh.Trimesh) -> None:
     vertices = np.asarray(mesh.vertices, float)
@@ -157,16 +149,10 @@ def test_a_failed_decomposition_leaves_the_hull_and_is_not_kept(monkeypatch: pyt
     assert measured(mesh)[0] > 1
 
 
-def test_real_hands_keep_their_hulls_but_for_barretts_palm(shared_data: Path) -> None:
+def test_real_hands_keep_their_hulls_but_for_barretts_palm(shared_data) -> None:
     counts = {"allegro/allegro_hand_right.urdf": 23, "barrett_bh280/bh280.urdf": 14, "barrett/bhand_model.urdf": 33}
     for file, count in counts.items():
         assert len(hand_from_path(shared_data / "hands" / file).pieces) == count, file
-
-
-#: Area is measured by at least 30,000 random candidates: the standard error of a share p is sqrt(p (1-p) / 30000), here
-#: below 0.3 %; four of these.
-AREA_TOLERANCE = 0.012
-ON_SURFACE_M = 1e-9
 
 
 def shape(geometry: str, xyz: str = "0 0 0") -> str:
@@ -177,9 +163,6 @@ def hand_of(*palm_shapes: str, finger: str = shape('<sphere radius="0.01"/>', "0
     """A hand whose palm has the given shapes and whose only finger is a sphere far away."""
     urdf = robot(link("palm", "".join(palm_shapes)), link("a", finger), joint("j", "palm", "a"))
     return load_hand({"h.urdf": urdf}, name="h", digest="".join(palm_shapes) + finger)
-
-
-BALL, CUBE, SLAB = '<sphere radius="0.04"/>', '<box size="0.04 0.04 0.04"/>', '<box size="0.08 0.08 0.04"/>'
 
 
 def palm_area(hand: HandModel, count: int = 1500) -> float:
@@ -221,7 +204,7 @@ def test_a_point_inside_another_body_at_rest_is_dropped() -> None:
     finger = points.position[points.body == 1]
     world = apply(body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0, 1], finger)
     (palm,) = (piece for piece in hand.pieces if piece.body == 0)
-    assert len(finger) and piece_distance(palm, world).min() >= -BURIED_M
+    assert len(finger) and piece_distance(palm, world).min() >= -surface.BURIED_M
 
 
 @pytest.mark.parametrize("count", [16, 400, 2000])
@@ -237,8 +220,7 @@ def test_samples_follow_their_seed_and_are_drawn_once_pre_shape() -> None:
     points = sample_surface(hand, 300)
     assert not np.array_equal(points.position, sample_surface(hand, 300, seed=4).position)
     assert sample_surface(replace(hand, closing=-hand.closing), 300) is points
-    bent = replace(hand, preshape=0.5 * (hand.lower + hand.upper))
-    assert sample_surface(bent, 300) is not points
+    assert sample_surface(replace(hand, preshape=0.5 * (hand.lower + hand.upper)), 300) is not points
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
@@ -252,7 +234,7 @@ def test_points_lie_on_the_surface_with_outward_unit_normals(name: str) -> None:
         if not mine.any():
             continue
         nearest = np.min([piece_distance(p, points.position[mine]) for p in pieces], axis=0)
-        outside = points.position[mine] + COINCIDENT_M * points.normal[mine]
+        outside = points.position[mine] + surface.COINCIDENT_M * points.normal[mine]
         above = np.min([piece_distance(p, outside) for p in pieces], axis=0)
         assert np.abs(nearest).max() < ON_SURFACE_M
         assert (above >= 0).all()
@@ -260,8 +242,7 @@ def test_points_lie_on_the_surface_with_outward_unit_normals(name: str) -> None:
 
 def test_points_spread_more_evenly_than_random_ones() -> None:
     """Blue noise keeps the nearest neighbours apart: random points come arbitrarily close."""
-    hand = hand_of(shape('<sphere radius="0.05"/>'))
-    points = sample_surface(hand, 600)
+    points = sample_surface(hand_of(shape('<sphere radius="0.05"/>')), 600)
     mine = points.position[points.body == 0]
     gaps = cKDTree(mine).query(mine, k=2)[0][:, 1]
     spacing = np.sqrt(4 * np.pi * 0.05**2 / len(mine))
@@ -269,8 +250,7 @@ def test_points_spread_more_evenly_than_random_ones() -> None:
 
 
 def test_seats_follow_weights_and_farthest_points_are_distinct() -> None:
-    seats = apportion(np.array([3.0, 1.0, 0.0]), 8, np.array([100, 100, 100]))
+    seats = surface.apportion(np.array([3.0, 1.0, 0.0]), 8, np.array([100, 100, 100]))
     assert seats.tolist() == [6, 2, 0]
-    assert apportion(np.array([3.0, 1.0]), 8, np.array([2, 100])).tolist() == [2, 6]
-    points = np.random.default_rng(0).random((50, 3))
-    assert len(set(farthest_points(points, 50).tolist())) == 50
+    assert surface.apportion(np.array([3.0, 1.0]), 8, np.array([2, 100])).tolist() == [2, 6]
+    assert len(set(surface.farthest_points(np.random.default_rng(0).random((50, 3)), 50).tolist())) == 50

@@ -1,7 +1,6 @@
 """From URDF joints to bodies: merging, mimics, couplings; where a hand begins, behind its arm or in a whole robot."""
 
 import math
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +14,8 @@ from graspd.worker.hands.mounting import wrist_positions
 from tests.worker.hands.urdfs import chain, joint, link, load, report, robot
 
 THREE = (joint("j1", "palm", "a"), joint("j2", "a", "b"), joint("j3", "b", "c"))
+_BOX = '<collision><geometry><box size="{} {} {}"/></geometry></collision>'
+FOREARM = '<collision><origin xyz="0.01 0 0.1"/>' + _BOX.format(0.05, 0.06, 0.2)[11:]
 
 
 def test_a_fixed_joint_merges_its_links_into_one_body() -> None:
@@ -83,7 +84,7 @@ def test_roots_and_dropped_links_take_what_hangs_on_them() -> None:
         ({"fix": {"j1": 0.0, "j2": 0.0, "j3": 0.0}}, "no moving joint"),
     ],
 )
-def test_an_option_that_cannot_be_is_named(options: dict[str, Any], named: str) -> None:
+def test_an_option_that_cannot_be_is_named(options: dict, named: str) -> None:
     with pytest.raises(HandError, match=named):
         load(chain(*THREE), **options)
 
@@ -101,9 +102,6 @@ def test_a_continuous_joint_turns_and_a_prismatic_one_slides() -> None:
     hand = load(robot(link("palm"), link("a"), joint("j1", "palm", "a", kind="prismatic")))
     pose = body_poses(hand, IDENTITY_POSE, np.array([0.3]))[0, 1]
     np.testing.assert_allclose(pose[:3], [0, 0.3, 0.04], atol=1e-12)
-
-
-_BOX = '<collision><geometry><box size="{} {} {}"/></geometry></collision>'
 
 
 def bone(name: str, length: float) -> str:
@@ -171,9 +169,6 @@ def test_fingers_without_shapes_are_named_prefixes_passed_over() -> None:
     assert "a, b have no collision shapes" in report(robot(*parts))["message"]
     urdf = humanoid("right").replace(b"</robot>", b'<drake:filter name="x"><drake:member/></drake:filter></robot>')
     assert report(urdf)["verdict"] == "accept"
-
-
-FOREARM = '<collision><origin xyz="0.01 0 0.1"/>' + _BOX.format(0.05, 0.06, 0.2)[11:]
 
 
 def limits(lower: float, upper: float) -> str:

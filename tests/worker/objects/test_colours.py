@@ -3,7 +3,6 @@
 import io
 import json
 import struct
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,6 +23,63 @@ from tests.worker.objects.test_formats import pack_glb
 #: sRGB of a byte, rounded twice.
 STEP = 1.5 / 255
 PRIMARIES = np.array([[230, 20, 20], [230, 20, 20], [230, 20, 20], [230, 20, 20]], np.uint8).reshape(2, 2, 3)
+OUTSIDE = ["../../secret.png", "/etc/secret.png", "secret.stl", "..", "", "a\0.png", "file://"]
+BOMB = (
+    "".join(f'<node id="n{k}">' + f'<instance_node url="#n{k + 1}"/>' * 10 + "</node>" for k in range(12))
+    + '<node id="n12"><instance_geometry url="#g"/></node>'
+)
+#: Two triangles without a material, a square that is cut into two, and a triangle of a material that nobody describes.
+OBJ = b"""mtllib looks/part.mtl
+v 0 0 0
+v 1 0 0
+v 1 1 0
+v 0 1 0
+v 0 0 1
+f 1 2 5
+usemtl green
+f 1 2 3 4
+usemtl photo
+f 1 4 5
+usemtl unknown
+f 2 3 5
+"""
+MTL = b"newmtl green\nKd 0 1 0\nnewmtl photo\nKd 0.8 0.8 0.8\nmap_Kd -s 1 1 1 skin.png\n"
+GREEN, RED = (0.0, 1.0, 0.0), (0.902, 0.078, 0.078)
+IMAGE = '<library_images><image id="img"><init_from>{}</init_from></image></library_images>'
+TEXTURED = (
+    '<newparam sid="surf"><surface type="2D"><init_from>img</init_from></surface></newparam>'
+    '<newparam sid="samp"><sampler2D><source>surf</source></sampler2D></newparam>'
+    '<technique sid="c"><lambert><diffuse><texture texture="samp" texcoord="UV"/></diffuse></lambert></technique>'
+)
+HEAD = '<?xml version="1.0"?><COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">'
+#: A tetrahedron and a square of four corners, each in a colour of its own, in millimetres, moved and turned.
+SCENE = """
+<asset><unit meter="0.001" name="millimeter"/><up_axis>Y_UP</up_axis></asset>
+<library_effects>
+ <effect id="e1"><profile_COMMON><technique sid="c"><phong>
+  <diffuse><color>1 0 0 1</color></diffuse></phong></technique>
+ </profile_COMMON></effect>
+ <effect id="e2"><profile_COMMON><technique sid="c"><phong>
+  <diffuse><texture texture="x" texcoord="y"/></diffuse></phong>
+ </technique></profile_COMMON></effect>
+</library_effects>
+<library_materials><material id="m1"><instance_effect url="#e1"/></material>
+ <material id="m2"><instance_effect url="#e2"/></material></library_materials>
+<library_geometries><geometry id="g"><mesh>
+ <source id="p"><float_array id="f" count="15">0 0 0 10 0 0 0 10 0 0 0 10 10 10 0</float_array>
+  <technique_common><accessor source="#f" count="5" stride="3"/></technique_common></source>
+ <vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
+ <triangles material="red" count="4"><input semantic="VERTEX" source="#v" offset="0"/>
+  <input semantic="NORMAL" source="#p" offset="1"/><p>0 0 2 0 1 0 0 0 1 0 3 0 1 0 2 0 3 0 0 0 3 0 2 0</p></triangles>
+ <polylist material="plain" count="1"><input semantic="VERTEX" source="#v" offset="0"/>
+  <vcount>4</vcount><p>0 1 4 2</p></polylist>
+</mesh></geometry></library_geometries>
+<library_nodes><node id="part"><translate>100 0 0</translate><rotate>0 0 1 90</rotate>
+ <instance_geometry url="#g"><bind_material><technique_common><instance_material symbol="red" target="#m1"/>
+ <instance_material symbol="plain" target="#m2"/></technique_common></bind_material></instance_geometry></node>
+</library_nodes>
+<library_visual_scenes><visual_scene id="s"><node><scale>2 2 2</scale><instance_node url="#part"/></node>
+</visual_scene></library_visual_scenes><scene><instance_visual_scene url="#s"/></scene>"""
 
 
 def glb(material: trimesh.visual.material.PBRMaterial) -> bytes:
@@ -119,31 +175,6 @@ def test_an_obj_has_the_colours_of_its_vertices() -> None:
     assert read_mesh("m.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n").colours is None
 
 
-#: Two triangles without a material, a square that is cut into two, and a triangle of a material that nobody describes.
-OBJ = b"""mtllib looks/part.mtl
-v 0 0 0
-v 1 0 0
-v 1 1 0
-v 0 1 0
-v 0 0 1
-f 1 2 5
-usemtl green
-f 1 2 3 4
-usemtl photo
-f 1 4 5
-usemtl unknown
-f 2 3 5
-"""
-MTL = b"newmtl green\nKd 0 1 0\nnewmtl photo\nKd 0.8 0.8 0.8\nmap_Kd -s 1 1 1 skin.png\n"
-GREEN, RED = (0.0, 1.0, 0.0), (0.902, 0.078, 0.078)
-IMAGE = '<library_images><image id="img"><init_from>{}</init_from></image></library_images>'
-TEXTURED = (
-    '<newparam sid="surf"><surface type="2D"><init_from>img</init_from></surface></newparam>'
-    '<newparam sid="samp"><sampler2D><source>surf</source></sampler2D></newparam>'
-    '<technique sid="c"><lambert><diffuse><texture texture="samp" texcoord="UV"/></diffuse></lambert></technique>'
-)
-
-
 def picture(format: str = "PNG") -> bytes:
     """Half of it (205, 15, 15), half (255, 25, 25)."""
     half = np.array([[[205, 15, 15], [255, 25, 25]]], np.uint8).repeat(8, axis=1)
@@ -164,13 +195,11 @@ def test_obj_has_colours_of_its_library_and_mean_of_its_picture() -> None:
     assert colours({**files, "m/looks/skin.png": b"no picture"}) == grey
     assert colours({**files, "m/looks/skin.png": large()}) == grey
     del files["m/looks/skin.png"]
-    assert colours(files) == grey
-    assert colours({"m/part.obj": OBJ}) == {None: 5}
+    assert colours(files) == grey and colours({"m/part.obj": OBJ}) == {None: 5}
 
 
 def textured_dae(named: str) -> bytes:
-    text = dae().decode()
-    before, rest = text.split("<technique", 1)
+    before, rest = dae().decode().split("<technique", 1)
     technique, after = rest.split("</technique>", 1)
     assert "<color>" in technique
     return (before + TEXTURED + after).replace("<library_nodes>", IMAGE.format(named) + "<library_nodes>").encode()
@@ -193,16 +222,13 @@ def test_a_change_of_a_picture_is_another_look() -> None:
     assert one != two
 
 
-OUTSIDE = ["../../secret.png", "/etc/secret.png", "secret.stl", "..", "", "a\0.png", "file://"]
-
-
 @pytest.mark.parametrize("reference", OUTSIDE)
 def test_names_lead_nowhere_else(reference: str) -> None:
     there = {"secret.png", "/etc/secret.png", "../secret.png", "m/secret.stl", "etc/secret.png"}
     assert beside("m/part.obj", reference, there.__contains__) is None
 
 
-def test_a_hand_brings_looks_its_meshes_name_none_from_outside(tmp_path: Path) -> None:
+def test_a_hand_brings_looks_its_meshes_name_none_from_outside(tmp_path) -> None:
     folder = tmp_path / "hand"
     (folder / "m" / "looks").mkdir(parents=True)
     outside = b"newmtl other\nmap_Kd ../../secret.png\n"
@@ -218,37 +244,6 @@ def test_a_hand_brings_looks_its_meshes_name_none_from_outside(tmp_path: Path) -
         assert set(files) == {"h.urdf", "m/part.obj", "m/looks/part.mtl", "m/other.mtl", "m/looks/skin.png"}
     hand = hand_from_path(folder / "h.urdf")
     assert {mesh.colour for mesh in hand.visuals.meshes} == {None, GREEN, RED}
-
-
-HEAD = '<?xml version="1.0"?><COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">'
-#: A tetrahedron and a square of four corners, each in a colour of its own, in millimetres, moved and turned.
-SCENE = """
-<asset><unit meter="0.001" name="millimeter"/><up_axis>Y_UP</up_axis></asset>
-<library_effects>
- <effect id="e1"><profile_COMMON><technique sid="c"><phong>
-  <diffuse><color>1 0 0 1</color></diffuse></phong></technique>
- </profile_COMMON></effect>
- <effect id="e2"><profile_COMMON><technique sid="c"><phong>
-  <diffuse><texture texture="x" texcoord="y"/></diffuse></phong>
- </technique></profile_COMMON></effect>
-</library_effects>
-<library_materials><material id="m1"><instance_effect url="#e1"/></material>
- <material id="m2"><instance_effect url="#e2"/></material></library_materials>
-<library_geometries><geometry id="g"><mesh>
- <source id="p"><float_array id="f" count="15">0 0 0 10 0 0 0 10 0 0 0 10 10 10 0</float_array>
-  <technique_common><accessor source="#f" count="5" stride="3"/></technique_common></source>
- <vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
- <triangles material="red" count="4"><input semantic="VERTEX" source="#v" offset="0"/>
-  <input semantic="NORMAL" source="#p" offset="1"/><p>0 0 2 0 1 0 0 0 1 0 3 0 1 0 2 0 3 0 0 0 3 0 2 0</p></triangles>
- <polylist material="plain" count="1"><input semantic="VERTEX" source="#v" offset="0"/>
-  <vcount>4</vcount><p>0 1 4 2</p></polylist>
-</mesh></geometry></library_geometries>
-<library_nodes><node id="part"><translate>100 0 0</translate><rotate>0 0 1 90</rotate>
- <instance_geometry url="#g"><bind_material><technique_common><instance_material symbol="red" target="#m1"/>
- <instance_material symbol="plain" target="#m2"/></technique_common></bind_material></instance_geometry></node>
-</library_nodes>
-<library_visual_scenes><visual_scene id="s"><node><scale>2 2 2</scale><instance_node url="#part"/></node>
-</visual_scene></library_visual_scenes><scene><instance_visual_scene url="#s"/></scene>"""
 
 
 def dae(body: str = SCENE) -> bytes:
@@ -268,12 +263,6 @@ def test_a_mesh_that_trimesh_wrote_comes_back_ours_is_placed() -> None:
     soup = read_mesh("a.dae", bytes(mesh.export(file_type="dae")))
     # Its vertices stand in the file in single precision.
     np.testing.assert_allclose(soup.vertices[soup.faces], mesh.vertices[mesh.faces], atol=1e-7)
-
-
-BOMB = (
-    "".join(f'<node id="n{k}">' + f'<instance_node url="#n{k + 1}"/>' * 10 + "</node>" for k in range(12))
-    + '<node id="n12"><instance_geometry url="#g"/></node>'
-)
 
 
 @pytest.mark.parametrize(

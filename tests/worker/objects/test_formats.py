@@ -17,10 +17,17 @@ from graspd.worker.objects.check import check_object
 from graspd.worker.objects.formats import read_mesh
 from graspd.worker.objects.formats.bare import stl_bytes
 from graspd.worker.objects.formats.soup import MAX_FACES, triangulate
+from tests.api.factories import zipped
 from tests.worker.objects.shapes import Mesh, box, damaged
-from tests.worker.stages.test_ingest import zipped
 
 VOLUME = 0.06 * 0.05 * 0.04
+SCALED = {"mesh": 0, "scale": [1e-4] * 3}
+#: A channel, open above: its ends are polygons with two re-entrant corners.
+U = np.array([(0, 0), (80, 0), (80, 50), (70, 50), (70, 10), (10, 10), (10, 50), (0, 50)], float) / 1000
+LENGTH = 0.06
+POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize 12345\n"
+FOUR = b"facet normal 0 0 0\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 1 1 0\nvertex 0 1 0\nendloop\nendfacet\n"
+FACETS_OF_FOUR = b"solid\n" + 3 * FOUR + b"endsolid\n"
 
 
 def ascii_stl(mesh: Mesh) -> bytes:
@@ -218,9 +225,6 @@ def test_a_glb_that_would_be_read_wrongly_is_refused(change: dict[str, object], 
         read_mesh("m.glb", quantised(False, change))
 
 
-SCALED = {"mesh": 0, "scale": [1e-4] * 3}
-
-
 @pytest.mark.parametrize(
     "change",
     [
@@ -247,11 +251,6 @@ def test_strips_and_fans_of_glb_are_wound_as_trimesh_winds_them(mode: int) -> No
     expected = trimesh.util.triangle_strips_to_faces([order]) if mode == 5 else fan
     # A triangle may begin at any of its corners.
     np.testing.assert_array_equal(*([np.roll(f, -np.argmin(f)).tolist() for f in given] for given in (faces, expected)))
-
-
-#: A channel, open above: its ends are polygons with two re-entrant corners.
-U = np.array([(0, 0), (80, 0), (80, 50), (70, 50), (70, 10), (10, 10), (10, 50), (0, 50)], float) / 1000
-LENGTH = 0.06
 
 
 def channel() -> tuple[np.ndarray, list[list[int]]]:
@@ -367,9 +366,6 @@ def test_word_where_number_belongs_is_told_without_pythons_words(name: str) -> N
     assert not any(word in str(found.value) for word in ("float", "int()", "literal", "b'"))
 
 
-POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize 12345\n"
-
-
 @pytest.mark.parametrize("suffix", ["stl", "obj", "ply", "off", "glb", "dae"])
 @pytest.mark.parametrize(
     ("data", "told"),
@@ -463,10 +459,6 @@ def test_noise_is_refused(name: str, data: bytes) -> None:
 @given(MUTATED, st.booleans())
 def test_ten_thousand_damaged_meshes_load_or_are_refused(file: tuple[str, bytes], allow_open: bool) -> None:
     answers(*file, allow_open)
-
-
-FOUR = b"facet normal 0 0 0\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 1 1 0\nvertex 0 1 0\nendloop\nendfacet\n"
-FACETS_OF_FOUR = b"solid\n" + 3 * FOUR + b"endsolid\n"
 
 
 def test_what_trimesh_loses_of_these_files_is_read_or_refused() -> None:

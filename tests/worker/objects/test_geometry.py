@@ -2,9 +2,7 @@
 
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,23 +14,21 @@ from graspd.service.model.errors import MeshError
 from graspd.service.model.states import AssetKind
 from graspd.service.store.assets import builtin_files, builtin_names
 from graspd.worker.grasps import GRID_M, GraspSet, Posture
+from graspd.worker.objects import mesh_geometry
 from graspd.worker.objects.check import check_object
 from graspd.worker.objects.convex import WorkLimitExceeded, coacd_parts
 from graspd.worker.objects.distance import MeshDistance, deviation, point_triangle_distance, sample_faces
-from graspd.worker.objects.mesh_geometry import (
-    centred,
-    corner_normals,
-    from_manifold,
-    mass_properties,
-    signed_volume,
-    to_centre,
-    to_file,
-)
+from graspd.worker.objects.mesh_geometry import corner_normals, mass_properties, signed_volume
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import from_bytes, load_object, object_from_path, simplify, to_bytes
 from graspd.worker.objects.topology import components, is_closed
 from tests.worker.models import object_from_mesh
 from tests.worker.objects.shapes import box, cylinder, sphere, stl
+
+SIZE = (0.06, 0.05, 0.1)
+NEAR, FAR, UTM = (0.123456, 0.05, -0.2), (5.0, -3.0, 2.0), (500_000.0, 4_500_000.0, 300.0)
+PLACES = pytest.mark.parametrize("place", [NEAR, FAR, UTM], ids=["near", "6 m", "UTM"])
+_CORNERS, _FACES = np.eye(4, 3), np.array([[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]])
 
 
 def test_mass_properties_are_exact_anywhere_and_turn_with_body() -> None:
@@ -90,9 +86,8 @@ def test_distances_are_those_of_a_fine_grid_and_of_spheres() -> None:
     assert deviation(sphere(0.04, 128), sphere(0.041, 128)) == pytest.approx(1e-3, abs=3e-5)
 
 
-def test_mesh_distance_equals_the_minimum_over_all_triangles(shared_data: Path) -> None:
-    path = shared_data / "objects" / "024_bowl" / "clean.stl"
-    model = object_from_path(path, 0.0)
+def test_mesh_distance_equals_the_minimum_over_all_triangles(shared_data) -> None:
+    model = object_from_path(shared_data / "objects" / "024_bowl" / "clean.stl", 0.0)
     faces = model.faces.astype(np.int64)
     points = sample_faces(model.vertices, faces, 60)[0] + np.random.default_rng(0).normal(scale=0.01, size=(60, 3))
     brute = point_triangle_distance(points[:, None], model.vertices[faces][None]).min(axis=1)
@@ -118,7 +113,7 @@ def test_simplification_is_monotone_and_exact_at_zero() -> None:
     vertices, faces = sphere(segments=128)
     same = simplify(vertices, faces, 0.0)
     assert same[0] is vertices and same[1] is faces and same[2] == 0.0
-    vertices, faces = from_manifold(Manifold.cube((0.06, 0.05, 0.04), True).refine_to_length(0.002))
+    vertices, faces = mesh_geometry.from_manifold(Manifold.cube((0.06, 0.05, 0.04), True).refine_to_length(0.002))
     assert len(faces) > 5000
     assert len(simplify(vertices, faces, 1e-5)[1]) < 100
 
@@ -129,11 +124,6 @@ def test_the_model_of_a_box_has_its_hull_and_radius() -> None:
     assert len(model.hull_vertices) == 8 and len(model.hull_faces) == 12
     assert model.radius == pytest.approx(np.linalg.norm([0.03, 0.025, 0.02]), rel=1e-6)
     assert signed_volume(model.hull_vertices, model.hull_faces) == pytest.approx(model.volume, rel=1e-6)
-
-
-SIZE = (0.06, 0.05, 0.1)
-NEAR, FAR, UTM = (0.123456, 0.05, -0.2), (5.0, -3.0, 2.0), (500_000.0, 4_500_000.0, 300.0)
-PLACES = pytest.mark.parametrize("place", [NEAR, FAR, UTM], ids=["near", "6 m", "UTM"])
 
 
 def box_at(place: tuple[float, ...], unit: float = 1.0) -> trimesh.Trimesh:
@@ -178,7 +168,7 @@ def test_an_object_keeps_its_place_and_a_scan_its_points() -> None:
     again = from_bytes(to_bytes(obj), name=obj.name, digest=obj.digest)
     assert (again.content, again.centred.content) == (obj.content, obj.centred.content)
     points = np.random.default_rng(0).uniform(-0.1, 0.1, (2000, 3)).astype(np.float32).astype(float)
-    found = centred(points)
+    found = mesh_geometry.centred(points)
     np.testing.assert_allclose(found.points + found.centre, points, atol=2e-9)
 
 
@@ -189,10 +179,9 @@ def test_poses_come_back_from_frame_of_file_with_the_same_bits(place: tuple[floa
     pose[:, 3:] /= np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
     centre = np.rint(np.array(place) / GRID_M) * GRID_M
     hands = GraspSet(*(Posture(pose, np.zeros((200, 1))) for _ in range(3)), np.zeros(200)).moved(np.zeros(3))
-    back = hands.moved(centre).moved(-centre)
-    np.testing.assert_array_equal(back.grasp.hand_pose, hands.grasp.hand_pose)
+    np.testing.assert_array_equal(hands.moved(centre).moved(-centre).grasp.hand_pose, hands.grasp.hand_pose)
     lying = hands.grasp.hand_pose
-    np.testing.assert_array_equal(to_centre(to_file(lying, centre), centre), lying)
+    np.testing.assert_array_equal(mesh_geometry.to_centre(mesh_geometry.to_file(lying, centre), centre), lying)
 
 
 @pytest.mark.parametrize(("place", "says"), [((0.3, 0, 0), False), (FAR, True), (UTM, True)])
@@ -213,7 +202,7 @@ def refused(data: bytes) -> str:
     [(refused, UTM), (lambda data: str(check_object({"b.stl": data}, "box")["message"]), (3000.0, 0.0, 0.0))],
     ids=["refused", "a note"],
 )
-def test_file_whose_numbers_do_not_tell_its_points_apart_is_told(tell: Callable[[bytes], str], place) -> None:
+def test_file_whose_numbers_do_not_tell_its_points_apart_is_told(tell, place) -> None:
     told = tell(stl_of(box_at(place)))
     assert "where the file's numbers are" in told and "OBJ, PLY" in told
 
@@ -221,9 +210,6 @@ def test_file_whose_numbers_do_not_tell_its_points_apart_is_told(tell: Callable[
 def test_other_faults_are_not_laid_on_the_origin() -> None:
     flat = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], process=False)
     assert "origin" not in refused(stl_of(flat))
-
-
-_CORNERS, _FACES = np.eye(4, 3), np.array([[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]])
 
 
 def ending(code: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -266,8 +252,7 @@ def test_copies_turned_scaled_or_meshed_anew_are_of_one_family(flask: trimesh.Tr
     others = {"box": named(trimesh.creation.box((0.05, 0.07, 0.18)), "b"), "ball": ball}
     copies = {"bottle": flask, "turned": turned, "finer": finer, "larger": larger}
     found = families(others | {name: named(mesh, f"c{k}") for k, (name, mesh) in enumerate(copies.items())})
-    assert {found[name] for name in copies} == {"c0"}
-    assert (found["box"], found["ball"]) == ("b", "a")
+    assert {found[name] for name in copies} == {"c0"} and (found["box"], found["ball"]) == ("b", "a")
     assert families({"jar": named(flask, "x"), "bottle": named(flask, "x")}) == {"jar": "x", "bottle": "x"}
     assert families({}) == {}
 

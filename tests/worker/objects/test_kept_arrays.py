@@ -1,33 +1,56 @@
-"""Arrays that are kept on the machine: read bit for bit, made anew when anything they follow from changes."""
+"""Arrays kept on the machine and in the store: read bit for bit, made anew when what they follow from changes."""
 
 import dataclasses
+import io
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
 
 from graspd.service import user_cache
+from graspd.service.model import names
+from graspd.service.model.digests import digest_files
 from graspd.service.model.errors import MeshError
-from graspd.service.model.transforms import IDENTITY_POSE
+from graspd.service.model.messages import TaskMessage
+from graspd.service.model.states import AssetKind, Stage
+from graspd.service.model.transforms import IDENTITY_POSE, apply
+from graspd.service.store.assets import builtin_files, builtin_model, builtin_names
+from graspd.service.store.integrity import sealed
+from graspd.service.store.library import publish_asset
+from graspd.service.store.store import Store, open_store
 from graspd.worker.hands import surface
 from graspd.worker.hands.kinematics import body_poses
+from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.surface import sample_surface
 from graspd.worker.objects import disk_cache, prepare
 from graspd.worker.objects.disk_cache import arrays_kept_or_made, content_of
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.objects.prepare import load_object
+from graspd.worker.objects.prepare import load_object, object_from_path
 from graspd.worker.quality.probe import probe_of
 from graspd.worker.rendering.scene_setup import CameraPlan, Setting
 from graspd.worker.scenes.simulate import rest_probability
 from graspd.worker.simulation import sampling
+from graspd.worker.stages import assets
+from graspd.worker.stages.assets import prepared_object
+from graspd.worker.stages.context import batch_seed
+from graspd.worker.stages.models import hand_glb, model_of, object_glb, publish_model
+from tests.fakes import message_for, request
 from tests.worker.models import object_from_mesh, two_finger_hand
 from tests.worker.objects.shapes import box, join, sphere, stl
 
+#: Two balls in one another: a repair to remember.
+BALLS = stl(join(sphere(segments=24), sphere(segments=24, at=(0.02, 0.0, 0.0))))
+BRICK = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))
+HAND = two_finger_hand()
+FILES = {"asset.json": b'{"file": "m.stl"}', **BALLS}
+DIGEST = digest_files(AssetKind.OBJECT, FILES)
+TOLERANCE_M = 5e-7  # positions are single precision: half a micrometre at half a metre
+OTHERS = [{"batch": 1}, {"stage": Stage.SCENE}, {"hand_digest": "d" * 32}, {"object_digest": "d" * 32}]
 
-@pytest.fixture(autouse=True)
+
+@pytest.fixture
 def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     return tmp_path / "graspd"
@@ -37,13 +60,9 @@ def made(number: float) -> dict[str, np.ndarray]:
     return {"a": np.full((2, 3), number), "b": np.arange(4)}
 
 
-def never() -> dict[str, np.ndarray]:
-    raise AssertionError("it is there already")
-
-
 def test_what_was_made_is_read_bit_for_bit(own_cache: Path) -> None:
     first = arrays_kept_or_made("things", ("x", 1), (disk_cache,), lambda: made(1 / 3))
-    again = arrays_kept_or_made("things", ("x", 1), (disk_cache,), never)
+    again = arrays_kept_or_made("things", ("x", 1), (disk_cache,), lambda: pytest.fail("it is there already"))
     assert all(np.array_equal(first[name], again[name]) and first[name].dtype == again[name].dtype for name in first)
     assert [file.suffix for file in (own_cache / "things").iterdir()] == [".npz"]
 
@@ -57,7 +76,7 @@ def test_entries_differ_with_terms_and_code_bad_ones_are_remade(own_cache: Path)
     assert arrays_kept_or_made("things", ("x", 1), (disk_cache,), lambda: made(4))["a"][0, 0] == 4
 
 
-def test_samples_are_those_of_a_process_without_a_cache() -> None:
+def test_samples_are_those_of_a_process_without_a_cache(own_cache: Path) -> None:
     hand = two_finger_hand()
     ball = load_object(stl(sphere(segments=24)), name="ball", digest="", face_error_m=0.0)
     shapes = surface._Shapes(hand.pieces, body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0])
@@ -67,11 +86,7 @@ def test_samples_are_those_of_a_process_without_a_cache() -> None:
         assert np.array_equal(sampling.object_samples(ball, 90, seed=1), sampling._sampled(ball, 90, 1))
 
 
-#: Two balls in one another: a repair to remember.
-BALLS = stl(join(sphere(segments=24), sphere(segments=24, at=(0.02, 0.0, 0.0))))
-
-
-def load_balls(files: dict[str, bytes] = BALLS, error: float = 3e-4, **options: Any) -> ObjectModel:
+def load_balls(files: dict[str, bytes] = BALLS, error: float = 3e-4, **options) -> ObjectModel:
     """As a process that begins."""
     prepare._prepared.cache_clear()
     prepare._repaired.cache_clear()
@@ -79,7 +94,7 @@ def load_balls(files: dict[str, bytes] = BALLS, error: float = 3e-4, **options: 
 
 
 @pytest.fixture
-def built(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+def built(own_cache: Path, monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """The bounds to which objects were prepared, not read."""
     bounds: list[float] = []
     build = prepare.build
@@ -88,7 +103,8 @@ def built(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
 
 def same(one: ObjectModel, two: ObjectModel) -> bool:
-    return all(np.array_equal(getattr(one, field.name), getattr(two, field.name)) for field in fields(one))
+    pairs = [(np.asarray(getattr(one, field.name)), np.asarray(getattr(two, field.name))) for field in fields(one)]
+    return all(np.array_equal(a, b) and a.dtype == b.dtype for a, b in pairs)
 
 
 def test_a_second_process_reads_what_the_first_made_not_refusals(built: list[float], own_cache: Path) -> None:
@@ -134,12 +150,8 @@ def test_an_entry_that_is_none_is_made_again_and_replaced(own_cache: Path, built
     assert len(built) == 2
 
 
-BRICK = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))
-HAND = two_finger_hand()
-
-
 @pytest.mark.parametrize("model", [BRICK, HAND], ids=["object", "hand"])
-def test_whatever_differs_in_a_model_changes_its_content(model: Any) -> None:
+def test_whatever_differs_in_a_model_changes_its_content(model) -> None:
     for field in dataclasses.fields(model):
         changed = dataclasses.replace(model, **{field.name: np.array([7])})
         assert (changed.content == model.content) == (field.name in ("name", "digest")), field.name
@@ -148,7 +160,7 @@ def test_whatever_differs_in_a_model_changes_its_content(model: Any) -> None:
         content_of(dataclasses.replace(BRICK, repairs=object()))  # type: ignore[arg-type]
 
 
-def test_no_cache_gives_one_mesh_of_a_file_for_another() -> None:
+def test_no_cache_gives_one_mesh_of_a_file_for_another(own_cache: Path) -> None:
     # As many corners and faces, the same digest of the file: only what was prepared differs.
     other = dataclasses.replace(object_from_mesh(trimesh.creation.box((0.02, 0.04, 0.05))), digest=BRICK.digest)
     one, two = (probe_of(HAND, obj, hand_points=64, object_points=64) for obj in (BRICK, other))
@@ -167,3 +179,75 @@ def test_no_cache_gives_one_mesh_of_a_file_for_another() -> None:
     assert rest_probability(cube, [0]) != rest_probability(plate, [0])
     again = probe_of(two_finger_hand(), dataclasses.replace(BRICK), hand_points=64, object_points=64)
     assert again is one, "an equal model that was loaded again"
+
+
+@pytest.fixture
+def store() -> Store:
+    opened = open_store("memory://")
+    publish_asset(opened, AssetKind.OBJECT, "balls", FILES)
+    return opened
+
+
+def test_the_second_worker_finds_what_the_first_has_made(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    fresh = load_object(FILES, name="balls", digest=DIGEST, face_error_m=3e-4)
+    assert same(prepared_object(store, DIGEST, name="balls", face_error_m=3e-4), fresh)
+    monkeypatch.delattr(assets, "load_object")
+    assert same(prepared_object(store, DIGEST, name="balls", face_error_m=3e-4), fresh)
+    assert fresh.repairs
+
+
+def test_another_bound_is_another_object(store: Store) -> None:
+    fine, coarse = (prepared_object(store, DIGEST, name="balls", face_error_m=bound) for bound in (1e-4, 3e-3))
+    assert prepared_object(store, DIGEST, name="other", face_error_m=1e-4).name == "other"
+    assert len(fine.faces) > len(coarse.faces)
+    assert len(list(store.list(f"assets/object/{DIGEST}/prepared"))) == 2
+
+
+@pytest.mark.parametrize("data", [b"", b"noise" * 100, b"PK\x03\x04" + bytes(60)])
+def test_what_cannot_be_read_is_made_again(store: Store, data: bytes) -> None:
+    prepared_object(store, DIGEST, name="balls", face_error_m=3e-4)
+    (entry,) = store.list(f"assets/object/{DIGEST}/prepared")
+    spoilt = open_store("memory://")
+    publish_asset(spoilt, AssetKind.OBJECT, "balls", FILES)
+    spoilt.put(entry.key, data)
+    fresh = load_object(FILES, name="balls", digest=DIGEST, face_error_m=3e-4)
+    assert same(prepared_object(spoilt, DIGEST, name="balls", face_error_m=3e-4), fresh)
+
+
+@pytest.mark.parametrize("name", builtin_names(AssetKind.HAND))
+def test_a_hands_nodes_stand_where_kinematics_puts_its_bodies(name: str) -> None:
+    hand = hand_from_path(name)
+    scene = trimesh.load(io.BytesIO(hand_glb(hand)), file_type="glb", force="scene")
+    poses = body_poses(hand, IDENTITY_POSE, np.zeros(len(hand.joint_names)))[0]
+    expected = np.concatenate([apply(poses[piece.body], piece.vertices) for piece in hand.pieces])
+    found = np.concatenate([mesh.bounds for mesh in scene.dump() if isinstance(mesh, trimesh.Trimesh)])
+    for end in (np.min, np.max):
+        np.testing.assert_allclose(end(found, axis=0), end(expected, axis=0), atol=TOLERANCE_M)
+
+
+@pytest.mark.parametrize("kind", list(AssetKind))
+def test_models_that_come_with_graspd_are_those_of_its_assets(kind: AssetKind) -> None:
+    for name in builtin_names(kind):
+        made = model_of(kind, name, builtin_files(kind, name))
+        assert made == builtin_model(kind, name), "python -m graspd.worker.stages.models"
+
+
+def test_a_model_is_published_once(tmp_path) -> None:
+    store = open_store(tmp_path.as_uri())
+    obj = object_from_path("block")
+    publish_model(store, AssetKind.OBJECT, obj)
+    key = names.asset_model(AssetKind.OBJECT, obj.digest)
+    assert store.get(key)[:4] == b"glTF"
+    publish_model(store, AssetKind.OBJECT, obj)
+    assert store.get(key) == sealed(key, object_glb(obj))
+
+
+def message(**changes) -> TaskMessage:
+    return message_for(Stage.RENDER, scenes=1, views=1).model_copy(update=changes)
+
+
+@pytest.mark.parametrize("changes", [*OTHERS, {"request": request(seed=7)}])
+def test_batches_stages_hands_objects_and_seeds_draw_anew(changes: dict) -> None:
+    assert batch_seed(message(**changes)) != batch_seed(message())
+    other = message(request=request(method="graspit"), output="e" * 32)
+    assert batch_seed(other) == batch_seed(message()), "two methods show their grasps in the same pictures"

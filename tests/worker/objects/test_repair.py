@@ -1,8 +1,5 @@
 """From triangles to a solid: what is repaired, what is refused, and that both are said."""
 
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 import trimesh
@@ -20,9 +17,16 @@ from tests.worker.objects.shapes import Mesh, box, cylinder, join, sphere, stl
 
 #: Uploads are float32: seven digits of 0.1 m.
 ROUNDING = 1e-6
+#: One of each format and source; a handle, and what is thin.
+SOME = ("011_banana", "025_mug", "048_hammer", "koala")
+RADIUS = 0.008
+#: Where two cylinders of one radius cross at right angles they share 16/3 r^3 (Steinmetz).
+SHARED = 16 / 3 * RADIUS**3
+#: A circle of 24 corners has 1.1 % less area; bent along a curve the tube is no exact cylinder where it crosses itself.
+ROUGHLY = 0.04
 
 
-def check(mesh: Mesh, **options: Any) -> dict[str, Any]:
+def check(mesh: Mesh, **options) -> dict:
     return check_object(stl(mesh), "m", face_error_m=0.0, **options)
 
 
@@ -34,7 +38,7 @@ def check(mesh: Mesh, **options: Any) -> dict[str, Any]:
         ("open_shell.stl", {"allow_open": True}, None),
     ],
 )
-def test_the_mend_that_a_refusal_names_works(shared_data: Path, file: str, options, volume: float | None) -> None:
+def test_the_mend_that_a_refusal_names_works(shared_data, file: str, options, volume: float | None) -> None:
     report = report_object(str(shared_data / "bad" / file), options)
     assert report["verdict"] != "refuse"
     if volume is not None:
@@ -42,7 +46,7 @@ def test_the_mend_that_a_refusal_names_works(shared_data: Path, file: str, optio
         assert report["facts"]["volume_m3"] == pytest.approx(volume, rel=0.015)
 
 
-def test_an_open_mesh_is_marked_as_such(shared_data: Path) -> None:
+def test_an_open_mesh_is_marked_as_such(shared_data) -> None:
     files = {"m.stl": (shared_data / "bad" / "open_shell.stl").read_bytes()}
     model = load_object(files, name="m", digest="", face_error_m=0.0, options={"allow_open": True})
     assert not model.watertight and model.volume > 0
@@ -60,8 +64,7 @@ def test_a_sound_mesh_is_taken_as_it_is_scaled_and_weighed() -> None:
 def test_winding_is_turned_out_and_made_to_agree() -> None:
     vertices, faces = sphere()
     report = check((vertices, faces[:, ::-1]))
-    assert report["verdict"] == "repair" and "winding" in report["message"]
-    assert report["facts"]["volume_m3"] > 0
+    assert report["verdict"] == "repair" and "winding" in report["message"] and report["facts"]["volume_m3"] > 0
     turn = np.random.default_rng(0).random(len(faces)) < 0.4
     report = check((vertices, np.where(turn[:, None], faces[:, ::-1], faces)))
     assert report["facts"]["volume_m3"] == pytest.approx(check((vertices, faces))["facts"]["volume_m3"], rel=ROUNDING)
@@ -113,12 +116,8 @@ def test_seams_are_welded_and_debris_without_volume_dropped() -> None:
     assert report["facts"]["volume_m3"] == pytest.approx(0.06 * 0.05 * 0.04, rel=1e-4)
 
 
-#: One of each format and source; a handle, and what is thin.
-SOME = ("011_banana", "025_mug", "048_hammer", "koala")
-
-
 @pytest.mark.parametrize("chosen", [SOME, pytest.param((), marks=pytest.mark.slow)], ids=["some", "all"])
-def test_published_scans_become_closed_solids(shared_data: Path, chosen: tuple[str, ...]) -> None:
+def test_published_scans_become_closed_solids(shared_data, chosen: tuple[str, ...]) -> None:
     known = sorted((shared_data / "objects").glob("*/raw.*"))
     scans = [path for path in known if path.parent.name in chosen] if chosen else known
     assert len(scans) == (len(chosen) or 14)
@@ -135,13 +134,6 @@ def test_unknown_keys_and_two_meshes_are_refused() -> None:
         load_object({**stl(box()), **wrong}, name="m", digest="", face_error_m=0)
     with pytest.raises(MeshError, match="name one"):
         load_object({**stl(box()), "n.stl": b"x"}, name="m", digest="", face_error_m=0)
-
-
-RADIUS = 0.008
-#: Where two cylinders of one radius cross at right angles they share 16/3 r^3 (Steinmetz).
-SHARED = 16 / 3 * RADIUS**3
-#: A circle of 24 corners has 1.1 % less area; bent along a curve the tube is no exact cylinder where it crosses itself.
-ROUGHLY = 0.04
 
 
 def crossing_tube(scale: float = 0.04, inside_out: bool = False) -> Mesh:
@@ -211,7 +203,7 @@ def boxes(gap: float, upper: tuple[float, float, float] = (0.04, 0.05, 0.03)) ->
     return trimesh.util.concatenate([lower, other])
 
 
-def check_parts(mesh: trimesh.Trimesh, suffix: str = "obj", **options: Any) -> dict[str, Any]:
+def check_parts(mesh: trimesh.Trimesh, suffix: str = "obj", **options) -> dict:
     data = mesh.export(file_type=suffix)
     return check_object({f"m.{suffix}": data if isinstance(data, bytes) else data.encode()}, "m", **options)
 

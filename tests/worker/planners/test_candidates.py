@@ -1,13 +1,11 @@
 """Which candidate of a grasp is taken after its trials."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from graspd.service.model.fidelity import resolve_fidelity
-from graspd.service.model.scene_spec import SceneSpec
 from graspd.worker.control.postures import normal_force, squeeze
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet
@@ -18,19 +16,18 @@ from graspd.worker.planners.fast_graspd import candidates, planner
 from graspd.worker.planners.fast_graspd.candidates import GENTLER, Refinements
 from graspd.worker.planners.fast_graspd.planner import FAILED, FREE, STANDS
 from graspd.worker.planners.fast_graspd.schedule import PULL
-from graspd.worker.scenes.kinds import rest_poses, supports_of
 from graspd.worker.scenes.rollout import lift_rollout
 from graspd.worker.simulation.data import Data, HandState
 from graspd.worker.simulation.environment import Obstacle, PlacedGrasps
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.prescreening import SLIPS, push_rollout
-from tests.worker.models import two_finger_hand
+from tests.worker.models import on_tables, two_finger_hand
 from tests.worker.quality.helpers import grasp_set, posture
 from tests.worker.simulation.rigs import ball
 
 QUICK = resolve_fidelity("draft").model_copy(update={"starts": 2, "finalists": 2})
 TABLE = (Obstacle.half_space([0, 0, 1], 0.0),)
-TABLE_SPEC = SceneSpec(kind="table")
+BAD = 2 * candidates.HOPEFUL
 
 
 def plain(hand, obj, state: HandState, losses: np.ndarray, placed: PlacedGrasps, *, device: str) -> GraspSet:
@@ -66,9 +63,6 @@ def taken(scores, monkeypatch, merit=None, infeasible=()) -> tuple[list[int], li
     rows = found.joined().stability_loss.astype(int).tolist()
     assert found.state.pivot[:, 0].tolist() == found.losses.tolist() == rows
     return rows, sorted(tries), sorted(seats)
-
-
-BAD = 2 * candidates.HOPEFUL
 
 
 @pytest.mark.parametrize(
@@ -111,12 +105,11 @@ def pair():
 
 @pytest.fixture(scope="module")
 def placed(pair) -> PlacedGrasps:
-    poses = rest_poses(TABLE_SPEC, pair[1], count=2, seed=1)["scene/object_pose"]
-    return PlacedGrasps(supports_of(TABLE_SPEC), poses, np.arange(4) % 2)
+    return on_tables(pair[1]).placed(np.arange(4) % 2)
 
 
 @pytest.fixture(scope="module")
-def in_scenes(pair, placed: PlacedGrasps) -> Callable[..., GraspSet]:
+def in_scenes(pair, placed: PlacedGrasps):
     """Four grasps on tables, chosen by a rollout."""
 
     def made(rollout=None, threads: int = 1) -> GraspSet:
@@ -198,7 +191,7 @@ def test_hand_that_nearly_lifts_squeezes_gently_where_that_helps(pair, in_scenes
 
 
 @pytest.fixture(scope="module")
-def free(pair) -> Callable[..., GraspSet]:
+def free(pair):
     """Six grasps of a free object, chosen by their trial, but for what is changed of the request."""
     rollout = push_rollout(*pair, lambda: ConvexPieces((pair[1].hull_vertices,), 1.0, 0.0, "block"))
     wanted = PlanRequest(6, QUICK, seed=4, rollout=rollout)
@@ -289,8 +282,7 @@ def test_hands_are_drawn_to_an_object_at_their_first_start_alone(free, monkeypat
     monkeypatch.setattr(planner, "_work", watched)
     monkeypatch.setattr(planner, "FREE", (FAILED, FAILED))
     free(count=1, rollout=always(9.0))
-    assert pulls[0] == (PULL, PULL) and len(pulls) > 1
-    assert set(pulls[1:]) == {(0.0, 0.0)}
+    assert pulls[0] == (PULL, PULL) and len(pulls) > 1 and set(pulls[1:]) == {(0.0, 0.0)}
 
 
 def test_attempts_made_ahead_give_grasps_of_one_after_the_other(free, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,8 +7,6 @@ from concurrent.futures import ProcessPoolExecutor
 from importlib import metadata
 from importlib.metadata import EntryPoint
 from multiprocessing import get_context
-from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
@@ -26,17 +24,21 @@ from graspd.worker.objects.prepare import load_object, object_from_path
 from graspd.worker.planners import PLANNERS, method, method_names, planner, synthesize
 from graspd.worker.planners.port import Method, PlanRequest
 from graspd.worker.quality.table import measure
+from tests.conftest import REPOSITORY
 
 #: All methods around free objects, with the options that make them quick.
 PEERS: dict[str, dict[str, object]] = {name: dict(method(name).quick) for name in PLANNERS if method(name).free}
 PEERS["graspd2022"]["grid"] = 24
 ONE = ExecutionContext(threads=1)
 EACH = pytest.mark.parametrize("name", sorted(PEERS))
+#: Knobs that make a call short; the mesh, which is what the fidelities here differ in, stays theirs.
+SHORT = dict.fromkeys(("coarse_points", "fine_points", "object_points"), 64)
+SHORT |= {"starts": 1, "finalists": 1, "coarse_iterations": 3, "fine_iterations": 2, "polish_iterations": 1}
+PAIR = ("draft", "fine")
+PAGE = (REPOSITORY / "docs" / "how-to" / "planners.md").read_text()
 
 
-def grasps(
-    name: str, count: int, *, run: ExecutionContext = ONE, seed: int = 0, batch: int = 0, hand: str = "barrett"
-) -> GraspSet:
+def grasps(name: str, count: int, *, run: ExecutionContext = ONE, seed=0, batch=0, hand="barrett") -> GraspSet:
     wanted, obj = PlanRequest(count, FIDELITIES["draft"], seed, batch), object_from_path("block")
     return synthesize(hand_from_path(hand), obj, wanted, run, method=name, options=PEERS[name])
 
@@ -68,13 +70,6 @@ def test_cancelling_stops_at_the_first_look(name: str) -> None:
     assert len(calls) == 1
 
 
-#: Knobs that make a call short; the mesh, which is what the fidelities here differ in, stays theirs.
-SHORT: dict[str, Any] = dict.fromkeys(("coarse_points", "fine_points", "object_points"), 64)
-SHORT |= {"starts": 1, "finalists": 1, "coarse_iterations": 3, "fine_iterations": 2, "polish_iterations": 1}
-METHODS = sorted(name for name in PLANNERS if method(name).free)
-PAIR = ("draft", "fine")
-
-
 def egg() -> bytes:
     """Round all over, so that every bound simplifies it to another mesh; small, so that this is soon done."""
     mesh = trimesh.creation.icosphere(subdivisions=3, radius=0.03)
@@ -86,17 +81,8 @@ def made(name: str, fidelity: Fidelity) -> dict[str, str]:
     """Digests of what a method makes on an egg at a fidelity: the mesh, postures, quality."""
     hand = hand_from_path("barrett")
     obj = load_object({"egg.stl": egg()}, name="egg", digest="egg", face_error_m=fidelity.face_error_m)
-    options = dict(method(name).quick) | ({"grid": 24} if name == "graspd2022" else {})
-    wanted, run = PlanRequest(count=2, fidelity=fidelity, seed=3), ExecutionContext(threads=1)
-    found = synthesize(hand, obj, wanted, run, method=name, options=options)
-    columns = {
-        "faces": obj.faces,
-        "grasp": found.grasp.hand_pose,
-        "joints": found.grasp.joint_positions,
-        "pregrasp": found.pregrasp.joint_positions,
-        "squeeze": found.squeeze.joint_positions,
-        **measure(hand, obj, found, run=run),
-    }
+    found = synthesize(hand, obj, PlanRequest(2, fidelity, seed=3), ONE, method=name, options=PEERS[name])
+    columns = {"faces": obj.faces, **found.to_columns(), **measure(hand, obj, found, run=ONE)}
     return {column: digest_bytes(values.tobytes()) for column, values in columns.items()}
 
 
@@ -111,9 +97,9 @@ def all_made(wanted: list[str]) -> dict[str, dict[str, str]]:
 
 @pytest.mark.slow
 def test_every_method_in_one_process_is_as_in_fresh_ones() -> None:
-    apart = [[f"{name}:{level}" for name in METHODS] for level in PAIR]
+    apart = [[f"{name}:{level}" for name in PEERS] for level in PAIR]
     # The other way round in methods, so that what methods share is met in another order, too.
-    mixed = [f"{name}:{level}" for name in reversed(METHODS) for level in PAIR]
+    mixed = [f"{name}:{level}" for name in reversed(PEERS) for level in PAIR]
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
         told = pool.map(all_made, apart)
         # This process has made other things before, and its caches are as full as any.
@@ -121,7 +107,7 @@ def test_every_method_in_one_process_is_as_in_fresh_ones() -> None:
         fresh = list(told)
     assert together == {key: value for found in fresh for key, value in found.items()}
     coarse, fine = (fresh[k][f"autograsp:{level}"] for k, level in enumerate(PAIR))
-    assert coarse["faces"] != fine["faces"] and coarse["grasp"] != fine["grasp"]
+    assert coarse["faces"] != fine["faces"] and coarse["grasp/hand_pose"] != fine["grasp/hand_pose"]
 
 
 @pytest.mark.parametrize("name", sorted(PLANNERS))
@@ -171,14 +157,9 @@ def test_entry_points_of_other_packages_are_methods_or_refused(monkeypatch, name
         method("magic")
 
 
-def documented_example() -> str:
-    page = (Path(__file__).parents[3] / "docs" / "how-to" / "planners.md").read_text()
-    return page.split("```python\n", 1)[1].split("```", 1)[0]
-
-
-def test_the_documented_package_runs_as_a_method(tmp_path: Path) -> None:
+def test_the_documented_package_runs_as_a_method(tmp_path) -> None:
     """As installed: a module and its metadata beside each other on the path."""
-    (tmp_path / "mine.py").write_text(documented_example())
+    (tmp_path / "mine.py").write_text(PAGE.split("```python\n", 1)[1].split("```", 1)[0])
     metadata = tmp_path / "mine-0.1.dist-info"
     metadata.mkdir()
     (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: mine\nVersion: 0.1\n")
@@ -195,8 +176,7 @@ def test_the_documented_package_runs_as_a_method(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", sorted(PLANNERS))
 def test_the_page_names_every_method_with_all_its_options_and_defaults(name: str) -> None:
-    page = (Path(__file__).parents[3] / "docs" / "how-to" / "planners.md").read_text()
-    row = next(line for line in page.splitlines() if line.startswith(f"| `{name}` | "))
+    row = next(line for line in PAGE.splitlines() if line.startswith(f"| `{name}` | "))
     for option, field in method(name).options.model_fields.items():
         assert f"`{option}` ({'required' if field.is_required() else format(field.default, 'g')}" in row
 

@@ -8,7 +8,6 @@ import pytest
 
 from graspd.service.model.errors import InputError, MeshError, TaskCancelled
 from graspd.service.model.fidelity import FIDELITIES, Fidelity
-from graspd.service.model.scene_spec import SceneSpec
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.load import hand_from_path
@@ -17,12 +16,12 @@ from graspd.worker.planners import BatchRequest, PlanRequest, synthesize
 from graspd.worker.planners.fast_graspd import pairs, planner, schedule
 from graspd.worker.planners.fast_graspd.planner import plan_joined
 from graspd.worker.quality.table import measure
-from graspd.worker.scenes.kinds import rest_poses, supports_of
-from graspd.worker.simulation.environment import PlacedGrasps
-from tests.worker.models import assert_same_grasps
+from tests.worker.models import assert_same_grasps, on_tables
 
 DRAFT = FIDELITIES["draft"]
 QUICK = DRAFT.model_copy(update={"coarse_iterations": 20, "fine_iterations": 6, "polish_iterations": 2})
+FIDELITY = DRAFT.model_copy(update={"name": "custom", "finalists": 2, "coarse_iterations": 30})
+ONE = ExecutionContext(threads=1)
 
 
 def grasps(count: int, fidelity: Fidelity = QUICK, hand: str = "allegro", obj: str = "mug") -> GraspSet:
@@ -78,9 +77,6 @@ def test_the_other_contact_solvers_also_reach_the_object(solver: str) -> None:
     assert np.median(quality["quality/contact_links"]) >= 2
 
 
-FIDELITY = DRAFT.model_copy(update={"name": "custom", "finalists": 2, "coarse_iterations": 30})
-
-
 def parts(count: int) -> planner.LaunchPart:
     """The grasps of a batch as one part."""
     hand, obj = hand_from_path("allegro"), object_from_path("block", face_error_m=1e-3)
@@ -123,15 +119,9 @@ def test_memory_is_flat_over_a_thousand_batches() -> None:
     assert grown_mb < 20
 
 
-TABLE = SceneSpec(kind="table")
-
-
 @pytest.fixture(scope="module")
 def pair():
     return hand_from_path("barrett"), object_from_path("block", face_error_m=QUICK.face_error_m)
-
-
-ONE = ExecutionContext(threads=1)
 
 
 def made(pair, wanted: list[PlanRequest], *runs: ExecutionContext) -> list[GraspSet | Exception]:
@@ -169,18 +159,13 @@ def test_a_launch_without_memory_is_halved_across_batches(pair, monkeypatch: pyt
         assert_same(one, other)
 
 
-def on_table(obj, count: int, seed: int) -> PlacedGrasps:
-    poses = rest_poses(TABLE, obj, count=2, seed=seed)["scene/object_pose"]
-    return PlacedGrasps(supports_of(TABLE), poses, np.arange(count) % 2)
-
-
 def good_enough(grasps: GraspSet, *_: object) -> np.ndarray:
     return np.zeros(len(grasps))
 
 
 def test_what_is_matter_with_one_batch_leaves_others_as_they_are(pair) -> None:
     hand, obj = pair
-    below = on_table(obj, 2, 3)
+    below = on_tables(obj, seed=3).placed(np.arange(2) % 2)
     below = replace(below, object_pose=below.object_pose - np.array([0, 0, 1.0, 0, 0, 0, 0]))
 
     def torn(*_: object) -> np.ndarray:
@@ -188,10 +173,10 @@ def test_what_is_matter_with_one_batch_leaves_others_as_they_are(pair) -> None:
 
     wanted = [
         PlanRequest(2, QUICK, 1, 0, below, good_enough),
-        PlanRequest(3, QUICK, 1, 1, on_table(obj, 3, 3), good_enough),
-        PlanRequest(2, QUICK, 1, 2, on_table(obj, 2, 3), torn),
-        PlanRequest(2, QUICK, 1, 3, on_table(obj, 2, 3), good_enough),
-        PlanRequest(3, QUICK, 2, 0, on_table(obj, 3, 4), good_enough),
+        PlanRequest(3, QUICK, 1, 1, on_tables(obj, seed=3).placed(np.arange(3) % 2), good_enough),
+        PlanRequest(2, QUICK, 1, 2, on_tables(obj, seed=3).placed(np.arange(2) % 2), torn),
+        PlanRequest(2, QUICK, 1, 3, on_tables(obj, seed=3).placed(np.arange(2) % 2), good_enough),
+        PlanRequest(3, QUICK, 2, 0, on_tables(obj, seed=4).placed(np.arange(3) % 2), good_enough),
     ]
     told: list[str] = []
     stopping = ExecutionContext("cpu", 1, progress=lambda *what: told.append(what[2]), cancelled=lambda: len(told) > 1)

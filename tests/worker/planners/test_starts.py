@@ -41,7 +41,13 @@ from tests.worker.simulation.rigs import ball, object_of
 #: A box that an Allegro hand spans in one direction only, and half of its width there [m].
 SIDES = (0.1, 0.24, 0.24)
 HALF = SIDES[0] / 2
+BLOCK = object_from_path("block", face_error_m=1e-3)
+CUBE = object_of(trimesh.creation.box((0.06, 0.06, 0.06)))
 DRAFT = FIDELITIES["draft"]
+UP = np.array([0.0, 0, 1])
+SIZE = np.array([0.05, 0.06, 0.08])
+BOX = object_from_mesh(trimesh.creation.box(SIZE))
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 
 
 def draft_model(hand: HandModel, obj: ObjectModel, scenes: Sequence[Environment] = ()) -> Model:
@@ -131,18 +137,13 @@ def test_draws_are_those_of_each_generator_alone_and_look_at_the_object() -> Non
 
 
 @pytest.fixture(scope="module")
-def cube() -> ObjectModel:
-    return object_of(trimesh.creation.box((0.06, 0.06, 0.06)))
-
-
-@pytest.fixture(scope="module")
 def ring() -> HandModel:
     """Its six fingers stand side by side."""
     return ring_hand(6)
 
 
-def test_a_ring_of_six_has_a_place_only_when_it_opens(ring: HandModel, cube: ObjectModel) -> None:
-    model, generators = draft_model(ring, cube), [start_generator(5, 0, i, 0) for i in range(4)]
+def test_a_ring_of_six_has_a_place_only_when_it_opens(ring: HandModel) -> None:
+    model, generators = draft_model(ring, CUBE), [start_generator(5, 0, i, 0) for i in range(4)]
     state, depth = clear_starts(model, generators)
     assert (depth > NO_PLACE).all()
     opened = starts.open_further(model, generators, state, depth, np.array([True, True, True, False]))
@@ -151,8 +152,8 @@ def test_a_ring_of_six_has_a_place_only_when_it_opens(ring: HandModel, cube: Obj
     assert (state.q[:3, closed].mean(axis=1) < ring.preshape[closed].mean()).all()
 
 
-def test_a_hand_that_has_a_place_keeps_it(cube: ObjectModel) -> None:
-    model, generators = draft_model(hand_from_path("barrett"), cube), [start_generator(5, 0, i, 0) for i in range(4)]
+def test_a_hand_that_has_a_place_keeps_it() -> None:
+    model, generators = draft_model(hand_from_path("barrett"), CUBE), [start_generator(5, 0, i, 0) for i in range(4)]
     state, depth = clear_starts(model, generators)
     before = state.pivot.copy(), state.rotation.copy(), state.q.copy()
     assert not starts.open_further(model, generators, state, depth, np.ones(4, bool)).any()
@@ -160,16 +161,13 @@ def test_a_hand_that_has_a_place_keeps_it(cube: ObjectModel) -> None:
         np.testing.assert_array_equal(was, now)
 
 
-def test_a_grasp_that_opened_does_not_depend_on_its_batch(ring: HandModel, cube: ObjectModel) -> None:
+def test_a_grasp_that_opened_does_not_depend_on_its_batch(ring: HandModel) -> None:
     many, few = (
-        synthesize(ring, cube, PlanRequest(count, DRAFT, seed=3), ExecutionContext(threads=threads)).grasp
+        synthesize(ring, CUBE, PlanRequest(count, DRAFT, seed=3), ExecutionContext(threads=threads)).grasp
         for count, threads in ((5, 3), (2, 1))
     )
     np.testing.assert_array_equal(many.hand_pose[:2], few.hand_pose)
     np.testing.assert_array_equal(many.joint_positions[:2], few.joint_positions)
-
-
-UP = np.array([0.0, 0, 1])
 
 
 def lying(obj) -> Environment:
@@ -180,11 +178,6 @@ def lying(obj) -> Environment:
 def on_its_table(obj) -> Scenes:
     """The same as a scene; the object's frame is the table's."""
     return Scenes(lying(obj).obstacles, np.array([[0.0, 0, 0, 1, 0, 0, 0]]))
-
-
-@pytest.fixture(scope="module")
-def block():
-    return object_from_path("block", face_error_m=1e-3)
 
 
 @pytest.fixture(scope="module")
@@ -204,12 +197,12 @@ def test_pairs_of_a_ball_are_its_chords_within_the_cones() -> None:
     assert max(np.linalg.norm(end - obj.centre_of_mass, axis=1).max() for end in pairs.ends()) <= obj.radius + 1e-9
 
 
-def test_what_a_hand_cannot_span_or_reach_is_told(block, barrett) -> None:
+def test_what_a_hand_cannot_span_or_reach_is_told(barrett) -> None:
     known = oppositions_of(barrett)
-    assert Openings.of(known, block, lying(block)).within_reach
-    deep = Environment((Obstacle.half_space(UP, float(block.vertices[:, 2].max()) + 0.01),), UP)
-    assert not Openings.of(known, block, deep).within_reach
-    wide = replace(block, vertices=10 * block.vertices, centre_of_mass=10 * block.centre_of_mass)
+    assert Openings.of(known, BLOCK, lying(BLOCK)).within_reach
+    deep = Environment((Obstacle.half_space(UP, float(BLOCK.vertices[:, 2].max()) + 0.01),), UP)
+    assert not Openings.of(known, BLOCK, deep).within_reach
+    wide = replace(BLOCK, vertices=10 * BLOCK.vertices, centre_of_mass=10 * BLOCK.centre_of_mass)
     opening = Openings.of(known, wide, lying(wide))
     assert not opening.within_reach and not len(opening.sums)
 
@@ -225,16 +218,16 @@ def test_hands_reach_across_what_lies_flat_from_above(barrett) -> None:
     assert np.abs(line @ UP).max() < 1e-6 and (found.away @ UP).min() > 0.6
 
 
-def test_hands_hold_the_middle_and_come_from_a_free_way(block, barrett) -> None:
+def test_hands_hold_the_middle_and_come_from_a_free_way(barrett) -> None:
     rng = np.random.default_rng(0)
-    opening, known = Openings.of(oppositions_of(barrett), block, lying(block)), oppositions_of(barrett)
+    opening, known = Openings.of(oppositions_of(barrett), BLOCK, lying(BLOCK)), oppositions_of(barrett)
     uniform = rng.random((40, 6))
     uniform[:, 5] = 0.0
-    found = across(barrett, block, opening, uniform, np.array([[0.0, 0, 1]]))
+    found = across(barrett, BLOCK, opening, uniform, np.array([[0.0, 0, 1]]))
     # Without noise the dofs are those of one of the known postures, whose middle lies in that of a pair.
     assert np.array_equal(found.q(barrett, np.zeros((40, barrett.dofs))), known.q[found.posture])
     rotation = quat_from_matrix(found.turn)
-    middle = found.pivot + block.centre_of_mass
+    middle = found.pivot + BLOCK.centre_of_mass
     middle = middle + quat_rotate(rotation, known.middle[found.posture] - barrett.palm.centre)
     gap = np.linalg.norm(middle[:, None] - opening.pairs.middle[None], axis=-1).min(axis=1)
     assert gap == pytest.approx(0.0, abs=1e-9)
@@ -253,22 +246,22 @@ def hindered(hand, obj, scenes: Scenes, height: float, share: float) -> float:
     return float(hindrance(model, HandState(at, np.array([[0.0, 1.0, 0.0, 0.0]]), q[None]), placed)[0])
 
 
-def test_a_hand_around_an_edge_or_below_a_board_is_hindered(block, barrett) -> None:
-    table = on_its_table(block)
-    assert hindered(barrett, block, table, 0.15, 0.1) == 0.0
-    assert hindered(barrett, block, table, 0.03, 1.0) > 0.1
-    top = float(block.vertices[:, 2].max())
+def test_a_hand_around_an_edge_or_below_a_board_is_hindered(barrett) -> None:
+    table = on_its_table(BLOCK)
+    assert hindered(barrett, BLOCK, table, 0.15, 0.1) == 0.0
+    assert hindered(barrett, BLOCK, table, 0.03, 1.0) > 0.1
+    top = float(BLOCK.vertices[:, 2].max())
     for room_m, low in ((0.06, True), (0.30, False)):
         # The palm is 15 cm above the block, the board `room_m` above the palm; the hand's back is some cm thick.
         board = Obstacle.box([0, 0, top + 0.15 + room_m + 0.25, 1, 0, 0, 0], [1.0, 1.0, 0.5])
         below = replace(table, supports=(*table.supports, board))
-        assert (hindered(barrett, block, below, 0.15, 0.1) > 0.1) == low
+        assert (hindered(barrett, BLOCK, below, 0.15, 0.1) > 0.1) == low
 
 
-def test_how_far_pair_is_beside_pads_of_a_hand_that_was_moved(block, barrett) -> None:
-    opening = Openings.of(oppositions_of(barrett), block, lying(block))
+def test_how_far_pair_is_beside_pads_of_a_hand_that_was_moved(barrett) -> None:
+    opening = Openings.of(oppositions_of(barrett), BLOCK, lying(BLOCK))
     uniform, ways = np.random.default_rng(0).random((30, 6)), np.array([[0.0, 0, 1]])
-    found = across(barrett, block, opening, uniform, ways)
+    found = across(barrett, BLOCK, opening, uniform, ways)
     assert found.deep.min() >= 0.0 and found.deep.max() > 0.02
     # Back by as much as it is deep, or less: what lies between palm and pads lies between the fingers.
     for share in (0.0, 0.5, 1.0):
@@ -282,13 +275,13 @@ def test_how_far_pair_is_beside_pads_of_a_hand_that_was_moved(block, barrett) ->
 
 
 @pytest.mark.parametrize("tips_m", [None, 0.0])
-def test_outlines_tell_how_far_a_hand_must_rise(block, barrett, tips_m) -> None:
-    opening = Openings.of(oppositions_of(barrett), block, lying(block))
+def test_outlines_tell_how_far_a_hand_must_rise(barrett, tips_m) -> None:
+    opening = Openings.of(oppositions_of(barrett), BLOCK, lying(BLOCK))
     uniform, ways = np.random.default_rng(0).random((60, 6)), np.array([[0.0, 0, 1], [0.6, 0, 0.8]])
-    table = replace(lying(block).obstacles[0], tips_m=tips_m)
+    table = replace(lying(BLOCK).obstacles[0], tips_m=tips_m)
     scene = Environment((table,), UP)
-    found = across(barrett, block, opening, uniform, ways)
-    centre = found.pivot + block.centre_of_mass
+    found = across(barrett, BLOCK, opening, uniform, ways)
+    centre = found.pivot + BLOCK.centre_of_mass
     known = oppositions_of(barrett).q
     outlines, again, few = (antipodal_starts.outlines_of(barrett, q) for q in (known, known.copy(), known[:3]))
     assert outlines is again and len(few.points) == 3
@@ -306,25 +299,25 @@ def test_outlines_tell_how_far_a_hand_must_rise(block, barrett, tips_m) -> None:
     assert (lack - told).max() < 0.018 and (lack - told).mean() < 0.002
 
 
-def test_draws_that_need_not_rise_come_first_in_their_order(block, barrett) -> None:
-    scene = lying(block)
-    opening = Openings.of(oppositions_of(barrett), block, scene)
-    uniform, ways = np.random.default_rng(1).random((5, 40, 6)), free_ways(scene, block)
-    order, off = promising(barrett, block, opening, uniform, ways, scene, room=0.006, keep=40)
+def test_draws_that_need_not_rise_come_first_in_their_order(barrett) -> None:
+    scene = lying(BLOCK)
+    opening = Openings.of(oppositions_of(barrett), BLOCK, scene)
+    uniform, ways = np.random.default_rng(1).random((5, 40, 6)), free_ways(scene, BLOCK)
+    order, off = promising(barrett, BLOCK, opening, uniform, ways, scene, room=0.006, keep=40)
     assert np.array_equal(np.sort(order, axis=1), np.tile(np.arange(40), (5, 1)))
     near = off <= antipodal_starts.NEAR_M
     assert near.any() and not near.all()
     for places, offs, alike in zip(order, off, near, strict=True):
         assert (np.diff(places[alike]) > 0).all()
         assert (np.diff(offs[~alike]) >= 0).all() and alike[: alike.sum()].all()
-    few, least = promising(barrett, block, opening, uniform[3:4], ways, scene, room=0.006, keep=7)
+    few, least = promising(barrett, BLOCK, opening, uniform[3:4], ways, scene, room=0.006, keep=7)
     assert np.array_equal(few[0], order[3, :7]) and np.array_equal(least[0], off[3, :7])
 
 
-def test_what_lies_flat_is_between_the_fingers_at_the_start(block, barrett) -> None:
+def test_what_lies_flat_is_between_the_fingers_at_the_start(barrett) -> None:
     scale = np.array([1.0, 0.6, 0.4])
-    thin = replace(block, vertices=block.vertices * scale, centre_of_mass=block.centre_of_mass * scale, digest="7" * 64)
-    thin = replace(thin, hull_vertices=block.hull_vertices * scale)
+    thin = replace(BLOCK, vertices=BLOCK.vertices * scale, centre_of_mass=BLOCK.centre_of_mass * scale, digest="7" * 64)
+    thin = replace(thin, hull_vertices=BLOCK.hull_vertices * scale)
     (table,) = lying(thin).obstacles
     placed = Scenes((replace(table, tips_m=0.0),), on_its_table(thin).object_pose).placed(np.zeros(4, int))
     model = draft_model(barrett, thin, placed.scenes)
@@ -341,11 +334,6 @@ def test_what_lies_flat_is_between_the_fingers_at_the_start(block, barrett) -> N
     low, high = thin.vertices.min(axis=0), thin.vertices.max(axis=0)
     between = ((line > low - 0.01) & (line < high + 0.01)).all(axis=-1).any(axis=1)
     assert between.mean() > 0.7
-
-
-SIZE = np.array([0.05, 0.06, 0.08])
-BOX = object_from_mesh(trimesh.creation.box(SIZE))
-UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 
 
 def beside_walls(gap: float, axes: tuple[int, ...]) -> Environment:
@@ -398,7 +386,6 @@ def test_candidate_grasps_none_of_which_is_valid_come_with_the_reason(tmp_path) 
     sheet = tmp_path / "sheet.stl"
     trimesh.creation.box([0.08, 0.08, 0.004]).export(sheet)
     place, request = SceneSpec(kind="table"), JobOptions(want="candidates", grasps=1, fidelity="draft", scene="table")
-    made = synthesized("allegro", str(sheet), request, place=place, scenes=1)
-    found = made.summary()
+    found = synthesized("allegro", str(sheet), request, place=place, scenes=1).summary()
     assert (found["grasps"], found["valid"], found["reason"]) == (1, 0, None)
     assert "is 4 mm high" in found["narrow"] and _said({"file": "g.h5", **found}).endswith(found["narrow"])

@@ -4,7 +4,6 @@ import json
 import re
 import signal
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -27,7 +26,7 @@ from tests.worker.commands_run import refused
 DRAFT = "--fidelity draft --device cpu"
 
 
-def synth(out: Path, more: str, obj: str | Path = "block") -> dict[str, Any]:
+def synth(out: Path, more: str, obj: str | Path = "block") -> dict:
     return graspd_command(f"synth --hand allegro -n 3 {DRAFT} {more} --object", obj, "-o", out)
 
 
@@ -37,12 +36,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def validated(folder: Path) -> tuple[Path, dict[str, Any]]:
+def validated(folder: Path) -> tuple[Path, dict]:
     return folder / "validated.h5", synth(folder / "validated.h5", "--budget 8")
 
 
 @pytest.fixture(scope="module")
-def unvalidated(folder: Path) -> tuple[Path, dict[str, Any]]:
+def unvalidated(folder: Path) -> tuple[Path, dict]:
     return folder / "unvalidated.h5", synth(folder / "unvalidated.h5", "--validation none")
 
 
@@ -62,7 +61,7 @@ def of_own_mesh(folder: Path, own_mesh: Path) -> Path:
     return folder / "own.h5"
 
 
-def test_grasps_called_valid_were_validated_as_in_a_job(validated: tuple[Path, dict[str, Any]]) -> None:
+def test_grasps_called_valid_were_validated_as_in_a_job(validated: tuple[Path, dict]) -> None:
     file, said = validated
     shard = read_shard(file, kind="base")
     assert (said["grasps"], said["valid"], said["feasible"], said["validation"]) == (3, 3, 3, "standard")
@@ -72,7 +71,7 @@ def test_grasps_called_valid_were_validated_as_in_a_job(validated: tuple[Path, d
     assert said["reason"] is None and "reason" not in shard.attributes
 
 
-def test_grasps_that_nobody_validated_are_sound_and_never_valid(unvalidated: tuple[Path, dict[str, Any]]) -> None:
+def test_grasps_that_nobody_validated_are_sound_and_never_valid(unvalidated: tuple[Path, dict]) -> None:
     file, said = unvalidated
     shard = read_shard(file, kind="base")
     assert (said["grasps"], said["valid"], said["feasible"], said["validation"]) == (3, 0, 3, "none")
@@ -82,14 +81,14 @@ def test_grasps_that_nobody_validated_are_sound_and_never_valid(unvalidated: tup
     assert "3 feasible of" in line and "not validated" in line and not re.search(r"\bvalid\b", line)
 
 
-def test_evaluate_gives_a_verdict_of_each_grasp_that_agrees(validated: tuple[Path, Any]) -> None:
+def test_evaluate_gives_a_verdict_of_each_grasp_that_agrees(validated: tuple) -> None:
     told = graspd_command("evaluate", validated[0])
     expected = [(str(validated[0]), row, True) for row in range(3)]
     assert [(one["file"], one["row"], one["held"]) for one in told["verdicts"]] == expected
     assert "verdicts" not in told["files"][0]
 
 
-def test_readers_take_grasps_that_nobody_validated_only_when_told(validated, unvalidated: tuple[Path, Any]) -> None:
+def test_readers_take_grasps_that_nobody_validated_only_when_told(validated, unvalidated: tuple) -> None:
     both = open_shards([validated[0], unvalidated[0]])
     rows = [Grasps(both, columns=["quality/epsilon"], **wish) for wish in ({}, {"unvalidated": True}, {"valid": False})]
     assert [len(found) for found in rows] == [3, 3, 6]
@@ -168,7 +167,7 @@ def test_fewer_grasps_than_asked_are_told_with_the_reason_and_exit_code_3(folder
 def test_who_stops_it_keeps_what_was_validated(folder: Path, monkeypatch, asked: signal.Signals) -> None:
     real, out = synthesis.synthesized, folder / f"stopped-{asked}.h5"
 
-    def stopped(*given: Any, progress: Any, **named: Any) -> Any:
+    def stopped(*given, progress, **named):
         def tell(done: float, total: float, message: str) -> None:
             if done >= 32 and signal.getsignal(asked) is not before:
                 signal.raise_signal(asked)

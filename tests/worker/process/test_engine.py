@@ -11,7 +11,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing import Pipe
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -150,8 +149,7 @@ def test_a_worker_ends_with_its_engine_and_leaves_the_lease_to_the_controller(st
     worker = start()
     worker.begin()
     os.kill(worker.engine, signal.SIGKILL)
-    assert worker.process.wait(60) == 1
-    assert worker.queue.leases() and worker.events() == [EventKind.STARTED]
+    assert worker.process.wait(60) == 1 and worker.queue.leases() and worker.events() == [EventKind.STARTED]
 
 
 @pytest.mark.parametrize("which", ["engine", "worker"])
@@ -172,10 +170,10 @@ class Deaf(Link):
     """To an engine that hears and says nothing until it is killed."""
 
     def __init__(self) -> None:
-        self.told: list[Any] = []
+        self.told = []
         self.killed = False
 
-    def say(self, word: str, about: Any = None) -> None:
+    def say(self, word: str, about=None) -> None:
         self.told.append(about)
 
     def hear(self, wait_s: float) -> None:
@@ -186,9 +184,7 @@ class Deaf(Link):
         self.killed = True
 
 
-def test_an_engine_is_stopped_when_the_time_of_a_task_is_over_and_then_ended(
-    rq_queue, redis_server, monkeypatch
-) -> None:
+def test_an_engine_with_too_long_a_task_is_stopped_then_ended(rq_queue, redis_server, monkeypatch) -> None:
     monkeypatch.setattr(main, "STUCK_AFTER_S", 0.2)
     deaf = Deaf()
     heart = Heartbeat(redis_server, beat_of(), lease_s=LEASE_S)

@@ -1,7 +1,6 @@
 """Which failures are the worker's own, and its check of itself with the real engine."""
 
 from collections.abc import Collection
-from typing import Any
 
 import pytest
 
@@ -66,8 +65,7 @@ def test_a_task_that_fails_with_a_sound_engine_has_failed(doubted: Doubted) -> N
 @pytest.mark.parametrize("error", [MeshError("torn"), DamagedError("no JSON")])
 def test_bad_input_casts_no_doubt_on_the_worker(doubted: Doubted, error: Exception) -> None:
     doubted.engine_works = False
-    assert doubted.run(message_for(), raising(error)).kind is EventKind.FAILED
-    assert doubted.checked == []
+    assert doubted.run(message_for(), raising(error)).kind is EventKind.FAILED and doubted.checked == []
 
 
 def test_failures_in_a_row_that_others_do_not_have_are_the_workers(doubted: Doubted) -> None:
@@ -97,8 +95,7 @@ def test_a_success_in_between_ends_the_row(doubted: Doubted) -> None:
 
 def test_a_worker_comes_back_once_its_engine_works_or_gives_up(doubted: Doubted) -> None:
     doubted.engine_works = False
-    assert not doubted.fitness.try_engine((Stage.SYNTHESIZE,))
-    assert not doubted.sits_out()
+    assert not doubted.fitness.try_engine((Stage.SYNTHESIZE,)) and not doubted.sits_out()
     assert len(doubted.checked) == 1 + len(module.PAUSES_S)
     doubted.states.clear()
     doubted.engine_works = True
@@ -115,8 +112,7 @@ def test_a_fault_that_the_check_cannot_see_is_not_cured_by_passing_it(doubted: D
 def test_a_worker_in_quarantine_stops_when_told(doubted: Doubted, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "PAUSES_S", (600.0,))
     doubted.engine_works = False
-    assert not doubted.fitness.try_engine((Stage.SYNTHESIZE,))
-    assert not doubted.sits_out(told_to_stop=True)
+    assert not doubted.fitness.try_engine((Stage.SYNTHESIZE,)) and not doubted.sits_out(told_to_stop=True)
 
 
 @pytest.mark.parametrize("stage", Stage)
@@ -127,10 +123,10 @@ def test_the_engine_of_every_stage_passes(stage: Stage) -> None:
 def test_an_engine_that_breaks_or_gives_nonsense_does_not_pass(monkeypatch: pytest.MonkeyPatch) -> None:
     plan = generation.validated_grasps
 
-    def broken(*args: Any, **options: Any) -> None:
+    def broken(*args, **options) -> None:
         raise ImportError("libwarp.so: cannot open\nshared object file")
 
-    def nonsense(*args: Any, **options: Any) -> Any:
+    def nonsense(*args, **options):
         found = plan(*args, **options)
         found.grasps.grasp.hand_pose[:] = float("nan")
         return found

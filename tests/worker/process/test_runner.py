@@ -1,7 +1,6 @@
-"""What becomes of a task, whatever its stage does."""
+"""What becomes of a task, whatever its stage does or when its GPU breaks down, with which the process ends."""
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -10,11 +9,13 @@ from graspd.service.model.errors import InputError, MeshError, QueueUnavailable,
 from graspd.service.model.messages import TaskMessage
 from graspd.service.model.states import Stage
 from graspd.service.queue.port import Event, EventKind
-from graspd.service.store.manifests import load_manifest
+from graspd.service.store.manifests import load_manifest, shard_exists
 from graspd.service.store.records import task_attempts
 from graspd.service.store.shards import read_shard
 from graspd.service.store.store import Store, open_store
+from graspd.worker.engines.devices import DeviceLost
 from graspd.worker.execution_context import ExecutionContext
+from graspd.worker.pool.pool import ProcessLost
 from graspd.worker.process.runner import Runner
 from graspd.worker.stages import scene
 from graspd.worker.stages.context import StopReason, TaskContext
@@ -27,14 +28,14 @@ class Bench:
 
     runner: Runner
 
-    def __init__(self, **options: Any) -> None:
+    def __init__(self, **options) -> None:
         self.store: Store = open_store("memory://")
         self.told: list[Event] = []
         self.calls = 0
         self.options = options
 
-    def run(self, message: TaskMessage, stage: Any = fake_synthesize, **changes: Any) -> Event | None:
-        def counted(task: TaskMessage, context: TaskContext) -> Any:
+    def run(self, message: TaskMessage, stage=fake_synthesize, **changes) -> Event | None:
+        def counted(task: TaskMessage, context: TaskContext):
             self.calls += 1
             return stage(task, context)
 
@@ -48,7 +49,7 @@ def bench() -> Bench:
     return Bench()
 
 
-def raising(error: Exception) -> Any:
+def raising(error: Exception):
     def stage(message: TaskMessage, context: TaskContext) -> None:
         raise error
 
@@ -62,8 +63,7 @@ def test_a_task_leaves_a_shard_and_a_manifest_that_describes_it(bench: Bench) ->
     assert [event.kind for event in bench.told] == [EventKind.STARTED]
     manifest = load_manifest(bench.store, Stage.SYNTHESIZE, message.output)
     shard = read_shard(bench.store.get(manifest.key), kind="base")
-    assert manifest.counts["N"] == len(manifest.grasps) == 32
-    assert manifest.valid == shard["quality/valid"].sum()
+    assert manifest.counts["N"] == len(manifest.grasps) == 32 and manifest.valid == shard["quality/valid"].sum()
     assert manifest.index_threshold_m == 0.005
     assert [g.epsilon for g in manifest.grasps] == list(shard["quality/epsilon"][:, 1])
     assert all(g.stability_loss is None for g in manifest.grasps), "nan is no JSON number"
@@ -73,8 +73,7 @@ def test_a_task_leaves_a_shard_and_a_manifest_that_describes_it(bench: Bench) ->
 def test_a_task_that_was_done_before_is_not_done_again(bench: Bench) -> None:
     message = message_for()
     bench.run(message)
-    assert bench.run(message, raising(AssertionError("it ran"))).kind is EventKind.FINISHED
-    assert bench.calls == 1
+    assert bench.run(message, raising(AssertionError("it ran"))).kind is EventKind.FINISHED and bench.calls == 1
 
 
 def test_a_shard_left_without_its_manifest_is_described_as_it_is(bench: Bench) -> None:
@@ -84,7 +83,7 @@ def test_a_shard_left_without_its_manifest_is_described_as_it_is(bench: Bench) -
     other.put(first.key, bench.store.get(first.key))
     bench.store = other
 
-    def different(task: TaskMessage, context: TaskContext) -> Any:
+    def different(task: TaskMessage, context: TaskContext):
         return fake_synthesize(task.model_copy(update={"batch": 9}), context)
 
     bench.run(message, different)
@@ -131,7 +130,7 @@ def full_disk(message: TaskMessage, context: TaskContext) -> None:
         (full_disk, "No space left on device: no file could be written"),
     ],
 )
-def test_a_part_that_is_away_or_full_costs_no_attempt(bench: Bench, stage: Any, said: str) -> None:
+def test_a_part_that_is_away_or_full_costs_no_attempt(bench: Bench, stage, said: str) -> None:
     message = message_for(attempt=3)
     outcome = bench.run(message, stage)
     assert (outcome.kind, outcome.message) == (EventKind.DEFERRED, said)
@@ -157,7 +156,7 @@ def test_a_failure_that_cannot_be_recorded_is_deferred(bench: Bench, monkeypatch
     ],
 )
 def test_why_a_task_was_stopped_decides_what_is_told(bench: Bench, reason: StopReason, kind: EventKind | None) -> None:
-    def stopping(message: TaskMessage, context: TaskContext) -> Any:
+    def stopping(message: TaskMessage, context: TaskContext):
         context.stop(reason)
         context.check()
 
@@ -168,7 +167,7 @@ def test_why_a_task_was_stopped_decides_what_is_told(bench: Bench, reason: StopR
 
 
 def test_a_stage_that_ignores_the_stop_still_writes_nothing(bench: Bench) -> None:
-    def deaf(message: TaskMessage, context: TaskContext) -> Any:
+    def deaf(message: TaskMessage, context: TaskContext):
         context.stop(StopReason.CANCELLED)
         return fake_synthesize(message, TaskContext(context.store))
 
@@ -185,7 +184,7 @@ def test_a_stage_that_ignores_the_stop_still_writes_nothing(bench: Bench) -> Non
         ({"revision": 99}, "revision 99 of synthesize"),
     ],
 )
-def test_what_another_version_must_do_costs_no_attempt(bench: Bench, changed: dict[str, Any], why: str) -> None:
+def test_what_another_version_must_do_costs_no_attempt(bench: Bench, changed: dict, why: str) -> None:
     message = message_for()
     outcome = bench.run(message, **changed)
     assert outcome.kind is EventKind.DEFERRED and why in outcome.message and bench.calls == 0
@@ -204,7 +203,7 @@ def test_what_another_version_must_do_costs_no_attempt(bench: Bench, changed: di
     ],
     ids=["number", "path", "scene", "file", "size", "many"],
 )
-def test_what_is_no_message_is_refused(bench: Bench, forged: dict[str, Any]) -> None:
+def test_what_is_no_message_is_refused(bench: Bench, forged: dict) -> None:
     message = message_for(scene="table")
     if "scene" in forged:
         forged = {"request": message.request.model_dump(mode="json") | forged}
@@ -237,3 +236,48 @@ def test_a_stage_refuses_a_damaged_shard_and_is_not_tried_again(bench: Bench) ->
     (attempt,) = task_attempts(bench.store, message.task_id)
     assert (outcome.kind, attempt.kind, attempt.last) == (EventKind.FAILED, "DamagedShard", True)
     assert base.shard_id in attempt.reason
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+
+def broken(device: str) -> None:
+    raise DeviceLost("CUDA error 700 on cuda:0: nothing runs there any more in this process")
+
+
+#: What a stage meets whose numbers no kernel has written.
+GARBLED = raising(ArithmeticError("not a number"))
+
+
+@pytest.mark.parametrize("stage", [fake_synthesize, GARBLED])
+def test_the_task_goes_back_without_a_result_or_an_attempt(stage) -> None:
+    bench, message = Bench(check_device=broken), message_for()
+    event = bench.run(message, stage)
+    assert event.kind is EventKind.RETURNED
+    assert "CUDA error 700" in event.message and "CUDA error 700" in bench.runner.device_lost
+    assert not shard_exists(bench.store, message.stage, message.output)
+    assert not list(task_attempts(bench.store, message.task_id))
+
+
+def test_a_task_that_takes_down_one_gpu_after_the_other_uses_up_its_attempts() -> None:
+    bench, message = Bench(check_device=broken), message_for()
+    bench.run(message)
+    assert bench.run(message).kind is EventKind.FAILED
+    (attempt,) = task_attempts(bench.store, message.task_id)
+    assert (attempt.kind, attempt.last) == ("DeviceLost", False)
+
+
+def test_a_task_over_which_a_process_beside_the_worker_ended_goes_back_once_and_the_worker_goes_on() -> None:
+    bench, message = Bench(check_device=lambda device: None), message_for()
+    lost = raising(ProcessLost("a process of the pool ended during its work (signal 9)"))
+    event = bench.run(message, lost)
+    assert (event.kind, bench.runner.device_lost) == (EventKind.RETURNED, "")
+    assert "signal 9" in event.message and not list(task_attempts(bench.store, message.task_id))
+    assert bench.run(message, lost).kind is EventKind.FAILED, "a task that ends each must use up its attempts"
+
+
+def test_a_device_that_works_is_not_blamed() -> None:
+    bench = Bench(check_device=lambda device: None)
+    assert (bench.run(message_for(), GARBLED).kind, bench.runner.device_lost) == (EventKind.FAILED, "")

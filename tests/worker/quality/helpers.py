@@ -14,6 +14,9 @@ from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.model import Scene
 from tests.worker.models import object_from_mesh, piece, two_finger_hand
 
+#: Pose of a hand that touches nothing.
+FAR = np.array([0, 0, -0.5, 1.0, 0, 0, 0])
+
 
 def posture(*rows: tuple[tuple[float, float, float], tuple[float, ...]]) -> Posture:
     """Postures with the root's axes along the object's: (position, joints) each."""
@@ -59,10 +62,6 @@ def pad_hand() -> HandModel:
     ball = trimesh.creation.icosphere(subdivisions=3, radius=radius)
     pads = tuple(piece(body, ball, "sphere", (radius,), (0, 0, 0.005 - radius)) for body in (1, 2))
     return dataclasses.replace(plates, name="pads", digest="9ad5" * 8, pieces=(plates.pieces[0], *pads))
-
-
-#: Pose of a hand that touches nothing.
-FAR = np.array([0, 0, -0.5, 1.0, 0, 0, 0])
 
 
 def placed_data(scene: Scene, joints: np.ndarray, pose: np.ndarray = FAR) -> mujoco.MjData:

@@ -2,8 +2,6 @@
 
 import dataclasses
 import math
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +19,6 @@ from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.surface import sample_surface
-from graspd.worker.objects import disk_cache
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.quality import diversity, probe
 from graspd.worker.quality.contact import contact_distance_consistency_mm, finger_of_body, spread_contacts
@@ -31,7 +28,7 @@ from graspd.worker.quality.intervals import wilson, wilson_of_mean
 from graspd.worker.quality.probe import HAND_POINTS, REACH_M, Probe
 from graspd.worker.quality.table import measure
 from graspd.worker.quality.volume import VOXEL_M, Overlap, SharedVolume
-from tests.worker.models import object_from_mesh, two_finger_hand
+from tests.worker.models import keep_arrays, object_from_mesh, two_finger_hand
 from tests.worker.quality.helpers import choose_contacts, grasp_set, pad_hand, plate_hand, posture
 from tests.worker.simulation.rigs import ball
 
@@ -42,6 +39,11 @@ ONE_ROW = 0.03
 
 BOX = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))
 SMALL_PLATES = plate_hand((0.03, 0.03, 0.01))
+GOOD = {"penetration_depth_mm": 0.5, "self_penetration_depth_mm": 0.0, "contact_links": 3.0}
+HAND = plate_hand((0.05, 0.04, 0.01))
+EVERY = np.ones((1, len(HAND.pieces)), bool)
+FINGERS, BALL = two_finger_hand(), ball(subdivisions=2)
+FIRST, SECOND = np.array([0]), np.array([1])
 
 
 def closed_on_box(press: float) -> Posture:
@@ -187,8 +189,7 @@ def test_bodies_of_many_postures_are_as_far_as_their_points_say(reach: float) ->
     turned = rng.normal(size=(40, 4))
     pose = np.column_stack([rng.uniform(-0.12, 0.12, (40, 3)), turned / np.linalg.norm(turned, axis=1, keepdims=True)])
     joints = hand.expand(rng.uniform(hand.lower, hand.upper, (40, hand.dofs)))
-    bodies = body_poses(hand, pose, joints)
-    points = probe.posed_points(bodies)
+    points = probe.posed_points(body_poses(hand, pose, joints))
     by_point = probe.signed_distance(points.reshape(-1, 3), reach=reach)[0].reshape(40, -1)
     wanted = np.full((40, hand.bodies), np.inf)
     np.minimum.at(wanted.T, probe.points.body, by_point.T)
@@ -206,9 +207,6 @@ def test_contacts_of_many_sets_are_those_chosen_one_set_at_time() -> None:
             alone = choose_contacts(near[b, t], place[b], normal[b], scale=0.5, limit=12)
             assert index[b, t, : count[b, t]].tolist() == alone.tolist()
     assert (count[:, 0] == 0).all() and (count[:, 1] > 0).all() and (count[:, 1] <= 12).all()
-
-
-GOOD = {"penetration_depth_mm": 0.5, "self_penetration_depth_mm": 0.0, "contact_links": 3.0}
 
 
 def gate(**changes: float) -> bool:
@@ -235,10 +233,6 @@ def test_bars_of_shares_and_means_cover_the_truth() -> None:
     for part, whole in ((0, 5), (3, 8), (8, 8), (41, 120)):
         assert wilson_of_mean(float(part), whole) == pytest.approx(wilson(part, whole), abs=1e-12)
     assert wilson(2, 8)[0] < wilson_of_mean(2.5, 8)[0] < wilson(3, 8)[0]
-
-
-HAND = plate_hand((0.05, 0.04, 0.01))
-EVERY = np.ones((1, len(HAND.pieces)), bool)
 
 
 def kept_and_shared(obj: ObjectModel, postures: Posture) -> tuple[np.ndarray, np.ndarray]:
@@ -272,11 +266,8 @@ def test_a_piece_in_the_object_and_an_object_in_a_piece_are_kept() -> None:
     assert kept.tolist() == [[False, True, False]] and shared[0, 1] > 0
 
 
-FINGERS, BALL = two_finger_hand(), ball(subdivisions=2)
-
-
 @pytest.fixture
-def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def own_cache(tmp_path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     return tmp_path / "graspd" / "coarse_grids"
 
@@ -290,11 +281,11 @@ def same(one: tuple[np.ndarray, ...], other: tuple[np.ndarray, ...]) -> bool:
     return all(np.array_equal(a, b) and a.dtype == b.dtype for a, b in zip(one, other, strict=True))
 
 
-def test_later_process_measures_with_what_the_first_one_computed(own_cache: Path, monkeypatch) -> None:
+def test_later_process_measures_with_what_the_first_one_computed(own_cache, monkeypatch) -> None:
     first = distances_of(Probe(FINGERS, BALL, hand_points=100, object_points=64))
     assert len(list(own_cache.iterdir())) == 1
 
-    def never(self: Any, points: Any, reach: float = 0.0) -> Any:
+    def never(self, points, reach: float = 0.0):
         raise AssertionError("it is there already")
 
     with monkeypatch.context() as patched:
@@ -307,17 +298,14 @@ def test_later_process_measures_with_what_the_first_one_computed(own_cache: Path
 
 
 @pytest.mark.parametrize("harm", ["shape", "kind", "name"])
-def test_an_entry_that_is_not_sound_is_made_again(own_cache: Path, harm: str) -> None:
+def test_an_entry_that_is_not_sound_is_made_again(own_cache, harm: str) -> None:
     first = distances_of(Probe(FINGERS, BALL, hand_points=100, object_points=64))
     (file,) = own_cache.iterdir()
     whole, grid = file.read_bytes(), first[0]
     harms = {"shape": {"coarse": grid[1:]}, "kind": {"coarse": grid.astype(float)}, "name": {"other": grid}}
-    disk_cache._write(file, harms[harm])
+    keep_arrays(file, harms[harm])
     assert same(distances_of(Probe(FINGERS, BALL, hand_points=100, object_points=64)), first)
     assert file.read_bytes() == whole
-
-
-FIRST, SECOND = np.array([0]), np.array([1])
 
 
 def moved(hand: HandModel, by: float) -> np.ndarray:
@@ -330,8 +318,7 @@ def moved(hand: HandModel, by: float) -> np.ndarray:
 def test_shifted_hand_is_off_by_the_shift_a_joint_by_its_points() -> None:
     # To rounding: every point moves by the same.
     assert distances(moved(pad_hand(), 0.003), FIRST, SECOND) == pytest.approx([0.003], abs=1e-12)
-    hand = plate_hand()
-    points = hand_points(hand, posture(((0, 0, 0), (0.02, 0.02)), ((0, 0, 0), (0.03, 0.02))))
+    points = hand_points(plate_hand(), posture(((0, 0, 0), (0.02, 0.02)), ((0, 0, 0), (0.03, 0.02))))
     slid = np.linalg.norm(points[0] - points[1], axis=1) > 1e-9
     assert 0 < slid.sum() < diversity.POINTS
     assert distances(points, FIRST, SECOND) == pytest.approx([0.010 * slid.mean()], abs=1e-12)
@@ -380,16 +367,14 @@ def hand_on(radius: float, at: float, q: np.ndarray) -> int:
     hand = hand_from_path("allegro")
     centre = hand.palm.centre + hand.palm.approach * (at + radius)
     ball = object_from_mesh(trimesh.creation.icosphere(subdivisions=3, radius=radius))
-    pose = np.array([[*-centre, 1, 0, 0, 0]])
-    grasp = grasp_set(Posture(pose, hand.expand(q[None])))
+    grasp = grasp_set(Posture(np.array([[*-centre, 1, 0, 0, 0]]), hand.expand(q[None])))
     return int(measure(hand, ball, grasp)["quality/grasp_type"][0])
 
 
 def test_a_ball_is_held_in_a_power_grasp_in_the_palm_or_by_pads() -> None:
     hand = hand_from_path("allegro")
     closed = np.where(hand.closing != 0, hand.lower + 0.7 * hand.span, hand.preshape)
-    assert hand_on(0.03, 0.0, closed) == GraspType.POWER
-    assert hand_on(0.01, 0.5, hand.preshape) == GraspType.NONE
+    assert hand_on(0.03, 0.0, closed) == GraspType.POWER and hand_on(0.01, 0.5, hand.preshape) == GraspType.NONE
     ball = object_from_mesh(trimesh.creation.icosphere(subdivisions=3, radius=0.03))
     # Pads stand 65 mm from the middle and slide inwards by 65 - 30 - 5 mm.
     found = measure(pad_hand(), ball, grasp_set(posture(((0, 0, 0), (0.065, 0.065)))))
@@ -412,7 +397,7 @@ def test_fingers_that_touch_by_their_sides_are_a_lateral_grasp() -> None:
     assert found["quality/grasp_type"].tolist() == [GraspType.LATERAL]
 
 
-def test_published_fingertip_grasps_are_precision_grasps(shared_data: Path) -> None:
+def test_published_fingertip_grasps_are_precision_grasps(shared_data) -> None:
     """FRoGGeR plans with four fixed points on the fingertips, so whoever plans nothing else holds nothing else."""
     case = load_case(shared_data / "reference_grasps" / "frogger_allegro" / "056_tennis_ball.json")
     some = case.grasps.take(np.arange(6))

@@ -3,7 +3,6 @@
 import json
 import math
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +18,10 @@ PRINTED = 1e-5
 JOGGLE = 1e-6
 ORIGIN = np.zeros(3)
 OCTAHEDRON = np.vstack([np.eye(3), -np.eye(3)])
+TETRAHEDRON = np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / math.sqrt(3)
+TRIPOD = np.array([[math.cos(a), math.sin(a), 0.0] for a in 2 * np.pi * np.arange(3) / 3])
+#: Both hulls joggle their points, ours by 1e-8; slivers between nearly coplanar points multiply that.
+JOGGLED = 1e-6
 
 
 def measure_space(edge_wrenches: np.ndarray) -> tuple[float, float]:
@@ -51,10 +54,6 @@ def test_spaces_of_closed_form() -> None:
     assert measure_space(edges) == pytest.approx((0.235702, 0.115207), abs=PRINTED)
 
 
-TETRAHEDRON = np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / math.sqrt(3)
-TRIPOD = np.array([[math.cos(a), math.sin(a), 0.0] for a in 2 * np.pi * np.arange(3) / 3])
-
-
 @pytest.mark.parametrize(
     ("points", "options", "friction", "epsilon", "volume"),
     [(OCTAHEDRON, {}, 0.2, 0.2 * math.sqrt(2 / 3), 0.024992), (OCTAHEDRON, {}, 0.5, 0.5 * math.sqrt(2 / 3), 0.598634),
@@ -84,8 +83,7 @@ def test_size_order_and_rotation_of_contacts_do_not_matter() -> None:
 
 
 def test_origin_outside_the_space_has_no_ball() -> None:
-    rng = np.random.default_rng(0)
-    epsilon, volume = measure_space(rng.normal(size=(20, 8, 6)) + 10)
+    epsilon, volume = measure_space(np.random.default_rng(0).normal(size=(20, 8, 6)) + 10)
     assert epsilon == 0.0 and volume > 0.0
 
 
@@ -103,7 +101,7 @@ def frogger_edges(grasp: dict[str, list[list[float]]]) -> np.ndarray:
     return np.concatenate([force, np.cross(np.array(grasp["contact_points_object"])[:, None], force)], axis=-1)
 
 
-def test_published_frogger_grasps_have_their_ferrari_canny(shared_data: Path) -> None:
+def test_published_frogger_grasps_have_their_ferrari_canny(shared_data) -> None:
     files = sorted((shared_data / "reference_grasps" / "frogger_allegro").glob("*.json"))
     grasps = [grasp for file in files for grasp in json.loads(file.read_text())["grasps"]]
     assert len(grasps) == 378
@@ -111,10 +109,6 @@ def test_published_frogger_grasps_have_their_ferrari_canny(shared_data: Path) ->
     # Stored points and normals are rounded to 1e-7 m and 1e-6, the stored metric to 1e-8.
     stored = [max(0.0, grasp["ferrari_canny_L1_recomputed_here"]) for grasp in grasps]
     np.testing.assert_allclose(found, stored, rtol=0, atol=1e-6)
-
-
-#: Both hulls joggle their points, ours by 1e-8; slivers between nearly coplanar points multiply that.
-JOGGLED = 1e-6
 
 
 def contacts(count: int, friction: float = 1.0, seed: int = 0) -> np.ndarray:

@@ -22,6 +22,7 @@ from tests.service.readers import box_scenes
 from tests.worker.models import object_from_mesh
 
 H, W = 6, 8
+DEPTH_M = 1e-4  # what a view promises of its depth [m]: tests/worker/rendering/test_views.py
 
 
 @pytest.fixture
@@ -90,18 +91,13 @@ def test_sidecar_tells_the_camera_and_a_second_export_is_refused(views, tmp_path
     export_images(views, tmp_path)
     left, right = (json.loads((tmp_path / f"view_{view:04}.json").read_text()) for view in range(2))
     assert (left["eye"], right["eye"], right["scene"], left["width"], left["height"]) == ("left", "right", 1, W, H)
-    assert left["position"] == [0, 0, -0.5]
-    assert left["intrinsics"] == [[9, 0, 4], [0, 9, 3], [0, 0, 1]]
-    assert left["bounding_box_2d_tight"] == [1, 2, 3, 4]
-    assert left["occlusion_ratio"] == 0.25
+    assert left["position"] == [0, 0, -0.5] and left["intrinsics"] == [[9, 0, 4], [0, 9, 3], [0, 0, 1]]
+    assert left["bounding_box_2d_tight"] == [1, 2, 3, 4] and left["occlusion_ratio"] == 0.25
     assert right["bounding_box_2d_tight"] is None and right["occlusion_ratio"] is None
     labels = json.loads((tmp_path / "labels.json").read_text())
     assert [labels[k]["class"] for k in "0123"] == ["background", "table", "mug", "block"]
     with pytest.raises(InputError, match="exported views already"):
         export_images(views, tmp_path)
-
-
-DEPTH_M = 1e-4  # what a view promises of its depth [m]: tests/worker/rendering/test_views.py
 
 
 def test_points_of_a_rendered_object_lie_on_its_mesh(tmp_path: Path) -> None:
@@ -117,8 +113,7 @@ def test_points_of_a_rendered_object_lie_on_its_mesh(tmp_path: Path) -> None:
         assert distance.max() < DEPTH_M
         cosine = np.einsum("pc,pc->p", mesh.face_normals[face], sample["cloud/normals"])
         # Faces turn by 7.5 degrees each, and a pixel's neighbours may lie on the next one.
-        assert np.quantile(cosine, 0.1) > np.cos(np.radians(12))
-        assert np.median(cosine) > np.cos(np.radians(4))
+        assert np.quantile(cosine, 0.1) > np.cos(np.radians(12)) and np.median(cosine) > np.cos(np.radians(4))
 
 
 def test_surface_of_the_hand_of_a_shard_follows_its_kinematics() -> None:

@@ -22,17 +22,6 @@ from graspd.worker.rendering import Extras, render, sheets
 from graspd.worker.rendering.hands import DrawnHand, drawn_bodies, hand_parts, without_visuals
 from graspd.worker.rendering.pictures import THREE_SIDES, grasp_pictures
 from graspd.worker.rendering.scenery import TABLE, TABLE_SIZE, seen_share, slab_poses, slabs
-from graspd.worker.rendering.sheets import (
-    GAP,
-    MARGIN,
-    PAPER,
-    best,
-    contact_sheet,
-    depth_colours,
-    figures,
-    three_sides_sheet,
-    views_page,
-)
 from graspd.worker.rendering.trajectory_pictures import KINDS, PictureScenes, animation, way_pictures
 from graspd.worker.stages.models import hand_glb
 from tests.worker.commands_run import refused
@@ -40,20 +29,26 @@ from tests.worker.hands.urdfs import joint, link, robot
 from tests.worker.models import object_from_mesh, two_finger_hand
 
 HAND = two_finger_hand()
+BLOCK = object_from_mesh(trimesh.creation.box((0.05, 0.04, 0.06)), "block")
 POSES = np.array([[0, 0, -0.06, 1.0, 0, 0, 0], [0, 0, 0.06, 0, 1.0, 0, 0]])
 JOINTS = np.array([[0.1, 0.1], [0.3, 0.3]])
 REST = np.array([[0, 0, 0.03, 1.0, 0, 0, 0]])
 TABLE_SCENE = PictureScenes((HalfSpace(),), REST)
+DOWN = np.array([0, 0, 0.06, 0, 1.0, 0, 0])
+SECONDS = [0.5, 0.05, 1.2]
+SPECS = {kind: supports_in(SceneSpec(kind=kind)) for kind in ("table", "bin", "shelf")}
+SHAPE = '<collision><geometry><box size="0.02 0.02 0.04"/></geometry></collision>'
+RED = '<material name="red"><color rgba="1 0 0 1"/></material>'
+SEEN = (
+    f'<visual><geometry><box size="0.06 0.06 0.01"/></geometry>{RED}</visual>'
+    '<visual><geometry><mesh filename="part.stl"/></geometry><material name="blue"/></visual>'
+    '<visual><geometry><mesh filename="missing.stl"/></geometry></visual>'
+)
 
 
 @pytest.fixture(scope="module")
-def block():
-    return object_from_mesh(trimesh.creation.box((0.05, 0.04, 0.06)), "block")
-
-
-@pytest.fixture(scope="module")
-def pictures(block) -> np.ndarray:
-    return grasp_pictures(HAND, block, POSES, JOINTS, (80, 64), THREE_SIDES, samples=4)
+def pictures() -> np.ndarray:
+    return grasp_pictures(HAND, BLOCK, POSES, JOINTS, (80, 64), THREE_SIDES, samples=4)
 
 
 def coloured_pixels(picture: np.ndarray, low: int, high: int) -> np.ndarray:
@@ -74,10 +69,10 @@ def test_every_side_shows_object_and_fingertips_in_their_colours(pictures) -> No
         assert coloured_pixels(picture, 115, 135).sum() > 5, "teal fingertips"
 
 
-def test_grasp_looks_the_same_whatever_grasps_are_drawn_with_it(block, pictures):
-    alone = grasp_pictures(HAND, block, POSES[1:], JOINTS[1:], (80, 64), THREE_SIDES, samples=4)
+def test_grasp_looks_the_same_whatever_grasps_are_drawn_with_it(pictures):
+    alone = grasp_pictures(HAND, BLOCK, POSES[1:], JOINTS[1:], (80, 64), THREE_SIDES, samples=4)
     np.testing.assert_array_equal(alone[0], pictures[1])
-    none = grasp_pictures(HAND, block, np.zeros((0, 7)), np.zeros((0, 2)), (80, 64), THREE_SIDES)
+    none = grasp_pictures(HAND, BLOCK, np.zeros((0, 7)), np.zeros((0, 2)), (80, 64), THREE_SIDES)
     assert none.shape == (0, 3, 64, 80, 3)
 
 
@@ -90,9 +85,9 @@ def quality(count: int) -> dict[str, np.ndarray]:
 
 def test_best_have_the_largest_epsilon_and_captions_quote_5_mm() -> None:
     chosen = np.array([True, True, True, True, False])
-    assert best(quality(5), 3, chosen).tolist() == [3, 2, 1]
-    assert best(quality(5), 9, chosen).tolist() == [3, 2, 1, 0]
-    (told,) = figures(quality(5), np.array([3]))
+    assert sheets.best(quality(5), 3, chosen).tolist() == [3, 2, 1]
+    assert sheets.best(quality(5), 9, chosen).tolist() == [3, 2, 1, 0]
+    (told,) = sheets.figures(quality(5), np.array([3]))
     assert told == [("epsilon", "30.000"), ("contact", "30.0 cm^2"), ("depth", "0.25 mm")]
 
 
@@ -101,47 +96,30 @@ def opened(data: bytes) -> np.ndarray:
 
 
 def test_a_contact_sheet_holds_every_picture_unchanged(pictures):
-    sheet = opened(contact_sheet(pictures[:, 0], title="block", columns=2))
+    sheet = opened(sheets.contact_sheet(pictures[:, 0], title="block", columns=2))
     for picture in pictures[:, 0]:
         windows = np.lib.stride_tricks.sliding_window_view(sheet[..., 0], (4, 80))
         assert (windows == picture[30:34, :, 0]).all(axis=(2, 3)).any()
-    assert tuple(sheet[0, 0]) == PAPER
-    assert opened(three_sides_sheet(pictures, title="block")).shape[1] >= 3 * 80
+    assert tuple(sheet[0, 0]) == sheets.PAPER
+    assert opened(sheets.three_sides_sheet(pictures, title="block")).shape[1] >= 3 * 80
 
 
 @pytest.mark.parametrize(("stereo", "cells"), [(True, 5), (False, 4)])
-def test_a_views_page_has_a_row_per_placement_and_a_column_for_a_hand(block, stereo, cells):
-    views = render(block, REST, views=2, stereo=stereo, width=64, height=48, seed=0, samples=2)
-    without = opened(views_page(views, title="block"))
+def test_a_views_page_has_a_row_per_placement_and_a_column_for_a_hand(stereo, cells):
+    views = render(BLOCK, REST, views=2, stereo=stereo, width=64, height=48, seed=0, samples=2)
+    without = opened(sheets.views_page(views, title="block"))
     assert without.shape[1] > cells * 64 and without.shape[0] > 2 * 48
     views["image/rgb_hand"] = np.full((len(views["image/rgb"]), 48, 64, 3), [255, 0, 255], np.uint8)
-    page = opened(views_page(views, title="block"))
-    assert page.shape[1] == without.shape[1] + 64 + GAP
+    page = opened(sheets.views_page(views, title="block"))
+    assert page.shape[1] == without.shape[1] + 64 + sheets.GAP
     shown = (page == [255, 0, 255]).all(axis=-1)
-    assert shown.sum() == 2 * 48 * 64 and not shown[:, : without.shape[1] - MARGIN].any()
-
-
-def test_boxes_are_drawn_the_loose_ones_with_the_wider_line() -> None:
-    views = {
-        "image/rgb": np.zeros((1, 60, 80, 3)),
-        "image/segmentation": np.zeros((1, 60, 80)),
-        "box/bounding_box_3d": np.tile([-10.0, -10, 1], (1, 8, 1)),
-        "camera/intrinsics": np.eye(3)[None],
-        "box/bounding_box_2d_loose": np.array([[10.0, 10, 70, 50]]),
-        "box/bounding_box_2d_tight": np.array([[30.0, 20, 60, 40]]),
-    }
-    row = np.asarray(sheets._boxes(views, 0).convert("L"), float)[30]
-    assert row[5:20].sum() > 1.5 * row[25:35].sum() > 0
+    assert shown.sum() == 2 * 48 * 64 and not shown[:, : without.shape[1] - sheets.MARGIN].any()
 
 
 def test_depth_colours_darken_with_distance_and_grey_is_nothing():
-    colours = depth_colours(np.array([0.2, 0.3, 0.4, 0.5, np.inf], np.float32), 0.2, 0.5).astype(int)
-    lightness = colours[:4] @ [0.2126, 0.7152, 0.0722]
-    assert np.all(np.diff(lightness) < -20)
+    colours = sheets.depth_colours(np.array([0.2, 0.3, 0.4, 0.5, np.inf], np.float32), 0.2, 0.5).astype(int)
+    assert np.all(np.diff(colours[:4] @ [0.2126, 0.7152, 0.0722]) < -20)
     assert colours[4].tolist() == [214, 214, 214]
-
-
-DOWN = np.array([0, 0, 0.06, 0, 1.0, 0, 0])
 
 
 def at(name: str, height: float = 0.0) -> Waypoint:
@@ -150,51 +128,50 @@ def at(name: str, height: float = 0.0) -> Waypoint:
     return Waypoint(name, DOWN + np.append(rise, np.zeros(4)), np.full(2, 0.1), rise)
 
 
-def grasped(block, scenes: PictureScenes, hand: HandModel = HAND, **options) -> np.ndarray:
-    return way_pictures(hand, block, [[at("grasp")]], scenes, (48, 48), samples=2, **options)[0, 0, 0]
+def grasped(scenes: PictureScenes, hand: HandModel = HAND, **options) -> np.ndarray:
+    return way_pictures(hand, BLOCK, [[at("grasp")]], scenes, (48, 48), samples=2, **options)[0, 0, 0]
 
 
-def test_every_posture_of_every_grasp_is_drawn_from_every_side(block):
+def test_every_posture_of_every_grasp_is_drawn_from_every_side():
     frames = [[at("grasp"), at("lift", 0.1)]] * 2
-    drawn = way_pictures(HAND, block, frames, TABLE_SCENE, (48, 36), sides=3, samples=2)
+    drawn = way_pictures(HAND, BLOCK, frames, TABLE_SCENE, (48, 36), sides=3, samples=2)
     assert drawn.shape == (2, 3, 2, 36, 48, 3)
     assert all(orange(picture).sum() > 10 for picture in drawn.reshape(-1, 36, 48, 3))
 
 
-def test_the_lifted_object_is_higher_in_the_picture(block):
+def test_the_lifted_object_is_higher_in_the_picture():
     frames = [[at("grasp"), at("lift", 0.1)]]
-    (low, high) = way_pictures(HAND, block, frames, TABLE_SCENE, (64, 64), samples=2)[0, 0]
+    (low, high) = way_pictures(HAND, BLOCK, frames, TABLE_SCENE, (64, 64), samples=2)[0, 0]
     assert np.argwhere(orange(high))[:, 0].mean() < np.argwhere(orange(low))[:, 0].mean() - 10
-    assert orange(grasped(block, PictureScenes())).sum() > 20, "a free grasp floats over a floor"
+    assert orange(grasped(PictureScenes())).sum() > 20, "a free grasp floats over a floor"
 
 
-def test_whole_hand_is_in_the_picture_where_that_is_asked_for(block):
+def test_whole_hand_is_in_the_picture_where_that_is_asked_for():
     frames = [[replace(at("", 0.5), carried=np.zeros(3)), at("grasp")]]
-    both = (way_pictures(HAND, block, frames, TABLE_SCENE, (48, 48), whole=w, samples=2) for w in (False, True))
+    both = (way_pictures(HAND, BLOCK, frames, TABLE_SCENE, (48, 48), whole=w, samples=2) for w in (False, True))
     near, whole = (seen[0, 0] for seen in both)
     # The camera steps back for the hand that is far above: the block is smaller, and what is drawn ends above the rim.
     assert 0 < orange(whole[1]).sum() < 0.5 * orange(near[1]).sum()
-    assert np.abs(whole[0][:2].astype(int) - grasped(block, TABLE_SCENE)[0, 0]).max() < 40
+    assert np.abs(whole[0][:2].astype(int) - grasped(TABLE_SCENE)[0, 0]).max() < 40
 
 
 @pytest.mark.parametrize("side", [0, 1, 2, 3])
-def test_no_wall_stands_between_the_object_and_the_camera(block, side):
+def test_no_wall_stands_between_the_object_and_the_camera(side):
     x, y = np.array([(0.1, 0), (0, 0.1), (-0.1, 0), (0, -0.1)])[side]
-    size = (0.02, 0.5, 0.5) if x else (0.5, 0.02, 0.5)
-    wall = Box(size=size, pose=(x, y, 0.25, 1, 0, 0, 0))
+    wall = Box(size=(0.02, 0.5, 0.5) if x else (0.5, 0.02, 0.5), pose=(x, y, 0.25, 1, 0, 0, 0))
     around = PictureScenes((HalfSpace(), wall), REST)
-    assert orange(grasped(block, around)).sum() > 0.5 * orange(grasped(block, TABLE_SCENE)).sum()
+    assert orange(grasped(around)).sum() > 0.5 * orange(grasped(TABLE_SCENE)).sum()
 
 
-def test_each_grasp_stands_in_its_own_scene(block):
+def test_each_grasp_stands_in_its_own_scene():
     turned = np.array([[0, 0, 0.02, np.sqrt(0.5), np.sqrt(0.5), 0, 0]])
     around = PictureScenes((HalfSpace(),), np.concatenate([REST, turned]), np.array([0, 1]))
-    first, second = way_pictures(HAND, block, [[at("grasp")]] * 2, around, (48, 48), samples=2)[:, 0, 0]
-    np.testing.assert_array_equal(second, grasped(block, PictureScenes((HalfSpace(),), turned)))
+    first, second = way_pictures(HAND, BLOCK, [[at("grasp")]] * 2, around, (48, 48), samples=2)[:, 0, 0]
+    np.testing.assert_array_equal(second, grasped(PictureScenes((HalfSpace(),), turned)))
     assert (first != second).any()
 
 
-def test_links_above_root_are_drawn_at_the_angles_of_the_wrist(block):
+def test_links_above_root_are_drawn_at_the_angles_of_the_wrist():
     # A copy of the hand behind its root serves as a forearm with two wrist joints.
     back = np.array([0, 0, -0.12])
     forearm = replace(HAND, pieces=tuple(replace(p, vertices=p.vertices + back) for p in HAND.pieces))
@@ -202,7 +179,7 @@ def test_links_above_root_are_drawn_at_the_angles_of_the_wrist(block):
 
     def picture(hand, wrist) -> np.ndarray:
         where = replace(TABLE_SCENE, wrist=wrist if wrist is None else np.array([wrist]))
-        return grasped(block, where, hand, whole=True).astype(int)
+        return grasped(where, hand, whole=True).astype(int)
 
     bare, straight, bent = picture(mounted, None), picture(mounted, [0.0, 0.0]), picture(mounted, [0.9, 0.9])
     assert np.array_equal(bare, picture(HAND, None))
@@ -215,9 +192,6 @@ def test_links_above_root_are_drawn_at_the_angles_of_the_wrist(block):
     assert (own[1, :, 2] < -10).all()
 
 
-SECONDS = [0.5, 0.05, 1.2]
-
-
 def colours() -> np.ndarray:
     return np.repeat(np.repeat(200 * np.eye(3, dtype=np.uint8)[:, None, None], 24, 1), 32, 2)
 
@@ -227,8 +201,7 @@ def test_every_picture_is_shown_for_its_time_and_again(suffix):
     if suffix == ".webp" and not features.check("webp"):
         pytest.skip("this Pillow writes no WebP")
     with Image.open(io.BytesIO(animation(colours(), SECONDS, suffix))) as film:
-        assert film.n_frames == 3
-        assert film.info.get("loop") == 0
+        assert film.n_frames == 3 and film.info.get("loop") == 0
         for frame, wanted, shown in zip(ImageSequence.Iterator(film), colours(), [500, 50, 1200], strict=True):
             # WebP is lossy: a plain colour comes back within a few of 256 steps.
             assert np.abs(np.asarray(frame.convert("RGB")).astype(int) - wanted).max() <= 6
@@ -261,13 +234,9 @@ def test_the_object_is_carried_with_the_hand_from_where_it_rests():
     np.testing.assert_allclose(points[-1].carried, [0, 0, 0.25], atol=1e-12)
 
 
-SPECS = {kind: supports_in(SceneSpec(kind=kind)) for kind in ("table", "bin", "shelf")}
-
-
 @pytest.mark.parametrize("normal", [(0, 0, 1), (1, 0, 0), (0, -2, 0), (1, 2, 3), (0, 0, -1)])
 def test_the_top_of_a_half_spaces_slab_is_its_plane(normal):
-    plane = HalfSpace(normal=normal, offset=0.12)
-    (pose,) = slab_poses([plane], np.array([0.1, 0.05, 0.2]), 0.7)
+    (pose,) = slab_poses([HalfSpace(normal=normal, offset=0.12)], np.array([0.1, 0.05, 0.2]), 0.7)
     unit = np.asarray(normal, float) / np.linalg.norm(normal)
     top = pose[:3] + quat_rotate(pose[3:], np.array([0.2, -0.3, TABLE_SIZE[2] / 2]))
     # Rounding of a handful of products near 1.
@@ -288,28 +257,19 @@ def test_a_box_keeps_its_size_and_hides_what_is_behind_it() -> None:
 
 
 @pytest.mark.parametrize("kind", ["bin", "shelf"])
-def test_every_camera_sees_the_object_past_walls_and_boards(block, kind):
+def test_every_camera_sees_the_object_past_walls_and_boards(kind):
     extras = Extras(supports=SPECS[kind], channels=("occlusion",))
-    views = render(block, REST, views=4, stereo=False, width=48, height=36, seed=3, samples=2, extras=extras)
+    views = render(BLOCK, REST, views=4, stereo=False, width=48, height=36, seed=3, samples=2, extras=extras)
     labels = np.asarray(views["image/segmentation"])
     assert ((labels == 2).sum(axis=(1, 2)) > 20).all()
     assert set(np.unique(labels)) <= {0, 1, 2}, "all supports are labelled as the table"
     assert (labels == 1).mean() > 0.2 and np.isfinite(views["box/occlusion_ratio"]).all()
 
 
-def test_a_table_looks_the_same_named_or_not(block):
+def test_a_table_looks_the_same_named_or_not():
     options = {"views": 1, "stereo": False, "width": 48, "height": 36, "seed": 3, "samples": 2}
-    named = render(block, REST, **options, extras=Extras(supports=SPECS["table"]))
-    np.testing.assert_array_equal(named["image/rgb"], render(block, REST, **options)["image/rgb"])
-
-
-SHAPE = '<collision><geometry><box size="0.02 0.02 0.04"/></geometry></collision>'
-RED = '<material name="red"><color rgba="1 0 0 1"/></material>'
-SEEN = (
-    f'<visual><geometry><box size="0.06 0.06 0.01"/></geometry>{RED}</visual>'
-    '<visual><geometry><mesh filename="part.stl"/></geometry><material name="blue"/></visual>'
-    '<visual><geometry><mesh filename="missing.stl"/></geometry></visual>'
-)
+    named = render(BLOCK, REST, **options, extras=Extras(supports=SPECS["table"]))
+    np.testing.assert_array_equal(named["image/rgb"], render(BLOCK, REST, **options)["image/rgb"])
 
 
 @pytest.fixture(scope="module")

@@ -16,19 +16,9 @@ from graspd.service.model.transforms import apply, quat_from_axis_angle
 from graspd.service.store.shards import check_columns
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.rendering import Extras, render
+from graspd.worker.rendering import Extras, cameras, render
 from graspd.worker.rendering.annotate import parse_channels
-from graspd.worker.rendering.cameras import (
-    ELEVATION,
-    FIELD_OF_VIEW,
-    NEAREST_M,
-    Cameras,
-    GivenCameras,
-    intrinsics,
-    look_at,
-    read_cameras,
-    sample_hemisphere,
-)
+from graspd.worker.rendering.cameras import Cameras, GivenCameras, intrinsics, look_at, read_cameras, sample_hemisphere
 from graspd.worker.rendering.hands import DrawnHand
 from graspd.worker.rendering.scenery import TABLE_SIZE
 from graspd.worker.scenes import Neighbours
@@ -43,6 +33,7 @@ REST = np.array([[0.02, -0.01, RADIUS, 1.0, 0, 0, 0], [0.0, 0.03, RADIUS, 0, 1.0
 HALF_PRECISION = 5e-4
 #: Interpolated normals of the ball's 20 480 facets; float32 rays.
 FACET_NORMAL = 2e-3
+CENTRE, OBJECT_RADIUS = np.array([0.05, -0.02, 0.04]), 0.07
 
 
 def shoot(obj: ObjectModel, poses: np.ndarray, **options) -> dict[str, np.ndarray]:
@@ -50,7 +41,7 @@ def shoot(obj: ObjectModel, poses: np.ndarray, **options) -> dict[str, np.ndarra
     return render(obj, poses, width=SIZE[0], height=SIZE[1], **options)
 
 
-def cameras(views: dict[str, np.ndarray]) -> Cameras:
+def cameras_of(views: dict[str, np.ndarray]) -> Cameras:
     height, width = views["image/depth"].shape[1:]
     return Cameras(width, height, views["camera/intrinsics"][0], views["camera/extrinsics"])
 
@@ -68,11 +59,6 @@ def world_rays(views: dict[str, np.ndarray], view: int) -> tuple[np.ndarray, np.
 def ball() -> ObjectModel:
     # 20 480 faces: the facets lie at most 8 um inside the sphere.
     return object_from_mesh(trimesh.creation.icosphere(subdivisions=5, radius=RADIUS), "ball")
-
-
-@pytest.fixture(scope="module")
-def ball_views(ball) -> dict[str, np.ndarray]:
-    return shoot(ball, REST[:1])
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +90,8 @@ def points(views: dict[str, np.ndarray], view: int) -> np.ndarray:
     return origin + np.where(np.isfinite(depth), depth, np.nan)[..., None] * rays
 
 
-def test_depths_are_of_sphere_and_plane_and_infinite_elsewhere(ball_views, ball) -> None:
+def test_depths_are_of_sphere_and_plane_and_infinite_elsewhere(ball) -> None:
+    ball_views = shoot(ball, REST[:1])
     for view in range(4):
         origin, rays = world_rays(ball_views, view)
         to_centre = REST[0, :3] - origin
@@ -115,8 +102,7 @@ def test_depths_are_of_sphere_and_plane_and_infinite_elsewhere(ball_views, ball)
         # Where the ray grazes, the facets' 8 um inside the sphere grow without bound along the ray.
         square_on = discriminant > 0.06 * square * RADIUS**2
         seen = square_on & (ball_views["image/segmentation"][view] == 2)
-        assert seen.sum() > 500
-        assert np.array_equal(seen, square_on)
+        assert seen.sum() > 500 and np.array_equal(seen, square_on)
         assert np.abs(ball_views["image/depth"][view] - depth)[seen].max() < DEPTH_M
         table = ball_views["image/segmentation"][view] == 1
         depth = -origin[2] / rays[..., 2]
@@ -130,7 +116,9 @@ def test_depths_are_of_sphere_and_plane_and_infinite_elsewhere(ball_views, ball)
 
 
 def test_point_projected_by_cameras_matrices_lands_on_its_pixel(mug_views):
-    points = cameras(mug_views).unproject(np.where(np.isfinite(mug_views["image/depth"]), mug_views["image/depth"], 1))
+    points = cameras_of(mug_views).unproject(
+        np.where(np.isfinite(mug_views["image/depth"]), mug_views["image/depth"], 1)
+    )
     for view in range(len(points)):
         k, e = mug_views["camera/intrinsics"][view], mug_views["camera/extrinsics"][view]
         image = (points[view].reshape(-1, 3) @ e[:3, :3].T + e[:3, 3]) @ k.T
@@ -139,7 +127,7 @@ def test_point_projected_by_cameras_matrices_lands_on_its_pixel(mug_views):
 
 
 def test_the_right_eye_sees_every_point_shifted_by_its_disparity(mug_views):
-    cams = cameras(mug_views)
+    cams = cameras_of(mug_views)
     points = cams.unproject(np.where(np.isfinite(mug_views["image/depth"]), mug_views["image/depth"], 1))
     focal, baseline = cams.intrinsics[0, 0], mug_views["camera/stereo_baseline_m"][0]
     for left in np.flatnonzero(mug_views["camera/eye"] == 1):
@@ -201,8 +189,7 @@ def test_columns_are_of_a_views_shard_and_mono_pictures_say_so(mug_views, ball) 
     assert mug_views["camera/eye"].tolist() == [1, 2] * 4
     assert mug_views["camera/scene_index"].tolist() == [0] * 4 + [1] * 4
     mono = shoot(ball, REST[:1], stereo=False)
-    assert mono["camera/eye"].tolist() == [0, 0]
-    assert mono["camera/stereo_baseline_m"].tolist() == [0.0, 0.0]
+    assert mono["camera/eye"].tolist() == [0, 0] and mono["camera/stereo_baseline_m"].tolist() == [0.0, 0.0]
     with pytest.raises(InputError, match="at least one"):
         shoot(ball, REST[:1], views=0)
 
@@ -238,12 +225,9 @@ def test_memory_stays_flat_over_repeated_renders(ball):
     assert peak() - before < 4096
 
 
-CENTRE, OBJECT_RADIUS = np.array([0.05, -0.02, 0.04]), 0.07
-
-
 def sampled(seed: int, views: int = 12) -> Cameras:
     rng = np.random.default_rng(seed)
-    extrinsics = sample_hemisphere(CENTRE, OBJECT_RADIUS, views=views, field_of_view=FIELD_OF_VIEW, rng=rng)
+    extrinsics = sample_hemisphere(CENTRE, OBJECT_RADIUS, views=views, field_of_view=cameras.FIELD_OF_VIEW, rng=rng)
     return Cameras(320, 240, intrinsics(320, 240), np.stack(extrinsics))
 
 
@@ -254,9 +238,8 @@ def test_a_camera_looks_at_its_target_upright_in_its_field() -> None:
     np.testing.assert_allclose(pixels[0, :, 0], [160, 160], atol=1e-9)
     assert pixels[0, 0, 1] == pytest.approx(120) and pixels[0, 1, 1] < 120
     assert depth[0, 0] == pytest.approx(np.linalg.norm(CENTRE - [0.3, 0.2, 0.4]))
-    assert 2 * np.arctan(120 / k[1, 1]) == pytest.approx(FIELD_OF_VIEW)
-    top = pixel_rays(k, 320, 240)[0, 0]
-    np.testing.assert_allclose(top, [-159.5 / k[0, 0], -119.5 / k[1, 1], 1.0])
+    assert 2 * np.arctan(120 / k[1, 1]) == pytest.approx(cameras.FIELD_OF_VIEW)
+    np.testing.assert_allclose(pixel_rays(k, 320, 240)[0, 0], [-159.5 / k[0, 0], -119.5 / k[1, 1], 1.0])
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -265,8 +248,8 @@ def test_sampled_cameras_on_the_hemisphere_see_the_object(seed):
     away = camera.centre - CENTRE
     distance = np.linalg.norm(away, axis=1)
     elevation = np.arcsin(away[:, 2] / distance)
-    assert np.all((elevation > ELEVATION[0] - 1e-9) & (elevation < ELEVATION[1] + 1e-9))
-    assert np.all(distance >= NEAREST_M + OBJECT_RADIUS - 1e-12)
+    assert np.all((elevation > cameras.ELEVATION[0] - 1e-9) & (elevation < cameras.ELEVATION[1] + 1e-9))
+    assert np.all(distance >= cameras.NEAREST_M + OBJECT_RADIUS - 1e-12)
     directions = np.random.default_rng(seed).normal(size=(200, 3))
     ball = CENTRE + OBJECT_RADIUS * 0.8 * directions / np.linalg.norm(directions, axis=1, keepdims=True)
     pixels, _ = camera.project(ball)
@@ -410,14 +393,12 @@ def test_the_drawn_hand_is_in_its_own_pictures_and_in_no_other(ball):
         np.testing.assert_array_equal(values, seen[name])
     assert seen["camera/hand_grasp"].tolist() == [5, 5, -1, -1]
     changed = (seen["image/rgb_hand"] != seen["image/rgb"]).any(axis=-1)
-    assert changed[:2].mean(axis=(1, 2)).min() > 0.05
-    assert not changed[2:].any()
+    assert changed[:2].mean(axis=(1, 2)).min() > 0.05 and not changed[2:].any()
 
 
 def test_channels_are_named_in_any_order_and_move_pictures_alone() -> None:
     assert parse_channels(["occlusion", " distance"]) == ("distance", "occlusion")
-    assert parse_channels(["all"]) == ("distance", "normals", "occlusion")
-    assert parse_channels([""]) == ()
+    assert parse_channels(["all"]) == ("distance", "normals", "occlusion") and parse_channels([""]) == ()
     with pytest.raises(InputError, match="unknown channel 'flow'"):
         parse_channels(["flow"])
 

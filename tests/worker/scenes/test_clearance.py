@@ -17,6 +17,9 @@ HAND = two_finger_hand()
 #: Tessellations lie inside round pieces by r (1 - cos(pi / 48)), and a sphere of 642 corners by 0.4 % of r.
 TESSELLATION_M = 6e-5
 IDENTITY = np.array([[0.0, 0, 0, 1, 0, 0, 0]])
+#: MuJoCo stores meshes in float32 and its GJK stops at 1e-6 of the size.
+ENGINE_M = 5e-6
+DOWN = np.concatenate([[0, 0, 0.25], quat_from_axis_angle(np.array([1.0, 0, 0]), np.asarray(np.pi))])
 
 
 def postures(rng: np.random.Generator, count: int) -> Posture:
@@ -71,8 +74,7 @@ def test_a_hand_that_sweeps_through_the_table_is_caught():
     result = transfer(HAND, grasp, pregrasp, IDENTITY)
     assert at_ends > MARGIN_M
     # Pointing straight down the tips reach 0.079 below the root.
-    assert result["grasp/table_clearance_m"][0] <= 0.075 - 0.079
-    assert result["grasp/valid"][0] == 0
+    assert result["grasp/table_clearance_m"][0] <= 0.075 - 0.079 and result["grasp/valid"][0] == 0
     assert result["grasp/contact_table_clearance_m"][0] == pytest.approx(lowest_vertex(grasp, IDENTITY[0])[0], abs=1e-4)
     assert result["grasp/rejection"][0] == Rejection.TABLE_ON_APPROACH
     on_table = Posture(np.array([[0, 0, 0.0, 1, 0, 0, 0]]), np.zeros((1, 2)))
@@ -91,18 +93,12 @@ def test_many_grasps_give_what_each_gives_alone():
 def test_no_grasps_are_empty_too_many_are_refused() -> None:
     none = Posture(np.zeros((0, 7)), np.zeros((0, 2)))
     result = transfer(HAND, none, none, IDENTITY)
-    assert result["grasp/hand_pose"].shape == (0, 7)
-    assert result["grasp/valid"].shape == (0,)
+    assert result["grasp/hand_pose"].shape == (0, 7) and result["grasp/valid"].shape == (0,)
     rng = np.random.default_rng(3)
     with pytest.raises(InputError, match="2 grasps come with 1 pregrasps"):
         transfer(HAND, postures(rng, 2), postures(rng, 1), IDENTITY)
     with pytest.raises(InputError, match="1 to 8"):
         drop_together(box(0.05, 0.05, 0.05), [box(0.02, 0.02, 0.02)] * 9, count=1, seed=0)
-
-
-#: MuJoCo stores meshes in float32 and its GJK stops at 1e-6 of the size.
-ENGINE_M = 5e-6
-DOWN = np.concatenate([[0, 0, 0.25], quat_from_axis_angle(np.array([1.0, 0, 0]), np.asarray(np.pi))])
 
 
 def box(*size: float):

@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,7 +20,6 @@ from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import ConvexPiece, HandModel
 from graspd.worker.hands.primitives import tessellate
-from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import synthesize
 from graspd.worker.planners.fast_graspd.candidates import posture_of
@@ -30,7 +28,7 @@ from graspd.worker.planners.fast_graspd.scene_starts import clear_scene_starts, 
 from graspd.worker.planners.fast_graspd.starts import CLEAR, start_generator
 from graspd.worker.planners.port import PlanRequest
 from graspd.worker.scenes.clearance import MARGIN_M, approach, transfer
-from graspd.worker.scenes.kinds import rest_poses, supports_of
+from graspd.worker.scenes.kinds import supports_of
 from graspd.worker.scenes.placement import joined_pieces, scenes_of
 from graspd.worker.scenes.rollout import scene_verdicts
 from graspd.worker.scenes.trajectory import plan_way
@@ -38,22 +36,23 @@ from graspd.worker.simulation.environment import STANDOFF_M, PlacedGrasps, Scene
 from graspd.worker.simulation.mounting import mounting_room
 from graspd.worker.simulation.obstacles import DeviceObstacles
 from tests.worker.commands_run import graspd, refused
-from tests.worker.hands.grippers import gripper
-from tests.worker.models import object_from_mesh
+from tests.worker.hands.urdfs import gripper
+from tests.worker.models import object_from_mesh, on_tables
 from tests.worker.simulation.test_surroundings import mujoco_distances, mujoco_room, parted
 
 #: What a draft's finish may lack of a distance that it aims at exactly [m].
 DRAFT_M = 5e-4
 QUICK = resolve_fidelity("draft").model_copy(update={"starts": 2})
+BLOCK = object_from_path("block", face_error_m=QUICK.face_error_m)
+TABLE = {"kind": "half_space"}
+UPRIGHT = (1.0, 0, 0, 0)
 
 
 @pytest.fixture(scope="module")
 def planned():
     hand = hand_from_path("barrett")
     obj = object_from_path("block", face_error_m=QUICK.face_error_m)
-    spec = SceneSpec(kind="table")
-    scenes = Scenes(supports_of(spec), rest_poses(spec, obj, count=2, seed=1)["scene/object_pose"])
-    placed = scenes.placed(np.arange(8) % 2)
+    placed = on_tables(obj).placed(np.arange(8) % 2)
     return hand, obj, placed, synthesize(hand, obj, PlanRequest(count=8, fidelity=QUICK, seed=4, placed=placed))
 
 
@@ -61,8 +60,7 @@ def test_every_grasp_is_clear_of_the_table_by_mujocos_distances(planned) -> None
     hand, _, placed, grasps = planned
     tips, rest = parted(hand)
     for number, scene in enumerate(placed.scenes):
-        rows = np.flatnonzero(placed.index == number)
-        mine = grasps.grasp.take(rows)
+        mine = grasps.grasp.take(np.flatnonzero(placed.index == number))
         assert mujoco_distances(rest, mine, scene.obstacles[0]).min() >= MARGIN_M
         # They may touch the table. A draft's few steps of finish leave less than this to fix; then none is clear.
         assert mujoco_distances(tips, mine, scene.obstacles[0]).min() >= -DRAFT_M
@@ -113,7 +111,7 @@ def test_a_grasp_does_not_depend_on_the_scenes_of_the_others(planned) -> None:
     assert np.array_equal(found.grasp.hand_pose, grasps.grasp.hand_pose[:3])
 
 
-def test_synth_in_a_scene_counts_grasps_that_lift(tmp_path: Path) -> None:
+def test_synth_in_a_scene_counts_grasps_that_lift(tmp_path) -> None:
     out = tmp_path / "g.h5"
     table = "synth --hand barrett --object block --scene table"
     said = graspd(f"{table} --scenes 2 -n 3 --budget 8 --fidelity draft -o", out)
@@ -126,15 +124,11 @@ def test_synth_in_a_scene_counts_grasps_that_lift(tmp_path: Path) -> None:
     assert (again["gsr"], again["clear_share"]) == (said["valid"] / said["grasps"], 1.0)
 
 
-def test_what_is_of_free_objects_only_is_refused_in_scenes(tmp_path: Path) -> None:
+def test_what_is_of_free_objects_only_is_refused_in_scenes(tmp_path) -> None:
     out, pair = tmp_path / "g.h5", "--hand barrett --object block -o"
     graspd(f"synth -n 1 --want candidates --validation none --fidelity draft {pair}", out)
     assert "synth --scene" in refused("evaluate --protocol lift", out)
     assert "free objects only" in refused(f"synth --scene table --method dfc {pair}", out)
-
-
-TABLE = {"kind": "half_space"}
-UPRIGHT = (1.0, 0, 0, 0)
 
 
 def cube(side: float = 0.05, name: str = "cube"):
@@ -192,13 +186,12 @@ def planned_beside():
     return hand, thing, placed, grasps
 
 
-def test_synth_with_neighbours_writes_them_lifts_judge_alike(tmp_path: Path) -> None:
+def test_synth_with_neighbours_writes_them_lifts_judge_alike(tmp_path) -> None:
     out = tmp_path / "g.h5"
     table = "--scene table --with mug --scenes 1 -n 4 --want candidates --fidelity draft"
     said = graspd(f"synth --hand barrett --object block {table} -o", out)
     shard = read_shard(out, kind="base")
-    assert shard["scene/neighbour_pose"].shape == (1, 1, 7)
-    assert shard.attributes["neighbours"] == ["mug"]
+    assert shard["scene/neighbour_pose"].shape == (1, 1, 7) and shard.attributes["neighbours"] == ["mug"]
     assert json.loads(str(shard.attributes["scene"]))["neighbours"][0]["object"] == "mug"
     told = graspd("evaluate --protocol lift", out)
     assert told["clear_share"] == said["clear_share"]
@@ -214,43 +207,35 @@ def test_synth_with_neighbours_writes_them_lifts_judge_alike(tmp_path: Path) -> 
         ("--scene table --with no-such-thing", "no-such-thing"),
     ],
 )
-def test_what_cannot_stand_beside_an_object_is_told_in_one_line(tmp_path: Path, args: str, words: str) -> None:
+def test_what_cannot_stand_beside_an_object_is_told_in_one_line(tmp_path, args: str, words: str) -> None:
     said = refused(f"synth --hand barrett --object block {args} -o", tmp_path / "g.h5")
     assert words in said and "Traceback" not in said
 
 
 def test_a_gripper_lifts_a_box_from_a_table() -> None:
     hand, box = gripper(), object_from_mesh(trimesh.creation.box((0.03, 0.04, 0.06)))
-    spec = SceneSpec(kind="table")
-    scenes = Scenes(supports_of(spec), rest_poses(spec, box, count=2, seed=1)["scene/object_pose"])
     wanted = JobOptions(scene="table", fidelity="draft", want="candidates", grasps=4, seed=2)
-    found = validated_grasps(hand, box, wanted, count=4, scenes=scenes, run=ExecutionContext(threads=1))
+    found = validated_grasps(hand, box, wanted, count=4, scenes=on_tables(box), run=ExecutionContext(threads=1))
     # A box between flat pads is the plainest of tasks: hardly a grasp may miss it.
     assert found.shares["lift_share"] >= 0.75
 
 
 @pytest.fixture(scope="module")
-def shadow(shared_data: Path) -> HandModel:
+def shadow(shared_data) -> HandModel:
     hand = hand_from_path(shared_data / "hands" / "shadow" / "shadow_hand_right.urdf")
     assert hand.mounting is not None
     return hand
 
 
 @pytest.fixture(scope="module")
-def block() -> ObjectModel:
-    return object_from_path("block", face_error_m=QUICK.face_error_m)
+def table() -> Scenes:
+    return on_tables(BLOCK)
 
 
 @pytest.fixture(scope="module")
-def table(block: ObjectModel) -> Scenes:
-    spec = SceneSpec(kind="table")
-    return Scenes(supports_of(spec), rest_poses(spec, block, count=2, seed=1)["scene/object_pose"])
-
-
-@pytest.fixture(scope="module")
-def mounted(shadow: HandModel, block: ObjectModel, table: Scenes) -> GraspSet:
+def mounted(shadow: HandModel, table: Scenes) -> GraspSet:
     placed = table.placed(np.arange(8) % 2)
-    found = synthesize(shadow, block, PlanRequest(count=8, fidelity=QUICK, seed=4, placed=placed))
+    found = synthesize(shadow, BLOCK, PlanRequest(count=8, fidelity=QUICK, seed=4, placed=placed))
     return replace(found, scene=placed.index)
 
 
@@ -260,20 +245,20 @@ def lowest(mounting: HandModel, poses: np.ndarray, wrist: np.ndarray) -> float:
     return min(float(apply(bodies[:, p.body, None], p.vertices)[..., 2].min()) for p in mounting.pieces)
 
 
-def test_starts_keep_the_forearm_off_the_table(shared_data: Path, block: ObjectModel, table: Scenes) -> None:
+def test_starts_keep_the_forearm_off_the_table(shared_data, table: Scenes) -> None:
     # A wrist that is held bent forwards: behind a palm that faces down the forearm is lowest.
     held = {"root": "palm", "fix": {"WRJ1": 0.48, "WRJ2": 0.0}}
     shadow = hand_from_path(shared_data / "hands" / "shadow" / "shadow_hand_right.urdf", held)
     placed, each = table.placed(np.arange(16) % 2), 4
-    obstacles = DeviceObstacles.create(shadow, placed.scenes, block.centre_of_mass, "cpu")
-    model = pair_of(shadow, block, QUICK, "cpu", in_scenes=True)
+    obstacles = DeviceObstacles.create(shadow, placed.scenes, BLOCK.centre_of_mass, "cpu")
+    model = pair_of(shadow, BLOCK, QUICK, "cpu", in_scenes=True)
     coarse = model.model(model.coarse, obstacles)
     generators = [start_generator(3, 0, i, k) for i in range(16) for k in range(each)]
-    ways = [free_ways(scene, block) for scene in placed.scenes]
+    ways = [free_ways(scene, BLOCK) for scene in placed.scenes]
     state, depth = clear_scene_starts(coarse, generators, each=each, placed=placed, ways=ways)
     clear = np.flatnonzero(depth <= CLEAR)
     assert len(clear) > 40
-    poses = posture_of(shadow, block, state).hand_pose[clear][:, None]
+    poses = posture_of(shadow, BLOCK, state).hand_pose[clear][:, None]
     _, room = mounting_room(shadow, poses, placed.scenes, np.repeat(placed.index, each)[clear])
     assert room.min() >= MARGIN_M
 
@@ -293,8 +278,8 @@ def test_the_wrist_is_bent_no_farther_than_the_table_asks(shadow: HandModel, tab
     assert lowest(shadow.mounting, level[None], np.zeros(2)) < MARGIN_M
 
 
-def test_valid_grasps_have_their_forearm_above_the_table(shadow: HandModel, block, table: Scenes, mounted) -> None:
-    found, columns = scene_verdicts(shadow, block, mounted, table, level="lift", pieces=None, run=DEFAULT_CONTEXT)
+def test_valid_grasps_have_their_forearm_above_the_table(shadow: HandModel, table: Scenes, mounted) -> None:
+    found, columns = scene_verdicts(shadow, BLOCK, mounted, table, level="lift", pieces=None, run=DEFAULT_CONTEXT)
     assert found.wrist is not None and found.wrist.shape == (8, 2) and found.approach is not None
     assert shadow.mounting is not None and found.lift is not None and found.scene is not None
     clear = np.flatnonzero(columns["quality/clearance_m"] >= MARGIN_M)
@@ -307,21 +292,21 @@ def test_valid_grasps_have_their_forearm_above_the_table(shadow: HandModel, bloc
     assert again.wrist is not None and np.array_equal(again.wrist, found.wrist)
 
 
-def test_a_grasp_with_its_mounting_in_the_table_is_not_clear(shadow: HandModel, block, table, mounted) -> None:
+def test_a_grasp_with_its_mounting_in_the_table_is_not_clear(shadow: HandModel, table, mounted) -> None:
     assert mounted.scene is not None and shadow.mounting is not None
-    bare = plan_way(replace(shadow, mounting=None), block, mounted, table.placed(mounted.scene))
+    bare = plan_way(replace(shadow, mounting=None), BLOCK, mounted, table.placed(mounted.scene))
     assert bare.clear.any() and bare.wrist.shape == (8, 0)
     # A mounting as large as this reaches down to the table from anywhere.
     vertices, faces = tessellate("sphere", (1.0,))
     ball = ConvexPiece(2, "sphere", (1.0,), IDENTITY_POSE, vertices, faces, "forearm")
     hand = replace(shadow, mounting=replace(shadow.mounting, pieces=(ball,)))
-    _, columns = scene_verdicts(hand, block, mounted, table, level="lift", pieces=None, run=DEFAULT_CONTEXT)
+    _, columns = scene_verdicts(hand, BLOCK, mounted, table, level="lift", pieces=None, run=DEFAULT_CONTEXT)
     assert (columns["quality/success"] == -1).all()
 
 
-def test_free_grasps_do_not_depend_on_the_mounting(shadow: HandModel, block: ObjectModel) -> None:
+def test_free_grasps_do_not_depend_on_the_mounting(shadow: HandModel) -> None:
     wanted = PlanRequest(count=2, fidelity=QUICK, seed=4)
-    ours, bare = (synthesize(hand, block, wanted) for hand in (shadow, replace(shadow, mounting=None)))
+    ours, bare = (synthesize(hand, BLOCK, wanted) for hand in (shadow, replace(shadow, mounting=None)))
     for one, other in ((ours.grasp, bare.grasp), (ours.pregrasp, bare.pregrasp), (ours.squeeze, bare.squeeze)):
         assert np.array_equal(one.hand_pose, other.hand_pose)
         assert np.array_equal(one.joint_positions, other.joint_positions)

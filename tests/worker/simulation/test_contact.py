@@ -17,6 +17,9 @@ END_TOLERANCE = 2e-6  # float32 solves of 6 x 6 systems with condition numbers u
 COSINE = 0.97
 INERTIA = np.diag([8e-4, 6e-4, 4e-4])
 WORLD = World(inertia=INERTIA, gyration=float(np.sqrt(np.trace(INERTIA) / 3)))
+MOTIONS = initial_motions(7, WORLD.step, WORLD.gyration)
+run = partial(run_kernel, near_gap=NEAR_GAP, lane=5)
+EACH = pytest.mark.parametrize("name", SOLVERS)
 
 
 def ring(rng: np.random.Generator, count: int = 24, gap: float = -1e-4, spread: float = 2e-4) -> Contacts:
@@ -24,11 +27,6 @@ def ring(rng: np.random.Generator, count: int = 24, gap: float = -1e-4, spread: 
     normals = rng.normal(size=(count, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     return Contacts(0.04 * normals, normals, gap + spread * rng.normal(size=count), rng.uniform(0.5, 1.5, count))
-
-
-MOTIONS = initial_motions(7, WORLD.step, WORLD.gyration)
-run = partial(run_kernel, near_gap=NEAR_GAP, lane=5)
-EACH = pytest.mark.parametrize("name", SOLVERS)
 
 
 @EACH
@@ -106,8 +104,7 @@ def test_one_contact_gives_object_the_momentum_of_its_impulse() -> None:
     w = 1.0 + arm @ np.linalg.inv(INERTIA) @ arm
     impulse = -depth / w
     expected = np.concatenate([impulse * normal, np.linalg.inv(INERTIA) @ (impulse * arm)])
-    end = run("gauss_seidel", single, world)[0][0]
-    np.testing.assert_allclose(end, expected, rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(run("gauss_seidel", single, world)[0][0], expected, rtol=1e-5, atol=1e-9)
 
 
 def test_a_balanced_grasp_leaves_the_object_at_rest_without_nan() -> None:
@@ -124,8 +121,7 @@ def test_a_balanced_grasp_leaves_the_object_at_rest_without_nan() -> None:
 
 @EACH
 def test_the_one_sided_leak_only_draws_free_points_nearer(name: str) -> None:
-    rng = np.random.default_rng(5)
-    free = ring(rng, gap=5e-3, spread=1e-4)
+    free = ring(np.random.default_rng(5), gap=5e-3, spread=1e-4)
     one = run(name, free, WORLD, leak=0.1)[2]
     two = run(name, free, WORLD, leak=0.1, one_sided=False)[2]
     # Descending a positive dL/drho shortens the distance.

@@ -28,6 +28,18 @@ from graspd.worker.simulation.sampling import object_samples
 from tests.worker.simulation.rigs import ball, rig, still
 
 _GOLDEN = (np.sqrt(5) - 1) / 2
+HANDS = ("allegro", "barrett", "shadow")
+EACH_HAND = pytest.mark.parametrize("name", HANDS)
+FK_TOLERANCE = 3e-7  # float32 positions of a hand 0.2 m large through at most 8 joints
+
+
+Energy = Callable[[HandState], float]
+#: float32 depths of 1e-3 m from coordinates of 0.1 m are good to 1e-5 relative; points that enter or leave within the
+#: difference add the rest.
+RELATIVE = 2e-3
+#: Penalties without a simulation of contacts.
+ALONE = LossOptions(simulate=False, leak=0.0, range_weight=0.0)
+MARGIN = 0.004
 
 
 def least_along(f: Callable[[np.ndarray], np.ndarray], edges: np.ndarray) -> np.ndarray:
@@ -78,14 +90,6 @@ def nearest_edges(hand: HandModel, bodies: np.ndarray, obstacle: Obstacle, far: 
         if pierce < min(out[number], 0.0):
             out[number] = pierce
     return out
-
-
-HANDS = ("allegro", "barrett", "shadow")
-EACH_HAND = pytest.mark.parametrize("name", HANDS)
-FK_TOLERANCE = 3e-7  # float32 positions of a hand 0.2 m large through at most 8 joints
-
-
-Energy = Callable[[HandState], float]
 
 
 def random_state(hand: HandModel, count: int, seed: int = 0) -> HandState:
@@ -147,19 +151,11 @@ def test_transpose_is_the_derivative_of_the_map_it_belongs_to(name: str) -> None
     model, data = rig(hand, ball(), capacity=1)
     data.set_state(state)
     record_placement(model, data).run()
-    points = apply(bodies_of(hand, state)[0], local)
-    wrench = np.concatenate([force, np.cross(points, force)], axis=1)
+    wrench = np.concatenate([force, np.cross(apply(bodies_of(hand, state)[0], local), force)], axis=1)
     data.wrench.assign(np.round(wrench[None] / wrenches.UNIT).astype(np.int64))
     wp.launch(kinematics.backward, 1, inputs=[model.hand.tree], outputs=[data.hands, data.gradient], device="cpu")
     # Sums of up to 23 float32 products of size 1.
     np.testing.assert_allclose(data.gradient.numpy()[0], expected, atol=2e-5)
-
-
-#: float32 depths of 1e-3 m from coordinates of 0.1 m are good to 1e-5 relative; points that enter or leave within the
-#: difference add the rest.
-RELATIVE = 2e-3
-#: Penalties without a simulation of contacts.
-ALONE = LossOptions(simulate=False, leak=0.0, range_weight=0.0)
 
 
 def fist_in_ball(hand: HandModel) -> HandState:
@@ -214,11 +210,9 @@ def test_links_inside_links_are_parted_along_the_true_gradient(name: str) -> Non
             total += float((np.maximum(depth, 0) ** 2).sum())
         return total * REFERENCE_SELF_POINTS / len(points)
 
-    rng = np.random.default_rng(0)
-    draws = hand.lower + rng.random((20, 1, hand.dofs)) * (hand.upper - hand.lower)
+    draws = hand.lower + np.random.default_rng(0).random((20, 1, hand.dofs)) * (hand.upper - hand.lower)
     states = [HandState(np.array([[0.5, 0.0, 0.0]]), np.array([[1.0, 0.0, 0.0, 0.0]]), q) for q in draws]
     state = max(states, key=energy)
-
     simulation = rig(hand, ball(), capacity=1, options=replace(ALONE, self_margin=0.0))
     check_gradient(simulation, state, energy, least=1e-4, self_penetration=1.0)
 
@@ -337,9 +331,6 @@ def test_a_step_moves_and_turns_a_hand_against_its_gradient(optimizer: str) -> N
     turned = quat_multiply(quat_from_axis_angle(step[3:6] / angle, np.asarray(angle)), state.rotation[0])
     np.testing.assert_allclose(found.rotation[0], turned, atol=1e-6)
     np.testing.assert_allclose(found.q[0], np.clip(state.q[0] + step[6:], hand.lower, hand.upper), atol=1e-6)
-
-
-MARGIN = 0.004
 
 
 def sphere_points(count: int, seed: int) -> np.ndarray:

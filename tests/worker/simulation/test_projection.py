@@ -2,7 +2,6 @@
 
 from functools import partial
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -35,6 +34,7 @@ HAND = two_finger_hand()
 BOX = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))
 HANDS = 6
 SINGLE = 2e-6  # distances, rows and poses are in single precision, so steps of millimetres are good to this
+FIDELITY = FIDELITIES["draft"].model_copy(update={"coarse_iterations": 20, "fine_iterations": 20})
 
 
 def pressing() -> HandState:
@@ -65,7 +65,7 @@ def evaluated(state: HandState) -> Projection:
 
 def equations(found: Projection, state: HandState, b: int) -> tuple[np.ndarray, np.ndarray, int]:
     """J'WJ (n, n), J'We (n,) and the number of residuals of hand b, in double precision."""
-    r: Any = found.residuals
+    r = found.residuals
     count = int(r.count.numpy()[b])
     body, other, point, direction, value, weight = (
         getattr(r, name).numpy()[b, :count] for name in ("body", "other", "point", "direction", "value", "weight")
@@ -124,9 +124,6 @@ def test_hands_without_penetration_stay_where_they_are() -> None:
     np.testing.assert_array_equal(moved.q, state.q)
 
 
-FIDELITY = FIDELITIES["draft"].model_copy(update={"coarse_iterations": 20, "fine_iterations": 20})
-
-
 @wp.kernel
 def add_all(force_in: wp.array(dtype=wp.vec3), wrench_inout: Wrenches):
     i = wp.tid()
@@ -158,8 +155,7 @@ def test_wrenches_add_up_with_the_same_bits_in_any_order() -> None:
 
 @pytest.mark.parametrize("count", [1, 31, 32, 33, 95])
 def test_marked_points_get_the_slots_of_a_counter(count: int) -> None:
-    rng = np.random.default_rng(count)
-    mark = rng.integers(0, 3, (4, count)).astype(np.int32)
+    mark = np.random.default_rng(count).integers(0, 3, (4, count)).astype(np.int32)
     active = wp.array([1, 1, 0, 1], dtype=wp.int32)
     counts = [wp.zeros((4, -(-count // packing.CHUNK)), dtype=wp.int32) for _ in range(2)]
     marked, packed = allocate_contacts(4, count, marked=True), allocate_contacts(4, count)
@@ -196,11 +192,11 @@ def test_batch_has_the_same_bits_where_threads_come_in_any_order(monkeypatch: py
     check_same(*states)
 
 
-def replayed_graphs(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+def replayed_graphs(monkeypatch: pytest.MonkeyPatch) -> list:
     """Graphs that `Launches` replays from now on, for a device that is said to be CUDA."""
-    replayed: list[Any] = []
+    replayed = []
 
-    def replay(graph: Any) -> None:
+    def replay(graph) -> None:
         replayed.append(graph)
         wp.capture_launch(graph)
 

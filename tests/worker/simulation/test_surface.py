@@ -1,17 +1,15 @@
 """Distances and normals of surfaces and pieces against closed forms, the mesh and NumPy; grids kept on disk."""
 
-from pathlib import Path
-from typing import Any
+import io
 
 import numpy as np
 import pytest
 import trimesh
 import warp as wp
 
+from graspd.service import user_cache
 from graspd.worker.hands.load import hand_from_path
-from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.surface import piece_distance
-from graspd.worker.objects import disk_cache
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.simulation import grids, kernels
@@ -19,9 +17,15 @@ from graspd.worker.simulation.device import DeviceHand, DeviceObject, face_plane
 from graspd.worker.simulation.grids import feature_normals
 from graspd.worker.simulation.kernels import pieces, surface
 from graspd.worker.simulation.sampling import object_samples
+from tests.worker.models import keep_arrays
 from tests.worker.simulation.rigs import ball, object_of
 
 FLOAT32 = 2e-8  # float32 coordinates of size 0.1 m
+#: float32 coordinates of size 0.1 m: both ways round differently.
+ROUNDED = 5e-8
+REACH = 0.03
+Grid = dict[str, np.ndarray]
+BALL = ball(subdivisions=2)
 
 
 @wp.kernel
@@ -89,8 +93,7 @@ def test_the_smoothed_distance_is_continuous_across_the_surface() -> None:
 
 def test_normals_of_a_fine_ball_point_outward_everywhere() -> None:
     obj = ball(0.035, subdivisions=4)
-    rng = np.random.default_rng(4)
-    points = np.concatenate([around(rng, 0.035, 0.003), obj.vertices[:20]])
+    points = np.concatenate([around(np.random.default_rng(4), 0.035, 0.003), obj.vertices[:20]])
     _, normals = probe(obj, points, alpha=0.5)
     radial = points / np.linalg.norm(points, axis=1, keepdims=True)
     # Faces of 2 mm on a ball of 35 mm turn by 0.06 rad from one to the next.
@@ -130,23 +133,11 @@ def test_points_far_away_on_edges_and_vertices_are_finite() -> None:
     assert np.all(np.isfinite(distance)) and np.all(np.isfinite(normal))
 
 
-#: float32 coordinates of size 0.1 m: both ways round differently.
-ROUNDED = 5e-8
-REACH = 0.03
-
-
 @wp.kernel
 def ask(surface_in: surface.Surface, point_in: wp.array[wp.vec3], listed_out: wp.array[float], out: wp.array[float]):
     i = wp.tid()
     listed_out[i] = surface.near_distance(surface_in, point_in[i], REACH).distance
     out[i] = surface.mesh_distance(surface_in, point_in[i], REACH).distance
-
-
-def near_points(obj: ObjectModel, count: int = 1200) -> np.ndarray:
-    """Points within some millimetres of the surface on both sides, and some at edges and corners."""
-    rng = np.random.default_rng(0)
-    samples = object_samples(obj, count)
-    return np.concatenate([samples + rng.normal(scale=0.004, size=samples.shape), obj.vertices]) - obj.centre_of_mass
 
 
 def winding_number(obj: ObjectModel, points: np.ndarray) -> np.ndarray:
@@ -164,7 +155,10 @@ def winding_number(obj: ObjectModel, points: np.ndarray) -> np.ndarray:
 def test_lists_of_faces_give_the_distances_and_signs_of_the_tree() -> None:
     for obj in (object_from_path("mug"), object_of(trimesh.creation.box((0.06, 0.04, 0.001)))):
         device = device_object(obj, alpha=0.0, cell=0.005)
-        points = near_points(obj)
+        # Within some millimetres of the surface on both sides, and some at edges and corners.
+        samples = object_samples(obj, 1200)
+        points = samples + np.random.default_rng(0).normal(scale=0.004, size=samples.shape)
+        points = np.concatenate([points, obj.vertices]) - obj.centre_of_mass
         with wp.ScopedDevice("cpu"):
             at, outputs = wp.array(points, dtype=wp.vec3), [wp.zeros(len(points)), wp.zeros(len(points))]
             wp.launch(ask, len(points), inputs=[device.surface, at], outputs=outputs)
@@ -193,25 +187,20 @@ def ask_piece(pieces_in: pieces.Pieces, piece_in: int, point_in: wp.array(dtype=
     out[i] = pieces.piece_distance(pieces_in, piece_in, local)
 
 
-def distances_from(hand: HandModel, index: int, points: np.ndarray) -> np.ndarray:
-    device = DeviceHand.create(hand, "cpu")
-    with wp.ScopedDevice("cpu"):
-        out = wp.zeros(len(points), dtype=wp.vec4)
-        wp.launch(ask_piece, len(points), inputs=[device.pieces, index, wp.array(points, dtype=wp.vec3)], outputs=[out])
-        return out.numpy().astype(float)
-
-
 @pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
 def test_depths_inside_every_piece_agree_with_float64_distance(name: str) -> None:
     kernels.load("cpu")
     hand = hand_from_path(name)
     rng = np.random.default_rng(0)
-    checked = 0
+    checked, device = 0, DeviceHand.create(hand, "cpu")
     for index, piece in enumerate(hand.pieces):
         low, high = piece.vertices.min(axis=0), piece.vertices.max(axis=0)
         points = rng.uniform(low, high, (200, 3))
         expected = piece_distance(piece, points)
-        found = distances_from(hand, index, points)[:, 3]
+        with wp.ScopedDevice("cpu"):
+            out, at = wp.zeros(len(points), dtype=wp.vec4), wp.array(points, dtype=wp.vec3)
+            wp.launch(ask_piece, len(points), inputs=[device.pieces, index, at], outputs=[out])
+        found = out.numpy()[:, 3].astype(float)
         inside = expected < -1e-6
         np.testing.assert_allclose(found[inside], expected[inside], atol=5e-8)
         assert np.all(found[expected > 1e-6] > 0)
@@ -226,23 +215,19 @@ def test_a_box_has_six_planes_however_it_is_triangulated() -> None:
     np.testing.assert_allclose(np.sort(planes[:, 3]), [0.01, 0.01, 0.015, 0.015, 0.025, 0.025], atol=1e-12)
 
 
-Grid = dict[str, np.ndarray]
-BALL = ball(subdivisions=2)
-
-
 @pytest.fixture
-def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def own_cache(tmp_path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     return tmp_path / "graspd" / "object_grids"
 
 
 @pytest.fixture
-def computed(own_cache: Path, monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, ...]]:
+def computed(own_cache, monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, ...]]:
     """The shapes of the grids that were computed, not read."""
     shapes: list[tuple[int, ...]] = []
     sampled = grids._sampled
 
-    def watched(skin: Any, shape: tuple[int, ...]) -> Any:
+    def watched(skin, shape: tuple[int, ...]):
         shapes.append(shape)
         return sampled(skin, shape)
 
@@ -263,13 +248,13 @@ def same(one: Grid, other: Grid) -> bool:
     return all(one[name].dtype == other[name].dtype and np.array_equal(one[name], other[name]) for name in one)
 
 
-def test_a_later_process_reads_what_the_first_one_computed(computed: list[Any], own_cache: Path) -> None:
+def test_a_later_process_reads_what_the_first_one_computed(computed: list, own_cache) -> None:
     first, second = kept_grid(), kept_grid()
     assert same(first, second) and len(first["face"]) > 0
     assert len(computed) == 1 and len(list(own_cache.iterdir())) == 1
 
 
-def test_another_cell_faces_or_binary_is_another_grid(computed: list[Any], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_cell_faces_or_binary_is_another_grid(computed: list, monkeypatch: pytest.MonkeyPatch) -> None:
     kept_grid()
     coarse = kept_grid(cell=0.01)
     kept_grid(alpha=1.0)
@@ -293,11 +278,11 @@ def test_another_cell_faces_or_binary_is_another_grid(computed: list[Any], monke
         ("field", None),
     ],
 )
-def test_an_entry_that_would_lead_kernels_astray_is_made_again(computed, own_cache: Path, name: str, change) -> None:
+def test_an_entry_that_would_lead_kernels_astray_is_made_again(computed, own_cache, name: str, change) -> None:
     first = kept_grid()
     (file,) = own_cache.iterdir()
-    arrays = dict(disk_cache._read(file) or {})
+    arrays = dict(np.load(io.BytesIO(user_cache.load(file))))
     array = arrays.pop(name)
-    disk_cache._write(file, arrays | ({name: change(array)} if change else {}))
+    keep_arrays(file, arrays | ({name: change(array)} if change else {}))
     for _ in range(2):  # the second time the entry is whole again
         assert same(kept_grid(), first) and len(computed) == 2

@@ -20,6 +20,13 @@ from tests.worker.models import piece, two_finger_hand
 
 TILTED = np.array([0.1, -0.2, 0.3, 0.8, 0.2, -0.4, 0.4])
 TILTED[3:] /= np.linalg.norm(TILTED[3:])
+UP = np.array([0.0, 0.0, 1.0])
+BOX = Obstacle.box([0, 0, 0, 1, 0, 0, 0], [0.1, 0.1, 0.1])
+R, L = 0.01, 0.06
+EXACT = 2e-6  # float32 coordinates of 0.1 m, and the end of the search along an edge
+EDGE, CORNER = np.sqrt(2), np.sqrt(3)
+#: Turned by 45 degrees about y: a capsule points away from the edge at (0.05, y, 0.05), a box lies across it.
+ACROSS = (np.cos(np.pi / 8), 0, np.sin(np.pi / 8), 0)
 
 
 def test_distances_are_closed_forms_and_a_bound_beyond_edges() -> None:
@@ -30,8 +37,7 @@ def test_distances_are_closed_forms_and_a_bound_beyond_edges() -> None:
     np.testing.assert_allclose(box.distance(points), [0.05, 0.1, -0.05, -0.01], atol=1e-12)
     box = Obstacle.box([0, 0, 0, 1, 0, 0, 0], [0.2, 0.2, 0.2])
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (500, 3))
-    outside = np.maximum(np.abs(points) - 0.1, 0.0)
-    true = np.linalg.norm(outside, axis=1)
+    true = np.linalg.norm(np.maximum(np.abs(points) - 0.1, 0.0), axis=1)
     assert (box.distance(points)[true > 0] <= true[true > 0] + 1e-12).all()
 
 
@@ -152,12 +158,6 @@ def mujoco_distances(hand, postures: Posture, obstacle: Obstacle) -> np.ndarray:
     return np.array(least)
 
 
-UP = np.array([0.0, 0.0, 1.0])
-BOX = Obstacle.box([0, 0, 0, 1, 0, 0, 0], [0.1, 0.1, 0.1])
-R, L = 0.01, 0.06
-EXACT = 2e-6  # float32 coordinates of 0.1 m, and the end of the search along an edge
-
-
 def link(kind: str) -> HandModel:
     """A hand of one piece about the origin of its root."""
     base = two_finger_hand()
@@ -175,11 +175,6 @@ def distance(kind: str, at: tuple[float, ...], obstacle: Obstacle, turn: tuple[f
     quaternion = np.array(turn, float) / np.linalg.norm(turn)
     posture = Posture(np.array([[*at, *quaternion]]), np.zeros((1, 2)))
     return float(obstacle_room(link(kind), posture, [Environment((obstacle,), UP)])[0])
-
-
-EDGE, CORNER = np.sqrt(2), np.sqrt(3)
-#: Turned by 45 degrees about y: a capsule points away from the edge at (0.05, y, 0.05), a box lies across it.
-ACROSS = (np.cos(np.pi / 8), 0, np.sin(np.pi / 8), 0)
 
 
 @pytest.mark.parametrize(
@@ -221,8 +216,7 @@ def test_no_hand_is_nearer_to_a_solid_than_it_says_by_mujoco(name: str) -> None:
     """Exact for links that are boxes or round (1e-5 m: MuJoCo's meshes are float32 and converge to 1e-6); for hulls a
     lower bound."""
     hand, rng = hand_from_path(name), np.random.default_rng(2)
-    corners = rng.normal(size=(40, 3)) * [0.03, 0.05, 0.04]
-    solid, _ = outer_solid(corners)
+    solid, _ = outer_solid(rng.normal(size=(40, 3)) * [0.03, 0.05, 0.04])
     postures = random_postures(hand, 60, rng)
     found = obstacle_room(hand, postures, [Environment((solid,), UP)])
     true = mujoco_distances(hand, postures, solid)

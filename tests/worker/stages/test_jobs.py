@@ -2,10 +2,7 @@
 
 import json
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -50,9 +47,16 @@ from tests.fakes import job_record, message_for
 from tests.networks import LEARNED, network_files, random_network
 
 STAGES = {Stage.SCENE: scene.run, Stage.SYNTHESIZE: synthesize.run, Stage.RENDER: render.run}
+TABLE = {"grasps": 6, "fidelity": "draft", "seed": 3, "rechecks": 0, "scene": "table", "scenes": 2}
+TABLE |= {"views": 1, "width": 48, "height": 36}
+DOWN = [0, 0, 0, 1, 0, 0, 0]
+ASKEW = {"scene": {"supports": [{"kind": "half_space"}], "target": [0, 0, 0.045, 1, 0, 0, 0]}}
+ASKEW |= {"neighbours": [{"object": "mug", "pose": [0.02, 0, 0, 1, 0, 0, 0]}]}
+SIZE = 3  # batches as small as they can be, so that several take a few seconds
+small = pytest.mark.usefixtures("small_batches")
 
 
-def job_of(store: Store, span: int = 1, **request: Any) -> JobRecord:
+def job_of(store: Store, span: int = 1, **request) -> JobRecord:
     """A job of the built-in hand and object, in the store with them."""
     hand = publish_asset(store, AssetKind.HAND, "barrett", builtin_files(AssetKind.HAND, "barrett"))
     obj = publish_asset(store, AssetKind.OBJECT, "block", builtin_files(AssetKind.OBJECT, "block"))
@@ -74,11 +78,6 @@ def end_of(store: Store, job: JobRecord) -> Event:
     return event
 
 
-TABLE = {"grasps": 6, "fidelity": "draft", "seed": 3, "rechecks": 0, "scene": "table", "scenes": 2}
-TABLE |= {"views": 1, "width": 48, "height": 36}
-DOWN = [0, 0, 0, 1, 0, 0, 0]
-
-
 @dataclass
 class Bench:
     """A store with the built-in Barrett hand and block, and a worker."""
@@ -86,7 +85,7 @@ class Bench:
     store: Store
     job: JobRecord = field(init=False)
 
-    def run(self, **request: Any) -> tuple[EventKind, str]:
+    def run(self, **request) -> tuple[EventKind, str]:
         """Kind and words of the end of a job's first batch."""
         for one in request.get("neighbours", ()):
             files = builtin_files(AssetKind.OBJECT, one["object"])
@@ -96,8 +95,7 @@ class Bench:
         return end.kind, end.message
 
     def last_attempt(self) -> tuple[str, bool]:
-        task = list(plan(self.job))[-1]
-        attempt = read_record(AttemptRecord, self.store, names.attempt(task.id, 1))
+        attempt = read_record(AttemptRecord, self.store, names.attempt(list(plan(self.job))[-1].id, 1))
         return attempt.kind, attempt.last
 
     def made(self, stage: Stage) -> Shard:
@@ -105,7 +103,7 @@ class Bench:
 
 
 @pytest.fixture(scope="module")
-def table(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+def table(tmp_path_factory: pytest.TempPathFactory):
     bench = Bench(open_store(tmp_path_factory.mktemp("store").as_uri()))
     assert bench.run(**TABLE) == (EventKind.FINISHED, "")
     yield bench
@@ -135,8 +133,7 @@ def test_readers_give_way_of_a_grasp_and_the_grasps_of_a_picture(table: Bench) -
     shards = open_shards(table.store, job=table.job.id)
     columns = ("grasp/approach", "grasp/lift", "grasp/scene_index", "quality/lift_hard", "quality/clearance_m")
     grasps = Grasps(shards, columns)
-    assert grasps[0]["grasp/approach"].shape == (6, 7)
-    assert len(grasps.arrays()["quality/lift_hard"]) == 6
+    assert grasps[0]["grasp/approach"].shape == (6, 7) and len(grasps.arrays()["quality/lift_hard"]) == 6
     pictures = Pictures(shards)
     assert sum(len(picture["grasp/hand_pose"]) for picture in pictures) == 6
     base, views = table.made(Stage.SYNTHESIZE), table.made(Stage.RENDER)
@@ -156,15 +153,14 @@ def test_neighbours_in_a_bin_stand_in_scenes_grasps_and_pictures(table: Bench) -
     first, base, views = shards
     assert base["scene/neighbour_pose"].shape == (1, 2, 7)
     np.testing.assert_array_equal(base["scene/neighbour_pose"], first["scene/neighbour_pose"])
-    scenes = placed_of_shard(base)
-    assert len(scenes.neighbours) == 2
+    assert len(placed_of_shard(base).neighbours) == 2
     assert table.store.exists(names.asset_model(AssetKind.OBJECT, beside[0]["digest"])), "viewers show it"
     alone = render_alone(bench, base)
     assert (views["image/depth"] != alone["image/depth"]).any(), "they are in the picture"
     assert set(np.unique(views["image/segmentation"])) - {0, 1, 2}
 
 
-def render_alone(bench: Bench, base: Shard) -> dict[str, Any]:
+def render_alone(bench: Bench, base: Shard) -> dict:
     message = message_of(bench.job, list(plan(bench.job))[-1], attempt=1, max_attempt=3)
     request, obj = bench.job.request, object_of(bench.store, message)
     options = {"views": 1, "stereo": False, "width": request.width, "height": request.height}
@@ -192,10 +188,6 @@ def test_payload_out_of_reach_fails_job_with_what_the_hand_lifts(table: Bench, s
     assert bench.last_attempt() == ("LoadError", True), "it is not tried again"
 
 
-ASKEW = {"scene": {"supports": [{"kind": "half_space"}], "target": [0, 0, 0.045, 1, 0, 0, 0]}}
-ASKEW |= {"neighbours": [{"object": "mug", "pose": [0.02, 0, 0, 1, 0, 0, 0]}]}
-
-
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
@@ -204,12 +196,9 @@ ASKEW |= {"neighbours": [{"object": "mug", "pose": [0.02, 0, 0, 1, 0, 0, 0]}]}
         ({"scene": "table", "method": "elsewhere"}, "unknown method"),
     ],
 )
-def test_what_only_a_worker_can_know_fails_the_job_in_a_line(table: Bench, changes: dict[str, Any], words: str) -> None:
+def test_what_only_a_worker_can_know_fails_the_job_in_a_line(table: Bench, changes: dict, words: str) -> None:
     kind, said = Bench(table.store).run(**TABLE | {"views": 0, "grasps": 1} | changes)
     assert kind is EventKind.FAILED and re.search(words, said)
-
-
-SIZE = 3  # batches as small as they can be, so that several take a few seconds
 
 
 @pytest.fixture
@@ -218,10 +207,7 @@ def small_batches(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(f"{module}.BATCH_SIZE", SIZE)
 
 
-small = pytest.mark.usefixtures("small_batches")
-
-
-def made(store: Store, span: int, **request: Any) -> tuple[JobRecord, list[tuple[Stage, Shard, Any]]]:
+def made(store: Store, span: int, **request) -> tuple[JobRecord, list[tuple]]:
     """What a job makes whose tasks have so many batches: stage, shard and manifest of each task."""
     job = job_of(store, span, fidelity="draft", seed=3, **request)
     end = end_of(store, job)
@@ -236,7 +222,7 @@ def made(store: Store, span: int, **request: Any) -> tuple[JobRecord, list[tuple
     [{"scenes": 2}, {"rechecks": SIZE}, {"scene": "table", "scenes": 2, "budget": 20}],
     ids=["scenes after", "rechecks of the first batch", "scenes before"],
 )
-def test_a_range_is_its_batches_one_after_the_other(request_of: dict[str, Any]) -> None:
+def test_a_range_is_its_batches_one_after_the_other(request_of: dict) -> None:
     apart = made(open_store("memory://"), 1, grasps=2 * SIZE + 1, **request_of)[1]
     _, together = made(open_store("memory://"), 3, grasps=2 * SIZE + 1, **request_of)
     assert len(apart) == 3 * len(together) > 0
@@ -255,8 +241,7 @@ def test_a_range_is_its_batches_one_after_the_other(request_of: dict[str, Any]) 
             if (firsts := {"grasp/scene_index": scenes, "grasp/base_index": bases}.get(path)) is not None:
                 pieces = [piece + first for piece, first in zip(pieces, firsts, strict=False)]
             np.testing.assert_array_equal(column, np.concatenate(pieces), err_msg=path)
-        assert manifest.batches == 3
-        assert manifest.valid == sum(one.valid for one in of_parts)
+        assert manifest.batches == 3 and manifest.valid == sum(one.valid for one in of_parts)
         assert manifest.candidates == sum(one.candidates for one in of_parts)
         assert manifest.rechecked == sum(one.rechecked for one in of_parts)
         if stage is Stage.SYNTHESIZE:
@@ -307,7 +292,7 @@ def test_a_batch_without_a_place_has_no_grasps_but_for_the_first(monkeypatch, re
     """As where none is found within the budget: the grasps of the other batches stay."""
     whole = generation.validated_grasps
 
-    def some(*given: Any, batch: int, **options: Any) -> Any:
+    def some(*given, batch: int, **options):
         if batch in refused:
             raise NoStartFound("no hand finds a way in")
         return whole(*given, batch=batch, **options)
@@ -332,7 +317,7 @@ def files() -> dict[str, bytes]:
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Store:
+def store(tmp_path) -> Store:
     return open_store((tmp_path / "store").as_uri())
 
 
@@ -401,7 +386,7 @@ def test_a_network_whose_finding_was_lost_is_checked_by_a_worker(store: Store, n
         {"supports": [{"kind": "box", "size": [1, 1, 0.1]}]},
     ],
 )
-def test_scene_is_refused_at_door_where_planner_finds_no_table(scene: Any) -> None:
+def test_scene_is_refused_at_door_where_planner_finds_no_table(scene) -> None:
     place = JobOptions(scene=scene).place
     assert place == scene_of(JobOptions(scene=scene).scene, faces="drawn", touch=0.0, beside=())
     try:

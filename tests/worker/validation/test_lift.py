@@ -1,6 +1,11 @@
-"""Lifts, the short lift and the short pushes on a gripper of two plates and a box that stands on a table."""
+"""Lifts, the short lift and the short pushes on a gripper of two plates and a box that stands on a table.
+
+The trial of candidates is the test of the validator itself, which is then not done again.
+"""
 
 import dataclasses
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,17 +14,21 @@ import trimesh
 from graspd.service.model.errors import InputError
 from graspd.service.model.matter import ACCELERATION
 from graspd.service.model.transforms import quat_from_axis_angle, quat_multiply, quat_rotate
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet, Posture, joined
+from graspd.worker.scenes import rollout as rollouts
+from graspd.worker.scenes.rollout import BEST, FALLS, TOUCHES, hold_rollout, lift_rollout, scene_verdicts
 from graspd.worker.simulation.environment import Neighbour, Obstacle, PlacedGrasps
 from graspd.worker.simulation.obstacles import obstacle_room
 from graspd.worker.validation import prescreening
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.lift import RISING, RISING_S, Lift, LiftOutcome
-from graspd.worker.validation.lifting import lift_key, validate_lifts
+from graspd.worker.validation.lifting import KnownLifts, LiftLevel, lift_key, validate_lifts
 from graspd.worker.validation.model import FRICTION, HARD, MujocoOptions, build
 from graspd.worker.validation.prescreening import PHYSICS, SLIPS, LiftRollouts, push_rollout
-from graspd.worker.validation.protocol import MAX_DISPLACEMENT_M, STAGE_S
+from graspd.worker.validation.protocol import MAX_DISPLACEMENT_M, STAGE_S, Test
 from graspd.worker.validation.robust import robust
+from graspd.worker.validation.validator import KnownRollouts, validate
 from graspd.worker.validation.variant import NOMINAL, Models, Variant, VariantLift, motion_of, seen, upright
 from tests.worker.models import object_from_mesh
 from tests.worker.quality.helpers import pad_hand, posture
@@ -34,6 +43,14 @@ PLACED = PlacedGrasps(
 )
 #: Joint value at which the pads touch.
 TOUCH = 0.065
+#: Squeeze [m] whose two normal forces F = kp d hold a pull of 1 N by friction: 2 mu F = 1 N; the same for the pulls.
+NEWTON = 1 / (2 * PHYSICS.friction[0]) / float(HAND.stiffness[0])
+LEAST, LEAST_PUSHED = prescreening.HANGS_WHOLE * NEWTON, prescreening.PULL * NEWTON
+#: The same of what hangs at half the friction.
+LEAST_AT_HALF = 2 * prescreening.HANGS * NEWTON
+#: Of a push towards a corner what two pads must hold by friction, across their normals; the rest one of them carries.
+ACROSS = float(np.sqrt(2.0 / 3.0))
+LIFTED, TOUCHED, FELL = 1, 3, 5
 
 
 def grasp(squeeze: float, way: np.ndarray | None = None) -> GraspSet:
@@ -41,8 +58,7 @@ def grasp(squeeze: float, way: np.ndarray | None = None) -> GraspSet:
     open_, touch, press = (posture(((0.0, 0.0, 0.0), (q, q))) for q in (TOUCH - 0.005, TOUCH, TOUCH + squeeze))
     approach = np.repeat(open_.hand_pose[:, None], 6, axis=1)
     approach[..., :3] += np.linspace(0.1, 0, 6)[:, None] * (np.array([0, 0, -1.0]) if way is None else way)
-    raised = press.hand_pose - np.array([0, 0, 0.1, 0, 0, 0, 0])
-    lift = Posture(raised, press.joint_positions)
+    lift = Posture(press.hand_pose - np.array([0, 0, 0.1, 0, 0, 0, 0]), press.joint_positions)
     found = GraspSet(touch, open_, press, np.full(1, np.nan))
     return dataclasses.replace(found, approach=approach, coming=open_.joint_positions, lift=lift)
 
@@ -158,27 +174,16 @@ def test_a_neighbour_that_leans_or_slides_has_moved() -> None:
     assert test._neighbours_moved()
 
 
-#: Squeeze [m] whose two normal forces F = kp d hold a pull of 1 N by friction: 2 mu F = 1 N; the same for the pulls.
-NEWTON = 1 / (2 * PHYSICS.friction[0]) / float(HAND.stiffness[0])
-LEAST, LEAST_PUSHED = prescreening.HANGS_WHOLE * NEWTON, prescreening.PULL * NEWTON
-#: The same of what hangs at half the friction.
-LEAST_AT_HALF = 2 * prescreening.HANGS * NEWTON
-
-
 def scores(*squeezes: float, threads: int = 1) -> np.ndarray:
     grasps = joined([grasp(squeeze) for squeeze in squeezes])
     return LiftRollouts(HAND, BOX, lambda: WHOLE, threads=threads).scores(grasps, placed(len(squeezes)))
 
 
-def fallen() -> float:
-    """Score of a box that nothing holds: how far it falls from rest until a stage's end finds it gone, over 5 cm."""
-    fall = 0.5 * prescreening.HANGS_WHOLE * ACCELERATION * (STAGE_S * np.arange(1, 10)) ** 2 / MAX_DISPLACEMENT_M
-    return float(fall[fall >= prescreening.GONE][0])
-
-
 def test_the_box_falls_by_what_friction_does_not_carry() -> None:
     nobody, weak, firm = np.subtract(scores(-0.005, 0.9 * LEAST, 1.05 * LEAST), SLIPS)
-    assert nobody == pytest.approx(fallen(), rel=0.05)
+    # How far it falls from rest until a stage's end finds it gone, over 5 cm.
+    fall = 0.5 * prescreening.HANGS_WHOLE * ACCELERATION * (STAGE_S * np.arange(1, 10)) ** 2 / MAX_DISPLACEMENT_M
+    assert nobody == pytest.approx(float(fall[fall >= prescreening.GONE][0]), rel=0.05)
     # What slips slowly is less than 5 cm down when the test ends, and would be farther in 2 s.
     assert weak > prescreening.GONE and 0.0 <= firm < 0.05
 
@@ -201,10 +206,6 @@ def test_threads_and_the_other_grasps_change_no_score() -> None:
     assert np.array_equal(scores(*squeezes, threads=3), scores(*squeezes))
     for score in (scores, pushed):
         assert np.array_equal(score(*squeezes)[1:2], score(squeezes[1]))
-
-
-#: Of a push towards a corner what two pads must hold by friction, across their normals; the rest one of them carries.
-ACROSS = float(np.sqrt(2.0 / 3.0))
 
 
 def pushed(*squeezes: float) -> np.ndarray:
@@ -309,3 +310,135 @@ def test_a_lift_needs_a_scene_and_a_way_of_each_grasp() -> None:
     for grasps, where, level in ((MANY, few, "lift"), (without, WHERE, "lift"), (MANY, WHERE, "no")):
         with pytest.raises(InputError):
             robust(HAND, BOX, grasps, placed=where, level=level, pieces=WHOLE)  # type: ignore[arg-type]
+
+
+SQUEEZES = (-0.005, 1.3 * LEAST, 4 * LEAST)
+THREE = joined([grasp(squeeze) for squeeze in SQUEEZES])
+THREE_PLACES = PlacedGrasps(PLACED.supports, PLACED.object_pose, np.zeros(3, int))
+
+
+@pytest.fixture
+def lifts(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Grows by the row of each lift that is simulated."""
+    done: list[int] = []
+    lift = Lift.lift
+    monkeypatch.setattr(Lift, "lift", lambda self, grasps, row: done.append(row) or lift(self, grasps, row))
+    return done
+
+
+def test_what_was_validated_once_is_not_simulated_again(lifts: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
+    known: KnownLifts = {}
+    first = validate_lifts(HAND, BOX, THREE, THREE_PLACES, pieces=WHOLE, known=known)
+    again = validate_lifts(HAND, BOX, THREE, THREE_PLACES, pieces=WHOLE, known=known)
+    assert len(lifts) == 3
+    assert np.array_equal(first.outcome, again.outcome) and np.array_equal(first.margin, again.margin)
+    rows: list[int] = []
+    standard = Test.standard
+    monkeypatch.setattr(Test, "standard", lambda self, given, row: rows.append(row) or standard(self, given, row))
+    known: KnownRollouts = {}
+    first = validate(HAND, BOX, THREE, pieces=WHOLE, known=known)
+    again = validate(HAND, BOX, THREE.take(np.array([2, 0])), pieces=WHOLE, known=known)
+    assert sorted(rows) == [0, 1, 2]
+    assert np.array_equal(again.outcome, first.outcome[[2, 0]])
+    validate(HAND, BOX, THREE, pieces=WHOLE, hard=True, known=known)
+    assert len(rows) == 6
+
+
+@pytest.mark.parametrize("other", ["friction", "squeeze", "scene"])
+def test_a_lift_of_anything_else_is_not_known(lifts: list[int], other: str) -> None:
+    known: KnownLifts = {}
+    validate_lifts(HAND, BOX, THREE, THREE_PLACES, pieces=WHOLE, known=known)
+    grasps, where = THREE, THREE_PLACES
+    if other == "squeeze":
+        grasps = joined([grasp(squeeze + 1e-6) for squeeze in SQUEEZES])
+    if other == "scene":
+        where = PlacedGrasps(
+            PLACED.supports, PLACED.object_pose + np.array([1e-6, 0, 0, 0, 0, 0, 0]), THREE_PLACES.index
+        )
+    validate_lifts(HAND, BOX, grasps, where, pieces=WHOLE, hard=other == "friction", known=known)
+    assert len(lifts) == 6
+
+
+def numbered(count: int) -> GraspSet:
+    """Grasps that are told apart by their loss."""
+    return replace(THREE.take(np.zeros(count, int)), stability_loss=np.arange(float(count)), scene=np.zeros(count, int))
+
+
+def lift_tests(monkeypatch: pytest.MonkeyPatch, outcomes: dict[bool, list[int]]) -> list[object]:
+    """Stands in for the lift test at half the friction (True) and at the whole of it; grows by what is tested."""
+    done: list[object] = []
+
+    def validated(hand, obj, some, placed, *, hard=False, **_):
+        rows = some.stability_loss.astype(int)
+        done.append((hard, rows.tolist()))
+        outcome = np.array(outcomes[hard])[rows]
+        return SimpleNamespace(success=(outcome == LIFTED).astype(int), outcome=outcome, margin=np.zeros(len(rows)))
+
+    def way(hand, obj, some, placed):
+        clear, wrist = np.ones(len(some), bool), np.zeros((len(some), 0))
+        seen = {"approach": some.approach, "open": some.coming, "lift": None, "least": 1.0 * clear, "wrist": wrist}
+        return SimpleNamespace(clear=clear, **seen)
+
+    monkeypatch.setattr(rollouts, "validate_lifts", validated)
+    monkeypatch.setattr(rollouts, "plan_way", way)
+    return done
+
+
+def rollout_of(monkeypatch, scores: list[float], outcomes, beat=None, level: LiftLevel = "lift"):
+    lift_tests(monkeypatch, outcomes)
+    monkeypatch.setattr(LiftRollouts, "scores", lambda *_: np.array(scores))
+    where = THREE_PLACES.take(np.zeros(len(scores), int))
+    rollout = lift_rollout(HAND, BOX, lambda: WHOLE, level=level)
+    return rollout(numbered(len(scores)), where, np.full(len(scores), np.inf) if beat is None else beat)
+
+
+def test_a_score_is_that_of_the_lift(monkeypatch: pytest.MonkeyPatch) -> None:
+    half = [LIFTED, FELL, FELL, FELL, FELL, TOUCHED, FELL]
+    outcomes = {True: half, False: [LIFTED, LIFTED, FELL, LIFTED, FELL, TOUCHED, FELL]}
+    found = rollout_of(monkeypatch, [0.2, 0.3, 0.4, 1.2, 1.3, 0.5, 4.0], outcomes)
+    falls = SLIPS + 1.0 + FALLS * np.array([0.4, 1.0])
+    assert found == pytest.approx([0.2, SLIPS, falls[0], 1.2, falls[1], 0.5 + TOUCHES, 4.0])
+    assert found[0] <= BEST
+
+
+def test_lifting_at_half_the_friction_is_asked_to_be_better(monkeypatch: pytest.MonkeyPatch) -> None:
+    outcomes = {True: [LIFTED, FELL], False: [LIFTED, LIFTED]}
+    assert rollout_of(monkeypatch, [0.2, 0.3], outcomes, np.array([1.5, 1.5])) == pytest.approx([0.2, 1.5])
+
+
+def test_the_published_lift_is_at_full_friction(monkeypatch: pytest.MonkeyPatch) -> None:
+    outcomes = {True: [LIFTED, LIFTED, FELL], False: [LIFTED, FELL, LIFTED]}
+    found = rollout_of(monkeypatch, [0.2, 0.3, 0.4], outcomes, level="dexgraspbench")
+    assert found == pytest.approx([0.2, SLIPS + 1.0 + FALLS * 0.3, SLIPS])
+    assert rollout_of(monkeypatch, [0.3], {True: [LIFTED], False: [FELL]}) == pytest.approx([0.3]), "at level lift"
+
+
+@pytest.mark.parametrize(
+    ("level", "tested", "success", "hard"),
+    [
+        ("lift", [(True, [0, 1, 2, 3]), (False, [2, 3])], [1, 1, 1, 0], [1, 1, 0, -1]),
+        ("dexgraspbench", [(False, [0, 1, 2, 3]), (True, [0, 2])], [1, 0, 1, 0], [1, -1, 0, -1]),
+    ],
+)
+def test_no_grasp_is_lifted_that_another_lift_decides(monkeypatch, level: LiftLevel, tested, success, hard) -> None:
+    done = lift_tests(monkeypatch, {True: [LIFTED, LIFTED, FELL, FELL], False: [LIFTED, FELL, LIFTED, FELL]})
+    scenes = SimpleNamespace(placed=lambda _: THREE_PLACES.take(np.zeros(4, int)))
+    _, columns = scene_verdicts(HAND, BOX, numbered(4), scenes, level=level, pieces=WHOLE, run=ExecutionContext())
+    assert done == tested
+    assert (columns["quality/success"].tolist(), columns["quality/lift_hard"].tolist()) == (success, hard)
+
+
+@pytest.mark.parametrize(("verdict", "score"), [(1, 0.2), (0, SLIPS + 1.0 + FALLS * 0.2)])
+def test_free_grasp_that_the_validator_drops_is_no_good_candidate(monkeypatch, verdict: int, score: float) -> None:
+    monkeypatch.setattr(rollouts, "push_rollout", lambda *_: lambda grasps, *_: np.array([0.2, 4.0, 4.0]))
+    monkeypatch.setattr(rollouts, "validate", lambda *_, **__: SimpleNamespace(success=np.array([verdict])))
+    assert hold_rollout(HAND, BOX, lambda: WHOLE)(THREE, None).tolist() == pytest.approx([score, 4.0, 4.0])
+
+
+def test_a_free_grasp_that_cannot_beat_another_is_not_validated(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rollouts, "push_rollout", lambda *_: lambda grasps, *_: np.array([0.6, 0.7, 0.8]))
+    validated: list[int] = []
+    held = SimpleNamespace(success=np.ones(1))
+    monkeypatch.setattr(rollouts, "validate", lambda hand, obj, grasps, **_: validated.append(len(grasps)) or held)
+    found = hold_rollout(HAND, BOX, lambda: WHOLE)(THREE, None, np.array([0.5, 0.7, np.inf]))
+    assert (validated, found.tolist()) == ([1], [0.6, 0.7, 0.8])

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -35,6 +34,8 @@ HAND = replace(two_finger_hand(), effort=np.full(2, TORQUE))
 #: The object's y is up: friction alone holds it.
 UPRIGHT = np.array([[0.0, 0.0, 0.03, np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0]])
 TABLE = PlacedGrasps((Obstacle.half_space((0, 0, 1), 0.0),), UPRIGHT, np.zeros(1, np.intp))
+BARRETT = "synth --hand barrett --object block --scene table --fidelity draft --seed 3"
+UP = np.array([[[0.0, 1.0, 0.0]]])
 
 
 def pinch() -> GraspSet:
@@ -117,10 +118,7 @@ def test_what_is_said_with_a_job_goes_over_what_the_file_says() -> None:
         BOX.weighing(density=1e7)
 
 
-BARRETT = "synth --hand barrett --object block --scene table --fidelity draft --seed 3"
-
-
-def test_whoever_says_the_weight_is_told_what_the_grasps_lift(tmp_path: Path) -> None:
+def test_whoever_says_the_weight_is_told_what_the_grasps_lift(tmp_path) -> None:
     keys = {"mass_kg", "lift_share", "lift_hard_share", "payload_kg"}
     words = f"{BARRETT} -n 1 --mass 0.37 -o"
     for more, told in (((), keys), (("--no-payload",), keys - {"payload_kg"})):
@@ -138,9 +136,6 @@ def test_a_job_counts_grasps_that_lift_the_wanted_payload(tmp_path, least, kept:
     assert (shard["quality/payload_kg"] >= least).all()
     survive = shard["quality/shake_margin"] < 1
     assert told["shake_share"] == (survive.mean() if kept else None)
-
-
-UP = np.array([[[0.0, 1.0, 0.0]]])
 
 
 @pytest.mark.parametrize("friction", [0.01, 0.3, FRICTION, 1.0])
@@ -174,7 +169,7 @@ def test_what_is_wanted_is_told_with_what_the_best_grasp_lifts() -> None:
 
 
 @pytest.mark.parametrize("wanted", [ENOUGH // 2, ENOUGH])
-def test_weight_out_of_reach_ends_work_with_what_the_hand_lifts(tmp_path: Path, wanted: int) -> None:
+def test_weight_out_of_reach_ends_work_with_what_the_hand_lifts(tmp_path, wanted: int) -> None:
     words = f"synth --hand allegro --object block --mass 20 --scene table -n {wanted} --fidelity draft --seed 3 -o"
     told = graspd(words, tmp_path / "g.h5", code=3)
     assert (told["grasps"], told["candidates"]) == (0, wanted), "the budget would be four times as many"

@@ -3,7 +3,6 @@
 import copy
 import dataclasses
 import json
-from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -40,6 +39,8 @@ from tests.worker.hands.mjcfs import CLAW
 from tests.worker.hands.test_mjcf import load
 from tests.worker.models import on_one_dof, piece, two_finger_hand
 from tests.worker.quality.helpers import BOX, FAR, PADS, WHOLE, many_grasps, placed_data, plate_hand, posture
+
+RNG = np.random.default_rng(11)
 
 
 def by_luck(monkeypatch: pytest.MonkeyPatch, odds: float = 0.7) -> None:
@@ -98,8 +99,7 @@ def test_no_model_is_validated_after_the_share_is_sure(monkeypatch: pytest.Monke
 
 def test_the_weakest_axis_is_that_of_the_first_model_that_fails() -> None:
     held = np.array([[1, 0, 0], [1, 1, 1], [0, -1, -1], [-1, -1, -1]], np.int8)
-    axis = np.array([[1, 4, 5], [2, 3, 4], [7, 0, 0], [0, 0, 0]], np.uint8)
-    found = Robustness(held, axis, 0.9, 0.0)
+    found = Robustness(held, np.array([[1, 4, 5], [2, 3, 4], [7, 0, 0], [0, 0, 0]], np.uint8), 0.9, 0.0)
     assert found.weakest.tolist() == [4, 0, 7, 0]
     assert found.by_axis() == {
         Axis.SHAPES: (1, 1), Axis.JOINTS: (1, 1), Axis.COUPLINGS: (1, 1), Axis.FRICTION: (1, 2), Axis.MASS: (0, 1),
@@ -128,9 +128,6 @@ def test_a_grasp_meets_the_same_models_each_axis_once() -> None:
 def test_it_stops_when_it_is_told_to() -> None:
     with pytest.raises(TaskCancelled):
         robust(PADS, BOX, many_grasps(), pieces=WHOLE, run=ExecutionContext(cancelled=lambda: True))
-
-
-RNG = np.random.default_rng(11)
 
 
 def models(hand: HandModel = PADS, friction: tuple[float, float] = (0.6, 0.02)) -> Models:
@@ -437,7 +434,7 @@ def test_a_drive_stays_what_it_is_with_followers_or_on_a_tendon() -> None:
     assert 2 * cord.limit(back.effort) == pytest.approx(ratio.effort[dof])
 
 
-def test_the_same_model_gives_the_same_verdicts(tmp_path: Path) -> None:
+def test_the_same_model_gives_the_same_verdicts(tmp_path) -> None:
     row = evaluate(plates_case(), validation_hand=same_hand(PADS_HAND, PADS_HAND), cache=tmp_path)
     assert row["foreign_held"] == {"both": 2, "nominal": 0, "foreign": 0, "neither": 1}
     assert (row["agreement"], row["foreign_share"], row["fingertips_mm"]) == (1.0, 1.0, pytest.approx(0.0, abs=1e-6))
@@ -445,12 +442,11 @@ def test_the_same_model_gives_the_same_verdicts(tmp_path: Path) -> None:
     json.dumps(row, allow_nan=False)
 
 
-def test_a_model_with_other_pads_says_otherwise(tmp_path: Path) -> None:
+def test_a_model_with_other_pads_says_otherwise(tmp_path) -> None:
     # The other model's pads do not reach the object: they are 40 mm nearer to their joints.
     back, (foot, *pads) = np.array([0, 0, -0.04, 0, 0, 0, 0]), PADS_HAND.pieces
     moved = (dataclasses.replace(p, vertices=p.vertices + back[:3], pose=p.pose + back) for p in pads)
-    other = dataclasses.replace(PADS_HAND, name="shorter", pieces=(foot, *moved))
-    same = same_hand(PADS_HAND, other)
+    same = same_hand(PADS_HAND, dataclasses.replace(PADS_HAND, name="shorter", pieces=(foot, *moved)))
     row = evaluate(plates_case(), validation_hand=same, cache=tmp_path)
     assert row["foreign_held"] == {"both": 0, "nominal": 2, "foreign": 0, "neither": 1}
     assert (row["foreign_share"], row["agreement"]) == (0.0, pytest.approx(1 / 3))
@@ -460,7 +456,7 @@ def test_a_model_with_other_pads_says_otherwise(tmp_path: Path) -> None:
     assert evaluate(plates_case(), validation_hand=theirs_in_ours, cache=tmp_path)["foreign_share"] == 0.0
 
 
-def test_rows_add_up_by_their_grasps(tmp_path: Path) -> None:
+def test_rows_add_up_by_their_grasps(tmp_path) -> None:
     row = evaluate(plates_case(), validation_hand=same_hand(PADS_HAND, PADS_HAND), cache=tmp_path)
     lost = {**row, "foreign_held": {"both": 0, "nominal": 1, "foreign": 1, "neither": 0}, "fingertips_mm": 0.4}
     whole = combine([row, lost])

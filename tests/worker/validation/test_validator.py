@@ -7,7 +7,6 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from types import ModuleType
 
 import mujoco
@@ -35,6 +34,12 @@ from graspd.worker.validation.validator import validate
 from tests.worker.models import object_from_mesh, on_one_dof, two_finger_hand
 from tests.worker.quality import helpers
 from tests.worker.quality.helpers import BOX, CONTACT, FAR, PADS, WHOLE, grasp_of, many_grasps, placed_data, posture
+
+#: Displacement or rotation over its limit by time [s].
+Motion = Callable[[float], float]
+SHORT_PADS, PLATES = helpers.pad_hand(), helpers.plate_hand()
+TABLE = Obstacle.half_space((0, 0, 1), -0.3)
+THUMB = ("joint_12.0", "joint_13.0", "joint_14.0", "joint_15.0")
 
 
 def test_a_pressed_box_is_held_and_a_free_one_falls() -> None:
@@ -139,8 +144,7 @@ def test_cheaper_levels_say_what_the_letter_says(level: str) -> None:
     dexgraspbench = validate(PADS, BOX, grasps, level="dexgraspbench", pieces=WHOLE)
     cheap = validate(PADS, BOX, grasps, level=level, pieces=WHOLE)
     assert 0 < dexgraspbench.success.sum() < len(grasps), "the set must hold both kinds"
-    assert cheap.success.tolist() == dexgraspbench.success.tolist()
-    assert cheap.steps < 0.5 * dexgraspbench.steps
+    assert cheap.success.tolist() == dexgraspbench.success.tolist() and cheap.steps < 0.5 * dexgraspbench.steps
 
 
 def test_hard_holds_no_more_and_threads_change_nothing() -> None:
@@ -255,13 +259,12 @@ def test_unknown_levels_are_refused_and_cancelled_validator_stops() -> None:
         validate(PADS, BOX, grasp_of(), pieces=WHOLE, run=ExecutionContext(cancelled=lambda: True))
 
 
-def test_a_convex_object_is_one_piece_and_an_l_is_cut_and_kept(tmp_path: Path) -> None:
+def test_a_convex_object_is_one_piece_and_an_l_is_cut_and_kept(tmp_path) -> None:
     pieces = decompose(BOX, cache=tmp_path)
     assert len(pieces) == 1 and pieces.volume_ratio == pytest.approx(1.0, abs=1e-6)
     parts = [trimesh.creation.box((0.1, 0.02, 0.02)), trimesh.creation.box((0.02, 0.1, 0.02))]
     parts[1].apply_translation([0.04, 0.04, 0])
-    shape = object_from_mesh(trimesh.boolean.union(parts, engine="manifold"))
-    pieces = decompose(shape, cache=tmp_path)
+    pieces = decompose(object_from_mesh(trimesh.boolean.union(parts, engine="manifold")), cache=tmp_path)
     assert 2 <= len(pieces) <= 4 and pieces.volume_ratio == pytest.approx(1.0, abs=0.05)
     assert len(list(tmp_path.glob("*.npz"))) == 2
     cube = np.asarray(trimesh.creation.box((0.02, 0.02, 0.02)).vertices)
@@ -269,7 +272,7 @@ def test_a_convex_object_is_one_piece_and_an_l_is_cut_and_kept(tmp_path: Path) -
 
 
 @pytest.mark.slow
-def test_shell_that_convex_pieces_fill_in_is_refused_with_reason(tmp_path: Path) -> None:
+def test_shell_that_convex_pieces_fill_in_is_refused_with_reason(tmp_path) -> None:
     """At this radius even the most pieces allowed stand more than 2 mm away from the inner wall."""
     shell = trimesh.creation.icosphere(subdivisions=2, radius=0.15)
     inner = trimesh.creation.icosphere(subdivisions=2, radius=0.1495)
@@ -287,7 +290,7 @@ class Exploding(Test):
 
 
 @pytest.mark.parametrize("level", ["dexgraspbench", "standard"])
-def test_a_blown_up_push_is_not_held_and_spoils_no_other_grasp(level: str, tmp_path: Path, monkeypatch) -> None:
+def test_a_blown_up_push_is_not_held_and_spoils_no_other_grasp(level: str, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     test = Exploding(build(PADS, BOX, WHOLE, MujocoOptions()))
     rollout = getattr(test, level)(grasp_of(), 0)
@@ -321,10 +324,6 @@ def test_a_displacement_that_is_no_number_is_told_as_none(monkeypatch: pytest.Mo
 
     monkeypatch.setattr(mujoco, "mj_step", poisoned)
     assert np.isnan(simulated_displacement_cm(PADS, BOX, grasp_of().grasp, pieces=WHOLE)[0])
-
-
-#: Displacement or rotation over its limit by time [s].
-Motion = Callable[[float], float]
 
 
 class Scripted(Test):
@@ -376,10 +375,6 @@ def test_a_push_ends_once_it_is_decided(moved: Motion, turned: Motion, outcome: 
     assert seconds is None or push.elapsed == pytest.approx(seconds)
 
 
-SHORT_PADS, PLATES = helpers.pad_hand(), helpers.plate_hand()
-TABLE = Obstacle.half_space((0, 0, 1), -0.3)
-
-
 def test_a_model_is_compiled_once_for_all_that_moves_a_verdict() -> None:
     own = (SHORT_PADS, BOX, WHOLE, MujocoOptions())
     assert scene_of(*own) is scene_of(SHORT_PADS, replace(BOX, name="another name"), WHOLE, MujocoOptions())
@@ -408,10 +403,7 @@ def test_displacement_is_free_fall_without_hand_and_none_at_rest() -> None:
     assert held < 1.0 < 10.0 < loose
 
 
-THUMB = ("joint_12.0", "joint_13.0", "joint_14.0", "joint_15.0")
-
-
-def test_a_published_grasp_without_its_thumb_is_refused(shared_data: Path) -> None:
+def test_a_published_grasp_without_its_thumb_is_refused(shared_data) -> None:
     case = load_case(shared_data / "reference_grasps" / "frogger_allegro" / "056_tennis_ball.json")
     some = case.grasps.take(np.arange(3))
     thumb = np.array([name in THUMB for name in case.hand.joint_names])

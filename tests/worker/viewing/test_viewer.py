@@ -9,7 +9,6 @@ import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -30,8 +29,10 @@ from tests.worker.models import attributes_of, object_from_mesh, quality_columns
 viser = pytest.importorskip("viser", reason="needs the extra: pip install graspd[view]")
 
 HAND = two_finger_hand()
+BLOCK = object_from_mesh(trimesh.creation.box((0.05, 0.04, 0.06)), "block")
 GRASPS = 3
 LIFT_M = 0.1
+SCENE = json_attribute(SceneSpec(kind="bin").model_dump(mode="json"))
 
 
 def arrays(joints: int) -> dict[str, np.ndarray]:
@@ -53,11 +54,8 @@ def arrays(joints: int) -> dict[str, np.ndarray]:
     return made | {"quality/valid": np.array([0, 1, 0], np.uint8), "quality/success": np.array([0, 1, 0], np.int8)}
 
 
-SCENE = json_attribute(SceneSpec(kind="bin").model_dump(mode="json"))
-
-
 @contextmanager
-def viewing(hand: HandModel, obj: ObjectModel, columns: dict[str, np.ndarray]) -> Iterator[Any]:
+def viewing(hand: HandModel, obj: ObjectModel, columns: dict[str, np.ndarray]) -> Iterator:
     from graspd.worker.viewing import Viewer, ViewerContent
 
     said = {"hand": "two fingers", "object": "block", "scene": SCENE}
@@ -69,14 +67,9 @@ def viewing(hand: HandModel, obj: ObjectModel, columns: dict[str, np.ndarray]) -
 
 
 @pytest.fixture(scope="module")
-def viewer(block) -> Iterator:
-    with viewing(HAND, block, arrays(2)) as made:
+def viewer() -> Iterator:
+    with viewing(HAND, BLOCK, arrays(2)) as made:
         yield made
-
-
-@pytest.fixture(scope="module")
-def block():
-    return object_from_mesh(trimesh.creation.box((0.05, 0.04, 0.06)), "block")
 
 
 @pytest.fixture(autouse=True)
@@ -86,7 +79,7 @@ def first(request) -> None:
         request.getfixturevalue("viewer").choose("all")
 
 
-def shown_at(viewer: Any, place: float) -> None:
+def shown_at(viewer, place: float) -> None:
     viewer.slider.value = place
     viewer.show()
 
@@ -183,11 +176,11 @@ def test_the_command_tells_its_address_and_ends_with_ctrl_c(tmp_path):
         assert process.wait(60) == 0
 
 
-def test_links_above_the_root_are_drawn_at_each_grasps_wrist(block) -> None:
+def test_links_above_the_root_are_drawn_at_each_grasps_wrist() -> None:
     # A copy of the hand behind its root serves as a forearm with two wrist joints.
     forearm, mounted = HAND, replace(HAND, mounting=HAND)
     angles = np.array([[0.0, 0], [0.3, 0.6], [0.9, 0.1]])
-    with viewing(mounted, block, arrays(2) | {"grasp/wrist_positions": angles}) as made:
+    with viewing(mounted, BLOCK, arrays(2) | {"grasp/wrist_positions": angles}) as made:
         made.choose("all")
         own = len(drawn_bodies(HAND))
         assert len(made.models.bodies) == own + len(drawn_bodies(forearm))

@@ -1,12 +1,17 @@
-"""Many worlds at once come to the standard level's verdicts, by the same looks, whatever order they take grasps in."""
+"""Many worlds at once come to the standard level's verdicts, by the same looks, whatever order they take grasps in.
+
+The engine has the arrays of MuJoCo Warp and steps in MuJoCo itself: its verdicts must be the validator's.
+"""
 
 import dataclasses
+import enum
 import logging
-from collections.abc import Iterator
-from typing import Any
+from types import SimpleNamespace
 
+import mujoco
 import numpy as np
 import pytest
+import warp as wp
 
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import InputError, TaskCancelled
@@ -27,7 +32,96 @@ from graspd.worker.validation.prefilter.prefilter import ROWS, PrefilterOutcomes
 from graspd.worker.validation.protocol import Outcome, ValidatedBy
 from graspd.worker.validation.validator import Verdicts, prefiltered, validate
 from tests.worker.quality.helpers import BOX, PADS, WHOLE, grasp_of, many_grasps, posture
-from tests.worker.validation.prefilter.engine import Stand
+
+ON = ExecutionContext(prefilter="on", threads=1)
+GRASPS = 84
+
+
+class Stand:
+    """Stands in for the module `mujoco_warp`."""
+
+    class OverflowType(enum.IntFlag):
+        NEFC = 1
+        NJMAX_NNZ = 2
+        BROADPHASE = 4
+        NARROWPHASE = 8
+        CCD = 16
+        EPA_HORIZON = 256
+
+    def __init__(self, *, needs_rows: int = 0, diverges: bool = False) -> None:
+        """Worlds overflow where they have fewer constraint rows than `needs_rows`; or one number is none at last."""
+        self.needs_rows, self.diverges = needs_rows, diverges
+        self.steps = 0
+
+    def put_model(self, model):
+        return SimpleNamespace(opt=SimpleNamespace(warn_overflow=1), mjm=model)
+
+    def make_data(self, model, *, nworld: int, nconmax: int, njmax: int):
+        def zeros(*shape: int, dtype=wp.float32):
+            return wp.zeros((nworld, *shape), dtype=dtype)
+
+        room = nworld * nconmax
+        contact = SimpleNamespace(
+            worldid=wp.zeros(room, dtype=wp.int32),
+            geom=wp.zeros(room, dtype=wp.vec2i),
+            dist=wp.zeros(room, dtype=wp.float32),
+        )
+        return SimpleNamespace(
+            each=[mujoco.MjData(model) for _ in range(nworld)],
+            njmax=njmax,
+            naconmax=room,
+            contact=contact,
+            qpos=zeros(model.nq),
+            qvel=zeros(model.nv),
+            qacc_warmstart=zeros(model.nv),
+            ctrl=zeros(model.nu),
+            mocap_pos=zeros(model.nmocap, dtype=wp.vec3),
+            mocap_quat=zeros(model.nmocap, dtype=wp.quat),
+            xfrc_applied=zeros(model.nbody, dtype=wp.spatial_vector),
+            overflow=zeros(dtype=wp.int32),
+            nacon=wp.zeros(1, dtype=wp.int32),
+            ncollision=wp.zeros(1, dtype=wp.int32),
+        )
+
+    _FIELDS = ("qpos", "qvel", "qacc_warmstart", "ctrl", "mocap_pos", "mocap_quat", "xfrc_applied")
+
+    def _load(self, data) -> None:
+        for name in self._FIELDS:
+            for one, row in zip(data.each, getattr(data, name).numpy(), strict=True):
+                getattr(one, name)[:] = row
+
+    def step(self, model, data) -> None:
+        self.steps += 1
+        self._load(data)
+        for one in data.each:
+            mujoco.mj_step(model.mjm, one)
+        for name in ("qpos", "qvel", "qacc_warmstart"):
+            getattr(data, name).assign(np.array([getattr(one, name) for one in data.each], np.float32))
+        if self.diverges and self.steps > 250:
+            qpos = data.qpos.numpy()
+            qpos[:, -7:] = np.nan
+            data.qpos.assign(qpos)
+        if data.njmax < self.needs_rows:
+            data.overflow.fill_(int(self.OverflowType.NEFC))
+
+    def fwd_position(self, model, data) -> None:
+        self._load(data)
+        for one in data.each:
+            mujoco.mj_forward(model.mjm, one)
+        found = [(w, *geoms, dist) for w, one in enumerate(data.each) for geoms, dist in _contacts(one)]
+        data.nacon.fill_(len(found))
+        data.ncollision.fill_(len(found))
+        for name, values in (("worldid", [f[0] for f in found]), ("geom", [f[1:3] for f in found])):
+            whole = getattr(data.contact, name).numpy()
+            whole[: len(found)] = np.array(values, np.int32).reshape(len(found), *whole.shape[1:])
+            getattr(data.contact, name).assign(whole)
+        depth = data.contact.dist.numpy()
+        depth[: len(found)] = [f[3] for f in found]
+        data.contact.dist.assign(depth)
+
+
+def _contacts(data) -> list[tuple]:
+    return list(zip(data.contact.geom.tolist(), data.contact.dist.tolist(), strict=True)) if data.ncon else []
 
 
 def every_kind() -> GraspSet:
@@ -103,11 +197,8 @@ def test_it_stops_when_told(monkeypatch: pytest.MonkeyPatch) -> None:
         pool(monkeypatch, Stand(), 4).validate(many_grasps(), ExecutionContext(cancelled=lambda: True))
 
 
-ON = ExecutionContext(prefilter="on", threads=1)
-
-
 @pytest.fixture(autouse=True)
-def stand_in(monkeypatch: pytest.MonkeyPatch) -> Iterator[Stand]:
+def stand_in(monkeypatch: pytest.MonkeyPatch):
     """MuJoCo itself as the engine; the pads pass for a hand, which grippers do not."""
     engine = Stand()
     monkeypatch.setattr(screening, "mujoco_warp", lambda: engine)
@@ -183,7 +274,7 @@ def test_a_first_judge_that_the_cpu_contradicts_is_not_believed(standard: Verdic
 
 
 def test_where_a_gpu_has_no_memory_for_it_the_cpu_judges(monkeypatch, caplog: pytest.LogCaptureFixture) -> None:
-    def full(*_: Any) -> Any:
+    def full(*_):
         raise RuntimeError("Failed to allocate 4096 bytes on device 'cuda:0'")
 
     monkeypatch.setattr(screening, "WorldPool", full)
@@ -210,7 +301,7 @@ def test_an_audit_follows_the_grasp_and_not_its_batch(monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize("mode", ["on", "off"])
-def test_a_shard_tells_of_each_grasp_who_validated_it(mode: Any) -> None:
+def test_a_shard_tells_of_each_grasp_who_validated_it(mode) -> None:
     request = JobOptions(grasps=1, validation="fast", want="candidates", rechecks=0)
     run = ExecutionContext(prefilter=mode, threads=1)
     found = scored(PADS, BOX, every_kind(), request, pieces=lambda obj: WHOLE, run=run)
@@ -228,9 +319,6 @@ def test_verdicts_that_were_asked_before_are_not_asked_twice(stand_in: Stand) ->
     assert stand_in.steps == launched > 0
     np.testing.assert_array_equal(again.outcome, made.outcome)
     np.testing.assert_array_equal(again.validated_by, made.validated_by)
-
-
-GRASPS = 84
 
 
 @pytest.mark.slow

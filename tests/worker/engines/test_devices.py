@@ -1,0 +1,151 @@
+"""What errors of GPUs mean for the work at hand, and that processes of one machine take different GPUs.
+
+Errors are put in where Warp would tell them; the GPUs are made up: only their names and ids are asked for.
+"""
+
+import gc
+import logging
+import subprocess
+import sys
+from collections import Counter
+
+import pytest
+import warp as wp
+
+from graspd.service.model.errors import InputError
+from graspd.worker.engines import devices
+from graspd.worker.engines.devices import Device, DeviceLost, Gpu, check_device, is_out_of_memory, take
+from graspd.worker.planners.threads import run_parts
+
+#: As Warp 1.19 says it.
+NO_MEMORY = "Failed to allocate 8589934592 bytes on device 'cuda:0'"
+FOUR = [Gpu(f"cuda:{k}", f"GPU-{k:04}", "H200") for k in range(4)]
+
+
+def test_only_a_gpu_without_memory_is_out_of_memory() -> None:
+    assert is_out_of_memory(RuntimeError(NO_MEMORY))
+    assert is_out_of_memory(RuntimeError("CUDA error 2 detected on device cuda:1: out of memory"))
+    for said in (
+        "Failed to allocate 64 bytes on device 'cpu'",
+        "CUDA error 700 detected on device cuda:0",
+        "error 201",
+    ):
+        assert not is_out_of_memory(RuntimeError(said))
+    assert not is_out_of_memory(ValueError(NO_MEMORY))
+
+
+@pytest.mark.parametrize(("code", "lost"), [(0, False), (2, False), (700, True), (719, True)])
+def test_a_device_is_lost_by_any_error_but_want_of_memory(monkeypatch, code: int, lost: bool) -> None:
+    def synchronize(device: str) -> None:
+        if code:
+            raise RuntimeError(f"Failed to synchronize device {device}: Warp CUDA error {code}: what happened")
+
+    monkeypatch.setattr(wp, "synchronize_device", synchronize)
+    check_device("cpu")
+    if not lost:
+        check_device("cuda:1")
+        return
+    with pytest.raises(DeviceLost, match=f"cuda:1: Warp CUDA error {code}"):
+        check_device("cuda:1")
+
+
+def work(room: int) -> tuple[list[range], object]:
+    """Work that fits up to `room` grasps, and the launches that were tried."""
+    tried: list[range] = []
+
+    def launch(part: range) -> list[int]:
+        tried.append(part)
+        if len(part) > room:
+            raise RuntimeError(NO_MEMORY)
+        return list(part)
+
+    return tried, launch
+
+
+@pytest.fixture
+def few_objects() -> None:
+    """Each halving looks for garbage: among those objects alone that the test makes."""
+    gc.collect()
+    gc.freeze()
+
+
+@pytest.mark.usefixtures("few_objects")
+@pytest.mark.parametrize("room", [1, 3, 8, 31, 32])
+def test_a_launch_that_does_not_fit_is_halved_until_it_does(room: int, caplog: pytest.LogCaptureFixture) -> None:
+    tried, launch = work(room)
+    with caplog.at_level(logging.WARNING):
+        found = run_parts([range(32)], launch)  # type: ignore[arg-type]
+    assert [index for part in found for index in part] == list(range(32))
+    assert len(caplog.messages) == len(tried) - len(found)
+    assert room == 32 or caplog.messages[0].startswith("too little memory on the GPU for 32 grasps in one launch")
+
+
+def test_one_grasp_without_room_and_other_errors_end_the_work() -> None:
+    _, launch = work(0)
+    with pytest.raises(RuntimeError, match="Failed to allocate"):
+        run_parts([range(4)], launch)  # type: ignore[arg-type]
+    tried = []
+
+    def lost(part: range) -> None:
+        tried.append(part)
+        raise RuntimeError("CUDA error 700 detected on device cuda:0: an illegal memory access was encountered")
+
+    with pytest.raises(RuntimeError, match="700"):
+        run_parts([range(32)], lost)
+    assert tried == [range(32)]
+
+
+@pytest.fixture(autouse=True)
+def own_locks(tmp_path, monkeypatch: pytest.MonkeyPatch):
+    """Locks of this test alone; a lock that is taken twice here is as one of two processes."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(devices, "_held", [])
+    yield
+    for lock in devices._held:
+        lock.close()
+
+
+def test_each_process_takes_its_own_gpu_then_they_share_evenly(tmp_path) -> None:
+    taken = [take(FOUR, tmp_path).name for _ in range(10)]
+    assert taken[:4] == [gpu.name for gpu in FOUR]
+    assert sorted(Counter(taken).values()) == [2, 2, 3, 3]
+    # Names count what a process sees, as CUDA_VISIBLE_DEVICES has it; ids are the machine's.
+    seen = [Gpu("cuda:0", "GPU-0001"), Gpu("cuda:1", "GPU-0002")]
+    assert take(seen, tmp_path).id == "GPU-0002"
+
+
+def test_the_gpu_of_a_killed_process_is_free_again(tmp_path) -> None:
+    script = (
+        "import sys, time, pathlib\n"
+        "from graspd.worker.engines.devices import Gpu, take\n"
+        "two = [Gpu('cuda:0', 'a'), Gpu('cuda:1', 'b')]\n"
+        "print(take(two, pathlib.Path(sys.argv[1])).name, flush=True)\n"
+        "time.sleep(600)\n"
+    )
+    two = [Gpu("cuda:0", "a"), Gpu("cuda:1", "b")]
+    with subprocess.Popen([sys.executable, "-c", script, str(tmp_path)], stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout is not None and other.stdout.readline().strip() == "cuda:0"
+        assert take(two, tmp_path).name == "cuda:1"
+        other.kill()
+        other.wait()
+    assert take(two, tmp_path).name == "cuda:0"
+
+
+def test_without_a_place_for_locks_it_is_the_first(tmp_path, caplog: pytest.LogCaptureFixture) -> None:
+    (tmp_path / "file").write_text("")
+    with caplog.at_level(logging.WARNING):
+        assert take(FOUR, tmp_path / "file" / "gpus").name == "cuda:0"
+    assert "processes per GPU are not counted" in caplog.text
+
+
+def test_a_number_decides_and_without_a_gpu_auto_is_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(devices, "visible_gpus", lambda: FOUR)
+    assert [Device("auto").resolve() for _ in range(2)] == ["cuda:0", "cuda:1"]
+    assert [Device("auto", number=number).resolve() for number in (3, 5)] == ["cuda:3", "cuda:1"]
+    named = Device("cuda:2", number=0)
+    assert (named.resolve(), named.name) == ("cuda:2", "H200")
+    assert Device("auto").resolve() == "cuda:0", "each of the four was taken"
+    monkeypatch.setattr(devices, "visible_gpus", list)
+    assert Device("auto", number=1).resolve() == "cpu"
+    with pytest.raises(InputError, match=r"no device 'cuda:1'; there are: cpu"):
+        Device("cuda:1")
