@@ -6,11 +6,12 @@ usage: python -m benchmarks.chain BEFORE AFTER DATA_DIR [--grasps 64] [--pairs a
 BEFORE and AFTER are checkouts of graspd; DATA_DIR holds hands/. One thread runs each stage. Times are processor time,
 so other load changes the ratios little. Nothing is stored or sent: docs/results/service.md has these costs.
 
-With --service, a job of a built-in hand and object runs through a whole service of each checkout. It is submitted over
-HTTP, planned, validated, measured, stored and indexed. A small job loads everything first. Processor time is that of
-all processes of the service; the table also has the time per candidate of BEFORE's planner alone. With --pictures, jobs
+With --service, a job of a built-in hand and object runs through a whole service of each checkout: submitted over HTTP,
+planned, validated, measured, stored, indexed. A small job loads everything first. Processor time is that of all
+processes of the service; the table also has the time per candidate of BEFORE's planner alone. With --pictures, jobs
 have the options of examples/million/million.toml: per batch, six pictures of the object at rest on a table, and eight
-rechecks."""
+rechecks.
+"""
 
 from __future__ import annotations
 
@@ -86,7 +87,7 @@ PILOT: Final = {"scenes": 2, "views": 3, "rechecks": 8, "budget": 4}
 def environment_of(root: Path) -> dict[str, str]:
     """Return an environment in which a program uses the code of a checkout, not the installed one."""
     environment = {key: value for key, value in os.environ.items() if not key.startswith("GRASPD_")}
-    # Allow bytecode caches: without them each process would compile all modules, unlike a process of a user.
+    # Allow bytecode caches: without them each process would compile all modules, unlike a user's.
     environment.pop("PYTHONDONTWRITEBYTECODE", None)
     return environment | {"PYTHONPATH": str(root)}
 
