@@ -1,8 +1,7 @@
 """Common parts of the baselines: hand and object on a device, free starts, inner surfaces, grasp sets.
 
 Baselines use flat triangles of the object (no Phong smoothing). Starts, postures around the grasp and quality come from
-the same code as `fast_graspd`, so that only the search is compared.
-"""
+the same code as `fast_graspd`, so that only the search is compared."""
 
 from __future__ import annotations
 

@@ -1,9 +1,8 @@
 """Cached candidates of a hand on an object with their verdicts and metrics, shared by the studies of quality.
 
 A cell is a pair of hand and object with a number of grasps of one revision of synthesize, planned as in a job. Its
-folder caches all results, so an interrupted study resumes, and studies with equal numbers of grasps share them and
-their verdicts.
-"""
+folder caches all results, so an interrupted study resumes. Studies with equal numbers of grasps share grasps and
+verdicts."""
 
 from __future__ import annotations
 
@@ -120,9 +119,7 @@ class Cell:
 
 def planned(hand: HandModel, obj: ObjectModel, *, count: int, seed: int, fidelity: str = "standard") -> GraspSet:
     """Plan candidates of a free object as in a job, with its rollout, about the centre of the object.
-
-    Positions are rounded to the job's grid.
-    """
+    Positions are rounded to the job's grid."""
     rollout = rollout_on(DEFAULT_CONTEXT, hand, obj.centred, lambda: decompose(obj.centred), in_scenes=False)
     found = synthesize(hand, obj.centred, PlanRequest(count, FIDELITIES[fidelity], seed, rollout=rollout))
     return found.moved(np.zeros(3)).moved(obj.centre)
@@ -147,11 +144,7 @@ def write_json(file: Path, value: object) -> None:
 def cell_parser(
     doc: str | None, *, objects: Sequence[str] | None = None, grasps: int = 64, hands: bool = True
 ) -> argparse.ArgumentParser:
-    """Return a parser of `data`, `--work`, `--hands`, `--objects` and `--grasps` with these defaults.
-
-    Args:
-        hands: whether the parser has the option `--hands`.
-    """
+    """Return a parser of `data`, `--work`, `--hands` (if `hands`), `--objects` and `--grasps` with these defaults."""
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path)
     parser.add_argument("--work", type=Path, default=Path("quality-work"))

@@ -5,8 +5,7 @@ usage: python -m benchmarks.clutter DATA_DIR [--hand allegro] [--targets 025_mug
 
 Neighbours are drawn from the other objects and dropped with the target. The time includes planning and validation, but
 not kernels, convex pieces and drops. A second is two seconds of processor time, for two cores, so other load changes
-the figures little. The gap is the distance to the nearest neighbour.
-"""
+the figures little. The gap is the distance to the nearest neighbour."""
 
 from __future__ import annotations
 

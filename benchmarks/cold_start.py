@@ -3,10 +3,9 @@
 usage: python -m benchmarks.cold_start CHECKOUT ... [--hand allegro] [--object mug] [--runs 3] [--seeds 0 1 2 3]
            [--no-service | --command]
 
-An untimed run first fills the user's cache, for example with kernels. Wall time depends on other load, so runs of the
-checkouts alternate, and the table has the least time besides the median. CPU time, of all processes together, depends
-little on other load. The cost of a seed's first grasp depends on whether the first candidates hold.
-"""
+An untimed run first fills the user's cache, for example with kernels. Wall time depends on other load. Runs of the
+checkouts therefore alternate, and the table has the least time besides the median. CPU time, of all processes together,
+depends little on other load. The cost of a seed's first grasp depends on whether the first candidates hold."""
 
 from __future__ import annotations
 

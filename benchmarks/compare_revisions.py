@@ -7,14 +7,13 @@ Both use the running Python, so its environment must suit both. The program comp
 
 - the OpenAPI document: removed or changed parts are differences, added parts are listed;
 - the help of every command, line by line;
-- shards of `graspd synth` for every built-in hand, on the CPU: each array bit for bit with its type, shape, chunks and
-  compression, and each attribute except those of the run (date, seconds);
-- the store of a small job through the whole service (`graspd demo`): names, shards as above, JSON records without
-  times, sizes and checksums, and all other objects byte for byte.
+- shards of `graspd synth` for every built-in hand, on the CPU: arrays bit for bit with type, shape, chunks and
+compression, and all attributes except those of the run (date, seconds);
+- the store of a small job through the whole service (`graspd demo`). Compared are names, shards as above, JSON records
+without times, sizes and checksums, and all other objects byte for byte.
 
 Fields added to a record are listed and are not differences. The output also has lines and modules of each package. Exit
-code 1: a difference exists.
-"""
+code 1: a difference exists."""
 
 from __future__ import annotations
 

@@ -4,9 +4,8 @@ usage: python -m benchmarks.corners DATA_DIR [--hands allegro ...] [--places wal
            [--grasps 16] [--seed 1400] [--page OUT.md]
        DATA_DIR holds hands/
 
-Shares are of candidates at fidelity standard on an upright box of 50 x 60 x 80 mm with a density of 700 kg/m3.
-Walls are 150 mm high, those of a slot 80 mm; neighbours are four boxes of the same size.
-"""
+Shares are of candidates at fidelity standard on an upright box of 50 x 60 x 80 mm with a density of 700 kg/m3. Walls
+are 150 mm high, walls of a slot 80 mm. Neighbours are four boxes of the same size."""
 
 from __future__ import annotations
 

@@ -4,8 +4,7 @@ usage: python -m benchmarks.cost_model [--grasps 1000000] [--grasps 100000000] [
                                        [--core-hour 0.04] [--from-data DIR] [--json]
 
 `docs/explanation/scaling.md` has the formulas, the origin of each input, and the limits of the model. Prices are
-examples; replace them by your own. `--from-data` measures the sizes in your data folder.
-"""
+examples; replace them by your own. `--from-data` measures the sizes in your data folder."""
 
 from __future__ import annotations
 
@@ -137,11 +136,7 @@ class Estimate:
 
 
 def estimate(work: Work, measured: Measured, prices: Prices, *, cores_per_worker: int = 4) -> Estimate:
-    """Return the cost of a dataset made by CPU workers.
-
-    Args:
-        cores_per_worker: threads of one worker; each worker sends heartbeats.
-    """
+    """Return the cost of a dataset made by CPU workers, each with `cores_per_worker` threads and its own heartbeats."""
     scenes = work.batches * work.scenes
     core_s = (
         work.grasps * measured.core_s_per_grasp
@@ -205,11 +200,8 @@ def gpu_hours(work: Work, grasps_per_second: float) -> float:
 
 
 def sizes(data: Path) -> dict[str, float]:
-    """Return sizes in a data folder with a file store, as fields of `Measured`.
-
-    Raises:
-        SystemExit: the folder has no shard.
-    """
+    """Return sizes in a data folder with a file store, as fields of `Measured`. Raises SystemExit: the folder has no
+    shard."""
     files = sorted((data / "store" / "shards").glob("*/*.json"))
     if not files:
         raise SystemExit(f"there is no shard below {data / 'store'}; give the data folder of a run")

@@ -4,9 +4,8 @@ usage: python -m benchmarks.large_index --data-dir DIR
        python -m benchmarks.dashboard_pages --data-dir DIR [--repeats 20] [--paint]
 
 Times are in milliseconds, for sequential requests to a warm server with the index in DIR. `cpu` is the processor time
-of a request including the client, which is independent of other load. --paint adds the time from opening a page in
-headless Chromium to its first contentful paint, over loopback.
-"""
+of a request including the client, which is independent of other load. With --paint the table also has the time from
+opening a page in headless Chromium to its first contentful paint, over loopback."""
 
 from __future__ import annotations
 

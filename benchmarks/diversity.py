@@ -2,8 +2,7 @@
 
 usage: python -m benchmarks.diversity DATA_DIR [--work DIR] [--hands allegro ...] [--objects NAME ...] [--grasps 64]
 DATA_DIR holds hands/ and objects/. Prints Markdown. Interrupted runs resume; grasps are shared with other studies (see
-cells.py).
-"""
+cells.py)."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ EDGE = 260
 THIN_MM = 8.0
 #: An object is wide for a hand if its pads open to less than this multiple of its least extent.
 ROOMY = 1.25
-#: Excess of penetration in MuJoCo over the mesh, relative to held grasps, that counts as the cause of a failure [mm].
+#: Excess of penetration in MuJoCo over the mesh, relative to held grasps, from which on it counts as a cause [mm].
 PUSHED_MM = 0.3
 
 

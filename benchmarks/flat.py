@@ -4,8 +4,7 @@ usage: python -m benchmarks.flat DATA_DIR [--hands allegro ...] [--things 60x60x
            [--seed 1300] [--page OUT.md] [--keep FOLDER]
        DATA_DIR holds hands/; --keep writes grasps to FOLDER/HAND-THING.h5
 
-Shares are of candidates at fidelity standard. This module builds the objects; their density is 700 kg/m3.
-"""
+Shares are of candidates at fidelity standard. This module builds the objects; their density is 700 kg/m3."""
 
 from __future__ import annotations
 

@@ -3,12 +3,11 @@
 usage: python -m benchmarks.fleet [--workers 64 512 4096] [--seconds 20] [--tasks 6000]
                                   [--sqlite] [--s3] [--json FILE]
 
-Each number of workers has two runs. In the first, all workers hold tasks, send heartbeats and report progress; in
-total --rate tasks end per second. Measured are the age of the oldest event that is not in the index, and the time to
-read all leases. In the second, tasks take no time; measured is the number of tasks per second through controller and
-index. All processes share this machine, so the processor time of each part is also counted. `benchmarks.fleet_workers`
-simulates the workers.
-"""
+Each number of workers has two runs. In the first run, all workers hold tasks, send heartbeats and report progress;
+`--rate` tasks end per second. The age of the oldest event that is not in the index, and the time to read all leases are
+measured. In the second run, tasks take no time; the number of tasks per second through controller and index is
+measured. All processes share this machine, so the processor time of each part is also counted.
+`benchmarks.fleet_workers` simulates the workers."""
 
 from __future__ import annotations
 

@@ -2,11 +2,10 @@
 
 usage: python -m benchmarks.fleet_workers WORKERS TASK_S      (settings from the environment)
 
-A worker that holds a task sends heartbeats and progress. After `TASK_S` seconds it writes the manifest of its shard
-and reports the end of the task. Manifests are copies of one real manifest under other names. Shards are not written,
+A worker that holds a task sends heartbeats and progress. After `TASK_S` seconds it writes the manifest of its shard and
+reports the end of the task. Manifests are copies of one real manifest under other names. Shards are not written,
 because no controller reads them. Commands of many workers share a pipeline, because a thousand interpreters do not fit
-on the measured machine; the load on Redis is the same.
-"""
+on the measured machine. The load on Redis is the same."""
 
 from __future__ import annotations
 
@@ -109,7 +108,7 @@ class Fleet:
         self._first = self._first and not self._held
 
     def _hold(self, pipe: Any, job: str, message: dict[str, Any], queue: str, now: float) -> None:
-        # The first tasks end evenly over the time of one task: workers of a fleet are not synchronous.
+        # The first tasks end evenly over the time of one task, since workers of a fleet are not synchronous.
         length = self._task_s * (random.random() if self._first else 1.0)
         held = Held(self._idle.popleft(), message, queue, f"{job}:{uuid.uuid4().hex}", now, now + length)
         self._held[held.worker] = held

@@ -4,11 +4,10 @@ usage: python -m benchmarks.forearm DATA_DIR [--hand shadow/shadow_hand_right.ur
            [--grasps 16] [--scenes 4] [--seed 31] [--scene table] [--beside 048_hammer ...] [--json OUT]
        DATA_DIR holds hands/ and objects/
 
-Candidates of each object are planned and validated as `graspd synth --want candidates --threads 1` does. The collision
-meshes of all links above the root are then placed by yourdfpy, which shares no code with graspd, at the stored wrist
-angles (0 if none are stored). Results on approach, grasp and lift are the lowest height of their vertices, and their
-common volume with supports or neighbours, by manifold3d. Seconds are CPU time of planning and validation per candidate.
-"""
+Candidates of each object are planned and validated as `graspd synth --want candidates --threads 1` does. Then yourdfpy,
+which shares no code with graspd, places the collision meshes of all links above the root. Wrist angles are the stored
+ones, or 0. Results on approach, grasp and lift are the lowest height of the meshes' vertices, and the common volume
+with supports or neighbours, by manifold3d. Seconds are CPU time of planning and validation per candidate."""
 
 from __future__ import annotations
 

@@ -3,11 +3,10 @@
     pip install --no-deps --target /tmp/hands robopianist
     python -m benchmarks.foreign DATA --sources /tmp/hands --out docs/results/foreign
 
-DATA holds hands/ and objects/. Grasps are planned with the URDF and validated at level standard, first in the URDF,
-then in the MJCF model of robopianist, which has other shapes, tendons, armature and dry friction. Planning has three
-variants: one drive per joint; the tendons J1 + J2; these tendons with the visual instead of the collision shapes of
-the URDF. `--work` caches the results of each object, so an interrupted run resumes.
-"""
+DATA holds hands/ and objects/. Grasps are planned with the URDF and validated at level standard: first in the URDF,
+then in the MJCF model of robopianist. This model has other shapes, tendons, armature and dry friction. Planning has
+three variants: one drive per joint; the tendons J1 + J2; these tendons with the URDF's visual shapes for collision.
+`--work` caches the results of each object, so an interrupted run resumes."""
 
 from __future__ import annotations
 

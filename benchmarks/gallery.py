@@ -4,9 +4,8 @@
     python -m benchmarks.gallery --sources /tmp/hands
 
 The packages' code is not run; their files are read like uploads. Each hand is tested by `graspd hands check`. Results
-are cached in `docs/results/hands-gallery.json` by the hand's digest and the planner's revision, so an interrupted run
-resumes and a changed hand or planner is tested again. `--out FOLDER` replaces docs/.
-"""
+are cached in `docs/results/hands-gallery.json` by the hand's digest and the planner's revision. An interrupted run
+therefore resumes, and a changed hand or planner is tested again. `--out FOLDER` replaces docs/."""
 
 from __future__ import annotations
 

@@ -3,9 +3,8 @@
 usage: python -m benchmarks.gpu_check [--arch 80 --arch 90 --arch 100] [--json OUT]       (make gpu-check)
 
 Warp compiles every module to PTX. `ptxas` (PyPI: nvidia-cuda-nvcc, the extra `gpu-check`) compiles it to machine code
-and reports registers, stack and spilled bytes of each kernel. The exit code is 1 if a kernel spills, has a stack above
-`STACK_BYTES`, or is hot (runs in every iteration) with more than `HOT_REGISTERS` registers.
-"""
+and reports registers, stack and spilled bytes of each kernel. The exit code is 1 if a kernel spills or has a stack
+above `STACK_BYTES`. It is also 1 if a hot kernel (one of every iteration) has more than `HOT_REGISTERS` registers."""
 
 from __future__ import annotations
 
@@ -28,7 +27,7 @@ from graspd.worker.engines.backend import ARCHITECTURES, modules
 
 STACK_BYTES = 512
 HOT_REGISTERS = 128
-#: Registers of a kernel that would spill with fewer: the 6 x 6 system and its factor stay in registers.
+#: Registers of kernels that would spill with fewer: the 6 x 6 system and its factor stay in registers.
 KNOWN = {("simulation.kernels.contact.direct", 100): 135}
 #: Kernels of every iteration of the planner, which determine the speed on a GPU.
 HOT = ("gather", "object_in_pieces", "pieces_in_pieces", "direct", "obstacle")

@@ -4,8 +4,7 @@
 
 DATA holds objects/ (YCB and others); the sources are those of `benchmarks.gallery`. Results are cached in
 `docs/results/grippers.json` by the gripper's digest and the planner's revision, so an interrupted run resumes. `--out
-FOLDER` replaces docs/results/.
-"""
+FOLDER` replaces docs/results/."""
 
 from __future__ import annotations
 

@@ -3,8 +3,7 @@
 usage: python -m benchmarks.large_index --data-dir DIR [--grasps 1000000] [--jobs 1000] [--index-url URL]
 
 `GRASPD_DATA_DIR=DIR graspd api` (or `graspd up`, without workers) then shows it. In Python:
-`fill(index, store, grasps=..., jobs=...)` on an empty index.
-"""
+`fill(index, store, grasps=..., jobs=...)` on an empty index."""
 
 from __future__ import annotations
 
@@ -47,12 +46,8 @@ _SCALES: Final = dict(zip(_NAMES, (0.25, 0.8, 9.0, 0.3, 0.8, 0.1, 0.05), strict=
 
 def fill(index: Index, store: Store, *, grasps: int = 1_000_000, jobs: int = 1000, seed: int = 0) -> dict[str, int]:
     """Publish the built-in hands and objects, and insert jobs of them with about `grasps` grasps in total.
-
-    One job in ten has scenes and views. Submission times are spread over the last 30 days.
-
-    Returns:
-        the number of rows per table.
-    """
+    One job in ten has scenes and views. Submission times are spread over the last 30 days. Return the number of rows
+    per table."""
     if index.jobs.page(limit=1).items:
         raise SystemExit("the index is not empty; give another data folder or database")
     for asset in publish_builtins(store):
@@ -69,7 +64,7 @@ def fill(index: Index, store: Store, *, grasps: int = 1_000_000, jobs: int = 100
 
 class _Maker:
     def __init__(self, index: Index, grasps_a_job: int, jobs: int, random: np.random.Generator) -> None:
-        # Unfinished jobs have fewer grasps than requested; the others have more.
+        # Unfinished jobs have fewer grasps than requested, other jobs have more.
         share = sum(_MIX[state] * _done_share(state) for state in _MIX) / sum(_MIX.values())
         self._grasps_a_job = max(1, round(grasps_a_job / share))
         self._jobs, self._random = jobs, random

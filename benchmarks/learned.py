@@ -6,8 +6,7 @@ usage: python -m benchmarks.learned --network NET.npz [OTHER.npz ...] [--data DA
 
 Grasps are planned on a table at fidelity standard and validated. Both methods get the same scenes, seeds and convex
 pieces, alternately, on one thread. Times are processor time, including validator and metrics, without one-time
-preparation of a pair. Choose objects that were not in a network's training set. Hands are the built-in ones.
-"""
+preparation of a pair. Choose objects that were not in a network's training set. Hands are the built-in ones."""
 
 from __future__ import annotations
 

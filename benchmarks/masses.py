@@ -4,8 +4,7 @@ usage: python -m benchmarks.masses DATA_DIR [--hands allegro ...] [--objects 025
            [--seed 1200] [--page OUT.md]
        DATA_DIR holds hands/ and objects/; objects need a mass in their meta.json
 
-Shares are of candidates at fidelity standard, planned for that mass, on the resting faces of drops.
-"""
+Shares are of candidates at fidelity standard, planned for the object's mass, on the resting faces of drops."""
 
 from __future__ import annotations
 

@@ -4,8 +4,7 @@
 
 DATA holds `hands/*/*.urdf` and `objects/*/clean.stl`. At a third of the work every process is killed with -9; then the
 same two commands, `graspd up` and `graspd datasets create`, resume. The page has the result of each cell, the repeated
-work, and the error of the estimate.
-"""
+work, and the error of the estimate."""
 
 from __future__ import annotations
 

@@ -4,8 +4,7 @@ usage: python -m benchmarks.on_gpu DATA_DIR [--device cuda:0] [--batches 32 256 
            [--json OUT] [--page OUT]
 
 DATA_DIR holds hands/ and objects/. For accuracy, both devices plan grasps from the same seeds; the CPU validates
-and measures them. Speed is the wall time of each stage of a launch, after an untimed one.
-"""
+and measures them. Speed is the wall time of each stage of a launch, after an untimed one."""
 
 from __future__ import annotations
 
@@ -74,9 +73,7 @@ def quality(hand: HandModel, obj: ObjectModel, device: str, count: int) -> dict[
 
 def stages(hand: HandModel, obj: ObjectModel, device: str, batch: int) -> dict[str, float]:
     """Return wall ms of each stage per grasp of a launch, the held share, and the largest shift of a hand [mm].
-
-    The shift is the distance between the hands of two equal launches.
-    """
+    The shift is the distance between the hands of two equal launches."""
     run, wanted = ExecutionContext(device), PlanRequest(batch, FIDELITY, SEED)
     parts = planner.optimise_batch(hand, obj, wanted, run)
     again, planned = timed(lambda: planner.optimise_batch(hand, obj, wanted, run))

@@ -6,8 +6,7 @@ usage: python -m benchmarks.payload DATA_DIR [--hands allegro ...] [--objects 02
 
 Grasps are valid for objects of their published masses. The full test repeats the validator's rise and hold, or each of
 its pushes, for each mass of a bisection to 3 %. The bound is the largest load capacity of a pair's grasps over their
-largest payload, squeezed with 50 to 1000 N.
-"""
+largest payload, squeezed with 50 to 1000 N."""
 
 from __future__ import annotations
 
@@ -127,10 +126,8 @@ def main() -> None:
 
 
 def of_pair(given: Any, hand: HandModel, name: str, mass: float) -> tuple[Floats, Floats, Floats, float]:
-    """Return for each valid grasp of a pair the payload over that of full tests, and the CPU time of both [ms].
-
-    The last value is the bound of all grasps over their largest payload.
-    """
+    """Return for each valid grasp of a pair the payload over the payload by full tests, and the CPU time of both [ms].
+    The last value is the bound of all grasps over their largest payload."""
     grasps, obj, placed = valid_grasps(given, hand, given.data / "objects" / name / "clean.stl", mass)
     around = (placed.supports,) if placed is not None else ()
     # The weld of a root that is not fixed yields, which moves the object and the hand.

@@ -2,8 +2,7 @@
 
 usage: python -m benchmarks.penetration DATA_DIR [--objects NAME ...] [--grasps 32]
 
-DATA_DIR holds hands/ and objects/ (YCB) and bad/.
-"""
+DATA_DIR holds hands/ and objects/ (YCB) and bad/."""
 
 from __future__ import annotations
 

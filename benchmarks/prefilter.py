@@ -3,10 +3,9 @@
 usage: python -m benchmarks.prefilter DATA_DIR [--work DIR] [--device cuda:0] [--hands ...] [--objects ...]
 [--grasps 48] [--speed 256 1024] [--worlds 256 1024] [--out docs/results/prefilter] DATA_DIR holds hands/ and objects/.
 The prefilter and level standard validate the same candidates; agreement refers to the prefilter's clear verdicts.
-`--speed N` times N grasps in pools of `--worlds`: those of the first cell of each hand, moved at random by up to 0.1
+`--speed N` times N grasps in pools of `--worlds`: grasps of the first cell of each hand, moved at random by up to 0.1
 mm. Prints Markdown; `--out` receives .json and .md. Interrupted runs resume (see cells.py), but the prefilter's
-verdicts are not cached.
-"""
+verdicts are not cached."""
 
 from __future__ import annotations
 

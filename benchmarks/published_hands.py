@@ -6,8 +6,7 @@
 
 DATA holds objects/ (YCB and others). Hands that are not in DIR are skipped. Results are cached in
 `docs/results/published_hands.json` by the hand's digest and the planner's revision, so an interrupted run resumes.
-`--out FOLDER` replaces docs/results/.
-"""
+`--out FOLDER` replaces docs/results/."""
 
 from __future__ import annotations
 

@@ -3,12 +3,11 @@
 Negative controls are postures that cannot hold; the pushes must reject them.
 
 usage: python -m benchmarks.published_picks DATA_DIR [--work DIR] [--objects NAME ...] [--out STEM]
-DATA_DIR/reference_grasps has the grasps published with FRoGGeR (IROS 2023) and whether each was picked. In the
+DATA_DIR/reference_grasps has the grasps published with FRoGGeR (IROS 2023), with the results of their picks. In the
 published pick (facts from the authors' program, MIT) the hand starts at the grasp, around an object of 150 kg/m^3 on a
 table. A QP over the measured pose of the object gives contact forces of at least 1 N per finger; friction is 0.5. The
 hand lifts 10 cm in 1 s, shakes by 3 mm and holds for 1.5 s. A pick fails at 7.5 cm of height error or 30 degrees.
-Prints Markdown; `--out` receives Markdown and JSON. `--work` caches verdicts.
-"""
+Prints Markdown; `--out` receives Markdown and JSON. `--work` caches verdicts."""
 
 from __future__ import annotations
 
@@ -264,7 +263,7 @@ def answers(case: Case, work: Path) -> dict[str, dict[str, Any]]:
 def row(words: str, held: NDArray[np.bool_], margin: Floats | None, truth: NDArray[np.bool_]) -> dict[str, Any]:
     agree = int((held == truth).sum())
     right, wrong = int((~held & ~truth).sum()), int((~held & truth).sum())
-    # A test differs from the constant answer only if it rejects a grasp: McNemar, exact.
+    # A test differs from the constant answer only if it rejects a grasp (McNemar, exact).
     chance = float(binomtest(right, right + wrong).pvalue) if right + wrong else 1.0
     return {
         "test": words,

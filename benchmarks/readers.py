@@ -1,9 +1,9 @@
 """Samples per second of the readers against plain HDF5: `python -m benchmarks.readers SHARDS [--json]`.
 
 SHARDS is a folder with base, scene and views shards, for example `demo-out/shards`. Each reader makes five warm passes,
-alternating with the others; the best pass counts, by wall time and by processor time. Ratios are to plain h5py with the
-same samples and the same number per read. Single pictures in random order are compared with plain h5py in bulk.
-"""
+alternating with the other readers. The best pass counts, by wall time and by processor time. Ratios are to plain h5py
+with the same samples and the same number per read. Single pictures in random order are compared with plain h5py in
+bulk."""
 
 from __future__ import annotations
 

@@ -3,8 +3,7 @@
 usage: python -m benchmarks.recipes DATA_DIR [--objects NAME ...] [--grasps 32]
 
 DATA_DIR holds hands/ and objects/. Candidates are planned without rollouts, so the planner's merit alone selects them.
-Seconds are processor time of all threads, including postures.
-"""
+Seconds are processor time of all threads, including postures."""
 
 from __future__ import annotations
 

@@ -2,8 +2,7 @@
 
 usage: python -m benchmarks.results_tables DATA_DIR [--work DIR] [--hands allegro ...] [--objects NAME ...] [--out DIR]
 DATA_DIR holds hands/ and objects/. Writes quality-HAND.json and quality-HAND.md to `--out`. An
-interrupted run resumes: `--work` caches every pair of hand and object (see cells.py). A run takes some core-hours.
-"""
+interrupted run resumes: `--work` caches every pair of hand and object (see cells.py). A run takes some core-hours."""
 
 from __future__ import annotations
 

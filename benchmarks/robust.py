@@ -1,10 +1,9 @@
 """Robustness of verdicts: effect of each error of a hand's model on success.
 
 usage: python -m benchmarks.robust DATA_DIR [--work DIR] [--hands allegro ...] [--objects NAME ...] [--out FOLDER]
-DATA_DIR holds hands/ and objects/. Standard candidates are validated at level standard. Those that hold are validated
+DATA_DIR holds hands/ and objects/. Standard candidates are validated at level standard. Held candidates are validated
 again in models that differ along one axis (`--draws` models each), along all axes at once, and as in a job. `--out`
-receives robust.json and robust.md. Interrupted runs resume (see cells.py).
-"""
+receives robust.json and robust.md. Interrupted runs resume (see cells.py)."""
 
 from __future__ import annotations
 

@@ -5,8 +5,7 @@ usage: python -m benchmarks.rolling DATA_DIR [--objects 011_banana ...] [--varia
 
 The drops exclude no stable face; for a face that scenes do not use, the table has the reason. The simulation has the
 physics of the lift test without a hand and lasts as long as a hand closes. It uses the object's own pieces, and pieces
-whose corners are moved by up to 1 mm.
-"""
+whose corners are moved by up to 1 mm."""
 
 from __future__ import annotations
 

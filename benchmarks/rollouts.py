@@ -3,8 +3,7 @@
 usage: python -m benchmarks.rollouts DATA --work WORK --out FOLDER [--hands ...] [--objects ...] [--grasps 8]
 
 Both selections of a pair are measured in one run. Times are processor time of one thread for planning, postures and, if
-used, rollouts. DATA holds hands/ and objects/. Pairs with results in WORK are not repeated.
-"""
+used, rollouts. DATA holds hands/ and objects/. Pairs with results in WORK are not repeated."""
 
 from __future__ import annotations
 

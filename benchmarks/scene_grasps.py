@@ -1,4 +1,4 @@
-"""Grasps planned in scenes against grasps planned around free objects and filtered, per hand and object.
+"""Comparison of grasps planned in scenes with filtered free grasps, per hand and object.
 
 usage: python -m benchmarks.scene_grasps DATA_DIR [--work W] [--hands allegro ...] [--objects 025_mug ...] [--grasps 32]
            [--per-face 0] [--filtered 0] [--touch 0] [--seed 404] [--json OUT] [--page OUT.md]
@@ -6,10 +6,9 @@ usage: python -m benchmarks.scene_grasps DATA_DIR [--work W] [--hands allegro ..
 
 Scenes have the object on a table, on each stable resting face on which at least 3 % of drops end. Each pair has at
 least `--grasps` grasps and at least `--per-face` per face. Free grasps are placed into the same scenes and validated
-alike; there are at least `--filtered` per pair, because few of them lift. A second is one of CPU time of one thread,
-so other load changes the ratios little. W caches the results of each pair: an interrupted run resumes, and several
-runs with different hands may run at the same time.
-"""
+alike; at least `--filtered` per pair, because few of them lift. A second is one of CPU time of one thread, so other
+load changes the ratios little. W caches the results of each pair: an interrupted run resumes, and runs with different
+hands may run at the same time."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """Pages of camera pictures: objects at rest, hands in clear grasps, and tables with several objects.
 
 usage: python -m benchmarks.scene_pictures --object mug --object mustard=MESH ... --out FOLDER [--hand allegro ...]
-           [--seed 0] [--device cpu]
-"""
+           [--seed 0] [--device cpu]"""
 
 from __future__ import annotations
 

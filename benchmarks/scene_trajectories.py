@@ -2,9 +2,8 @@
 
     python -m benchmarks.scene_trajectories [--count 24] [--json]
 
-Prints Markdown. The approach is a straight line of 10 cm. The last column counts grasps of which only the approach is
-not clear; a curved approach could save at most these.
-"""
+Prints Markdown. The approach is a straight line of 10 cm. The last column counts grasps with only the approach not
+clear. A curved approach could save at most these grasps."""
 
 from __future__ import annotations
 

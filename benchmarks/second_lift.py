@@ -6,8 +6,7 @@ usage: python -m benchmarks.second_lift DATA_DIR [--hands allegro ...] [--object
 
 The model has real gravity, MuJoCo's default contacts at 1 ms, CoACD pieces of another threshold, and the hand on a
 stiff vertical slide. The hand closes and squeezes in 1 s, rises 10 cm in 1 s and holds for 2 s. A grasp lifts if the
-object is then above 5 cm.
-"""
+object is then above 5 cm."""
 
 from __future__ import annotations
 
@@ -160,7 +159,7 @@ def lifts(model: Any, hand: HandModel, made: Any, row: int) -> bool:
     pose = np.asarray(made["scene/object_pose"][made["grasp/scene_index"][row]], float)
     base = compose(pose, np.asarray(made["grasp/hand_pose"][row], float))
     start = compose(pose, np.asarray(made["pregrasp/hand_pose"][row], float))
-    # The slide only rises: the palm moves from pregrasp to grasp before the fingers close.
+    # The slide only rises, so the palm moves from pregrasp to grasp before the fingers close.
     model.body("b0").pos[:], model.body("b0").quat[:] = start[:3], start[3:]
     ways = [hand.reduce(np.asarray(made[f"{name}/joint_positions"][row], float)) for name in WAYS]
     data.qpos[model.joint("object").qposadr[0] :][:7] = pose

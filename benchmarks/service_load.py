@@ -3,8 +3,7 @@
 usage: python -m benchmarks.service_load queue|workers|indexer|api|beside [--index-url URL] [--data-dir DIR]
 
 `api` needs a filled index: python -m benchmarks.large_index --data-dir DIR [--index-url URL].
-Workers are simulated (tests.fakes), so only the service is measured.
-"""
+Workers are simulated (tests.fakes), so only the service is measured."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """Success of candidates in the validator and their quality, per hand and object, as Markdown.
 
 usage: python -m benchmarks.success DATA_DIR [GRASPS [HAND ...]]     DATA_DIR holds hands/ and objects/
-The validator is MuJoCo with the DexGraspBench protocol, level `standard` (see worker/validation).
-"""
+The validator is MuJoCo with the DexGraspBench protocol, level `standard` (see worker/validation)."""
 
 from __future__ import annotations
 

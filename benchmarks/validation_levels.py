@@ -3,8 +3,7 @@
 usage: python -m benchmarks.validation_levels DATA_DIR [--work DIR] [--hands allegro ...] [--objects NAME ...] [--out
 FILE] DATA_DIR holds hands/ and objects/. Prints Markdown; `--out` writes the same as JSON. Interrupted runs resume (see
 cells.py). Valid grasps per second are for two cores: held grasps over half the CPU time, which depends less on other
-load than wall time.
-"""
+load than wall time."""
 
 from __future__ import annotations
 

@@ -2,21 +2,19 @@
 
 usage: python -m benchmarks.week [--nodes 1000] [--days 7] [--cores 1] [--seed 0] [--rates cloud|harsh] [--json FILE]
 
-Costs come from `benchmarks.cost_model` and `benchmarks.fleet`. Rates are assumptions of this module (`Rates`,
-`HARSH`). Events are interruptions: nodes that are reclaimed with notice, killed or cut off, a zone that fails, and
-outages of controller, Redis and store. Between two interruptions nodes are independent, so all tasks of this time are
-drawn at once.
+Costs come from `benchmarks.cost_model` and `benchmarks.fleet`. Rates are assumptions of this module (`Rates`, `HARSH`).
+Events are interruptions: nodes that are reclaimed with notice, killed or cut off, a zone that fails, and outages of
+controller, Redis and store. Between two interruptions nodes are independent, so all tasks of this time are drawn at
+once.
 
 The reactions to interruptions are those that `tests/system` tests on real processes:
 
-- a node with notice returns its task; the work on it is lost, but no attempt;
-- a killed node loses the work and an attempt; its task waits for `GRASPD_LEASE_S` and the next check of the controller;
-- a node that is cut off for longer continues, while another node does the same task; the work of one of them is lost,
-  because the store refuses the second result (create-only);
-- during an outage of the controller, workers take waiting tasks; during an outage of Redis, each ends its task and
-  waits;
-- during an outage of the store, a task that ends is returned and its work is lost; later tasks are returned before they
-  start.
+- A node with notice returns its task. The work on it is lost, but no attempt.
+- A killed node loses the work and an attempt. Its task waits for `GRASPD_LEASE_S` and the next check of the controller.
+- A node that is cut off for longer continues, while another node does the same task. The work of one of them is lost,
+because the store refuses the second result (create-only).
+- During an outage of the controller, workers take waiting tasks. During one of Redis, each ends its task and waits.
+- During an outage of the store, a task that ends is returned and its work is lost. Later tasks are returned unstarted.
 """
 
 from __future__ import annotations
@@ -41,7 +39,7 @@ _DAY_S: Final = 86_400.0
 _WAITING_A_WORKER: Final = 2
 #: Tasks per second through controller and index with 512 or more workers, from `python -m benchmarks.fleet`.
 CONTROLLER_TASKS_PER_S: Final = 336.0
-#: Spread of the time of a task (log-normal sigma): batches of a pair differ in their number of valid grasps.
+#: Spread of the time of a task (log-normal sigma), since batches of a pair differ in their number of valid grasps.
 _SPREAD: Final = 0.3
 _ATTEMPTS: Final = 3
 
@@ -51,7 +49,7 @@ class Rates:
     """Rates and durations of interruptions."""
 
     reclaimed_per_day: float = 1 / 3
-    """Of one node, with notice. Clouds that publish rates reclaim 5 to 20 % of spot nodes a month; this is 50 times
+    """Of one node, with notice. Clouds with published rates reclaim 5 to 20 % of spot nodes a month; this is 50 times
     as much."""
     killed_per_day: float = 1 / 30
     """Of one node, without notice: out of memory, kernel crash, power failure."""
@@ -67,7 +65,7 @@ class Rates:
     redis_away_s: float = 60.0
     store_outages_per_week: float = 2.0
     store_away_s: float = 300.0
-    """In total an availability of 99.9 % in a week, as object stores promise."""
+    """An availability of 99.9 % in a week in total, as stated by object stores."""
 
 
 HARSH: Final = Rates(
@@ -95,7 +93,7 @@ class Told:
     """Time in which running nodes were idle, by cause."""
     interruptions: Counter[str] = field(default_factory=Counter)
     done_twice: int = 0
-    """Tasks that two nodes completed; the store refused the second result."""
+    """Tasks completed by two nodes; the store refused the second result."""
     attempts_lost: int = 0
     failed_for_good: float = 0.0
     """Expected number of tasks that lose all their attempts, if all tasks are equally likely to lose one."""

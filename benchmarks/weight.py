@@ -3,8 +3,7 @@
 usage: python -m benchmarks.weight [--runs 5] [--no-wheel] [--json OUT]
 
 Sizes are of the files in this environment; an extra includes all required packages. Times are processor seconds of a
-new process, the least of the runs; `python -X importtime` gives the parts.
-"""
+new process, the least of the runs; `python -X importtime` gives the parts."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """Hands in DexGraspBench's layout: MJCF model with position actuators, configuration, map of joints.
 
 The model's world frame is the frame of our root link, so `qpos` begins with our pose of it. Bodies are named
-`root_<link>` and `f<number of the finger>_<link>`: the evaluator finds fingers by the prefix of a body's name.
-"""
+`root_<link>` and `f<number of the finger>_<link>`: the evaluator finds fingers by the prefix of a body's name."""
 
 from __future__ import annotations
 
@@ -24,7 +23,7 @@ from graspd.worker.hands.model import ConvexPiece, HandModel, JointType
 
 #: Joint damping over position gain [s], as in DexGraspBench's Allegro hand.
 _DAMPING_TIME: Final = 0.02
-#: A coupling is stiffer than a contact; otherwise a pressed finger would stretch it.
+#: Stiffness of couplings. They are stiffer than contacts; otherwise a pressed finger would stretch them.
 _COUPLING: Final = {"solref": "0.008 1", "solimp": "0.98 0.999 0.0001 0.5 2"}
 _BARE: Final = {"mass": 1e-3, "radius": 0.01}
 _COLOUR: Final = (0.87, 0.45, 0.2, 1.0)
@@ -50,7 +49,7 @@ def body_names(hand: HandModel) -> tuple[str, ...]:
 
 
 def _finger(hand: HandModel, body: int) -> str:
-    """Return the finger of a body: the child of the root above it."""
+    """Return the finger of a body: the child of the root above the body."""
     while hand.parent[body] > 0:
         body = int(hand.parent[body])
     return f"f{np.flatnonzero(hand.parent == 0).tolist().index(body)}"
@@ -259,7 +258,7 @@ _ALLEGRO_URDFS: Final = (
 )
 #: Rotation of their Allegro palm in the model's world frame: quaternion 0 1 0 1.
 _ALLEGRO_ROOT: Final = (0.0, 0.0, 0.0, 0.0, 0.5**0.5, 0.0, 0.5**0.5)
-#: Their Shadow palm keeps its position above the wrist, which is omitted.
+#: Position of their Shadow palm above the wrist, which is omitted.
 _SHADOW_ROOT: Final = (0.0, 0.0, 0.034, 1.0, 0.0, 0.0, 0.0)
 
 

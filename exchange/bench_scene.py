@@ -1,10 +1,9 @@
 """Objects and scenes in DexGraspBench's layout, and grasps on a table in the format of its tabletop test.
 
 An object has a mesh, convex pieces, facts, and scenes: floating at scale 1, and on a table. Poses in the files of a
-table are in its frame, z up, its top at z = 0; the evaluator has only a floor there. Grasps on a table have two more
-fields, which arms use: `approach_qpos` (W, 7 + J) leads from the standoff to the pregrasp with the hand open;
-`lift_qpos` (7 + J,) is the raised squeeze. The evaluator raises a hand without arm itself.
-"""
+table are in its frame, z up, with its top at z = 0. The evaluator has only a floor there. Grasps on a table have two
+more fields, for arms. `approach_qpos` (W, 7 + J) leads from the standoff to the pregrasp with the hand open.
+`lift_qpos` (7 + J,) is the raised squeeze. The evaluator raises a hand without arm itself."""
 
 from __future__ import annotations
 
@@ -138,9 +137,8 @@ def placed_of(obj_pose: Floats) -> PlacedGrasps:
 
 def object_of_scene(file: Path, scene_path: str) -> Row:
     """Return `obj_pose` and `obj_scale` of the object in the scene that a grasp's file names.
-
-    Its path is relative to a folder above the file, and below that folder's `assets`; InputError if it leads elsewhere.
-    """
+    The scene's path is relative to a folder above the file, and lies below `assets` of this folder. Raises InputError:
+    the path leads elsewhere."""
     place = PurePosixPath(scene_path)
     if place.is_absolute() or ".." in place.parts or place.parts[:1] != ("assets",):
         raise InputError(f"{file} names the scene {scene_path!r}; a scene lies below assets/")
@@ -161,7 +159,7 @@ def object_of_scene(file: Path, scene_path: str) -> Row:
 def with_way(
     hand: HandModel, grasps: GraspSet, rows: Sequence[Row], obj_pose: Floats, mapping: HandMapping | None
 ) -> GraspSet:
-    """Add approach and lift from files, in the object frame, if waypoints are equally many and the hand stays open."""
+    """Add approach and lift from files, in the object frame, if waypoint numbers are equal and the hand stays open."""
     if not all({"approach_qpos", "lift_qpos"} <= set(row) for row in rows):
         return grasps
     ways = [np.asarray(row["approach_qpos"], float) for row in rows]

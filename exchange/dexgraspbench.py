@@ -1,10 +1,9 @@
 """DexGraspBench's layout: one pickled dictionary per grasp, and the files that its evaluator needs.
 
 Fields: `obj_path`, `obj_scale`, `obj_pose` (7,), and `pregrasp_qpos`, `grasp_qpos`, `squeeze_qpos` (7 + J,) each: root
-position, root quaternion w x y z, joints. Root and object share one world frame. Root and joint order are those of the
-model that a benchmark's configuration names; a mapping beside the grasps relates them to ours. Grasps on a table have
-more fields, see `bench_scene`.
-"""
+position, root quaternion w x y z, joints. Root and object share one world frame. Root and joint order belong to the
+model that a benchmark's configuration names. A mapping beside the grasps relates them to root and joint order of
+graspd. Grasps on a table have more fields, see `bench_scene`."""
 
 from __future__ import annotations
 
@@ -42,13 +41,14 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.environment import PlacedGrasps
 
 POSTURES: Final = ("pregrasp", "grasp", "squeeze")
-#: Prefix of the configurations of our hands, and name of the experiment.
+#: Prefix of our hands' configurations, and name of the experiment.
 NAME: Final = "graspd"
 
 
 def read(path: Path, *, hand: str, obj: str) -> list[ImportedGrasps]:
-    """Read a file or folder: one set per scale, grasps on tables apart. Without a mapping, `hand` has their joints."""
-    # Descriptions of scenes are pickled dictionaries too.
+    """Read a file or folder: one set per scale, grasps on tables apart. Without a mapping, joints are those of
+    `hand`."""
+    # Descriptions of scenes are also pickled dictionaries.
     files = [path] if path.is_file() else [f for f in sorted(path.rglob("*.npy")) if "scene_cfg" not in f.parts]
     if not files:
         raise InputError(f"{path} has no .npy files; DexGraspBench has one for each grasp")
@@ -77,11 +77,9 @@ def write(
     placed: PlacedGrasps | None = None,
 ) -> list[Path]:
     """Write grasps with all files of DexGraspBench's evaluator: the folder completes its checkout.
-
     The object has scale 1. It is at the origin or, for `placed` grasps, on its table, as in the tabletop test; both are
     separate experiments. The hand is written as a model of our own, whose files are returned. If the benchmark has a
-    model of the same hand, the grasps are also written for that one.
-    """
+    model of the same hand, the grasps are also written for that model."""
     if placed is not None:
         check_table(placed)
     name = plain_name(obj.name)
@@ -114,7 +112,7 @@ def write(
 
 
 def models_of(hand: HandModel, folder: Path) -> list[HandMapping]:
-    """Return mappings for our hand model, written below `folder`, and the benchmark's if it has one."""
+    """Return mappings for our hand model, written below `folder`, and for the benchmark's model if it has one."""
     config = f"{NAME}_{plain_name(hand.name)}"
     model = write_hand(hand, config, folder)
     built: Any = mujoco.MjModel.from_xml_path(str(folder / model))

@@ -1,6 +1,6 @@
 """DexGraspNet 2.0's folder: scenes as in GraspNet-1Billion, and dexterous grasps for each.
 
-Zhang et al., DexGraspNet 2.0, CoRL 2024. Below `data/`, NNNN is a scene and VVVV a view of it:
+Zhang et al., DexGraspNet 2.0, CoRL 2024. Below `data/`, NNNN is a scene and VVVV is a view of the scene:
 
     scenes/scene_NNNN/realsense/
         depth_gt/VVVV.png           16 bits, steps of one metre over `factor_depth`, 0: nothing
@@ -14,11 +14,11 @@ Zhang et al., DexGraspNet 2.0, CoRL 2024. Below `data/`, NNNN is a scene and VVV
     dex_graspness_new/scene_NNNN/realsense/VVVV.npy
         (P, 1) f4 graspness of the P points of its loader for the view, in pixel order
 
-Its loader puts pixel (u, v) at u, v; ours has pixel centres at +0.5. The intrinsics account for this.
+Its loader puts pixel (u, v) at u, v; graspd has pixel centres at +0.5. The intrinsics account for this.
 
-Graspness is a distance-weighted number of grasps that aim at a point. The values follow their
-src/preprocess/dex_graspness.py, the clouds their src/utils/pc.py, both as in zcyqyq/DexTouch-sim2real at
-7824d859a8da1d942bc38709a9d217dfb548db5d. An object is 1,000 points of its surface:
+Graspness is a distance-weighted number of grasps that aim at a point. Values follow src/preprocess/dex_graspness.py,
+and clouds follow src/utils/pc.py, both of zcyqyq/DexTouch-sim2real at 7824d859a8da1d942bc38709a9d217dfb548db5d. An
+object is 1,000 points of its surface:
 
     grasp g aims from the palm at the middle between its thumb and its other fingers
     seen    points ahead within 30 degrees of that line, at most 20 mm farther along it than the first of them
@@ -27,13 +27,12 @@ src/preprocess/dex_graspness.py, the clouds their src/utils/pc.py, both as in zc
         normalised; their loader computes the logarithm of value + 0.001
     pixel   on the object: the value of the nearest point; elsewhere 0
 
-Their code uses thumb and middle finger of a LEAP hand and the centre of its palm's box; this module uses any hand's
+Their code uses thumb and middle finger of a LEAP hand, and the centre of its palm's box. This module uses any hand's
 thumb, the mean of its other fingertips, and the palm's surface. If no point is seen, their code stops; here the point
-nearest to the palm counts. For the nearest point their code documents a limit of 15 mm but compares 0.015 with the
+nearest to the palm counts. For the nearest point their code documents a limit of 15 mm, but compares 0.015 with the
 squared distance of pytorch3d's `knn_points`. This module uses the resulting limit of 122 mm.
 
-`service.readers.clouds.graspness` differs: it is the share of grasps whose hand touches a point.
-"""
+`service.readers.clouds.graspness` differs: it is the share of grasps whose hand touches a point."""
 
 from __future__ import annotations
 
@@ -86,7 +85,7 @@ BAND_M: Final = 0.02
 #: Angle [rad] and height beyond the first point [m] that halve the weight of a seen point.
 ANGLE_HALF: Final = np.pi / 18
 HEIGHT_HALF_M: Final = 0.015
-#: Powers of ten by which a grasp's weight falls per metre from its aim point.
+#: Powers of ten by which a grasp's weight falls per metre from its aim point [1/m].
 FALL_PER_M: Final = 150.0
 #: Largest distance of a pixel from the point whose value it takes [m].
 REACH_M: Final = 0.015**0.5
@@ -115,7 +114,7 @@ class SceneGraspness:
 
     @classmethod
     def of(cls, hand: HandModel, grasps: Posture, samples: Floats) -> SceneGraspness:
-        """Compute it from K grasps in the object's frame; without grasps all values are 0."""
+        """Compute the graspness from K grasps in the object's frame; without grasps all values are 0."""
         pointed = pointed_at(*lines_of_sight(hand, grasps), samples)
         return cls(samples, pointed, summed(samples, pointed))
 
@@ -123,10 +122,9 @@ class SceneGraspness:
         self, depth: Floats, labels: NDArray[np.uint8], intrinsics: Floats, camera: Floats, object_pose: Floats
     ) -> NDArray[np.float32]:
         """Return the graspness (N, 1) of the loader's cloud of a picture, row by row; 0 on neighbours.
-
-        `depth` (H, W) is 0 where nothing is [m]; `labels` (H, W) are 0 for background, 1 for the object of the grasps,
-        at least one pixel; `intrinsics` (3, 3) [px]; `camera` (4, 4) is in the table's frame, `object_pose` (7,) in it.
-        """
+        `depth` (H, W) [m] is 0 without a surface. `labels` (H, W) are 0 for background and 1 for the object of the
+        grasps, which has at least one pixel. `intrinsics` are (3, 3) [px]. `camera` (4, 4) and `object_pose` (7,) are
+        in the table's frame."""
         cloud = back_projected(depth, intrinsics)
         inside = in_workspace(cloud, depth, labels, camera)
         found = np.zeros(np.count_nonzero(inside), np.float32)
@@ -140,10 +138,8 @@ class SceneGraspness:
 
 def lines_of_sight(hand: HandModel, grasps: Posture) -> tuple[Floats, Floats]:
     """Return origins (K, 3) and unit directions (K, 3) of K grasps' lines of sight, in their frame [m].
-
-    The thumb is the fingertip that is on average farthest from the others before the hand closes. For hands with one
-    fingertip, or with fingers that meet in the palm, the line is the approach.
-    """
+    The thumb is the fingertip that is on average farthest from the other fingertips before the hand closes. For hands
+    with one fingertip, or with fingers that meet in the palm, the line is the approach."""
     palm = apply(grasps.hand_pose, hand.palm.centre)
     line = quat_rotate(grasps.hand_pose[:, 3:], hand.palm.approach)
     if len(hand.fingertips) < 2:
@@ -196,11 +192,9 @@ def back_projected(depth: Floats, intrinsics: Floats) -> Floats:
 
 
 def in_workspace(cloud: Floats, depth: Floats, labels: NDArray[np.uint8], camera: Floats) -> NDArray[np.bool_]:
-    """Return (H, W) pixels whose points (H, W, 3) the loader keeps.
-
-    These have a depth and lie in the box around all labelled pixels, on the table. As in the loader, labelled pixels
-    without depth extend the box, at the camera.
-    """
+    """Return a mask (H, W) of pixels whose points (H, W, 3) the loader keeps.
+    Such pixels have a depth and lie in the box around all labelled pixels, on the table. As in the loader, labelled
+    pixels without depth extend the box, at the camera."""
     whole = np.concatenate([cloud.reshape(-1, 3), np.ones((depth.size, 1))], axis=1)
     there = np.einsum("ab,nb->na", camera, whole)[:, :3]
     objects = there[labels.reshape(-1) > 0]
@@ -214,13 +208,13 @@ CAMERA: Final = "realsense"
 VIEWS: Final = 256
 #: Steps per metre in a depth picture: 16 bits reach 6.5 m.
 FACTOR: Final = 10000
-#: Numbers of scenes: its split `train_1` with those of `part`; and `val` with `test`.
+#: Numbers of scenes: split `train_1` with the scenes of `part`, and split `val` with `test`.
 TRAIN: Final = (range(90), range(1000, 8500))
 HELD_OUT: Final = (range(90, 100), range(100, 190))
 #: Keys of a file of grasps that are no joints.
 _PLACE: Final = ("translation", "rotation", "point")
 _OURS: Final = ("pregrasp_qpos", "squeeze_qpos", "success", "row")
-#: Names that NumPy's writer uses for its own arguments.
+#: Argument names of NumPy's writer.
 _NUMPYS: Final = ("file", "args", "kwds", "allow_pickle")
 #: A `meta` file has two kilobytes; unpacked it is at most a thousand times as large [bytes].
 _LARGEST_META: Final = 64 * 2**10
@@ -310,7 +304,7 @@ def _write_scene(
         if labels.any():  # its loader skips empty views, which have no workspace
             found = graspness.of_view(steps / FACTOR, labels, intrinsics, first @ poses[view], pose)
             np.save(values / f"{view:04}.npy", found)
-    # It samples among 256 views: the rest repeat the same files.
+    # The loader samples among 256 views, so further views repeat the same files.
     for view in range(len(some), VIEWS):
         for folder, suffix in kinds:
             _again(folder / f"{view % len(some):04}.{suffix}", folder / f"{view:04}.{suffix}")
@@ -351,9 +345,7 @@ def _write_grasps(look: PictureReference, lot: ExportPart, folder: Path, graspne
 
 def read(path: Path, *, hand: str, obj: str, number: int = 0) -> list[ImportedGrasps]:
     """Read `dex_grasps_new/SCENE/HAND/OBJECT.npz` in its folder `data` with the scene's `meta`; object frame.
-
-    `number` is the index of the object in the scene, from 0.
-    """
+    `number` is the index of the object in the scene, from 0."""
     found = load_npz(path)
     try:
         count = len(found["translation"])

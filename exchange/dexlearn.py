@@ -8,8 +8,7 @@ The folder overlays a checkout of DexLearn (Chen et al., baselines of BODex and 
     object/graspd/vision_data/azure_kinect_dk/SCENE_ID/partial_pc_NN.npy    (P, 3) points [m]
 
 Root poses and points share one frame: the table's or, for grasps of a free object, the object's. Roots and joints are
-those of a hand model that DexGraspBench evaluates, see `bench_hand`.
-"""
+those of a hand model that DexGraspBench evaluates, see `bench_hand`."""
 
 from __future__ import annotations
 
@@ -72,7 +71,7 @@ def write(
     return done
 
 
-#: Scene file below the folder, by shard and scene; free grasps have the one of their object.
+#: Scene file below the folder, by shard and scene; free grasps have the scene file of their object.
 _Scenes = dict[tuple[str, int], Path]
 #: Rows of a lot that share scene and type.
 _Part = tuple[ExportPart, Path, int, NDArray[np.intp]]
@@ -129,7 +128,7 @@ def _write_group(
     parts = [(lot, *part) for lot in lots for part in _rows_of(lot, scenes, folder, seen=seen)]
     listed = sorted({kind for _, _, kind, _ in parts if _in_both(kind, parts, out)})
     if not listed:
-        # No type has objects in both splits: all grasps get one type.
+        # No type has objects in both splits, so all grasps get one type.
         parts, listed = [(lot, scene, 0, rows) for lot, scene, rows in _untyped(parts)], [0]
     done.counts["grasps"] += sum(len(rows) for *_, rows in parts)
     for mapping in models_of(lots[0].hand, folder):

@@ -7,10 +7,10 @@ Murali et al., GraspGen, ICRA 2026. Written and read:
     objects/UUID.obj                     and map_uuid_to_path.json: {UUID: file}
     grippers/GRIPPER.yaml                width, depth, and frame of its convention: z approaches, x closes
 
-A record: `object` {file, scale}, `grasps` {`transforms` (N, 4, 4): pose of the gripper's base link in the object's
-frame, the mesh multiplied by `scale`; `object_in_gripper` (N,) true or false}. Its readers ignore our other fields:
-`joint_names`, and root and joints of pregrasp, grasp and squeeze, which restore grasps of multi-fingered hands.
-"""
+A record has `object` {file, scale} and `grasps` {`transforms` (N, 4, 4), `object_in_gripper` (N,) true or false}. A
+transform is the pose of the gripper's base link in the object's frame, with the mesh multiplied by `scale`. GraspGen's
+readers ignore our other fields: `joint_names`, and root and joints of pregrasp, grasp and squeeze. These fields restore
+grasps of multi-fingered hands."""
 
 from __future__ import annotations
 
@@ -50,14 +50,14 @@ PER_SHARD: Final = 64
 LARGEST: Final = 256 * 2**20
 #: GraspGen's generator skips objects with fewer good grasps.
 FEWEST: Final = 5
-#: Tolerance of a published rotation matrix: they are printed with six digits or more.
+#: Tolerance of a published rotation matrix, since matrices are printed with six digits or more.
 _ROTATION: Final = 1e-3
 #: Hands that are closed at once.
 _AT_ONCE: Final = 256
 
 
 def write(lots: Sequence[ExportPart], folder: Path, out: frozenset[str]) -> ExportSummary:
-    """Write all validated grasps of each hand, good and bad; held-out objects are in `valid.txt`."""
+    """Write all validated grasps of each hand, good and bad; `valid.txt` lists held-out objects."""
     if (folder / "grasps").exists():
         raise InputError(f"{folder} holds grasps already; give another folder as --output")
     done = ExportSummary({"grasps": 0, "good": 0, "objects": 0, "files": 0})
@@ -128,10 +128,8 @@ def _record(hand: HandModel, lots: list[ExportPart]) -> dict[str, Any]:
 
 def convention(hand: HandModel) -> dict[str, Any]:
     """Return the YAML of a gripper: clear width [m], reach along its approach [m], and frame.
-
-    The frame is that of GraspGen's convention in the base link's, as [[x, y, z], [x, y, z, w]]. For a hand with more
-    than two jaws, x is the direction across the approach with the largest distance of its open fingertips.
-    """
+    The frame is that of GraspGen's convention in the base link's frame, as [[x, y, z], [x, y, z, w]]. For a hand with
+    more than two jaws, x is the direction across the approach with the largest distance of its open fingertips."""
     z, jaws = hand.palm.approach, jaws_of(hand)
     if jaws is not None:
         widest = int(np.argmax(jaws.width))

@@ -4,8 +4,7 @@
     pictures/{train,test}-00000.parquet   one picture per row: colour, depth, labels, camera, grasps in its frame
     README.md                             description of the files
 
-Columns, units and frames are those of `GRASPS` and `PICTURES`; docs/how-to/exchange/huggingface.md is the reference.
-"""
+Columns, units and frames are those of `GRASPS` and `PICTURES`; docs/how-to/exchange/huggingface.md is the reference."""
 
 from __future__ import annotations
 
@@ -194,7 +193,7 @@ def png(pixels: NDArray[Any]) -> dict[str, Any]:
 
 
 def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[ImportedGrasps]:
-    """Read a file, or `grasps/*.parquet` of a folder; free grasps and those on tables are separate sets."""
+    """Read a file, or `grasps/*.parquet` of a folder; free grasps and grasps on tables are separate sets."""
     files = [path] if path.is_file() else sorted((path / "grasps").glob("*.parquet"))
     columns: dict[str, list[Any]] = {}
     for file in files:

@@ -1,4 +1,4 @@
-"""Imported grasps before our quality stage: scaled objects, and NumPy pickles that are read safely.
+"""Imported grasps before our quality stage: scaled objects, and safe reading of NumPy pickles.
 
 A pickle may call any function while it is loaded. Only arrays, numbers, strings and their containers are allowed here.
 """
@@ -61,7 +61,7 @@ def verdicts(values: Sequence[Any] | NDArray[Any]) -> NDArray[np.int8]:
 
 
 def joints_by_name(hand: HandModel, names: Sequence[str], values: Any, *, what: str) -> Floats:
-    """Return (N, J) joints of the hand from (N, n) values of `names`; all others are at the middle of their range."""
+    """Return (N, J) joints of the hand from (N, n) values of `names`; other joints are at the middle of their range."""
     given = np.atleast_2d(np.asarray(values, float))
     if given.shape[1] != len(names):
         raise InputError(f"{what}: {given.shape[1]} joint values for {len(names)} joints")

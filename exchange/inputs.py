@@ -35,7 +35,7 @@ class Case:
     seconds: float | None = None
     """Time to make the grasps, if known [s]."""
     validated: bool = False
-    """Whether that time includes validation."""
+    """Whether this time includes validation."""
     published: NDArray[np.int8] | None = None
     """(N,) success as published: 1, 0, -1 unknown."""
     placed: PlacedGrasps | None = None
@@ -70,9 +70,7 @@ def _of_scenes(path: Path) -> bool:
 
 def load_case(path: Path, *, hand: str | None = None, obj: str | None = None) -> Case:
     """Read a base shard (HDF5), a reference-grasps JSON, or a folder with DexGraspBench `.npy` files.
-
-    `hand` (URDF or built-in) and `obj` (mesh or built-in) override those of the file.
-    """
+    `hand` (URDF or built-in) and `obj` (mesh or built-in) override hand and object of the file."""
     if path.is_dir():
         return _bench_folder(path, hand, obj)
     if not path.is_file():

@@ -5,12 +5,11 @@
     data/chunk-CCC/file-FFF.parquet                       frames, with pictures as PNG
 
 A frame is a waypoint of the trajectory, from the standoff to the squeeze. `observation.state` is the present posture,
-`action` the next one (for the last frame the lift): root position [m] and quaternion w x y z in the table's frame, then
-all moving joints [rad or m]. `observation.environment_state` is the object's rest pose in the same frame. Waypoints
-have no times, so `fps` only numbers them.
+`action` the next one, after the last frame the lift. A posture has the root's position [m] and quaternion w x y z in
+the table's frame, then all moving joints [rad or m]. `observation.environment_state` is the object's rest pose in the
+same frame. Waypoints have no times, so `fps` only numbers them.
 
-The importer `lerobot` reads trajectories of data sets from graspd, in the object's frame.
-"""
+The importer `lerobot` reads trajectories of data sets from graspd, in the object's frame."""
 
 from __future__ import annotations
 
@@ -67,7 +66,7 @@ _INDEXED: Final = {
 
 
 def write(lots: Sequence[ExportPart], pictures: Pictures, folder: Path, out: frozenset[str]) -> ExportSummary:
-    """Write an episode for each grasp whose scene has a picture (several in turn); held-out objects come last."""
+    """Write an episode for each grasp whose scene has a picture (of several, in turn); held-out objects come last."""
     parquet.arrow()
     if (folder / "meta").exists():
         raise InputError(f"{folder} holds a data set already; give another folder as --output")

@@ -21,7 +21,7 @@ from graspd.service.parquet import arrow
 
 @contextmanager
 def opened(folder: Path) -> Iterator[None]:
-    """Open all files that are written into a folder within this context; GraspdError if a library cannot read one."""
+    """Open all files written into a folder within this context. Raises GraspdError: a library cannot read one."""
     before = _stamps(folder)
     yield
     for path, stamp in sorted(_stamps(folder).items()):
@@ -38,7 +38,7 @@ def _open(path: Path, library: str, read: Callable[[Path], Any]) -> None:
     try:
         read(path)
     except ImportError:
-        return  # The writer did not need this library, so its user may use another.
+        return  # The writer did not need this library, so the reader of the export may use another one.
     except Exception as error:  # Each library raises its own errors.
         why = " ".join(str(error).split())[:300]
         raise GraspdError(

@@ -1,23 +1,22 @@
 """Readers of published grasp sets: DDGC, DexGraspNet, MultiDex (GenDexGrasp), `reference-grasps/1`.
 
-Lundell et al., DDGC, RA-L 2021. For each object of the scene a list of grasps: position and quaternion x y z w of the
-hand in the object's frame; eight joint angles: spread, medial and distal of finger 1, the same of finger 2, then medial
-and distal of finger 3, closing positive.
+Lundell et al., DDGC, RA-L 2021. Each object of the scene has a list of grasps. A grasp has position and quaternion x y
+z w of the hand in the object's frame, and eight joint angles, closing positive. The angles are spread, medial and
+distal of finger 1, the same of finger 2, then medial and distal of finger 3.
 
 DexGraspNet's layout: a `.npy` for each object, a list of dictionaries with `qpos` by joint name and `scale`.
 
-Wang et al., DexGraspNet, ICRA 2023. `qpos` has the root's translation WRJTx, y, z [m], its rotation WRJRx, y, z (Euler
-angles about the fixed axes x, y, z in turn [rad]), and the joints `robot0:FFJ3` ... of the MuJoCo Shadow hand, whose
+Wang et al., DexGraspNet, ICRA 2023. `qpos` has the root's translation WRJTx, y, z [m] and its rotation WRJRx, y, z:
+Euler angles about the fixed axes x, y, z in turn [rad]. Joints are `robot0:FFJ3` ... of the MuJoCo Shadow hand, whose
 numbers are one less than in the URDF (FFJ4 ...). The object's mesh is multiplied by `scale`.
 
 MultiDex, the dataset of GenDexGrasp: a torch file with a list `metadata` of (..., q, object, robot) tuples.
 
 Li et al., GenDexGrasp, ICRA 2023. `q` has the root's translation [m], the first two columns of its rotation matrix, and
-the joints in the order of the robot's URDF. The original entries begin with a contact map; later versions of the file
-omit it, and some give the rotation as three Euler angles (rotating axes x, y, z).
+the joints in the order of the robot's URDF. The original entries begin with a contact map, which later versions of the
+file omit. Some versions give the rotation as three Euler angles (rotating axes x, y, z).
 
-Reference grasps as JSON (`reference-grasps/1`): poses as matrices, joints by name, with published scores.
-"""
+Reference grasps as JSON (`reference-grasps/1`): poses as matrices, joints by name, with published scores."""
 
 from __future__ import annotations
 
@@ -53,9 +52,7 @@ ROLES: Final = tuple(
 
 def read_ddgc(path: Path, *, hand: str, obj: str, number: int = 0) -> list[ImportedGrasps]:
     """Read `barrett_translation_K.npy`, with `barrett_representation_K.npy` beside it: object `number` of the scene.
-
-    Joints of the Barrett hand name finger (1, 2, 3) and phalanx (spread or prox, med, dist).
-    """
+    Joints of the Barrett hand name finger (1, 2, 3) and phalanx (spread or prox, med, dist)."""
     beside = path.with_name(path.name.replace("translation", "representation"))
     if beside == path or not beside.is_file():
         raise InputError(f"{path} needs its barrett_representation_K.npy beside it")
@@ -138,9 +135,7 @@ def _urdf_name(name: str, hand: HandModel) -> str:
 
 def read_multidex(path: Path, *, hand: str, obj: str, robot: str, object_name: str) -> list[ImportedGrasps]:
     """Read the grasps of one robot (`allegro`) on one object (`contactdb+mug`) in `cmap_dataset.pt`.
-
-    torch loads tensors and plain values only.
-    """
+    torch loads tensors and plain values only."""
     rows = [row for row in _metadata(path) if len(row) >= 3 and row[-1] == robot and row[-2] == object_name]
     if not rows:
         raise InputError(f"{path} has no grasp of {robot!r} on {object_name!r}")
@@ -188,7 +183,7 @@ def _metadata(path: Path) -> list[Any]:
 
 
 def read_reference(path: Path, *, hand: str | None = None, obj: str | None = None) -> list[ImportedGrasps]:
-    """Read the grasps of one file; hand and object default to those that the file names."""
+    """Read the grasps of one file; hand and object default to the names in the file."""
     stored = _stored(path)
     try:
         rows = stored["grasps"]

@@ -3,8 +3,7 @@
 Beside the image files of `worker.rendering.export`: `bounding_box_2d_tight_NNNN.npy`, `..._2d_loose_NNNN.npy` and
 `..._3d_NNNN.npy` as structured arrays with their `_labels_` and `_prim_paths_` JSON files,
 `semantic_segmentation_labels_NNNN.json` and `camera_params_NNNN.json`. USD's conventions: matrices act on row vectors,
-cameras look along -z with y up, pixels count from the upper left.
-"""
+cameras look along -z with y up, pixels count from the upper left."""
 
 from __future__ import annotations
 
@@ -49,11 +48,9 @@ def write(views: Shard, folder: Path) -> list[Path]:
 
 
 def box_3d(corners: Floats, extrinsics: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return corners (3,), (3,) of an object-aligned box in its own centred frame, and that frame in the world.
-
+    """Return corners (3,), (3,) of an object-aligned box in its own centred frame, and this frame in the world.
     The frame (4, 4) acts on row vectors. Corner k of (8, 3) in the camera frame has the maximum x, y, z if bit 0, 1, 2
-    of k is set.
-    """
+    of k is set."""
     world = (corners - extrinsics[:3, 3]) @ extrinsics[:3, :3]
     edges = np.stack([world[1 << axis] - world[0] for axis in range(3)])
     half = 0.5 * np.linalg.norm(edges, axis=1)

@@ -49,7 +49,7 @@ class RobotExportOptions:
     speed: float = 0.5
     """Share of the velocity limits that trajectories use."""
     arm: str | None = None
-    """Description of the arm; the next three place it and mount the hand."""
+    """Description of the arm; the next three fields place the arm and mount the hand."""
     mount: str | None = None
     base: str | None = None
     mount_pose: str | None = None

@@ -33,9 +33,7 @@ def write_scored(
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Path:
     """Validate and measure a set of grasps and write it as a base shard, its object's mesh beside it.
-
-    Grasps in scenes are tested by a lift; the hand's trajectory is replanned, as for our own grasps.
-    """
+    Grasps in scenes are tested by a lift; the hand's trajectory is replanned, as for our own grasps."""
     name = plain_name(found.name)
     path = folder / f"{plain_name(found.hand.name)}-{name}-{ordinal:03}.h5"
     if path.exists():

@@ -1,8 +1,8 @@
 """Export of shards as training folders of other projects: grasps, pictures, splits by object family.
 
 Families compare the distribution of distances between two random surface points (D2 of Osada et al., "Shape
-distributions", 2002) over their root mean square. Rotated, moved, mirrored, scaled and remeshed copies have the same.
-"""
+distributions", 2002) over their root mean square. Rotated, moved, mirrored, scaled and remeshed copies have the same
+distribution."""
 
 from __future__ import annotations
 
@@ -41,9 +41,7 @@ class TrainingExportOptions:
 
 def export_training(source: Path, format_: str, wishes: TrainingExportOptions, folder: Path) -> ExportSummary:
     """Write the grasps of a folder of shards in a training format.
-
-    Writers take grasps (`lots`), pictures of their scenes, held-out objects (`out`) and the noise of a depth camera.
-    """
+    Writers take grasps (`lots`), pictures of their scenes, held-out objects (`out`) and the noise of a depth camera."""
     if not 0 < wishes.held_out < 1:
         raise InputError(f"--held-out is {wishes.held_out:g}; give a share of the objects between 0 and 1")
     shards = open_shards(source)
@@ -98,9 +96,9 @@ def _chosen(shard: Shard, format_: str, wishes: TrainingExportOptions) -> np.nda
 #: Pairs of points, and stored quantiles of their distances.
 PAIRS: Final = 40_000
 QUANTILES: Final = np.linspace(0.01, 0.99, 50)
-#: Root mean square difference of the quantiles, with distances of about 1, below which two shapes count as one. For 14
-#: scanned objects, copies that were turned, mirrored, scaled and simplified to 3 mm differ by at most 0.0043; the two
-#: most similar objects differ by 0.0095. Too large families hardly affect a split; too small ones leak.
+#: Root mean square difference of the quantiles, with distances of about 1, below which two shapes count as one. 14
+#: scanned objects were turned, mirrored, scaled and simplified to 3 mm: copies differ by at most 0.0043. The two most
+#: similar objects differ by 0.0095. Too large families hardly affect a split; too small ones leak.
 SAME: Final = 0.006
 
 
@@ -117,7 +115,7 @@ def signature(obj: ObjectModel) -> Floats:
 
 
 def families(objects: Mapping[str, ObjectModel]) -> dict[str, str]:
-    """Return each object's family: the least digest of files of transitively similar objects."""
+    """Return each object's family: the least digest of the files of all transitively similar objects."""
     names = sorted(objects, key=lambda name: objects[name].digest)
     found = np.array([signature(objects[name]) for name in names]).reshape(len(names), len(QUANTILES))
     family: dict[str, str] = {}

@@ -1,8 +1,8 @@
 """Pictures with their grasps as WebDataset tar files: members that share a key are one sample.
 
-For each picture `KEY.rgb.png`, `KEY.depth.exr` (float32 [m]), `KEY.segmentation.png` and `KEY.json`: camera, boxes, and
-the grasps of the scene that are clear of the table, in the camera's frame. Only what a views shard has is written.
-"""
+Each picture has `KEY.rgb.png`, `KEY.depth.exr` (float32 [m]), `KEY.segmentation.png` and `KEY.json`. The JSON has
+camera, boxes, and grasps of the scene that are clear of the table, in the camera's frame. Data that a views shard lacks
+are omitted."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
 """Throughput of the planner over fidelities, batches, threads, hand points and object faces: table, JSON and plot.
 
-Iterations are timed launch by launch, batches by kernel time and host time.
-"""
+Iterations are timed launch by launch, batches by kernel time and host time."""
 
 from __future__ import annotations
 
@@ -34,7 +33,7 @@ from graspd.worker.simulation.launches import kernel_seconds
 from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.record import record_iteration
 
-#: Most grasps per launch for which host time is reported.
+#: Largest number of grasps per launch for which host time is reported.
 LARGE: Final = 1024
 
 
@@ -51,14 +50,10 @@ def bench(
     say: Callable[[str], None],
 ) -> dict[str, Any]:
     """Run each fidelity x batch x joins x threads once; `say` receives a line per run.
-
     `load` loads the object at a fidelity's simplification error bound [m]; `joins` are numbers of batches per launch.
-    The median of `repeats` timed calls is reported, after an untimed call. A GPU ignores `threads`.
-
-    Returns:
-        `device`, `runs[]` with the keys of the command line's contract, `start` with cold and warm seconds,
-        `host_ms_per_grasp` (None on a GPU, where waiting threads are busy), `kernels`.
-    """
+    The median of `repeats` timed calls is reported, after an untimed call. A GPU ignores `threads`. Return `device`,
+    `runs[]` with the keys of the command line's contract, `start` with cold and warm seconds, `kernels`, and
+    `host_ms_per_grasp`: None on a GPU, where waiting threads are busy."""
     first = fidelities[0]
     nominal = load(first.face_error_m)
     start = _start_times(hand, nominal, first, device)
@@ -88,7 +83,7 @@ def bench(
 
 
 def _start_times(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, device: str) -> dict[str, float]:
-    """Return seconds to the first grasp of a fresh process (kernels cached or compiled) and to the next."""
+    """Return seconds to the first grasp of a fresh process, with kernels cached or compiled, and to the next grasp."""
     seconds = []
     for seed in (0, 1):
         began = time.perf_counter()
@@ -145,9 +140,7 @@ SAMPLED: Final = 12
 
 def kernel_shares(pair: Pair, fidelity: Fidelity, count: int) -> dict[str, Any]:
     """Return ms per iteration of each phase, time shares of kernels, and closest-point queries per second.
-
-    `count` grasps are planned at once, on one thread.
-    """
+    `count` grasps are planned at once, on one thread."""
     state = sample_starts(pair.model(pair.coarse), seed=0, batch=0, indices=range(count), each=1)
     phases: dict[str, Any] = {}
     for name, side, schedule in (
@@ -211,10 +204,8 @@ def _timed(
 
 def host_ms(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, count: int) -> float:
     """Return host time per candidate on the CPU [ms]: time of one thread outside the planner's kernels.
-
-    It includes starts, merits, projection, the postures around the grasp, copies and launches. A first batch of
-    `count` grasps fills the caches.
-    """
+    It includes starts, merits, projection, the postures around the grasp, copies and launches. A first batch of `count`
+    grasps fills the caches."""
     run = ExecutionContext("cpu", threads=1)
     plan(hand, obj, PlanRequest(count, fidelity, seed=1), run)
     with kernel_seconds() as elsewhere:

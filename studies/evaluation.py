@@ -48,7 +48,7 @@ COLUMNS: Final = {
     "epsilon": "epsilon",
     "wrench_volume": "wrench_volume",
 }
-#: Seed of the models around the nominal one. No job uses it, so that these models are independent of a job's selection.
+#: Seed of the models around the nominal one. No job uses it, so these models are independent of a job's selection.
 MODELS_SEED: Final = 2**31
 
 
@@ -69,14 +69,17 @@ def evaluate(
 
     Level dexgraspbench uses the mass and friction of its protocol, other levels those of the object.
 
-    Keys: n, protocol, level, hard, mu, mass_kg, object_friction; gsr (share that holds), osr (1 if any holds), sgs
-    (held grasps per second of planning and validation; of planning alone: sgs_without_validation), pd_mm and spd_mm
-    (penetration, self-penetration), ca_cm2, iv_cm3, epsilon, wrench_volume, cdc_mm, sd_cm: medians; diversity: variance
-    explained by the first principal component; nearest_mm: distance of the two most similar grasps. verdicts, after
-    validation: see `_told`. With `models` models around the nominal one: robust_share (mean over held grasps), robust_n
-    (number of these grasps), robust_axes (share by axis); `tell` receives the result of each grasp.
-    With protocol lift also clear_share (no collision with the scene in approach, closing and lift). With another model
-    of the hand as `validation_hand` also `ForeignVerdicts.facts`, and in the verdicts held_foreign and reason_foreign.
+    - Settings: n, protocol, level, hard, mu, mass_kg, object_friction.
+    - Success: gsr (share that holds), osr (1 if any holds), sgs (held grasps per second of planning and validation),
+      sgs_without_validation (per second of planning alone).
+    - Medians: pd_mm and spd_mm (penetration, self-penetration), ca_cm2, iv_cm3, epsilon, wrench_volume, cdc_mm, sd_cm.
+    - Set: diversity (variance explained by the first principal component), nearest_mm (least distance of two grasps).
+    - After validation: verdicts, see `_told`.
+    - With `models` models around the nominal one: robust_share (mean over held grasps), robust_n (their number),
+      robust_axes (share by axis). `tell` receives the results.
+    - With protocol lift: clear_share (no collision with the scene in approach, closing and lift).
+    - With another model of the hand as `validation_hand`: `ForeignVerdicts.facts`; in verdicts held_foreign and
+      reason_foreign.
 
     Raises:
         InputError: protocol lift on grasps of a free object, or with a level that it lacks.
@@ -250,7 +253,7 @@ def combine(rows: list[dict[str, Any]]) -> dict[str, Any]:
         return dict(rows[0])
     out: dict[str, Any] = {"n": sum(row["n"] for row in rows)}
     for key in ("protocol", "level", "hard", "mu"):
-        # No common value if the rows differ.
+        # Without a common value in all rows the value is None.
         out[key] = rows[0][key] if all(row[key] == rows[0][key] for row in rows) else None
     validated = [row for row in rows if row["gsr"] is not None]
     out["gsr"] = _rate(validated, "gsr", "n")

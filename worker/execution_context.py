@@ -24,7 +24,7 @@ Cancelled = Callable[[], bool]
 
 
 class CoreSharing:
-    """Number of parallel parts that share the cores; a part that ends frees its cores for the others."""
+    """Number of parallel parts that share the cores; a finished part frees its cores for the remaining parts."""
 
     def __init__(self, members: int) -> None:
         self.members = members
@@ -50,7 +50,7 @@ class ExecutionContext:
     pool: Pool | None = None
     """Processes for validation and measurement; None: threads of this process."""
     sharing: CoreSharing | None = None
-    """Parallel parts that share the cores, this one included; None: all cores are available."""
+    """Parallel parts, including this one, that share the cores; None: all cores are available."""
 
     @property
     def cores(self) -> int:

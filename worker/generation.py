@@ -2,9 +2,8 @@
 
 A grasp is feasible if it passes the geometric gate, and valid if it is feasible and held by the validator. Without
 validation, feasible grasps are counted instead and none is valid. If a job wants a share of models, a valid grasp
-counts only if it holds in that share. Expensive steps come last: grasps that are not held are not measured, and
-grasps that are not valid are not validated in further models.
-"""
+counts only if it holds in this share of models. Expensive steps come last: measurement after validation, perturbed
+models last."""
 
 from __future__ import annotations
 
@@ -47,13 +46,13 @@ from graspd.worker.validation.protocol import DIRECTIONS, Outcome
 from graspd.worker.validation.robust import reaches, robust
 from graspd.worker.validation.validator import prefiltered, validate
 
-#: Reasons to reject a grasp: its numbers are not finite; an obstacle of its scene blocks it; it was not held by the
-#: validator; it failed the geometric gate; it held in too few models; its payload is too small; it is a near-duplicate
-#: of a selected grasp.
+#: Reasons to reject a grasp. diverged: its numbers are not finite. blocked: an obstacle of its scene is in the way.
+#: dropped: the validator did not hold it. gate: it fails the geometric gate. not_robust: it holds in too few models.
+#: weak: its payload is too small. alike: it is a near-duplicate of a selected grasp.
 REJECTIONS: Final = ("diverged", "blocked", "dropped", "gate", "not_robust", "weak", "alike")
-#: Names of outcomes that differ from the names of their rejections; verdicts of the validator are `dropped`.
+#: Rejection of each outcome with another name; failed pushes and lifts of the validator are `dropped`.
 _REJECTION_OF: Final = {"no_place": "blocked", **{f"gate_{name}": "gate" for name in GATES}}
-#: Names of the outcomes in which a push or a lift drops a grasp.
+#: Outcomes of a push or a lift that drops a grasp.
 _PUSHED: Final = {
     Outcome.PENETRATION: "penetration",
     Outcome.LOST_WHILE_CLOSING: "lost_while_closing",
@@ -75,7 +74,7 @@ class ValidatedBatch:
     grasps: GraspSet
     columns: Arrays
     candidates: int
-    """Number of candidates up to the last selected grasp; all candidates if fewer grasps were found than wanted."""
+    """Number of candidates up to the last selected grasp; all candidates if too few grasps were found."""
     rejected: dict[str, int]
     """Number of rejected candidates, by `REJECTIONS`."""
     outcomes: dict[str, int]
@@ -85,8 +84,8 @@ class ValidatedBatch:
     planned: int
     seconds: dict[str, float] = field(default_factory=dict)
     shares: dict[str, float] = field(default_factory=dict)
-    """In scenes, shares of all candidates: clear_share (no obstacle at contact, on the approach and in the lift),
-    lift_share (also lifted), lift_hard_share (also lifted at half friction)."""
+    """In scenes, shares of all candidates. clear_share: no obstacle at contact, on the approach and in the lift.
+    lift_share: also lifted. lift_hard_share: also lifted at half friction."""
     narrow: str | None = None
     """In scenes without a valid grasp, the geometric reason; see `why_narrow`."""
     limit: Limit | None = None
@@ -109,11 +108,9 @@ def validated_grasps(
     partial: bool = False,
 ) -> ValidatedBatch:
     """Plan batch number `batch` of a job: `count` valid grasps (without validation: feasible), or fewer at the budget.
-
     `scenes` are used in turn; valid then means lifted out of the scene. `pieces` runs during the first round's
     planning. With `partial`, a cancellation returns the grasps validated so far; TaskCancelled if there are none.
-    Raises also the errors of `require_graspable`, and MeshError: the object has no usable convex pieces.
-    """
+    Raises also the errors of `require_graspable`, and MeshError: the object has no usable convex pieces."""
     require_graspable(hand, obj)
     with Scoring(hand, obj, request, scenes=scenes, pieces=pieces, run=run) as scoring:
         work = Batch(scoring, batch, count, run)

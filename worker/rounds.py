@@ -21,7 +21,8 @@ ROUND_STRIDE: Final = 1 << 20
 #: Fewest grasps of a round, and of a part of a round.
 SMALLEST_ROUND: Final = 8
 SMALLEST_PART: Final = 8
-#: Least share of valid grasps that is assumed for the next round, however few were valid before: it bounds the rounds.
+#: Least share of valid grasps that is assumed for the next round, even if fewer were valid before; it bounds the
+#: rounds.
 _LEAST_RATE: Final = 0.1
 
 
@@ -68,8 +69,9 @@ class Round:
 
 
 def next_round(wanted: int, valid: int, candidates: int, budget: int) -> int:
-    """Return the number of grasps to plan next: those missing at the rate so far, plus 10 %.
-    `wanted` is the number of valid grasps, `budget` the most to plan; 0: enough are found or the budget is used up."""
+    """Return the number of grasps to plan next: the missing ones at the rate so far, plus 10 %.
+    `wanted` is the number of valid grasps, `budget` the largest number of planned ones. 0: enough are found, or the
+    budget is used up."""
     if valid >= wanted or candidates >= budget:
         return 0
     if candidates == 0:

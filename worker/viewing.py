@@ -1,4 +1,4 @@
-"""The viewer: a viser server that shows the grasps of one file, with a slider over the trajectory.
+"""Viewer: a viser server that shows the grasps of one file, with a slider over the trajectory.
 Hand, object and scene are nodes. Metres; poses x y z, w x y z."""
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _OBJECT: Final = (232, 184, 120)
 _NEIGHBOUR: Final = (180, 174, 191)
 _TABLE: Final = (207, 212, 214)
 _WALL: Final = (143, 163, 176)
-#: Signed distance [m] and colour: red inside, green touching, blue near; lightness varies too.
+#: Signed distance [m] and colour: red inside, green touching, blue near, with different lightness.
 _STOPS: Final = (-0.001, -0.0002, 0.0003, 0.002, NEAR_M)
 _COLOURS: Final = np.array([(209, 38, 60), (240, 128, 60), (20, 184, 122), (53, 162, 240), (185, 212, 245)], np.float64)
 
@@ -148,7 +148,7 @@ class Viewer:
     """Server of one file until it is closed. `url` is its address; `row` is the grasp shown."""
 
     def __init__(self, shown: ViewerContent, *, host: str = "127.0.0.1", port: int = 8080) -> None:
-        """Start the server on a port (0: any free one; else the first free one from there on).
+        """Start the server on a port; 0: any free port; otherwise the first free port from this number on.
         Raises InputError: viser is not installed, the file holds no grasps, or the address cannot be used."""
         if said := missing():
             raise InputError(said)
@@ -279,7 +279,7 @@ def _served(host: str, port: int) -> Any:
             with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
                 probe.bind((host, 0))
                 port = int(probe.getsockname()[1])
-        # viser prints a greeting with the address, which graspd prints itself.
+        # viser's greeting is suppressed: graspd prints the address itself.
         with contextlib.redirect_stdout(io.StringIO()):
             return viser.ViserServer(host=host, port=port, label="graspd view", verbose=False)
     except OSError as error:

@@ -150,11 +150,9 @@ def close(
     stopped_inout: wp.array2d(dtype=wp.int32),
     q_inout: wp.array2d(dtype=wp.float32),
 ):
-    """Stop dofs that move a touching body; close the others by less than any point's gap. Launch over B.
-
+    """Stop dofs that move a touching body; close other dofs by less than any point's gap. Launch over B.
     The points of body a move by at most the sum of lever[d, a] |dq_d| over the closing dofs d. With one step for all
-    dofs of a finger, step = share * gap / sum lever, no contact is skipped (conservative advancement).
-    """
+    dofs of a finger, step = share * gap / sum lever, no contact is skipped (conservative advancement)."""
     b = wp.tid()
     if active_inout[b] == 0:
         return

@@ -1,8 +1,7 @@
 """GraspIt!'s autograsp: random collision-free start, approach to the object, closing of the fingers until contact.
 
 GraspIt! closes joints in small steps and moves back after a collision. Here step lengths follow from distances. The
-result is the same, contact within `TOUCH_M`, and no step tunnels through the object.
-"""
+result is equal, contact within `TOUCH_M`, and no step tunnels through the object."""
 
 from __future__ import annotations
 
@@ -74,7 +73,7 @@ TOUCH_M: Final = 2e-4
 REACH_M: Final = 0.03
 #: Fingers with a smaller gap reduce each other's steps [m].
 MARGIN_M: Final = 0.005
-#: Share of a gap that is crossed in one step. Large distances come from a grid with errors up to a third.
+#: Share of a gap that is crossed in one step. Large distances come from a grid with errors of up to a third.
 SHARE: Final = 0.6
 #: Longest closing step [rad], and largest number of steps.
 LARGEST: Final = 0.1

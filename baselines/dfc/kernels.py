@@ -2,8 +2,7 @@
 
 E = E_fc + 100 E_dis + 100 E_pen + 10 E_spen + E_joints
 step 0.005 * 0.95^floor(t / 50), each gradient over its root mean square, v <- 0.98 g^2 + 0.02 v
-temperature 18 * 0.95^floor(t / 30): a proposal is accepted with probability min(1, exp((E - E') / T))
-"""
+temperature 18 * 0.95^floor(t / 30): a proposal is accepted with probability min(1, exp((E - E') / T))"""
 
 import warp as wp
 
@@ -71,10 +70,9 @@ def propose(
     energy_out: wp.array2d(dtype=wp.float32),
 ):
     """Step down the gradient, redraw each contact with probability 1/2, reset energies. Launch over B.
-
-    The published code divides by the root mean square over its batch. Here each grasp has root mean squares of its
-    own, for translation, rotation and joints (columns 0 to 2 of `moment`), so that grasps of a batch are independent.
-    """
+    The published code divides by the root mean square over its batch. Here each grasp has its own root mean squares, so
+    that grasps of a batch are independent. They are those of translation, rotation and joints (columns 0 to 2 of
+    `moment`)."""
     b = wp.tid()
     it = iteration_in[0]
     size = step_size(it)

@@ -1,7 +1,6 @@
 """Differentiable force closure: DexGraspNet's starts around the convex hull, then annealed descent.
 
-All hands are returned; `info` lists those that the published code would accept.
-"""
+All hands are returned; `info` lists those that the published code would accept."""
 
 from __future__ import annotations
 
@@ -42,7 +41,7 @@ from graspd.worker.simulation.record import add_poses, add_root_gradient
 
 #: Bounds of the published code on force closure, distance and penetration.
 PASSES: Final = (0.3, 0.005, 0.001)
-#: Distance of the palm from the hull [m]. The published code puts the root, one palm length behind it, at 0.2 to 0.3.
+#: Distance of the palm from the hull [m]. In the published code the root, one palm length behind, is at 0.2 to 0.3 m.
 DISTANCE: Final = (0.1, 0.2)
 #: Largest tilt of the approach from the hull's normal [rad].
 TILT: Final = np.pi / 6
@@ -122,7 +121,7 @@ INFINITE: Final = 1e30
 
 
 def key_points(hand: HandModel) -> tuple[Ints, Floats, Ints, Ints]:
-    """Return bodies (K,), piece centres (K, 3), and the pairs that repel each other: those not close at rest."""
+    """Return bodies (K,), piece centres (K, 3), and pairs that repel each other: pairs that are not close at rest."""
     body = np.array([piece.body for piece in hand.pieces], np.int32)
     place = np.array([piece.vertices.mean(axis=0) for piece in hand.pieces])
     rest = apply(body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0][body], place)

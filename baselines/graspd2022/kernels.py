@@ -5,10 +5,9 @@ object's surface, dilated by r, exerts the force
 
     f = -k c n - min(kf |v_t|, mu k c) v_t / |v_t|,   c = max(r - d, 0).
 
-In the relaxation every point and velocity has its own force F. Two descents alternate: F moves to the nearest forces
-that stop the object (`relax`), and the hand moves so that contact forces approach F, by the gradient of sum |f - F|^2.
-Points without contact get a share of that gradient (leak), which attracts them.
-"""
+In the relaxation every point and velocity has its own force F. Two descents alternate. F moves to the nearest forces
+that stop the object (`relax`). The hand moves so that contact forces approach F, by the gradient of sum |f - F|^2.
+Points without contact get a share of this gradient (leak), which attracts them."""
 
 import warp as wp
 
@@ -75,10 +74,8 @@ def multipliers(
     pull_out: wp.array2d(dtype=vec6),
     residual_out: wp.array2d(dtype=wp.float32),
 ):
-    """Compute the tasks' residuals |wanted + sum F| [N], multipliers, pull on forces. Over (B, M).
-
-    The modified differential method of multipliers (Platt & Barr 1988) enforces residual <= tolerance.
-    """
+    """Compute the tasks' residuals |wanted + sum F| [N], multipliers, pull on forces. Launch over (B, M).
+    The modified differential method of multipliers (Platt & Barr 1988) enforces residual <= tolerance."""
     b, j = wp.tid()
     if active_in[b] == 0:
         return

@@ -1,7 +1,6 @@
 """Grasp'D: collision-free starts and descent with relaxed forces; no selection or repair, as published.
 
-The object is a grid of signed distances with trilinear interpolation; its error is of second order in the cell size.
-"""
+The object is a grid of signed distances with trilinear interpolation. Its error is of second order in the cell size."""
 
 from __future__ import annotations
 
@@ -109,7 +108,7 @@ FORCE_RATE: Final = 1e-2
 RATES: Final = (1e-3, 2e-3, 3e-3)
 BETAS: Final = (0.9, 0.999)
 WARMUP: Final = 200
-#: Initial distance of the dilated object from the hand, and of hands beyond their nearest free place [m].
+#: Initial distance of the dilated object from the hand, and distance of hands from their nearest free place [m].
 APART_M: Final = 0.01
 BACKOFF_M: Final = 0.05
 CHUNK: Final = 25
@@ -192,9 +191,7 @@ class _Batch:
 
 def distance_grid(obj: DeviceObject, cells: int) -> Any:
     """Return a `Surface` from the mesh with `cells` cells along the longest side of the padded box.
-
-    Distances are exact at the corners; the array lies on the object's device.
-    """
+    Distances are exact at the corners; the array is on the object's device."""
     model = obj.model
     low = model.vertices.min(axis=0) - model.centre_of_mass - PAD_M
     high = model.vertices.max(axis=0) - model.centre_of_mass + PAD_M

@@ -4,8 +4,7 @@ GraspIt!'s schedule with default parameters is a very fast re-annealing (Ingber 
 
     T(k) = T0 exp(-C k^(1/D)),   C = 7, D = 8, T0 = 1e6, k from 30,000
     neighbour: x + sgn(u - 1/2) T ((1 + 1/T)^|2u - 1| - 1) jump,   u uniform
-    accept with probability 1 if E' < E, else exp(1e-6 (E - E') / T)
-"""
+    accept with probability 1 if E' < E, else exp(1e-6 (E - E') / T)"""
 
 import warp as wp
 
@@ -29,9 +28,9 @@ T0 = wp.constant(1e6)
 C = wp.constant(7.0)
 ROOT = wp.constant(1.0 / 8)
 SCALE = wp.constant(1e-6)
-#: Most draws of a collision-free neighbour per step; if all fail the step does not count.
+#: Largest number of draws of a collision-free neighbour per step; if all fail the step does not count.
 TRIES = wp.constant(11)
-#: Most draws of one variable for a value inside its bounds.
+#: Largest number of draws of one variable for a value inside its bounds.
 REDRAWS = wp.constant(100)
 #: Distances are capped at this [m].
 FAR = wp.constant(1.0)

@@ -3,10 +3,10 @@
 Virtual contacts are a few points of a hand: two on each link's inner side, and some on the palm. GraspIt! has files of
 them for its own hands; here they are computed for any hand.
 
-GraspIt! has eigengrasps for Barrett (spread; all fingers) and the human hand (flexion of the knuckles with a little of
-the distal joints; knuckles against distal joints), none for Allegro or Shadow. Here a hand with one closing dof per
-finger uses Barrett's. Any other hand uses the human hand's, by the position of each joint along its finger.
-"""
+GraspIt! has eigengrasps for two hands here. Barrett: spread; all fingers. Human hand: flexion of the knuckles with a
+little of the distal joints; knuckles against distal joints. It has none for Allegro or Shadow. In this module a hand
+with one closing dof per finger uses Barrett's. Any other hand uses the human hand's, by the position of each joint
+along its finger."""
 
 from __future__ import annotations
 
@@ -72,17 +72,8 @@ class Search:
 
     def run(self, seeds: list[list[int]], *, steps: int, keep: int, tell: StepCounter) -> HandState:
         """Return the `keep` best states of each chain, best first, grouped by chain.
-
-        Args:
-            seeds: seeds of the chains.
-            steps: value of the schedule's counter at which a chain ends.
-            keep: length of the list of best states.
-            tell: called with one unit of work per move.
-
-        Raises:
-            InputError: no free hand pose around the object.
-            TaskCancelled: through `tell`.
-        """
+        `seeds` are those of the chains. A chain ends when the schedule's counter reaches `steps`. `tell` receives one
+        unit of work per move. Raises InputError: no free hand pose around the object. TaskCancelled: through `tell`."""
         chains = len(seeds)
         random = np.array([np.random.SeedSequence(seed).generate_state(1)[0] for seed in seeds], np.uint32)
         with wp.ScopedDevice(self.device):
@@ -160,7 +151,7 @@ PLACE_JUMP: Final = 0.15
 ANGLES: Final = ((0.0, np.pi), (-np.pi, np.pi), (0.0, np.pi))
 ANGLE_JUMPS: Final = (np.pi / 5, np.pi / 2, np.pi / 2)
 PHI: Final = 4
-#: Grid size per amplitude of the self-collision test, and tolerated overlap, present in real hand models at rest [m].
+#: Grid size per amplitude of the self-collision test, and tolerated overlap [m]: real hand models have some at rest.
 CLASH_GRID: Final = 49
 CLASH_M: Final = 2e-3
 #: Number of uniform draws for a legal start, and of rounds between two checks for cancellation.

@@ -65,7 +65,7 @@ class LearnedPlanner:
 
 
 METHOD: Final = Method(
-    summary="fast_graspd from the proposals of a network that saw the object on its table",
+    summary="fast_graspd from a network's proposals for the visible points of an object on a table",
     source="unpublished; PointNet, CVPR 2017, and flow matching, ICLR 2023",
     planner=LearnedPlanner,
     joined=lambda options: LearnedPlanner(options).joined,
@@ -107,11 +107,7 @@ class Seeds:
         placed: PlacedGrasps,
         ways: Sequence[Floats],
     ) -> tuple[HandState, Floats]:
-        """See `scene_starts.clear_scene_starts`.
-
-        Raises:
-            SceneError: the scenes have no table.
-        """
+        """See `scene_starts.clear_scene_starts`. Raises SceneError: the scenes have no table."""
         scene = np.repeat(placed.index, each)
         drawn, away = self._proposed(model, generators, each, placed)
         state, depth = _clear(model, drawn, away, scene, placed)
@@ -150,10 +146,7 @@ class Seeds:
 
 def table_height(supports: Sequence[Obstacle]) -> float:
     """Return z of the table among the supports of a scene [m].
-
-    Raises:
-        SceneError: there is no table, that is no half-space below a horizontal plane.
-    """
+    Raises SceneError: there is no table, that is, no half-space below a horizontal plane."""
     heights = [float(o.planes[0, 3]) for o in supports if len(o.planes) == 1 and o.planes[0, :3] @ UP > UPRIGHT]
     if not heights:
         raise SceneError("method learned proposes grasps of things on a table; this scene has none, choose fast_graspd")
@@ -164,9 +157,7 @@ def _clear(
     model: Model, drawn: HandState, away: Floats, scene: NDArray[np.intp], placed: PlacedGrasps
 ) -> tuple[HandState, Floats]:
     """Return for each start (n) the free hand with the fewest retreat steps, and its depth (n,) [m]; inf if none.
-
-    A hand that lacks clearance from obstacles is first raised.
-    """
+    A hand that lacks clearance from obstacles is raised first."""
     count, probe = len(scene), Probe(model, len(scene), room=ROOM)
     draws = len(drawn.pivot) // count
     near = (np.linalg.norm(drawn.pivot, axis=1) < model.obj.model.radius + FAR_M).reshape(count, draws)
@@ -196,8 +187,8 @@ def _clear(
     return best, depth
 
 
-#: Elevation of a camera above the table [rad]; share of its field of view (half of it [rad]) that the object's bounding
-#: ball fills; nearest distance of the ball [m]: as in the pictures of a job.
+#: Cameras as in the pictures of a job: elevation above the table [rad]; half of the field of view [rad]; its share
+#: filled by the object's bounding ball; nearest distance of the ball [m].
 ELEVATION: Final = (np.radians(18.0), np.radians(62.0))
 HALF_FIELD: Final = np.radians(20.0)
 FILL: Final = (0.7, 1.0)

@@ -1,7 +1,7 @@
 """Inference of a proposal network in NumPy alone: a point cloud in, grasps out.
 
-A cloud contains the visible points of an object on a table, in a frame with z up. A PointNet encoder (Qi et al., CVPR
-2017: one network for every point, then the maximum) computes a feature; conditional flow matching (Lipman et al., ICLR
+A cloud contains the visible points of an object on a table, in a frame with z up. A PointNet encoder computes a feature
+(Qi et al., CVPR 2017: one network for every point, then the maximum). Conditional flow matching (Lipman et al., ICLR
 2023, with straight paths) transforms normal noise to grasps. A grasp is a row of D = 12 + 3 J numbers, standardised by
 the network's `mean` and `std`:
 
@@ -12,9 +12,8 @@ the network's `mean` and `std`:
     12+J:12+2J     pregrasp minus grasp
     12+2J:12+3J    squeeze minus grasp
 
-Velocity of a row x at time t: MLP of [x, sin(2 pi 2^k t) k = 0..3, cos(2 pi 2^k t) k = 0..3, condition], where the
-condition is [feature of the cloud, height of the anchor above the table / 0.1 m, label].
-"""
+Velocity of a row x at time t: MLP of [x, sin(2 pi 2^k t) k = 0..3, cos(2 pi 2^k t) k = 0..3, condition]. The condition
+is [feature of the cloud, height of the anchor above the table / 0.1 m, label]."""
 
 from __future__ import annotations
 
@@ -33,7 +32,7 @@ from graspd.service.store.network_file import BLOCKS, CONDITION, ENCODER, POSE, 
 #: Unit of lengths in the encoder's input and in the condition [m].
 LENGTH_M: Final = 0.1
 #: Matrix products are split into parts of 32 rows and at most this many multiplications. OpenBLAS computes such a part
-#: on one thread; other sizes or splits would round differently. So a proposal is independent of the number of
+#: on one thread; other sizes or splits would round differently. A proposal is thus independent of the number of
 #: proposals and of the machine's cores.
 _ROWS: Final = 32
 _MULTIPLICATIONS: Final = 2**18
@@ -60,11 +59,7 @@ class Proposals:
 
 
 def save(network: ProposalNetwork, path: Path) -> None:
-    """Write a network's file.
-
-    Raises:
-        InputError: `service.store.network_file.from_bytes` would refuse it.
-    """
+    """Write a network's file. Raises InputError: `service.store.network_file.from_bytes` would refuse it."""
     path.write_bytes(to_bytes(network))
 
 
@@ -80,6 +75,7 @@ def propose(
     spread: float = 1.0,
 ) -> Proposals:
     """Propose grasps for one cloud. The first proposals do not depend on `count`.
+    Raises InputError: the cloud or the network's output is not finite.
 
     Args:
         network: network of the hand.
@@ -89,11 +85,7 @@ def propose(
         count: number of proposals.
         rng: source of the noise.
         label: 1 for grasps that hold, 0 for grasps that fail.
-        spread: standard deviation of the noise; 1 as in training. Below 1, grasps are likelier and less diverse.
-
-    Raises:
-        InputError: the cloud or the network's output is not finite.
-    """
+        spread: standard deviation of the noise; 1 as in training. Below 1, grasps are likelier and less diverse."""
     inputs, anchor = cloud_inputs(points, normals, table_height)
     condition = conditions(network, inputs[None], np.array([anchor[2] - table_height]), label)
     noise = (spread * rng.standard_normal((count, network.numbers))).astype(np.float32)
@@ -102,12 +94,8 @@ def propose(
 
 def cloud_inputs(points: ArrayLike, normals: ArrayLike, table_height: float) -> tuple[Floats32, Floats]:
     """Return the encoder's input (P, 7) of a cloud, and its anchor (3,) [m].
-
-    Row of a point: offset from the anchor / 0.1 m, normal, height above the table / 0.1 m.
-
-    Raises:
-        InputError: the cloud is empty, of another shape, or not finite.
-    """
+    A row has a point's offset from the anchor / 0.1 m, its normal, and its height above the table / 0.1 m. Raises
+    InputError: the cloud is empty, of another shape, or not finite."""
     p, n = np.asarray(points, float), np.asarray(normals, float)
     if p.ndim != 2 or p.shape[1:] != (3,) or not len(p) or n.shape != p.shape:
         raise InputError(f"a cloud has points and normals (P, 3), not {p.shape} and {n.shape}")
@@ -119,14 +107,8 @@ def cloud_inputs(points: ArrayLike, normals: ArrayLike, table_height: float) -> 
 
 
 def conditions(network: ProposalNetwork, clouds: Floats32, height: Floats, label: float = 1.0) -> Floats32:
-    """Return conditions (C, 258) of the flow for C clouds.
-
-    Args:
-        network: the network.
-        clouds: (C, P, 7) of `cloud_inputs`.
-        height: (C,) of their anchors above the table [m].
-        label: see `propose`.
-    """
+    """Return conditions (C, 258) of the flow for C clouds (C, P, 7) of `cloud_inputs`.
+    `height` (C,) is the height of their anchors above the table [m]; for `label` see `propose`."""
     found = np.empty((len(clouds), CONDITION), np.float32)
     layers = _layers(network)
     with np.errstate(all="ignore"):  # `flow` checks for overflow
@@ -142,10 +124,7 @@ def conditions(network: ProposalNetwork, clouds: Floats32, height: Floats, label
 
 def flow(network: ProposalNetwork, noise: Floats32, condition: Floats32) -> Floats32:
     """Integrate normal noise (n, D) under conditions (n, 258) to grasp rows: Euler steps, t = 0 to 1.
-
-    Raises:
-        InputError: the result is not finite.
-    """
+    Raises InputError: the result is not finite."""
     layers = _layers(network)
     x, c = np.asarray(noise, np.float32), np.asarray(condition, np.float32)
     with np.errstate(all="ignore"):  # checked below

@@ -111,10 +111,8 @@ def auc(score: Floats, held: Bools) -> float:
 
 def ranking(scores: list[Floats], held: list[Bools], draws: int = 400) -> Row:
     """Return the mean AUC over objects with a 95 % bootstrap interval over grasps.
-
     Objects whose grasps all have the same outcome are omitted. Grasps are ranked within each object, as in the planner,
-    because scales differ between objects.
-    """
+    because scales differ between objects."""
     pairs = [(s, h) for s, h in zip(scores, held, strict=True) if 0 < h.sum() < len(h)]
     rng = np.random.default_rng(0)
     found = []

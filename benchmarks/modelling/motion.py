@@ -1,8 +1,7 @@
 """Influence of simulated motion and stiffness of hand and object on the verdict.
 
 The reference is level standard: fingers driven by actuators, hand root on a weld, rigid bodies. All variants use the
-same unselected grasps.
-"""
+same unselected grasps."""
 
 from __future__ import annotations
 
@@ -42,7 +41,7 @@ def predictors(subjects: list[Subject], held: list[Bools], spent: float) -> list
     for k, count in enumerate(STEPS):
         scores = [-r[:, k] for r in rolled]
         rows.append(_row(f"static hand, {count} step{'s' * (count > 1)} (L_stable)", scores, held, None, spent))
-        # The first step is part of the planner; the cost of others is their number.
+        # The first step is part of the planner; the cost of more steps is their number.
         rows[-1]["steps_ratio"] = float(count)
     with cpu() as clock:
         balance = [-hold_forces(s.hand, s.obj, s.grasps.grasp, friction=FRICTION).residual for s in subjects]
@@ -77,7 +76,7 @@ def _rollouts(subjects: list[Subject]) -> tuple[list[Floats], float]:
 
 def _soft(width_m: float) -> Callable[[Scene], None]:
     def soften(scene: Scene) -> None:
-        # Use the hand's parameters alone; MuJoCo would average those of both geometries.
+        # Use the hand's parameters alone; MuJoCo would average the parameters of both geometries.
         scene.model.geom_priority[scene.hand_geoms] = 1
         scene.model.geom_solimp[scene.hand_geoms] = (0.05, 0.95, width_m, 0.5, 2.0)
 

@@ -26,9 +26,7 @@ MANY, RAYS = 96, SAMPLES_DEFAULT
 
 def study(data: Path | None, name: str, width: int = 160) -> dict[str, Any]:
     """Return costs relative to `RAYS` rays, and root mean square differences of colours.
-
-    The reference of other numbers of rays has `MANY` rays; the reference of other settings has `RAYS`.
-    """
+    The reference of other numbers of rays has `MANY` rays; the reference of other settings has `RAYS`."""
     obj, full = object_of(data, name), object_of(data, name, 0.0)
     poses = drop(obj, count=SCENES, seed=SEED)["scene/object_pose"]
     plan = CameraPlan(VIEWS, width, width * 3 // 4, None)
@@ -50,7 +48,7 @@ def study(data: Path | None, name: str, width: int = 160) -> dict[str, Any]:
         setattr(config, flag, before)
         rows.append(_row(what, pictures, plain, seconds / base))
     other = Setting([full], poses[:, None], plan, seed=SEED, samples=RAYS)
-    # Keep the cameras: those computed from the other hull differ by rounding.
+    # Keep the cameras, since cameras computed from the other hull differ by rounding.
     other.shot = replace(other.shot, extrinsics=setting.shot.extrinsics)
     _shoot(other, 2)
     pictures, seconds = _shoot(other, RAYS)

@@ -1,8 +1,7 @@
 """Influence of the scene's model on the verdict of the lift test.
 
 The reference is the lift test: a rigid table with friction, approach, closing, lift and hold. All variants use the same
-grasps, planned on a table, with a clear approach.
-"""
+grasps, planned on a table, with a clear approach."""
 
 from __future__ import annotations
 

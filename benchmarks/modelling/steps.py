@@ -1,8 +1,7 @@
 """Several steps of the contact simulation instead of one; the object moves and contacts are recomputed.
 
-The step is the planner's (worker/simulation/kernels/contact.py, `direct`) in float64, for one grasp and one velocity
-at a time, with distances to the mesh. The hand is fixed, as in the loss.
-"""
+The step is the planner's (worker/simulation/kernels/contact.py, `direct`) in float64, for one grasp and one velocity at
+a time, with distances to the mesh. The hand is fixed, as in the loss."""
 
 from __future__ import annotations
 
@@ -24,9 +23,7 @@ VELOCITIES = 7
 
 def forward_simulation(probe: Probe, grasp: Posture, world: World, steps: tuple[int, ...]) -> Floats:
     """Return (N, K) L_stable of N grasps after each of K numbers of steps, as means over the velocities.
-
-    Motions are in units of the free motion of one step, for any number of steps; this does not affect ranks.
-    """
+    Motions are in units of the free motion of one step, for any number of steps; this does not affect ranks."""
     weight = probe.points.area * (REFERENCE_POINTS / probe.points.area.sum())
     hands = probe.posed_points(body_poses(probe.hand, grasp.hand_pose, grasp.joint_positions))
     motions = initial_motions(VELOCITIES, world.step, world.gyration)

@@ -5,8 +5,7 @@ usage: python -m benchmarks.results [--quick] [--data DIR] [--sources DIR] [--be
 
 Results go to docs/, those of quick runs (`--quick`) to results-quick/; results/MANIFEST.json there records each study
 when it ends. `--enter` records files of docs/ that were made by other means, from their contents and the git history.
-The exit code is 1 if a study failed, or if `--stale` found a stale study.
-"""
+The exit code is 1 if a study failed, or if `--stale` found a stale study."""
 
 from __future__ import annotations
 

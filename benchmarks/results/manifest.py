@@ -82,9 +82,7 @@ def staleness(study: Study, record: Mapping[str, Any] | None) -> str:
 
 def entered(study: Study, docs: Path) -> dict[str, Any]:
     """Return a record of existing files from their contents and the git history; unknown fields are null.
-
-    The revision is the oldest of the commits that last changed one of the files.
-    """
+    The revision is the oldest of the commits that last changed one of the files."""
     files = digests(study, docs)
     commits = [_git("log", "-1", "--format=%cI %h", "--", f"docs/{path}") for path in files]
     changed = [path for path in files if _git("status", "--porcelain", "--", f"docs/{path}")]

@@ -1,7 +1,6 @@
 """Pages from the manifest: `docs/results/README.md`, and tables of results in other pages.
 
-A page has the first table of a file between `<!-- results/FILE -->` and `<!-- /results/FILE -->`.
-"""
+A page has the first table of a file between `<!-- results/FILE -->` and `<!-- /results/FILE -->`."""
 
 from __future__ import annotations
 

@@ -198,7 +198,7 @@ class Runner:
 
 
 def slim(file: Path) -> None:
-    """Give a PNG a palette of 256 colours if that saves bytes (about two thirds) and shows no steps."""
+    """Give a PNG a palette of 256 colours if this saves bytes (about two thirds) and shows no steps."""
     if file.suffix != ".png":
         return
     with Image.open(file) as picture:

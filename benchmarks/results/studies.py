@@ -1,9 +1,8 @@
 """Studies that make the figures and pictures of the docs: their commands and files.
 
-In a command `DATA` is a folder with hands/ and objects/ (real URDFs, YCB meshes), `SOURCES` a folder with the packages
-of `benchmarks.gallery`, `BEFORE` a checkout for comparison, `WORK` a folder for intermediate results, and `OUT` the
-folder of the docs (docs/, or another one for quick runs).
-"""
+Names in commands: `DATA` is a folder with hands/ and objects/ (real URDFs, YCB meshes), `SOURCES` a folder with the
+packages of `benchmarks.gallery`. `BEFORE` is a checkout for comparison, `WORK` a folder for intermediate results. `OUT`
+is the folder of the docs: docs/, or another one for quick runs."""
 
 from __future__ import annotations
 
@@ -57,10 +56,8 @@ def _on_its_way(hand: str, obj: str, scene: str) -> tuple[str, str]:
 @dataclass(frozen=True)
 class Study:
     """A study; `files` are globs under the folder of the docs.
-
     A study without `quick` has no quick run. A study without `run` is a page written by hand. `stages` are the stages
-    whose revisions affect its figures; times depend on all code and have no stages.
-    """
+    whose revisions affect its figures; times depend on all code and have no stages."""
 
     name: str
     about: str

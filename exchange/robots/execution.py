@@ -1,8 +1,7 @@
 """Executable grasps: six postures each, in a frame of the user's choice, and the timed trajectory.
 
 Each motion starts and ends at rest (minimum jerk, Flash and Hogan 1985). After the share u of its time it has covered
-the share 10 u^3 - 15 u^4 + 6 u^5 of its path; the steepest slope of this polynomial is 15/8.
-"""
+the share 10 u^3 - 15 u^4 + 6 u^5 of its path. The steepest slope of this polynomial is 15/8."""
 
 from __future__ import annotations
 
@@ -43,9 +42,7 @@ class ToolFrame:
 @dataclass(frozen=True)
 class Executions:
     """N grasps of one hand on one object with all their postures.
-
-    Poses are in the frame named `frame`: the object's own, or the scene's (z up) for grasps planned in one.
-    """
+    Poses are in the frame named `frame`: the object's own, or the scene's (z up) for grasps planned in a scene."""
 
     hand: HandModel
     obj: ObjectModel
@@ -98,7 +95,8 @@ def executions(
     tool: ToolFrame,
     quality: dict[str, NDArray[Any]],
 ) -> Executions:
-    """Return the grasps with a trajectory, as planned in their scene, or here for a free object if it can be left."""
+    """Return the grasps with a trajectory, planned in their scene; for a free object planned here, if a retreat
+    exists."""
     frame, at = "object", np.tile(IDENTITY_POSE, (len(grasps), 1))
     free = np.ones(len(grasps), bool)
     if placed is None or grasps.approach is None or grasps.coming is None or grasps.lift is None:
@@ -152,9 +150,7 @@ def parse_pose(text: str, what: str) -> Floats:
 
 def tool_frame(text: str | None, root_link: str, links: Mapping[str, tuple[int, Floats]]) -> ToolFrame:
     """Return the user's tool frame: a link that no finger moves, or a pose in the root link's frame (the default).
-
-    `links` has body and pose of each link, see `Description`.
-    """
+    `links` has body and pose of each link, see `Description`."""
     if not text or text == root_link:
         return ToolFrame(root_link, IDENTITY_POSE.copy())
     if text in links:
@@ -220,7 +216,7 @@ class RobotTrajectory:
 
     joint_names: tuple[str, ...]
     phase: tuple[str, ...]
-    """(K,) motion of each point; the first point belongs to the first one."""
+    """(K,) motion to which each point belongs."""
     time: Floats
     """(K,) since the start [s]."""
     hand_pose: Floats
@@ -253,9 +249,8 @@ def straight_paths(found: Executions, row: int, points: int = 2) -> list[Path]:
 
 def timed(paths: Sequence[Path], names: Sequence[str], velocity: Floats, *, speed: float) -> RobotTrajectory:
     """Time the motions in sequence, each at rest at both ends; each starts at the end of the previous one.
-
-    `speed` is the used share of the limits `velocity` (J,) [rad/s or m/s] and of the hand's; above 0, at most 1.
-    """
+    `speed` is the used share of the limits `velocity` (J,) [rad/s or m/s] and of the hand's limits; above 0, at most
+    1."""
     phase, time, pose, joints = [paths[0].phase], [0.0], [paths[0].hand_pose[:1]], [paths[0].joints[:1]]
     for path in paths:
         seconds = max(SHORTEST_S, _STEEPEST * _slowness(path, velocity) / speed)
@@ -279,7 +274,7 @@ def timed(paths: Sequence[Path], names: Sequence[str], velocity: Floats, *, spee
 
 
 def _slowness(path: Path, velocity: Floats) -> float:
-    """Return the seconds of the motion at its limits for a constant rate."""
+    """Return the duration of the motion at a constant rate within its limits [s]."""
     pieces = len(path.joints) - 1
     joints = np.abs(np.diff(path.joints, axis=0)) / velocity
     way = np.linalg.norm(np.diff(path.hand_pose[:, :3], axis=0), axis=1) / HAND_M_S

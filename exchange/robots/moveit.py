@@ -1,8 +1,7 @@
 """Grasps as `moveit_msgs/Grasp` and `RobotTrajectory` messages in YAML, with URDFs of hand and object.
 
-`grasp_pose` is the tool frame's, which for MoveIt is the end-effector's link. Directions are in the frame of the pose.
-ROS quaternions are x y z w. `effort` [N m or N] is the squeeze's: stiffness times distance from the grasp.
-"""
+`grasp_pose` is the pose of the tool frame, which is MoveIt's end-effector link. Directions are in the frame of the
+pose. ROS quaternions are x y z w. `effort` [N m or N] is the squeeze's: stiffness times distance from the grasp."""
 
 from __future__ import annotations
 
@@ -19,7 +18,7 @@ from graspd.exchange.robots.execution import RobotTrajectory
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import Floats
 
-#: Share of a straight motion that must be possible for a grasp to be attempted.
+#: Share of a straight motion that must be possible before MoveIt attempts a grasp.
 LEAST_SHARE: Final = 0.5
 
 

@@ -1,8 +1,7 @@
 """Grasps as MuJoCo scenes with a key frame per posture: the validator's hand alone, or on its arm.
 
-The world is the frame of the grasps, z up in a scene. A mocap body leads the hand's root; position actuators have the
-names of the degrees of freedom. In a scene gravity acts on the object alone; a free object floats.
-"""
+The world is the frame of the grasps, z up in a scene. A mocap body leads the hand's root. Position actuators have the
+names of the degrees of freedom. In a scene gravity acts on the object alone; a free object floats."""
 
 from __future__ import annotations
 
@@ -31,7 +30,7 @@ _SPEC_NAMES: Final = {"vertex": "uservert"}
 
 
 def write(bundle: Bundle, folder: Path) -> list[Path]:
-    """Write `scene.xml`, which needs no other file, `replay.py`, which validates its grasps, and an arm's `arm.xml`."""
+    """Write `scene.xml`, which needs no other file; `replay.py`, which validates its grasps; and an arm's `arm.xml`."""
     found, pieces = bundle.found, decompose(bundle.found.obj)
     folder.mkdir(parents=True, exist_ok=True)
     around = ((), ()) if found.placed is None else (found.placed.supports, found.placed.neighbours)

@@ -1,7 +1,6 @@
 """Grasps as posed meshes, one file each: binary glTF (+y up), and USD stages over time (extra `usd`).
 
-A stage is in metres, z up. Defaults show the grasp; 24 time samples per second lead from the standoff to the lift.
-"""
+A stage is in metres, z up. Defaults show the grasp; 24 time samples per second lead from the standoff to the lift."""
 
 from __future__ import annotations
 
@@ -80,7 +79,7 @@ class Solid:
     colour: Colour
     """Linear RGB, 0 .. 1."""
     body: int | None = None
-    """Body of the hand that carries it; None: the object, or nothing."""
+    """Body of the hand that carries it; None: the object carries it, or it does not move."""
 
 
 def hand_meshes(found: Executions) -> list[Solid]:

@@ -1,8 +1,7 @@
 """An arm that carries a hand, and the grasps that it can execute: inverse kinematics, limits, MuJoCo collisions.
 
-Differential inverse kinematics by mink: each step is a quadratic program in the joints' increments that respects their
-limits. Between consecutive poses of the trajectory the arm must not jump.
-"""
+Inverse kinematics are differential, by mink. Each step is a quadratic program in the joints' increments that respects
+the joints' limits. Between consecutive poses of the trajectory the arm must not jump."""
 
 from __future__ import annotations
 
@@ -35,7 +34,7 @@ from graspd.worker.validation.model import add_mesh, add_shape, add_support
 
 @dataclass(frozen=True)
 class Arm:
-    """The chain of an arm with all its links but those below the mount."""
+    """The chain of an arm with all its links, except links below the mount."""
 
     model: HandModel
     """Bodies, joints, limits and convex pieces; it has no palm and no fingers."""
@@ -49,10 +48,8 @@ class Arm:
 
 def read_arm(path: str | pathlib.Path, mount: str, hand_pose: Floats) -> Arm:
     """Read the arm of a URDF, its folder or a ZIP.
-
-    Links below the mount, such as a gripper, are omitted. Joints that do not lead to it are fixed at zero, or at the
-    nearest value inside their limits.
-    """
+    Links below the mount, such as a gripper, are omitted. Joints that do not lead to the mount are fixed at zero, or at
+    the nearest value inside their limits."""
     name, files, stated = files_from_path(path)
     source = HandSource.read(files, stated, name=name, digest=digest_files(AssetKind.HAND, files))
     robot = source.robot
@@ -103,12 +100,12 @@ def describe(files: Mapping[str, bytes], options: Mapping[str, Any] | None = Non
 #: Tolerance of the hand's pose [m, rad].
 NEAR_M: Final = 1e-4
 NEAR_RAD: Final = 1e-3
-#: Start postures of the arm in the search for the grasp, and steps of each search.
+#: Number of start postures of the arm in the search for the grasp, and of steps of each search.
 STARTS: Final = 24
 STEPS: Final = 80
 #: Largest motion of a joint between consecutive points of the trajectory, 5 mm apart [rad or m].
 JUMP: Final = 0.25
-#: Points of the two long motions, and of those that mainly move the fingers.
+#: Number of points of each long motion, and of each motion that mainly moves the fingers.
 LONG: Final = 21
 SHORT: Final = 5
 _LONG_PHASES: Final = ("approach", "lift")
@@ -163,7 +160,7 @@ class ReachSearch:
         return reached
 
     def one(self, row: int) -> tuple[list[Path] | None, str]:
-        """Return the motions of one grasp, or the reason of the start that got farthest."""
+        """Return the motions of one grasp; else the reason for failure of the start that got farthest."""
         long, short = (straight_paths(self.found, row, points) for points in (LONG, SHORT))
         ways = [a if a.phase in _LONG_PHASES else b for a, b in zip(long, short, strict=True)]
         rng, farthest, reason = np.random.default_rng(row), -1, ""
@@ -212,7 +209,7 @@ class ReachSearch:
         return np.array(rows)
 
     def _solve(self, q: Floats, root_pose: Floats, steps: int) -> Floats | None:
-        """Return dofs (A,) within limits that reach a pose (7,) of the hand's root link; None if not found."""
+        """Return dofs (A,) within limits that reach a pose (7,) of the hand's root link; None if none are found."""
         mink, configuration, task = self._mink, self._configuration, self._task
         full = np.zeros(self._model.nq)
         full[self._order] = self.arm.model.expand(q)
@@ -250,12 +247,13 @@ class ReachSearch:
         return ""
 
 
-#: Pairs of bodies in contact in this share of random postures are excluded: their hulls exceed their meshes.
+#: Share of random postures in contact from which on a pair of bodies is excluded: their hulls exceed their meshes.
 ALWAYS: Final = 0.95
 SAMPLES: Final = 100
 #: Name of the frame that carries the hand.
 MOUNT: Final = "mount"
-#: The arm is tested against everything; hand, object and supports only against the arm: other pairs were tested.
+#: The arm is tested against everything. Hand, object and supports are tested only against the arm: their own pairs were
+#: tested before.
 _ARM: Final = {"contype": 1, "conaffinity": 1}
 _OTHER: Final = {"contype": 0, "conaffinity": 1}
 
@@ -334,7 +332,7 @@ class ArmScene:
             mujoco.mj_collision(model, data)
             count.update({tuple(sorted(model.geom_bodyid[c.geom].tolist())) for c in data.contact if c.dist < 0})
         for (a, b), times in sorted(count.items()):
-            # The first link turns at the base; any other link that is always in a support means a wrong base.
+            # The first link turns at the base. Any other link that is always in a support means a wrong base.
             if times >= ALWAYS * SAMPLES and (a or model.body(b).name == "arm1"):
                 self.spec.add_exclude(bodyname1=model.body(a).name, bodyname2=model.body(b).name)
 

@@ -5,10 +5,10 @@
     python replay.py scene.xml --json
 
 Each grasp has six key frames in the scene: standoff, arrival, pregrasp, grasp, squeeze, lift. The hand must not touch
-anything during its approach, and closes in 0.8 s. With gravity it then rises within 0.4 s and holds for 2 s; else the
-object is pushed with ten times its mass in newton in six directions for 2 s each. The object may end 5 cm and 15
-degrees from its goal. Without --full a test ends early if the object's present velocities keep it there for 2 s.
-"""
+anything during its approach, and closes in 0.8 s. With gravity it then rises within 0.4 s and holds for 2 s. Without
+gravity the object is pushed in six directions for 2 s each; the force [N] is ten times its mass [kg]. The object may
+end 5 cm and 15 degrees from its goal. Without --full a test ends early if the object's present velocities keep it there
+for 2 s."""
 
 import argparse
 import json
@@ -109,7 +109,7 @@ class Replay:
             self.run(STAGE_S)
 
     def hold(self, goal: Any) -> str:
-        """Hold as the validator does: end once its present velocities keep the object within half of its limits."""
+        """Hold as the validator does. End once the object's present velocities keep it within half of its limits."""
         self.run(FIRST_LOOK_S - LOOK_S)
         elapsed, before = FIRST_LOOK_S - LOOK_S, self.offset(goal)
         while elapsed < HOLD_S - 1e-9:

@@ -41,18 +41,11 @@ def write_card(
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, Any]:
     """Read all shards and write the card; replace the files of an earlier card.
-
-    `progress` is called after each shard with the number of shards read and of all shards.
-
-    Returns:
-        the figures, as in `card.json`, and under `plots` the names of the pictures.
-
-    Raises:
-        InputError: the folder cannot be created, the dataset has no grasp, or a checksum differs.
-        StoreUnavailable: the store is unavailable.
-    """
+    `progress` is called after each shard with the number of shards read and of all shards. Return the figures, as in
+    `card.json`, and under `plots` the names of the pictures. Raises InputError: the folder cannot be created, the
+    dataset has no grasp, or a checksum differs. StoreUnavailable."""
     if not contents.shards.of("base"):
-        raise InputError(f"{contents.name} holds no base shard: there is nothing to say of it yet")
+        raise InputError(f"{contents.name} has no base shard, so its card would be empty")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -117,7 +110,7 @@ def choose(files: tuple[ShardFile, ...]) -> list[ShardFile]:
     ranked = sorted(cells, key=lambda cell: (hands.index(cell[0]) - objects.index(cell[1])) % len(hands))
     some = ranked[: max(MOST, len(objects))]
     spread = some if len(some) <= MOST else [some[round(k)] for k in np.linspace(0, len(some) - 1, MOST)]
-    # Take different batch numbers: batches with equal numbers share materials and lights.
+    # Take different batch numbers, since batches with equal numbers share materials and lights.
     chosen = (cells[cell] for cell in sorted(spread, key=lambda cell: objects.index(cell[1])))
     return [batches[number % len(batches)] for number, batches in enumerate(chosen)]
 

@@ -59,18 +59,14 @@ class Contents:
     snapshot: Snapshot | None = None
     record: DatasetRecord | None = None
     gaps: Mapping[Pair, tuple[int, str]] = field(default_factory=dict)
-    """For each cell, number of batches missing in the snapshot, and the reason."""
+    """For each cell, the number of batches missing in the snapshot, and the reason."""
     root: Path | None = None
     """Folder of the shards; None for shards in a store."""
 
 
 def contents_of_store(store: Store, dataset: str, snapshot: str | None = None, cache: Path | None = None) -> Contents:
     """Return a snapshot of a dataset, by default the newest.
-
-    Raises:
-        NotFoundError: the dataset or the snapshot does not exist.
-        StoreUnavailable: the store is unavailable.
-    """
+    Raises NotFoundError: the dataset or the snapshot does not exist. StoreUnavailable."""
     taken = newest_snapshot(store, dataset, snapshot)
     record = load_dataset(store, dataset)
     return Contents(
@@ -86,11 +82,8 @@ def contents_of_store(store: Store, dataset: str, snapshot: str | None = None, c
 
 def contents_of_folder(folder: Path) -> Contents:
     """Return the shards of a folder, such as an export; only built-in hands and objects have facts.
-
-    Raises:
-        NotFoundError: the folder contains no shard.
-        InputError: a file is not a shard, or `snapshot.json` is damaged.
-    """
+    Raises NotFoundError: the folder contains no shard. InputError: a file is not a shard, or `snapshot.json` is
+    damaged."""
     shards = open_shards(folder)
     listed = folder / "snapshot.json"
     taken = parse_record(Snapshot, listed.read_bytes(), str(listed)) if listed.is_file() else None
@@ -104,13 +97,9 @@ def contents_of_folder(folder: Path) -> Contents:
 
 def with_provenance(contents: Contents, file: Path) -> Contents:
     """Add missing licences and sources of hands and objects from a JSON file.
-
-    `{"hands": {"shadow": {"licence": "...", "source": "..."}}, "objects": {"*": {...}, "mug": {...}}}`; `*` stands for
-    all others.
-
-    Raises:
-        InputError: the JSON is invalid, or names assets that the dataset lacks.
-    """
+    Its form is `{"hands": {"shadow": {"licence": "...", "source": "..."}}, "objects": {"*": {...}, "mug": {...}}}`,
+    where `*` stands for all other assets. Raises InputError: the JSON is invalid, or names assets that the dataset
+    lacks."""
     try:
         said = from_json(file.read_bytes())
         groups = {kind: {str(k): dict(v) for k, v in said.get(kind, {}).items()} for kind in ("hands", "objects")}
@@ -126,7 +115,7 @@ def _informed(
     assets: Mapping[str, AssetFacts], said: Mapping[str, Mapping[str, Any]], file: Path
 ) -> dict[str, AssetFacts]:
     if unknown := set(said) - set(assets) - {"*"}:
-        raise InputError(f"{file} names {sorted(unknown)[0]!r}, which the dataset does not hold")
+        raise InputError(f"{file} names {sorted(unknown)[0]!r}, which the dataset lacks")
     informed = {}
     for name, asset in assets.items():
         own = said.get(name, said.get("*", {}))

@@ -12,7 +12,7 @@ Row = Mapping[str, Any]
 
 #: A cell's yield below this share of the median over its hand's cells is low.
 _LITTLE: Final = 0.5
-#: Share of its range; a joint that stays within it in 98 of 100 grasps hardly moves.
+#: Share of its range within which a joint hardly moves: it stays inside in 98 of 100 grasps.
 _STILL: Final = 0.05
 #: A larger share of grasps with a joint at its limit is reported.
 _AT_LIMIT: Final = 0.5
@@ -23,7 +23,7 @@ _UNEVEN: Final = 1.2
 #: A direction is preferred above this multiple of its share under uniform directions.
 _PEAKED: Final = 1.25
 _SHOWN: Final = 8
-#: Key of a card's `making`, and what must not be mixed.
+#: Key of a card's `making`, and name of the setting that must not be mixed.
 _UNMIXED: Final = {
     "methods": "methods",
     "levels": "levels of the validator",

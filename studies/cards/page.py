@@ -18,7 +18,7 @@ Row = Mapping[str, Any]
 #: Size classes of dataset hubs, and their limits.
 _SIZES: Final = ("n<1K", "1K<n<10K", "10K<n<100K", "100K<n<1M", "1M<n<10M", "n>10M")
 _LIMITS: Final = tuple(10**power for power in range(3, 8))
-#: Most objects of a table that is not collapsed.
+#: Largest number of objects of a table that is not collapsed.
 _UNFOLDED: Final = 20
 _LEVELS: Final = {
     "dexgraspbench": "MuJoCo, DexGraspBench's protocol unchanged",
@@ -191,7 +191,7 @@ def _rejected(rejected: Mapping[str, int] | None) -> str:
 
 
 def _template() -> Any:
-    # The page is Markdown: nothing is escaped but the cells of tables.
+    # The page is Markdown, so only cells of tables are escaped.
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent),
         autoescape=False,

@@ -14,9 +14,9 @@ from graspd.studies.cards.tally import Tally, cell_counts
 Row = Mapping[str, Any]
 COLOURS: Final = ("#0f766e", "#b45309", "#4338ca", "#be123c", "#4d7c0f", "#6b7280", "#a21caf", "#0369a1")
 INK: Final = "#1f2937"
-#: Most objects of a matrix with names and numbers.
+#: Largest number of objects of a matrix with names and numbers.
 _NAMED: Final = 40
-#: Most panels: the first hands get one each.
+#: Largest number of panels: the first hands get one each.
 _PANELS: Final = 6
 #: Title, column, and whether the axis ends at the 99th percentile.
 _QUALITIES: Final = tuple(
@@ -29,8 +29,7 @@ def draw(card: Row, tally: Tally, folder: Path) -> dict[str, str]:
     """Write the plots that have data.
 
     Returns:
-        file name -> caption, in the order of the card.
-    """
+        file name -> caption, in the order of the card."""
     plots: tuple[tuple[str, str, Callable[[Row, Tally], Any]], ...] = (
         ("yield.png", "Valid share of validated grasps, by hand and object", _yields),
         ("quality.png", "Distribution of each quality over the valid grasps, by hand", _qualities),

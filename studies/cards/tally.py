@@ -1,7 +1,6 @@
 """Sums over the shards of a dataset, and approach directions in cells of equal area.
 
-A cell stores its grasps as a few float32 columns, so that millions fit in memory.
-"""
+A cell stores its grasps as a few float32 columns, so that millions fit in memory."""
 
 from __future__ import annotations
 
@@ -57,10 +56,8 @@ class JointUse:
 
     def shares(self) -> dict[str, dict[str, float]]:
         """Return statistics of each joint as shares of its range.
-
-        These are the 5th, 50th and 95th percentile, the range from the 1st to the 99th (`used`), and the shares of
-        grasps at the lower and upper limit.
-        """
+        These are the 5th, 50th and 95th percentile, and the range from the 1st to the 99th (`used`). Further statistics
+        are the shares of grasps at the lower and upper limit."""
         found = {}
         near = max(1, round(_AT * BINS))
         for name, counts in zip(self.names, self.counts, strict=True):
@@ -83,7 +80,7 @@ class JointUse:
 
 Array = NDArray[Any]
 Floats32 = NDArray[np.float32]
-#: Number of a cell's first grasps that its diversity is computed from.
+#: Number of a cell's first grasps from which its diversity is computed.
 SAMPLED: Final = 512
 #: Number of arrays of a cell above which they are merged.
 _UNPACKED: Final = 16
@@ -97,10 +94,8 @@ class CellTally:
 
     n: Counter[str] = field(default_factory=Counter)
     """Numbers of grasps and pairs.
-
     `validated`: candidates in validated shards. `placed`: valid grasps placed into scenes; `clear`: clear in at least
-    one of them. `lift_tested`: valid grasps in scenes tested at half friction; `lift_hard`: held there.
-    """
+    one scene. `lift_tested`: valid grasps in scenes tested at half friction; `lift_hard`: held in this test."""
     seconds: float = 0.0
     """Worker seconds over all stages."""
     rejected: Counter[str] = field(default_factory=Counter)
@@ -284,8 +279,8 @@ def _add_scene(
     sums["clear"] += elevations(towards[clear])
 
 
-#: Fewest grasps for statements on empty cells: with this many uniform ones a cell is empty with probability e^-5, which
-#: gives 0.3 empty cells of 48.
+#: Fewest grasps for statements on empty cells. With this many uniform grasps a cell is empty with probability e^-5,
+#: which gives 0.3 empty cells of 48.
 ENOUGH: Final = 5 * DIRECTION_CELLS
 #: Elevations from -90 to 90 degrees.
 ELEVATION_BINS: Final = 36
@@ -293,9 +288,7 @@ ELEVATION_BINS: Final = 36
 
 def cell_counts(directions: NDArray[Any], bands: int = BANDS, sectors: int = SECTORS) -> NDArray[np.int64]:
     """Return (bands, sectors) counts of unit vectors (N, 3) per cell.
-
-    Band 0 is the lowest; sector 0 begins at azimuth -180 degrees.
-    """
+    Band 0 is the lowest; sector 0 begins at azimuth -180 degrees."""
     cells = cells_of(np.asarray(directions).reshape(-1, 3), bands, sectors)
     return np.bincount(cells, minlength=bands * sectors).reshape(bands, sectors)
 

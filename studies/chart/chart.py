@@ -25,8 +25,8 @@ from graspd.worker.validation.decomposition import decompose
 
 Say = Callable[[str], None]
 
-#: Error bound of the object's mesh for measurement and validation [m], equal for all settings: it reveals the cost of
-#: coarser meshes in planning.
+#: Error bound of the object's mesh for measurement and validation [m]. It is equal for all settings, so that the chart
+#: shows the effect of coarser meshes in planning.
 TRUE_ERROR_M: Final = FIDELITIES["standard"].face_error_m
 
 
@@ -49,13 +49,9 @@ def chart(
     keep: Callable[[dict[str, Any]], None],
 ) -> dict[str, Any]:
     """Run all settings on all pairs; validate each held grasp in `models` models around the nominal one.
-
-    `say` receives a line per cell, `keep` the partial result after each pair.
-
-    Returns:
-        `runs[]` with the keys of the command line's contract, `summary[]` over hands and objects, `by_hand` over each
-        hand's objects, `device`, `created`.
-    """
+    `say` receives a line per cell, `keep` the partial result after each pair. Return `runs[]` with the keys of the
+    command line's contract, `summary[]` over hands and objects, `by_hand` over each hand's objects, `device`,
+    `created`."""
     runs: list[dict[str, Any]] = []
     for thing in things:
         for hand in hands:
@@ -132,13 +128,8 @@ def settings_of(
     run: ExecutionContext,
 ) -> list[Setting]:
     """Return a setting for every method, fidelity and batch; methods without fidelities have one each.
-
-    Methods with a step budget need seconds per grasp: they get `baseline_batch` grasps per call, others the first
-    batch.
-
-    Raises:
-        InputError: a method is unknown, or an option belongs to none of them.
-    """
+    Methods with a step budget need seconds per grasp: they get `baseline_batch` grasps per call, other methods the
+    first batch. Raises InputError: a method is unknown, or an option belongs to no method."""
     variants = [_variant(text) for text in methods]
     given = _options_of(options, [name for name, _, _ in variants])
     found: list[Setting] = []

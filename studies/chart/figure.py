@@ -208,7 +208,7 @@ def _error(row: Row, key: str) -> list[list[float]]:
 
 
 def _label(row: Row, rows: Sequence[Row]) -> str:
-    """Return the fidelity, with the batch size if there are several; the method's name if it has only one setting."""
+    """Return the fidelity, with the batch size if there are several; for a method with one setting its name."""
     own = [r for r in rows if r["method"] == row["method"]]
     if len(own) == 1:
         return str(row["method"])
@@ -254,7 +254,7 @@ def draw_sweeps(rows: Sequence[Row], file: Path) -> None:
 Boxes = NDArray[np.float64]
 
 SIZE_PT: Final = 8
-#: Distances of a label from its point [pt], preferred ones first; from the third on a line connects both.
+#: Distances of a label from its point [pt], preferred ones first. From the third on, a line connects both.
 _REACHES_PT: Final = (8.0, 15.0, 26.0, 38.0, 52.0)
 #: Directions from the point, preferred ones first [degrees].
 _TURNS: Final = (30, -30, 150, -150, 90, -90, 0, 180, 60, -60, 120, -120)
@@ -301,7 +301,7 @@ def _place(axes: Any, pixels: float, labels: Sequence[Label]) -> list[Any]:
     offered = {index: _candidates(points[index], _size(axes, labels[index].text), pixels) for index in worded}
     fixed = {index: _fixed_costs(offered[index], points, index, bars, inside) for index in worded}
     chosen = dict.fromkeys(worded, 0)
-    # Each label in turn moves to the best place given the others, until no label moves.
+    # Each label in turn moves to the best place among the other labels, until no label moves.
     for _ in range(_ROUNDS):
         before = dict(chosen)
         for index in worded:
@@ -313,7 +313,7 @@ def _place(axes: Any, pixels: float, labels: Sequence[Label]) -> list[Any]:
     made = []
     for index, at in chosen.items():
         box = offered[index][at]
-        # Far from its point, or nearer to another one, a label would be ambiguous without a line.
+        # Far from its point, or nearer to another point, a label would be ambiguous without a line.
         led = at // len(_TURNS) > 1 or _is_nearer_to_another(box, points, index)
         made.append(_write(axes, labels[index], points[index], box, pixels, led=led))
     return made
@@ -365,7 +365,7 @@ def _candidates(point: Boxes, size: tuple[float, float], pixels: float) -> list[
     for reach, turn in product(_REACHES_PT, _TURNS):
         across, up = math.cos(math.radians(turn)), math.sin(math.radians(turn))
         corner = point + reach * pixels * np.array([across, up])
-        # The label's nearest corner or side touches that place.
+        # The label's nearest corner or side touches this place.
         left = corner[0] - size[0] * (0.5 - 0.5 * _side(across))
         bottom = corner[1] - size[1] * (0.5 - 0.5 * _side(up))
         found.append(np.array([left, bottom, left + size[0], bottom + size[1]]))

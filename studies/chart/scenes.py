@@ -1,11 +1,10 @@
 """Comparison of grasps planned in a scene with grasps of a free object that are filtered in the same scene.
 
 Methods that plan in scenes run in both modes, other methods only in the second. In both modes grasp i uses scene i of
-the object's stable faces, in turn. The tests are the same: clear trajectory, lift, lift under the unmodified protocol,
-lift at half friction, and lift in models around the nominal one. Speed is lifted grasps over seconds (on a CPU
-core-seconds, which are independent of other load): once for planner and postures alone, once end to end, with
-trajectory, validator and metrics of lifted grasps.
-"""
+the object's stable faces, in turn. The tests are equal: clear trajectory, lift, lift under the unmodified protocol,
+lift at half friction, and lift in models around the nominal one. Speed is lifted grasps over seconds; on a CPU over
+core-seconds, which are independent of other load. It is measured for planner and postures alone, and end to end: with
+trajectory, validator and metrics of lifted grasps."""
 
 from __future__ import annotations
 
@@ -51,7 +50,7 @@ SHARES: Final = ("clear", "lift", "lift_dexgraspbench", "lift_hard")
 SPEEDS: Final = (("valid_per_second", "seconds"), ("end_to_end_per_second", "end_seconds"))
 #: Increase when the columns of a row change: cached results are then discarded.
 FORM: Final = 2
-#: For each speed in lifted grasps, the key of the speed in candidates.
+#: Key of the speed in candidates, for each speed in lifted grasps.
 RAW: Final = {"valid_per_second": "grasps_per_second", "end_to_end_per_second": "candidates_end_to_end_per_second"}
 #: Above this time per grasp [s] the time to the first grasp is not measured in an extra run.
 _SHORT_S: Final = 1.0
@@ -92,14 +91,10 @@ def scene_chart(
     keep: Callable[[Row], None],
 ) -> Row:
     """Run all settings on all pairs; a setting's `batch` is its number of grasps per pair.
-
     Each lifted grasp is lifted again in `models` models around the nominal one. `work` is a folder for the results of
-    each setting and pair; an interrupted run resumes from it. `say` receives a line per cell, `keep` the partial
-    result after each pair.
-
-    Returns:
-        `runs[]` of one setting on one pair each, `summary[]` over the pairs, `by_hand`, `device`, `created`.
-    """
+    each setting and pair; an interrupted run resumes from it. `say` receives a line per cell, `keep` the partial result
+    after each pair. Return `runs[]` of one setting on one pair each, `summary[]` over the pairs, `by_hand`, `device`,
+    `created`."""
     runs: list[Row] = []
     for thing in things:
         place = ObjectScenes(thing, spec)
@@ -214,9 +209,7 @@ class ValidatedGrasps:
 
     def counts(self, models: int) -> Row:
         """Count grasps that are clear, lifted, lifted by DexGraspBench's protocol, and lifted at half friction.
-
-        Also sum, over lifted grasps, the shares of models in which they are lifted.
-        """
+        Also sum, over lifted grasps, the shares of models in which they are lifted."""
         lifted = self.lifted
         grasps, placed = self.grasps.take(lifted), self.placed.take(lifted)
         given: dict[str, Any] = {"models": models, "seed": MODELS_SEED, "pieces": self.place.pieces}
@@ -232,9 +225,8 @@ class ValidatedGrasps:
 
 def figures(rows: Sequence[Mapping[str, Any]]) -> Row:
     """Return shares of all candidates with 95 % intervals (Wilson), and lifted grasps per second.
-
-    `robust` is the mean share of models over lifted grasps. All grasps have equal weight. A refused cell has no time.
-    """
+    `robust` is the mean share of models over lifted grasps. All grasps have equal weight. A refused cell has no
+    time."""
     grasps = sum(row["grasps"] for row in rows)
     found: Row = {"grasps": grasps}
     for name in SHARES:
@@ -256,9 +248,7 @@ def figures(rows: Sequence[Mapping[str, Any]]) -> Row:
 
 def summed(runs: Sequence[Row]) -> list[Row]:
     """Return a row for each mode, method and fidelity over all pairs.
-
-    `gain` is relative to mode filtered at the same fidelity: the median over pairs with lifted filtered grasps.
-    """
+    `gain` is relative to mode filtered at the same fidelity: the median over pairs with lifted filtered grasps."""
     groups: dict[tuple[str, str, str, int], list[Row]] = {}
     for run in runs:
         groups.setdefault((run["way"], run["method"], run["fidelity"], run["batch"]), []).append(run)

@@ -56,7 +56,7 @@ def widen(row: dict[str, Any], valid: int, grasps: int, per_second: float) -> No
 
 
 def widen_speed(row: dict[str, Any], key: str, valid: int, grasps: int, per_second: float) -> None:
-    """Widen the bars of a speed to at least those that follow from the share of counted grasps."""
+    """Widen the bars of a speed at least to the bars that follow from the share of counted grasps."""
     low, high = wilson(valid, grasps)
     row[f"{key}_low"] = min(row[f"{key}_low"], low * per_second)
     row[f"{key}_high"] = max(row[f"{key}_high"], high * per_second)
@@ -79,9 +79,7 @@ def _scrutinised(cell: Rollout) -> dict[str, Any]:
 
 def first_valid(share: float, seconds: Sequence[float], grasps: int) -> float | None:
     """Return expected seconds until repeated calls give a valid grasp; None if none was valid.
-
-    The time of a call is the median of `seconds`.
-    """
+    The time of a call is the median of `seconds`."""
     if share <= 0 or not seconds:
         return None
     return float(np.median(seconds)) / (1.0 - (1.0 - share) ** grasps)
@@ -108,9 +106,7 @@ def _draws(cell: Rollout) -> dict[str, Floats]:
 
 def summed(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return one row per method, fidelity and batch, over all hands and objects.
-
-    Speed is all valid grasps over all seconds; accuracies are means over the pairs, with bars of these means.
-    """
+    Speed is all valid grasps over all seconds; accuracies are means over the pairs, with bars of these means."""
     groups: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
     for run in runs:
         groups.setdefault((run["method"], run["fidelity"], run["batch"]), []).append(run)
@@ -121,7 +117,7 @@ def summed(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         row: dict[str, Any] = {"method": method, "fidelity": fidelity, "batch": batch, "pairs": len(own)}
         row["grasps"] = sum(r["grasps"] for r in own)
         row["grasps_per_second"] = row["grasps"] / seconds
-        # The time of pairs without a valid grasp is unknown: a mean without them would be too good.
+        # The time of pairs without a valid grasp is unknown; a mean without these pairs would be too good.
         row["seconds_to_first_valid"] = None if None in firsts else float(np.mean(firsts))
         for key in METRICS:
             # Robustness is undefined for a pair without held grasps.
@@ -146,7 +142,7 @@ def mark_fronts(rows: Sequence[dict[str, Any]], metrics: Mapping[str, bool]) -> 
     for row in rows:
         row["front"] = []
     for key, more in metrics.items():
-        # Exclude methods without valid grasps: a hand without contact has no penetration either.
+        # Exclude methods without valid grasps, since a hand without contact has no penetration either.
         able = [row for row in rows if row["end_to_end_per_second"] and row[key] is not None]
         for index in pareto([(row["end_to_end_per_second"], row[key] if more else -row[key]) for row in able]):
             able[index]["front"].append(key)
@@ -171,9 +167,7 @@ def _ratio_bar(runs: Sequence[dict[str, Any]], key: str, seconds: str, side: str
 
 def most_valid(row: Mapping[str, Any]) -> float:
     """Return the 95 % upper bound on valid grasps per second, end to end, if none of n is valid.
-
-    The bound on the share is 3 / n. In scenes it applies to lifted grasps.
-    """
+    The bound on the share is 3 / n. In scenes it applies to lifted grasps."""
     raw = row.get("candidates_end_to_end_per_second", row["grasps_per_second"])
     return float(raw) * min(1.0, 3.0 / row["grasps"])
 

@@ -1,8 +1,7 @@
 """One-at-a-time sweeps of fast_graspd's settings: loss of accuracy and gain in speed.
 
-Some settings are not part of a fidelity: passes of the contact solver, culling by grid and band, and whether the M
-simulations share one closest-point query per hand point (the default) or make M queries (as in the paper's code).
-"""
+Some settings are not part of a fidelity: passes of the contact solver, culling by grid and band, and queries. By
+default the M simulations share one closest-point query per hand point; the paper's code makes M queries."""
 
 from __future__ import annotations
 
@@ -58,10 +57,7 @@ def _options(**changes: Any) -> Change:
 
 def turns(quick: bool = False, knobs: Sequence[str] = ()) -> list[KnobValue]:
     """Return values of all settings, of a few (`quick`), or of the named ones; each setting includes its default.
-
-    Raises:
-        InputError: a name is not a setting.
-    """
+    Raises InputError: a name is not a setting."""
 
     def knob(name: str, between: str, **values: Sequence[Any]) -> list[KnobValue]:
         rows = zip(*values.values(), strict=True)
@@ -106,10 +102,8 @@ def sweep(
     say: Callable[[str], None],
 ) -> list[dict[str, Any]]:
     """Return one row per setting (`knob`) and value: `knob`, `value`, `default`, `speedup` and a run's figures.
-
     Values are interleaved, repeat by repeat. `speedup` is the default's cost over the value's. The cost is in
-    core-seconds on a CPU, independent of other load, and in wall-clock seconds on a GPU.
-    """
+    core-seconds on a CPU, independent of other load, and in wall-clock seconds on a GPU."""
     wp.load_module(module=kernels, device=run.device)
     default = KnobValue("", "default")
     true = thing.load(TRUE_ERROR_M)

@@ -1,8 +1,7 @@
 """Difficult objects and hands: thin, sharp, open, tiny, huge; few or many fingers, coupled drives.
 
 All are ingested like uploads. The hands are a family: equal three-joint fingers in a ring, which lean outward when
-open.
-"""
+open."""
 
 from __future__ import annotations
 
@@ -155,15 +154,8 @@ def shape_cell(
     **asked: Any,
 ) -> MapCell:
     """Return candidates of a hand on a mesh, planned and validated as in a job.
-
-    Args:
-        hand: the hand.
-        place: panel, x and y of the cell.
-        mesh: mesh in metres; it is prepared like an upload.
-        options: size and execution context of the job.
-        allow_open: whether the mesh may be open.
-        asked: fidelity or method of the job.
-    """
+    `place` has panel, x and y of the cell. The `mesh` in metres is prepared like an upload; `allow_open`: it may be
+    open. `options` has size and execution context of the job, `asked` its fidelity or method."""
     request = JobRequest(hand="hand", object="shape", grasps=options.count, want="candidates", rechecks=0, **asked)
     try:
         obj = prepared(mesh, request.knobs.face_error_m, allow_open=allow_open)
@@ -207,16 +199,8 @@ _EFFORT: Final = 1.0
 
 def ring_hand(fingers: int, *, coupling: Coupling = "each joint", size: float = 1.0, ratio: float = 0.8) -> HandModel:
     """Return a hand of equal fingers around a palm.
-
-    Args:
-        fingers: number of fingers.
-        coupling: which joints one drive moves.
-        size: size relative to a human hand.
-        ratio: rotation of a coupled distal joint over the middle one's.
-
-    Raises:
-        HandError: the hand is unusable.
-    """
+    `coupling` is which joints one drive moves. `size` is relative to a human hand. `ratio` is the rotation of a coupled
+    distal joint over the middle joint's. Raises HandError: the hand is unusable."""
     radius, height = (size * x for x in _PALM_M)
     parts = [f'<robot name="ring"><link name="palm">{_solid("cylinder", -height / 2, radius, height)}</link>']
     for k in range(fingers):

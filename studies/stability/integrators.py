@@ -1,9 +1,8 @@
 """Integrators alone: a ball thrown into a cage of contact points, step by step, in float64.
 
 The cage is fixed and the ball flies inside it. A good integrator adds no energy, keeps the ball in the cage and
-prevents penetration. The position-based ones are those of `worker.simulation.reference`, the reference of the kernels'
-tests; the force-based one is the penalty force of Grasp'D (2022) under semi-implicit Euler.
-"""
+prevents penetration. Position-based integrators are those of `worker.simulation.reference`, the reference of the
+kernels' tests. The force-based one is the penalty force of Grasp'D (2022) under semi-implicit Euler."""
 
 from __future__ import annotations
 
@@ -86,7 +85,7 @@ def position_based(solver: Solver, *, dt: float, speed: float) -> tuple[float, f
 
 
 def force_based(*, dt: float, speed: float, stiffness: float, mass: float = 1.0) -> tuple[float, float]:
-    """Return the same for penalty forces -k c n with friction; `stiffness` [N/m], `mass` [kg]."""
+    """Return the same values for penalty forces -k c n with friction; `stiffness` [N/m], `mass` [kg]."""
     points = _cage_around(dt, speed)
     inertia = 0.4 * mass * RADIUS_M**2
 
@@ -171,7 +170,7 @@ def time_step_map(time_steps: Sequence[float], speeds: Sequence[float]) -> Stabi
         for dt, speed in grid
     ]
     step = LossOptions().step
-    # The grid approximates the planner's step to a tenth of it.
+    # The grid approximates the planner's step within 10 %.
     cells = reachable(cells, lambda c: c.panel in _OFFERED and abs(float(c.x) * float(c.y) / step - 1) < 0.15)
     return StabilityMap(
         "time_step",
@@ -260,7 +259,7 @@ def _wall_cell(name: str, solver: Solver, count: int, depth: float, step: float)
     rng = np.random.default_rng(count)
     points = np.concatenate([0.005 * rng.normal(size=(count, 2)), np.full((count, 1), RADIUS_M)], axis=1)
     normals = np.tile([0.0, 0, 1], (count, 1))
-    # The compliant solver gets a finger of constant stiffness, independent of its number of points.
+    # The finger of the compliant solver has constant stiffness, independent of its number of points.
     contacts = Contacts(points, normals, np.full(count, -depth), np.full(count, 24.0 / count))
     world = ball_world(1.0, step)
     end = solver(contacts, np.array([0, 0, step, 0, 0, 0]), world)

@@ -1,8 +1,7 @@
 """Model errors: grasps held in the validator's model, validated in models with a single error.
 
-Amounts of error range from those of `--robust` (`worker.validation.variant`) to amounts at which few grasps are held.
-Each grasp has its own direction of displacements and rotations.
-"""
+Amounts of error range from the amounts of `--robust` (`worker.validation.variant`) to amounts at which few grasps are
+held. Each grasp has its own direction of displacements and rotations."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ COLOURS: Final = {
     "broken": ("#96261c", "#ffffff"),
     "refused": ("#e7e9ec", "#4b565e"),
 }
-#: Most panels in a row.
+#: Largest number of panels in a row.
 _COLUMNS: Final = 3
 #: Sizes of the numbers on cells [pt], largest first; if the last does not fit, the cell is blank.
 _FONT_SIZES: Final = (7.0, 6.0, 5.0)

@@ -174,10 +174,7 @@ def _cell(hand: HandModel, x: float | str, y: float | str, placement: Placement,
 
 def planned(hand: HandModel, sides_mm: Sequence[float], spec: SceneSpec, options: MapOptions) -> ValidatedBatch:
     """Return candidates of a box of these sides [mm] in a scene; the box is prepared like an upload.
-
-    Raises:
-        GraspdError: the box or the scene is refused.
-    """
+    Raises GraspdError: the box or the scene is refused."""
     mesh: Any = trimesh.creation.box(np.asarray(sides_mm) * MILLIMETRES)
     count, fidelity = options.count, options.fidelity
     obj = prepared(mesh, FIDELITIES[fidelity].face_error_m)

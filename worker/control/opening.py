@@ -19,29 +19,29 @@ from graspd.worker.quality.posed import PostureData
 from graspd.worker.simulation.kernels import distance, jamming, opening, optimizers
 from graspd.worker.simulation.launches import Launches, launch
 
-#: Fingers open up to this distance from the object [m]. It covers the errors of a calibrated arm; fingers that open
-#: farther arrive faster on closing and kick the object away more often.
+#: Largest distance of opening fingers from the object [m]. It covers the errors of a calibrated arm. From a larger
+#: distance, fingers arrive faster on closing and push the object away more often.
 CLEARANCE_M: Final = 0.003
-#: A finger that cannot move this far along its contact normals opens against `HandModel.closing` alone [m].
+#: A finger with less motion along its contact normals opens against `HandModel.closing` alone [m].
 STUCK_M: Final = 0.003
-#: The root retreats only if the open hand is closer than this to the object [m]. A palm in contact kicks the object,
-#: but so does a palm that moves back from afar while the fingers close.
+#: The root retreats only if the open hand is closer than this to the object [m]. A palm in contact pushes the object
+#: away. So does a palm that returns from a large distance while the fingers close.
 PALM_CLEARANCE_M: Final = 0.0005
 #: Share of the direction against `HandModel.closing` in a finger's opening direction. The rest follows the contact
-#: normals, so that the finger does not drag the object along when it closes.
+#: normals, so that the closing finger does not drag the object along.
 PLAIN_OPENING: Final = 0.3
 #: Opening steps of revolute [rad] and prismatic joints [m], and the number of steps.
 OPENING_STEP: Final = 0.05
 SLIDING_STEP_M: Final = 0.002
 OPENING_STEPS: Final = 24
-#: A finger may penetrate the rest of the hand by this much more than in the grasp [m]. This is checked at these shares
-#: of its path. A finger that jams opens half as far and is checked again; if the last check fails, it does not open.
+#: Allowed penetration of a finger into the rest of the hand on its path, beyond that in the grasp [m]. Then the checked
+#: shares of the path. A jammed finger opens half as far. After the last failed check it does not open.
 JAM_M: Final = 5e-4
 WAY: Final = (1 / 3, 2 / 3, 1.0)
 JAM_LOOKS: Final = 4
 RETREATS_M: Final = (0.0, 0.0025, 0.005, 0.0075, 0.010, 0.015, 0.020)
 
-#: Returns which fingers are blocked on paths (n, K, D) of the dofs, for the hands `rows`.
+#: Returns which fingers of the hands `rows` are blocked on the paths (n, K, D) of their dofs.
 Blocked = Callable[[NDArray[np.intp], Floats], NDArray[np.bool_]]
 
 
@@ -93,7 +93,7 @@ class Openings:
 
     def without_jams(self, blocked: Blocked | None = None) -> Floats:
         """Return the open dofs (N, D), reduced towards the grasp where fingers jam or `blocked` applies.
-        A finger that jams while opening would not reach the grasp when it closes again."""
+        A finger that jams on opening would not reach the grasp on closing."""
         jams = self._jams()
         depth = self._depths(jams)
         depth[0].run()

@@ -2,8 +2,7 @@
 
 Both affect a grasp's success more than the optimiser does (Dexonomy, table VI).
 
-A finger that rests on the table would sweep through it when it opens: such hands have a slightly higher pregrasp.
-"""
+A finger at rest on the table would sweep through the table on opening. Pregrasps of such hands are raised slightly."""
 
 from __future__ import annotations
 
@@ -27,27 +26,25 @@ from graspd.worker.simulation.obstacles import body_room, obstacle_room
 
 #: Clearance of opening fingers from obstacles [m].
 ROOM_M: Final = 0.0025
-#: Further opening of a joint on the approach, as a share of its range beyond the pregrasp. Without it, fingers that
-#: reach around the object would sweep it away.
+#: Further opening of a joint on the approach, as a share of its range beyond the pregrasp. Without this opening,
+#: fingers that enclose the object would push it away on the approach.
 WIDE: Final = 0.4
 
-#: Hand points that check a posture; those within this distance of the object press on it [m], at most this many.
+#: Number of hand points in the check of a posture; largest distance of pressing points [m]; largest number of them.
 _POINTS: Final = 600
 PRESSING_M: Final = 0.003
 MAX_PRESSING: Final = 16
-#: Points of a finger near the object but without contact press within this distance [m]. The command must close this
+#: Range within which points of a finger near the object, but without contact, press [m]. The command must close this
 #: finger, or else the other fingers push a free object past it.
 CLOSING_M: Final = 0.009
-#: A finger stands off if its distance is in this range [m]: it could touch but does not. Fingers farther away are not
-#: part of the grasp.
+#: Distances at which a finger could touch the object but does not [m]. Fingers beyond are not part of the grasp.
 STANDS_OFF_M: Final = (0.005, 0.02)
-#: Sum of the contact forces' normal components [N] and the Coulomb coefficient for their balance. The coefficient is
-#: smaller than the object's, because forces at the edge of their friction cones slip after a small displacement of the
-#: contact.
+#: Sum of the contact forces' normal components [N], and the Coulomb coefficient for their balance. The coefficient is
+#: smaller than the object's: forces at the edge of their friction cones slip after a small displacement.
 TOTAL_NORMAL_FORCE: Final = 50.0
 FRICTION: Final = 0.3
-#: Least and largest ratio of that sum to the object's weight. A sum of 50 N pushes a light flat object out from between
-#: fingertips that touch its upper edges. The largest ratio gives 50 N at 0.1 kg.
+#: Least and largest ratio of this sum to the object's weight. With a sum of 50 N, fingertips at the upper edges of a
+#: light flat object push it out. The largest ratio gives 50 N at 0.1 kg.
 OF_WEIGHT: Final = (10.0, 50.0)
 
 
@@ -56,8 +53,8 @@ def pregrasp(
 ) -> Posture:
     """Compute N postures from which the hand closes.
     Every finger moves away from the object along its contact normals until its points are `CLEARANCE_M` away. It stops
-    earlier at other fingers or, where the grasps are `placed`, at an obstacle of their scene. Then the root retreats
-    along the palm's approach until contact ends, and rises where fingers would penetrate a support they may touch."""
+    earlier at other fingers and, for `placed` grasps, at obstacles of the scene. Then the root retreats along the
+    palm's approach until contact ends. It rises where fingers would penetrate a support they may touch."""
     posing = posing_of(hand, obj, points=_POINTS, device=device)
     poses, joints = np.zeros((len(grasp), 7)), np.zeros((len(grasp), len(hand.joint_names)))
     for rows in posing.parts(len(grasp)):
@@ -130,7 +127,7 @@ def touching_links(hand: HandModel, obj: ObjectModel, grasp: Posture, *, device:
 
 
 def standing_off(hand: HandModel, obj: ObjectModel, grasp: Posture, *, device: str = "cpu") -> NDArray[np.bool_]:
-    """Check (N,) whether a finger could touch the object but does not: its distance is in `STANDS_OFF_M`."""
+    """Return a mask (N,) of grasps with a finger whose distance from the object is in `STANDS_OFF_M`."""
     near, far = STANDS_OFF_M
     gap = posing_of(hand, obj, points=_POINTS, device=device).finger_gaps(grasp, 2 * far)
     return np.asarray(((gap > near) & (gap < far)).any(axis=1))
@@ -140,7 +137,7 @@ def _in_the_way(hand: HandModel, opening: Openings, placed: PlacedGrasps | None)
     if placed is None:
         return None
     pose = opening.hand_pose
-    # In the grasp a finger may be closer to an obstacle than allowed: opening must not bring it even closer.
+    # A finger may be closer to an obstacle in the grasp than allowed; opening must not bring it closer.
     room = np.minimum(_finger_room(hand, pose, opening.q[:, None], placed), ROOM_M)
 
     def blocked(rows: NDArray[np.intp], way: Floats) -> NDArray[np.bool_]:
@@ -151,7 +148,8 @@ def _in_the_way(hand: HandModel, opening: Openings, placed: PlacedGrasps | None)
 
 
 def _finger_room(hand: HandModel, hand_pose: Floats, paths: Floats, placed: PlacedGrasps) -> Floats:
-    """Return fingers' least clearance (B, fingers) on paths (B, K, D), by `body_room`; inf: no finger."""
+    """Return fingers' least clearance (B, fingers) on paths (B, K, D), by `body_room`; inf for dofs without a
+    finger."""
     count, steps, _ = paths.shape
     finger = fingers_of_bodies(hand)
     out = np.full((count, count_fingers(hand)), np.inf)
@@ -163,13 +161,13 @@ def _finger_room(hand: HandModel, hand_pose: Floats, paths: Floats, placed: Plac
     return out
 
 
-#: Clearance of the open, and of the closing hand [m]; above the required one, since trajectories are checked in steps.
+#: Clearance of the open hand, and of the closing hand [m]. It exceeds the required one, because checks are discrete.
 RAISE_OPEN_M: Final = CLEAR_M + 0.0025
 
 RAISE_CLOSING_M: Final = CLEAR_M + 0.0003
-#: Shares of the trajectory to the grasp that are checked: those of the sweep, without the grasp itself.
+#: Checked shares of the trajectory to the grasp: those of the sweep, without the grasp itself.
 RAISE_LOOKS: Final = tuple(np.arange(8) / 8)
-#: Largest raise of a hand [m]: from higher up it would press the object down.
+#: Largest raise of a hand [m]: a hand raised further would press the object down.
 HIGHEST_RAISE_M: Final = 0.008
 
 

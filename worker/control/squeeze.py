@@ -1,8 +1,7 @@
 """Contact forces that balance and hold an object, and the joint torques that exert them.
 
 The hand is position-controlled: q_squeeze = q + Kp^-1 sum_i J_i^T f_i (Dexonomy). The forces f are non-negative
-combinations of friction pyramid edges without a net wrench, and their normal components sum to a given force.
-"""
+combinations of friction pyramid edges without a net wrench, and their normal components sum to a given force."""
 
 from __future__ import annotations
 
@@ -20,19 +19,19 @@ from graspd.worker.simulation.kernels import balance as kernels
 from graspd.worker.simulation.kernels import touching
 from graspd.worker.simulation.launches import launch
 
-#: Weight of the squared size of each edge force: distributes the load over equally good contacts.
+#: Weight of the squared size of each edge force. It distributes the load over equally good contacts.
 SPREAD: Final = 0.1
-#: Weight of joint torques, relative to the hardest one to exert: prefers forces that need little torque.
+#: Weight of joint torques relative to their limits. It favours forces that need little torque.
 TORQUE: Final = 0.05
-#: Weight of the sum of normal forces in the fit; the exact sum follows by scaling, balanced or not.
+#: Weight of the sum of normal forces in the fit. Scaling afterwards makes the sum exact.
 SUM: Final = 10.0
 
 
 @dataclass(frozen=True)
 class HoldForces:
     residual: Floats
-    """(N,) net wrench over the sum of normal forces, torques over the object's radius.
-    0: balanced; 1: nothing presses. It predicts whether a grasp holds."""
+    """(N,) net wrench over the sum of normal forces, with torques over the object's radius. 0: balanced; 1: nothing
+    presses. The residual predicts whether a grasp holds."""
     torque: Floats
     """(N, D) torques of the dofs that exert the forces [N m or N]."""
 
@@ -42,8 +41,8 @@ def balanced(
 ) -> tuple[Floats, Floats]:
     """Compute balanced contact forces of grasps within the hand's torque limits: residuals and torques of `HoldForces`.
     Their normal components sum to `total` [N]. Where torques exceed a limit, all forces are scaled together, which
-    keeps the balance. At most `most` hand points press, the most spread out. A point presses if it is within the first
-    `reach` of the object, or within the second for a finger without contact [m]."""
+    keeps the balance. At most `most` hand points press, the most spread out. A point presses within the first distance
+    of `reach`, on a finger without contact within the second [m]."""
     bodies, near = posing.touch(grasp, max(reach))
     count, points, radius = len(grasp), len(posing.probe.points), posing.probe.obj.radius
     rows = int(touching.FIRST_TORQUE) + posing.hand.dofs

@@ -1,8 +1,7 @@
 """Quiet initialisation of Warp, its kernel cache, and ahead-of-time compilation of kernels.
 
 A folder of precompiled kernels has the layout of Warp's cache, VERSION/MODULE/FILE. File names contain the digest of
-the module's source and options, and the architecture. Kernels that do not match a machine are compiled as usual.
-"""
+the module's source and options, and the architecture. Kernels that do not match a machine are compiled as usual."""
 
 from __future__ import annotations
 
@@ -49,7 +48,7 @@ def _default_of_each_thread() -> None:
 
 
 def start() -> None:
-    """Initialise Warp once, with warnings only; stderr receives all but the note on the missing driver."""
+    """Initialise Warp once, with warnings only; the note on a missing driver is not printed."""
     global _started
     with _lock:
         if _started:
@@ -119,7 +118,7 @@ def bake(names: Iterable[str], *, architectures: Sequence[int] = ARCHITECTURES, 
         if architectures:
             wp.compile_aot_module(module, arch=list(architectures), use_ptx=False)
         if cpu:
-            # Ahead-of-time compilation for a CPU has another block size, and digest, than a launch requests.
+            # Ahead-of-time compilation for a CPU differs in block size from a launch, and therefore in its digest.
             wp.load_module(module, device="cpu")
     return sorted(file for file in Path(wp.config.kernel_cache_dir).glob("*/*") if file.is_file())
 
@@ -138,7 +137,7 @@ def lay_out(cache: Path) -> None:
 
 
 def binary_name(module: ModuleType) -> str:
-    """Return the identity of a module's kernels on this CPU: two processes with the same one run the same code."""
+    """Return the identity of a module's kernels on this CPU; processes with equal identities run the same code."""
     known = wp.get_module(module.__name__)
     # A launch on the CPU has blocks of one thread.
     name = known._get_compile_output_name(wp.get_device("cpu"), block_dim=1)

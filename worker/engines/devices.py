@@ -1,12 +1,11 @@
 """Warp devices: their names, the default GPU of a process, and GPU errors.
 
-Worker number k takes the k-th GPU that `CUDA_VISIBLE_DEVICES` shows, cyclically; a process without a number takes the
-GPU with the fewest processes. Processes are counted by file locks, which the kernel releases with the process: lock n
-of a GPU is held by the n-th process on it, in the user's cache, which the containers of one machine share.
+Worker number k takes the k-th GPU that `CUDA_VISIBLE_DEVICES` shows, cyclically. A process without a number takes the
+GPU with the fewest processes. File locks count these processes: the n-th process on a GPU holds lock n. Locks are in
+the user's cache, which containers of one machine share. The kernel releases them at the end of the process.
 
-After an illegal access, a reset or a bus error Warp only writes a line to stderr and continues with undefined memory,
-so results leave the process only after the device is synchronised.
-"""
+After an illegal access, a reset or a bus error Warp writes a line to stderr and continues with undefined memory.
+Results therefore leave the process only after synchronisation of the device."""
 
 from __future__ import annotations
 
@@ -102,7 +101,7 @@ class Gpu:
 
 def take(gpus: Sequence[Gpu], folder: Path, *, number: int | None = None) -> Gpu:
     """Select one of the GPUs (at least one): that of worker `number`, else one with the fewest processes.
-    The GPU counts as taken until this process ends. Without a writable folder: that of `number`, else the first."""
+    The GPU counts as taken until this process ends. Without a writable folder: the GPU of `number`, else the first."""
     eligible = [gpus[number % len(gpus)]] if number is not None else list(gpus)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -136,8 +135,7 @@ def _lock(file: Path) -> bool:
 _NO_MEMORY: Final = re.compile(r"Failed to allocate \d+ bytes.*'cuda:\d+'|CUDA error 2\b|out of memory", re.DOTALL)
 
 
-#: Held during a launch on a GPU that another thread may use too: a graph under capture must not contain launches of
-#: other threads.
+#: Held during a launch on a GPU that another thread may use: a graph under capture must contain no other launches.
 exclusive: Final = threading.RLock()
 
 

@@ -9,14 +9,14 @@ from graspd.service.model.cores import ROOT, available_cores, available_memory
 from graspd.service.model.domain import BATCH_SIZE
 
 #: Grasps per multiprocessor of a GPU. With 2 finalists of 7 simulations each, 8 grasps fill four warps, one for each
-#: scheduler. Kernels over hand points fill the GPU with fewer grasps.
+#: scheduler. Kernels over hand points need fewer grasps to fill the GPU.
 GRASPS_PER_MULTIPROCESSOR: Final = 8
-#: Most memory of a grasp, that of the fidelity `paper` [bytes], and the share of the free memory to use.
+#: Largest memory of a grasp, at fidelity `paper` [bytes], and the used share of the free memory.
 BYTES_PER_GRASP: Final = 2.5 * 2**20
 MEMORY_SHARE: Final = 0.5
-#: Largest number of batches. More batches of one pair are seldom in the queue.
+#: Largest number of batches per launch: the queue seldom has more batches of one pair.
 MOST: Final = 64
-#: Most memory of a process with the models of its cached pairs [bytes]; see docs/explanation/performance.md.
+#: Largest memory of a process with the models of its cached pairs [bytes]; see docs/explanation/performance.md.
 BYTES_PER_PROCESS: Final = 400 * 2**20
 #: Share of the machine's memory for these processes.
 PROCESS_SHARE: Final = 0.25
@@ -34,18 +34,16 @@ def batches_at_once(device: str, join: int | None) -> int:
 
 
 def fitting(multiprocessors: int, free_bytes: int) -> int:
-    """Return a power of two, so that a launch is halved evenly; at least 1."""
+    """Return a power of two, so that launches can be halved evenly; at least 1."""
     grasps = min(GRASPS_PER_MULTIPROCESSOR * multiprocessors, MEMORY_SHARE * free_bytes / BYTES_PER_GRASP)
     batches = max(1, min(MOST, int(grasps // BATCH_SIZE)))
     return 1 << (batches.bit_length() - 1)
 
 
 def processes_at_once(device: str, wanted: int, *, threads: int = 0, workers: int = 1, root: Path = ROOT) -> int:
-    """Return the number of processes that validate and measure: `wanted`, if not 0; 1: the worker's own, with threads.
-
+    """Return the number of processes that validate and measure: `wanted`, if not 0; 1: only the worker's threads.
     By default a worker on a GPU has one process fewer than its share of the cores. All `workers` together use at most a
-    quarter of the memory. On a CPU the planner needs all cores, so the default is 1.
-    """
+    quarter of the memory. On a CPU the planner needs all cores, so the default is 1."""
     if wanted or not device.startswith("cuda"):
         return wanted or 1
     room = int(PROCESS_SHARE * available_memory(root) / workers / BYTES_PER_PROCESS)

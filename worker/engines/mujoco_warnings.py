@@ -1,8 +1,7 @@
-"""MuJoCo's warnings: detected if they invalidate a result, and kept out of the user's working folder.
+"""MuJoCo's warnings: detection of invalid results, and no log file in the user's working folder.
 
 After a numerical divergence MuJoCo resets the state and continues: an object back at its initial pose looks held. By
-default each warning is appended to MUJOCO_LOG.TXT in the working folder.
-"""
+default each warning is appended to MUJOCO_LOG.TXT in the working folder."""
 
 from __future__ import annotations
 
@@ -24,7 +23,7 @@ _VOIDING: Final = [
         mujoco.mjtWarning.mjWARN_CNSTRFULL,
     )
 ]
-#: Memory for the constraints of a hand deep in an object; the system allocates it only on use [bytes].
+#: Memory for the constraints of a hand deep in an object [bytes]; the system allocates it only on use.
 ARENA: Final = 64 * 2**20
 
 

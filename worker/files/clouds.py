@@ -27,9 +27,8 @@ _WORDS = ("hand", "object", "shard_id", "base_id")  # keys of a sample that stat
 
 def write_clouds(clouds: Clouds, folder: Path, said: Mapping[str, Any]) -> dict[str, int]:
     """Write all clouds: `clouds-NNNNN.npz`, and `clouds.json` with `said` and the returned numbers of files and clouds.
-
-    An npz has the keys of a sample (docs/how-to/clouds.md) stacked over its C clouds. Arrays with a row per grasp are
-    concatenated cloud by cloud; `grasp/count` (C,) is the number of rows of each cloud.
+    An npz has the keys of a sample (docs/how-to/clouds.md), stacked over its C clouds. Arrays with a row per grasp are
+    concatenated; `grasp/count` (C,) is the number of rows of each cloud.
     Raises ConflictError: the folder exists and is not empty."""
     require_empty(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -54,7 +53,7 @@ def stacked(samples: list[dict[str, Any]]) -> dict[str, Any]:
     return found
 
 
-#: Number of points on a hand: about 5 mm apart on one of human size.
+#: Number of points on a hand: about 5 mm apart on a hand of human size.
 POINTS: Final = 2048
 _hands: LRUCache[Any, HandModel] = LRUCache(8)
 

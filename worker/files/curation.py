@@ -20,7 +20,7 @@ from graspd.worker.quality.diversity import distinct, hand_points
 #: Categories over which grasps can be balanced.
 KINDS: Final = ("type", "direction", "face")
 _COLUMNS: Final = {"type": "quality/grasp_type", "direction": "quality/approach_cell"}
-#: Two scenes have the object on one face if their down directions in its frame differ by less [cosine of 20 deg].
+#: Cosine of the angle below which down directions of two scenes, object frame, belong to one face: 20 degrees.
 _SAME_FACE: Final = float(np.cos(np.radians(20)))
 
 
@@ -29,7 +29,7 @@ class Balance:
     """Balanced selection; a `Chooser` of `worker.files.subsets` for the shards of one hand and object."""
 
     by: Sequence[str]
-    at_most: int = 0  # largest number per category; 0: that of the median category
+    at_most: int = 0  # largest number per category; 0: number of the median category
     min_distance: float = 0.0  # least distance of two selected grasps [m], see `worker.quality.diversity`; 0: any
     seed: int = 0
     hand: str | None = None  # the hand's file if the shards do not lead to it; only distances need it
@@ -86,7 +86,7 @@ def _down(shard: Shard) -> NDArray[np.float64]:
 
 
 def faces(down: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return face numbers (N,) of down directions (N, 3); one covers 20 degrees about its first direction."""
+    """Return face numbers (N,) of down directions (N, 3); a face covers 20 degrees about its first direction."""
     seen = np.zeros((0, 3))
     found = np.full(len(down), -1, np.int64)
     for row in np.flatnonzero(np.linalg.norm(down, axis=1) > 0):

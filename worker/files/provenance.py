@@ -1,7 +1,6 @@
 """Provenance of a shard: attributes that identify hand, object and grasps; search for their files.
 
-Files are identified by digest, so a modified or different file is never used instead.
-"""
+Files are identified by digest, so a modified or different file is never used instead."""
 
 from __future__ import annotations
 
@@ -307,10 +306,8 @@ def base_attributes(
     outcomes: Mapping[str, int] = MappingProxyType({}),
 ) -> dict[str, Attribute]:
     """Return the attributes of a base shard: joints, request, scene, candidates, settings of validation.
-
     `candidates` counts up to the last selected one. `verdict_key` is the digest of all settings that affect verdicts;
-    None: not validated. `outcomes` are the numbers of rejected candidates.
-    """
+    None: not validated. `outcomes` are the numbers of rejected candidates."""
     said: dict[str, Attribute] = {
         "joint_names": list(hand.joint_names),
         "mu": request.friction,

@@ -44,7 +44,7 @@ def require_empty(folder: Path) -> None:
 def write_subset(shards: Shards, choose: Chooser, out: Path, *, said: Mapping[str, Any]) -> dict[str, int]:
     """Write base shards of selected grasps, `HAND/OBJECT/base-BATCH.h5`, and the selection, `subset.json`.
     Shards without selected grasps are left out. All columns of a grasp, including its scene, are unchanged.
-    Return numbers: looked_at and kept grasps, shards written, and passed_over: shards of scenes and views, not copied.
+    Return the numbers looked_at and kept (grasps), shards (written), and passed_over (shards of scenes and views).
     Raises ConflictError: the folder contains files already. InputError: nothing is selected."""
     require_empty(out)
     looked_at = kept = 0

@@ -202,12 +202,10 @@ def synthesized(
     partial: bool = False,
 ) -> SynthesisResult:
     """Make the grasps of a job in one process: `hand` and `obj` are files or built-in names, `place` is their scene.
-
-    `mesh`: options for the object's file. `join`: batches of 32 planned in one launch; None: as many as fill a GPU.
-    `processes` that validate and measure; 1: this one only; 0: on a GPU the cores less one, else 1.
+    `mesh` has options for the object's file. `join` is the number of batches of 32 in one launch of the planner; None:
+    as many as fill a GPU. `processes` validate and measure; 1: this one only; 0: on a GPU the cores less one, else 1.
     Raises InputError: an invalid argument, or a scene without space. TaskCancelled: `cancelled` returned True; with
-    `partial`, before any validation.
-    """
+    `partial`, before any validation."""
     planner(request.method, request.options, in_scenes=place.kind != "free")  # before the files are read
     if request.shake and place.kind == "free":
         raise InputError(SHAKE_NEEDS_A_SCENE)

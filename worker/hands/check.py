@@ -22,7 +22,7 @@ from graspd.worker.hands.tree import build_tree, cut_drives, passed_limits
 
 #: Number of points that measure the outer surface.
 _SURFACE_POINTS = 512
-#: Entry of the guessed values: the palm's approach direction could equally be the opposite one.
+#: Entry of the guessed values for an approach direction of the palm that could equally be the opposite one.
 TIED = "approach (a tie)"
 
 
@@ -33,11 +33,8 @@ def check_hand(
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> dict[str, Any]:
     """Check these files with `load_hand`; `run` receives the link whose shapes are being made.
-
-    Returns:
-        verdict: accept, repair or refuse; message: one line; repairs: changes; facts: measured or guessed values in SI
-        units; for a refusal that options fix, `problem` and `options_suggested`, keys of `HandOptions`.
-    """
+    Return verdict (accept, repair or refuse), message (one line), repairs (changes), and facts: measured or guessed
+    values in SI units. A refusal that options fix also has `problem` and `options_suggested`, keys of `HandOptions`."""
     try:
         source = HandSource.read(files, options, name=name, digest="0" * 32, run=run)
         robot, settings = source.robot, source.options
@@ -105,7 +102,7 @@ def _limits(robot: Robot, settings: HandOptions) -> list[str]:
     tree = build_tree(robot, settings)
     passed = passed_limits(robot, tree, settings)
     notes = (
-        [f"limits of {', '.join(passed)} are not used, as in ROS, because these joints follow others"] if passed else []
+        [f"limits of {', '.join(passed)} are not used, as in ROS, because these joints are coupled"] if passed else []
     )
     notes += cut_drives(robot, tree)
     return notes + ([f"{', '.join(tree.still)} cannot move: the limits leave one value"] if tree.still else [])

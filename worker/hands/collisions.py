@@ -16,9 +16,7 @@ TOUCH_M = 1e-4
 
 def resting_neighbours(hand: HandModel) -> frozenset[tuple[int, int]]:
     """Return pairs of bodies (a < b): parent or grandparent and child, and those that touch at rest.
-
-    Rest means both the pre-shape and the middle of the limits: bodies that touch in both cannot be separated.
-    """
+    Rest means both the pre-shape and the middle of the limits: bodies that touch in both cannot be separated."""
     pairs: set[tuple[int, int]] = set()
     for body in range(1, hand.bodies):
         parent = int(hand.parent[body])
@@ -47,9 +45,8 @@ def touching_bodies(hand: HandModel, q: Floats, margin: float) -> set[tuple[int,
 
 def hull_distance(a: Floats, b: Floats) -> float:
     """Compute the distance [m] of the convex hulls of two point sets (N, 3) and (M, 3); 0 if they overlap.
-
-    Least squares over convex weights x, y: min |a'x - b'y| with sum x = sum y = 1, the sums as heavy extra rows.
-    """
+    Least squares over convex weights x, y: min |a'x - b'y| with sum x = sum y = 1. The sums are rows of large
+    weight."""
     from scipy.optimize import nnls  # slow to load
 
     scale = max(float(np.ptp(a, axis=0).max()), float(np.ptp(b, axis=0).max()))

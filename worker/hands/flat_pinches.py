@@ -1,8 +1,7 @@
 """Pinch postures for flat objects on a support: ends of opposed fingertips on a plane, face to face.
 
-The pads of `worker.hands.pinch_postures` are farther from the fingertips' ends than a flat object is high. The same
-search uses here the surface within the object's height above the plane.
-"""
+The pads of `worker.hands.pinch_postures` are farther from the fingertips' ends than a flat object is high. The search
+is the same, but over the surface within the object's height above the plane."""
 
 from __future__ import annotations
 
@@ -20,7 +19,7 @@ from graspd.worker.hands.pinch_postures import Oppositions, climbed, opposed_fin
 from graspd.worker.hands.surface import farthest_points, sample_surface
 from graspd.worker.objects.memory_cache import cached_by_content
 
-#: Object heights with their own postures [m]; higher objects reach the pads.
+#: Object heights, each with its own postures [m]; higher objects reach the pads.
 HEIGHTS_M: Final = (0.005, 0.008, 0.012, 0.018)
 #: Number of postures, candidates per posture, and random steps that improve them.
 POSTURES: Final = 120
@@ -29,26 +28,24 @@ CROWD: Final = 20
 FEW: Final = 8
 #: Range of widths [m].
 WIDTHS_M: Final = (0.004, 0.12)
-#: Points of each fingertip and of each other body, and the size of the sample of the hand from which they come.
+#: Number of points of each fingertip, of points of each other body, and of the hand's points from which both are drawn.
 _TIP_POINTS: Final = 120
 _OTHER_POINTS: Final = 20
 _DENSE: Final = 8000
-#: A fingertip that ends above the plane by more than this share of the height misses the object; and the length that
-#: scales differences of width in the cost [m].
+#: A fingertip that ends above the plane by more than this share of the height misses the object.
+#: The second value scales differences of width in the cost [m].
 REACHES: Final = 0.4
 WIDTH_M: Final = 0.02
 #: Least height of the rest of the hand above the plane [m].
 OVER_M: Final = 0.008
-#: Least cosine of the ends' facing, and the limit on the palm's cosine with the line between them.
+#: Least cosine of the ends' facing, and largest cosine of the palm with the line between the ends.
 FACING: Final = 0.8
 SQUARE: Final = 0.7
 
 
 def pinches_of(hand: HandModel, height: float) -> Oppositions:
     """Return postures for an object of this height [m]; none if it reaches the pads or the hand has one finger.
-
-    The palm's approach without its part along `axis` points at the plane. `middle` is half the height above it.
-    """
+    The palm's approach without its part along `axis` points at the plane. `middle` is half the height above it."""
     known = [h for h in HEIGHTS_M if h >= height]
     return _kept(hand, known[0]) if known and len(hand.fingertips) > 1 else Oppositions.of_none(hand)
 
@@ -85,10 +82,11 @@ class _Seen:
     middle: Floats
     width: Floats
     short: Floats
-    """(N,) height of the ends above the plane over the largest that reaches the object: the larger of the
-    opposing end's and the others' mean."""
+    """(N,) height of the ends above the plane, over the largest height that reaches the object. The larger value of the
+    opposing end and of the other ends' mean counts."""
     facing: Floats
-    """(N,) cosine between the surface within the height and the line between the ends, for the worse side."""
+    """(N,) cosine between the surface within the height and the line between the ends; the lower value of both
+    sides."""
     square: Floats
     over: Floats
     """(N,) height of the rest of the hand above the plane [m]."""
@@ -142,7 +140,7 @@ class _Look:
         place = quat_rotate(tips[..., 3:], self.tips) + tips[..., :3]
         normal = quat_rotate(tips[..., 3:], self.normals)
         down, axis, ends = np.tile(hand.palm.approach, (len(q), 1)), np.zeros((len(q), 3)), np.zeros((len(q), 0))
-        # The plane depends on the lowest points, and these depend on the plane.
+        # The plane and its lowest points depend on each other.
         for _ in range(3):
             low = np.einsum("nfvi,ni->nfv", place, down).argmax(axis=2)
             end = np.take_along_axis(place, low[..., None, None], axis=2)[:, :, 0]

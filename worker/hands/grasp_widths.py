@@ -1,9 +1,8 @@
-"""Postures in which any two parts of a hand face each other, for objects narrower than pads can grip, or wider.
+"""Postures in which two parts of a hand face each other, for objects narrower than pads can grip, or wider.
 
 An object of 10 mm is held between the sides of two fingers, or between a finger and the palm. An object as wide as the
-hand's span is held between the sides of fingertips. In both cases there are two surface points with normals along
-the line between them, and room for a cube as wide as their distance. Sampling and random steps find such pairs.
-"""
+hand's span is held between the sides of fingertips. In both cases two surface points have normals along the line
+between them. A cube as wide as their distance fits between them. Sampling and random steps find such pairs."""
 
 from __future__ import annotations
 
@@ -34,14 +33,14 @@ POSTURES: Final = 120
 CROWD: Final = 8
 CLIMBS: Final = 80
 #: Least cosine of both surfaces with the line between them. A smaller cosine costs as much as this difference of width
-#: [m], and so does penetration of the hand into the cube between them.
+#: [m]. Penetration of the hand into the cube between them has the same cost.
 FACING: Final = {"small": 0.9, "wide": 0.8}
 TURNED_M: Final = 0.2
 DEEP: Final = 2.0
 #: Least closing motion of the hand on the object, by joints with at least this lever about it [m].
 CLOSES_M: Final = 0.04
 LEVER_M: Final = 0.02
-#: Radius within which flat parts cover the tangent plane [m], and the cost of parts that do not [m].
+#: Radius within which flat parts cover the tangent plane [m], and the cost of parts that do not cover it [m].
 FLAT_M: Final = 0.006
 ROUND_M: Final = 0.003
 _DENSE: Final = 4000
@@ -108,7 +107,7 @@ class _Look:
         self.points = sample_surface(hand, POINTS[size])
         body = self.points.body
         holds = np.ones(len(body), bool) if size == "small" else np.isin(body, hand.fingertips)
-        # Sorted by body, so that the pairs of a body's points with those of later bodies are one matrix product.
+        # Sorted by body: the pairs of a body's points with those of later bodies are then one matrix product.
         self.holding = np.flatnonzero(holds)[np.argsort(body[holds], kind="stable")]
         flat = _flatness(hand, self.points)[self.holding] if size == "small" else np.ones(len(self.holding))
         self.round = ROUND_M * (1 - np.minimum(flat[:, None], flat))
@@ -189,7 +188,7 @@ class _Look:
         half = 0.5 * width
         start = np.minimum(np.einsum("nki,nki->nk", one, up), np.einsum("nki,nki->nk", other, up))
         start = start - np.minimum(half, BEYOND_M)
-        # (n, K, points), along the line between both ends, perpendicular to it and upwards.
+        # (n, K, points): along the line between both ends, perpendicular to it, and upwards.
         middle, points, across = 0.5 * (one + other), place.swapaxes(1, 2), np.cross(axis, up)
         along, aside, above = axis @ points, across @ points, up @ points
         along -= np.einsum("nki,nki->nk", axis, middle)[..., None]

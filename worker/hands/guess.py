@@ -20,16 +20,16 @@ from graspd.worker.hands.tree import Tree
 PRESHAPE_SHARE = 0.25
 #: Iterations over closing and palm, which depend on each other.
 LOOKS = 2
-#: Opposed fingers: the sum of tip motions across the hand is below this share of their lengths. It is 0 for equal
-#: fingers around an axis, .3 to .55 where two oppose one, .75 and more for hands with a thumb.
+#: Fingers are opposed if the sum of tip motions across the hand is below this share of their lengths. The share is 0
+#: for equal fingers around an axis, .3 to .55 for two against one, .75 and more for hands with a thumb.
 OPPOSED = 0.65
-#: Tips are beside their fingers' bases if they are ahead by no more than this share of the bases' spread.
+#: Tips are beside their fingers' bases if they are ahead of the bases by at most this share of the bases' spread.
 LEAST_AHEAD = 0.1
-#: Two unit estimates contradict each other if their sum is shorter than this; then there is no direction.
+#: Two unit estimates contradict each other if their sum is shorter than this. The direction is then unknown.
 CONTRADICTING = 0.2
 #: Tips close along their dominant line if the motion across it is below this share of the motion along it.
 SIDEWAYS = 0.3
-#: Angle below which two lines coincide, and below which a line is the root axis [degrees].
+#: Angle below which two lines coincide, and angle below which a line is the root axis [degrees].
 SAME_LINE = 1.0
 #: Angles within which lines and root axes may refine a rough and a precise direction [degrees].
 ROUGH, GOOD = 40.0, 10.0
@@ -49,7 +49,7 @@ def complete(hand: HandModel, tree: Tree, options: HandOptions) -> HandModel:
         seen = replace(hand, closing=_closing_seen(hand, stated))
         if (jaws := find_jaws(seen)) is not None:
             return _gripper(seen, jaws, tree, options)
-        # Sliding fingertips are identified by the surfaces that come together.
+        # Surfaces that come together identify sliding fingertips.
         hand = replace(hand, closing=np.where(slide, seen.closing, hand.closing))
     for _ in range(LOOKS):
         hand = _with_palm(hand, tree, options)
@@ -96,12 +96,12 @@ def _approach_of_jaws(hand: HandModel, jaws: Jaws) -> Floats:
     ahead, axis = _unit(_ahead(hand, jaws)), jaws.axis[len(jaws.q) // 2]
     if (line := _line_of_joints(hand, ahead, ROUGH, 2, axis)) is not None:
         return line
-    # A root frame that is not aligned with the closing line gives no information.
+    # A root frame that is not aligned with the closing line says nothing of the approach.
     return _snapped(ahead) if _angle(axis, _root_axis(axis)) < GOOD else ahead
 
 
 def _ahead(hand: HandModel, jaws: Jaws) -> Floats:
-    """Return the direction from the palm to between the pads, perpendicular to the closing line."""
+    """Return the direction from the palm to the point between the pads, perpendicular to the closing line."""
     half = len(jaws.q) // 2
     poses = body_poses(hand, IDENTITY_POSE, hand.expand(jaws.q[half]))[0]
     palm = [piece.vertices.mean(axis=0) for piece in hand.pieces if piece.body == 0]
@@ -112,10 +112,7 @@ def _ahead(hand: HandModel, jaws: Jaws) -> Floats:
 
 def _closing_seen(hand: HandModel, stated: Mapping[int, float]) -> Floats:
     """Return closing of a possible gripper: as stated, else from facing surfaces, else from limits.
-
-    Raises:
-        HandError: fingers slide, and nothing opposes them.
-    """
+    Raises HandError: fingers slide, and nothing opposes them."""
     seen = closing_by_geometry(hand)
     if not seen.any() and not stated and slides(hand).all():
         raise HandError(
@@ -138,12 +135,10 @@ def _fingertips(hand: HandModel, tree: Tree, options: HandOptions) -> tuple[int,
 
 def guess_approach(hand: HandModel) -> tuple[Floats, bool]:
     """Return the direction out of the palm, and whether the side on which the hand grasps is a tie.
-
-    There are two estimates. The mean motion of the fingertips during closing points out of a human-like palm. The
-    position of the tips of the half-closed hand is ahead of a gripper's palm, but also far along the fingers of a
-    human-like hand. The sum of both has the smallest error. If fingers oppose each other, the tip motions cancel to a
-    sideways residual or rounding noise: see `_between_fingers`.
-    """
+    Two estimates are added. The mean motion of the fingertips during closing points out of a human-like palm. The
+    position of the tips of the half-closed hand is ahead of a gripper's palm, but far along the fingers of a human-like
+    hand. Their sum has the smallest error. If fingers oppose each other, the tip motions cancel to a sideways residual
+    or rounding noise: see `_between_fingers`."""
     ways, ahead = _ways(hand), _unit(_tips_ahead(hand))
     if _cancelling(ways, ahead) < OPPOSED:
         return _between_fingers(hand)
@@ -159,7 +154,7 @@ def _ways(hand: HandModel) -> Floats:
 
 
 def _tips_ahead(hand: HandModel) -> Floats:
-    """Return the vector (3,) from the middle of the palm to that of the tips of the half-closed hand."""
+    """Return the vector (3,) from the middle of the palm to the middle of the half-closed hand's tips."""
     body = carriers(hand)[-1]
     pose = body_poses(hand, IDENTITY_POSE, hand.expand(posture(hand, 0.6)))[0, body]
     palm = [apply(pose, piece.vertices.mean(axis=0)) for piece in hand.pieces if piece.body == body]
@@ -167,8 +162,8 @@ def _tips_ahead(hand: HandModel) -> Floats:
 
 
 def _cancelling(ways: Floats, ahead: Floats) -> float:
-    """Return the length of the sum of tip motions across `ahead` over the sum of their lengths.
-    It is 0 if fingers close around an axis, 1 if all move the same way."""
+    """Return the length of the sum of tip motions across `ahead`, over the sum of their lengths.
+    The ratio is 0 if fingers close around an axis, 1 if all move the same way."""
     axis = _unit(ahead)
     across = ways - np.outer(ways @ axis, axis)
     return float(np.linalg.norm(across.sum(axis=0)) / max(np.linalg.norm(across, axis=1).sum(), 1e-12))
@@ -176,7 +171,8 @@ def _cancelling(ways: Floats, ahead: Floats) -> float:
 
 def _between_fingers(hand: HandModel) -> tuple[Floats, bool]:
     """Return the direction out of the palm of a hand with opposed fingers, and whether it is a tie.
-    It runs from finger bases to half-closed tips, perpendicular to a common closing line; coplanar points are a tie."""
+    The direction runs from finger bases to half-closed tips, perpendicular to a common closing line. Coplanar points
+    are a tie."""
     body = carriers(hand)[-1]
     q = posture(hand, 0.5)
     poses = body_poses(hand, IDENTITY_POSE, hand.expand(q))[0]
@@ -202,7 +198,7 @@ def _between_fingers(hand: HandModel) -> tuple[Floats, bool]:
 def _line_of_joints(
     hand: HandModel, rough: Floats, within: float, least: int, beside: Floats | None = None
 ) -> Floats | None:
-    """Return the direction near a rough one (`within`, degrees) that at least `least` lines of the joints share."""
+    """Return a direction that at least `least` lines of the joints share, within `within` degrees of a rough one."""
     body = hand.joint_body[:_JOINTS]
     pose = body_poses(hand, IDENTITY_POSE, hand.expand(np.clip(0.0, hand.lower, hand.upper)))[0, body]
     axes = quat_rotate(pose[:, 3:], hand.axis[body])
@@ -221,7 +217,7 @@ def _line_of_joints(
 
 
 def _snapped(mean: Floats, within: float = ROUGH) -> Floats:
-    """Normalise a direction; replace it by a root axis `within` so many degrees of it."""
+    """Normalise a direction, and replace it by a root axis that is `within` so many degrees of it."""
     axis = _root_axis(mean)
     return axis if _angle(mean, axis) < within else _unit(mean)
 
@@ -263,7 +259,7 @@ def _palm_link(tree: Tree, options: HandOptions) -> tuple[int, Floats]:
 
 
 def _palm(hand: HandModel, tree: Tree, options: HandOptions, approach: Floats) -> PalmFrame:
-    """Return the stated palm; else the point where a ray between the finger bases leaves the palm."""
+    """Return the stated palm; else the point at which a ray between the finger bases leaves the palm."""
     body, link_pose = _palm_link(tree, options)
     poses = body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0]
     pose = compose(poses[body], link_pose)
@@ -290,14 +286,15 @@ def _palm(hand: HandModel, tree: Tree, options: HandOptions, approach: Floats) -
 
 def _leaves(parts: Sequence[Floats], point: Floats, direction: Floats) -> float | None:
     """Return the distance along `direction` at which a line through `point` leaves the last convex part.
-    Parts are (V, 3); None if it meets none."""
+    Parts are (V, 3); None if the line meets no part."""
     from scipy.spatial import ConvexHull  # slow to load
 
     ends = []
     for corners in parts:
         planes = ConvexHull(corners).equations  # (F, 4): n x + d <= 0
         rate, room = planes[:, :3] @ direction, -(planes[:, :3] @ point + planes[:, 3])
-        # Planes parallel to the line bound nothing; a part whose parallel plane excludes the point is not met.
+        # Planes parallel to the line bound nothing. If such a plane excludes the point, the line does not meet its
+        # part.
         across = np.abs(rate) > 1e-9
         first = np.max(room[across & (rate < 0)] / rate[across & (rate < 0)], initial=-np.inf)
         last = np.min(room[across & (rate > 0)] / rate[across & (rate > 0)], initial=np.inf)

@@ -1,8 +1,7 @@
 """Jaws of a gripper and pads of a hand: surfaces that meet on closing, their opening and closing line.
 
 A gripper is a hand whose closing is one motion of at most two degrees of freedom that brings opposing surfaces, the
-pads, together. Everything follows from geometry, so a joint at 0 may be open or closed.
-"""
+pads, together. Everything follows from geometry, so a joint at 0 may be open or closed."""
 
 from __future__ import annotations
 
@@ -22,15 +21,15 @@ from graspd.worker.objects.memory_cache import cached_by_content
 
 Ints = NDArray[np.intp]
 
-#: Most degrees of freedom of a gripper's closing.
+#: Largest number of degrees of freedom that close a gripper.
 MAX_DOFS: Final = 2
 #: Number of points that represent the hand's surface.
 _POINTS: Final = 1600
-#: Two surfaces face each other if their normals are opposite to within 37 degrees ...
+#: Two surfaces face each other if their normals are opposite to within 37 degrees.
 _FACING_COS: Final = 0.8
-#: ... and one is in front of the other, with a lateral offset of at most so many distances between sample points.
+#: One of them is then in front of the other. Largest lateral offset, in distances between sample points.
 _ASIDE: Final = 1.5
-#: Facing surfaces count if they approach each other with at least this share of the fastest speed.
+#: Least speed at which facing surfaces approach each other, as a share of the fastest speed.
 _FAST: Final = 0.5
 #: A pad is the part of a jaw within this distance of the first contact [m].
 _PAD_DEPTH_M: Final = 0.003
@@ -38,15 +37,15 @@ _PAD_DEPTH_M: Final = 0.003
 _LOOKS: Final = (0.5, 0.02, 0.98)
 #: Surfaces move ahead if their speed along their normals is at least this share of the fastest point's speed.
 _LEADING: Final = 0.3
-#: A body carries a pad if the area that faced the other jaw is at least this share of the largest such area.
+#: A body carries a pad if its area that faced the other jaw is at least this share of the largest such area.
 _PAD_SHARE: Final = 0.4
 #: Number of postures between open and closed.
 _STEPS: Final = 17
-#: Pads face each other if the difference of their mean normals is longer than this: up to 120 degrees between them.
+#: Pads face each other if the difference of their mean normals is longer than this: at most 120 degrees between them.
 _TOWARDS: Final = 1.0
 #: Pads nearer than this touch [m].
 _TOUCH_M: Final = 2e-4
-#: Least ratio of smallest to largest singular value of the ends' motions at which these are not planar.
+#: Ratio of smallest to largest singular value of the ends' motions from which on these are not planar.
 _IN_SPACE: Final = 0.2
 
 
@@ -71,7 +70,7 @@ class Jaws:
     first: NDArray[np.bool_]
     """(P,) mask of the points on the first pad."""
     length: float
-    """Extent of the pads along the approach that was given [m]."""
+    """Extent of the pads along the given approach [m]."""
 
     @cached_property
     def opening(self) -> float:
@@ -93,11 +92,9 @@ class Jaws:
 
 
 def closing_by_geometry(hand: HandModel) -> Floats:
-    """Return (D,) +1, -1: the direction in which each dof brings opposing surfaces together; 0: none.
-
-    The sign is that of a sum over postures from all dofs at their lower to all at their upper limits: the area of
-    facing surfaces times the speed at which they separate.
-    """
+    """Return the direction (D,) in which each dof brings opposing surfaces together: +1 or -1; 0: no direction.
+    The sign belongs to the sum over postures from all dofs at their lower limits to all at their upper limits. Summed
+    is the area of facing surfaces times the speed at which they separate."""
     points = _points(hand)
     balance, total = np.zeros(hand.dofs), np.zeros(hand.dofs)
     for share in np.linspace(0.05, 0.95, 5):
@@ -108,7 +105,7 @@ def closing_by_geometry(hand: HandModel) -> Floats:
         first, second, _ = _facing(place, normal, points, np.flatnonzero(moved))
         for dof, motion in enumerate(motions):
             rate = np.einsum("ni,ni->n", motion[second] - motion[first], normal[first])
-            # The rate of surfaces that slide along each other is rounding noise.
+            # The rate of sliding surfaces is rounding noise.
             rate[np.abs(rate) < 1e-3 * np.abs(motion).max(initial=1e-12)] = 0.0
             balance[dof] += points.area[first] @ rate
             total[dof] += points.area[first] @ np.abs(rate)
@@ -123,9 +120,7 @@ def jaws_of(hand: HandModel) -> Jaws | None:
 
 def find_jaws(hand: HandModel, approach: Floats | None = None) -> Jaws | None:
     """Find the jaws of a hand with known `closing`; None if it has none.
-
-    A gripper has at most `MAX_DOFS` dofs, one of which closes it, and opposing surfaces on two sides.
-    """
+    A gripper has at most `MAX_DOFS` dofs, one of which closes it, and opposing surfaces on two sides."""
     closing = np.flatnonzero(hand.closing)
     if not 1 <= len(closing) <= MAX_DOFS or hand.dofs > MAX_DOFS:
         return None
@@ -165,12 +160,12 @@ def _motion(hand: HandModel, points: SurfacePoints, q: Floats, dof: int) -> Floa
 
 
 def _ahead(motion: Floats, normal: Floats) -> Floats:
-    """Return the speed (N,) of points along their normals, of either sign, over that of the fastest point."""
+    """Return the speed (N,) of points along their normals, of either sign, over the speed of the fastest point."""
     return np.asarray(np.abs(np.einsum("ni,ni->n", motion, normal)) / np.abs(motion).max(initial=1e-12))
 
 
 def _facing(place: Floats, normal: Floats, points: SurfacePoints, among: Ints) -> tuple[Ints, Ints, Floats]:
-    """Return the points of `among` that face another body, the nearest one of each, and the gap [m]."""
+    """Return the points of `among` that face another body, the nearest faced point of each, and the gap [m]."""
     aside = _ASIDE * np.sqrt(points.area.sum() / len(points))
     first, second, gaps = [], [], []
     for i in among:
@@ -201,8 +196,8 @@ def _is_centric(hand: HandModel, points: SurfacePoints, path: Floats) -> bool:
 
 
 def _meeting(hand: HandModel, points: SurfacePoints, path: Floats) -> tuple[Floats, Ints, Ints, Floats] | None:
-    """Return the posture in which the pads meet, or the last of the path, and the first pairs of contact.
-    Also return the area (L,) of each body that faced another before contact, summed over postures."""
+    """Return the posture in which the pads meet, or the last of the path, and the first pairs in contact.
+    Also return the area (L,) of each body that faced another body before contact, summed over postures."""
     best: tuple[Floats, Ints, Ints, Floats] | None = None
     step, faced = path[-1] - path[0], np.zeros(hand.bodies)
     for k in range(len(path)):
@@ -222,7 +217,7 @@ def _meeting(hand: HandModel, points: SurfacePoints, path: Floats) -> tuple[Floa
         best = path[k], first[soonest], second[soonest], faced
         left = float(np.quantile(when, 0.02))
         if left < 1.0 / (_STEPS - 1):
-            # Contact is before the next posture.
+            # Contact occurs before the next posture.
             return np.clip(path[k] + left * step, hand.lower, hand.upper), first[soonest], second[soonest], faced
     return best
 
@@ -244,10 +239,8 @@ def _sides(
 
 
 def sign_of(line: Floats) -> float:
-    """Return -1 if a line's largest component is negative, else 1; the first of equally large ones counts.
-
-    The sign of a vector from a decomposition is rounding noise.
-    """
+    """Return -1 if a line's largest component is negative, else 1; of equally large ones the first counts.
+    The sign of a vector from a decomposition is rounding noise."""
     size = np.abs(line)
     return float(np.sign(line[int(np.argmax(size > (1 - 1e-6) * size.max()))]))
 
@@ -267,7 +260,7 @@ def _measured(
     for k, q in enumerate(path):
         place, normal = posed_points(hand, points, q)
         axis = normal[one].mean(axis=0) - normal[two].mean(axis=0)
-        # Pads that do not face each other hold nothing: jaws are not opened that far.
+        # Pads that do not face each other cannot hold: jaws are not opened that far.
         facing[k] = float(np.linalg.norm(axis)) > _TOWARDS
         axis /= max(float(np.linalg.norm(axis)), 1e-9)
         low, high = place[one] @ axis, place[two] @ axis
@@ -302,7 +295,7 @@ def slides(hand: HandModel) -> NDArray[np.bool_]:
     return np.array([JointType.PRISMATIC in hand.joint_type[hand.dof == d] for d in range(hand.dofs)])
 
 
-#: The pad of a fingertip is the part within this share of the tip's largest speed, and so of its length.
+#: A pad is the part of a fingertip within this share of the tip's largest speed, and thus of its length.
 PAD: Final = 0.5
 #: Least cosine of a pad's normals with its motion.
 _AHEAD: Final = 0.7
@@ -341,7 +334,7 @@ def pads_of(hand: HandModel) -> tuple[Pad, ...]:
 
 
 def fingertip_pad(hand: HandModel, tip: int) -> Pad:
-    """Return the pad of a fingertip: the end of the side that its last joint moves forward."""
+    """Return the pad of a fingertip: the end of its side that the last joint moves forward."""
     points = sample_surface(hand, _PAD_POINTS)
     mine = points.body == tip
     place, normal = points.position[mine], points.normal[mine]
@@ -349,10 +342,10 @@ def fingertip_pad(hand: HandModel, tip: int) -> Pad:
     driven = [b for b in chain if hand.closing[hand.dof[b]] != 0] or chain
     if not len(place) or not driven:
         return Pad(tip, np.zeros(3), np.array([0.0, 0, 1]), np.zeros((0, 3)))
-    # A joint that turns the tip about itself moves no side forward: then a joint nearer to the palm decides.
+    # A joint that turns the tip about itself moves no side forward; a joint nearer to the palm then decides.
     chosen = next((part for body in driven if (part := _moved_ahead(hand, tip, body, place, normal)).any()), None)
     if chosen is None:
-        # No joint decides, and normals of a whole tip cancel to rounding noise: use the side that the palm faces.
+        # No joint decides, and the normals of a whole tip cancel: use the side that the palm faces.
         pose = body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0, tip]
         ahead = quat_rotate(quat_conjugate(pose[3:]), hand.palm.approach)
         chosen = normal @ ahead > _AHEAD

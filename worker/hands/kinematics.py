@@ -12,16 +12,9 @@ from graspd.worker.hands.model import HandModel, JointType
 
 
 def body_poses(hand: HandModel, hand_pose: Floats, joint_positions: Floats) -> Floats:
-    """Compute the poses of all bodies.
-
-    Args:
-        hand: the hand.
-        hand_pose: (N, 7) pose of the root link in the world (here: the object) frame.
-        joint_positions: (N, J) in `HandModel.joint_names` order [rad or m].
-
-    Returns:
-        (N, L, 7) pose of each body's frame in the world frame.
-    """
+    """Compute the poses (N, L, 7) of all bodies' frames in the world frame, here the object's.
+    `hand_pose` (N, 7) is the pose of the root link in the world frame. `joint_positions` (N, J) are in the order of
+    `HandModel.joint_names` [rad or m]."""
     hand_pose = np.atleast_2d(np.asarray(hand_pose, float))
     joints = np.atleast_2d(np.asarray(joint_positions, float))
     poses = np.empty((len(hand_pose), hand.bodies, 7))
@@ -48,7 +41,7 @@ def _levels(parents: bytes) -> tuple[NDArray[np.intp], ...]:
 
 
 def ancestors(hand: HandModel) -> NDArray[np.bool_]:
-    """Return (L, L): [a, b] whether the joint of body b moves body a (b itself included, the root not)."""
+    """Return (L, L): [a, b] is True if the joint of body b moves body a; b itself is included, the root is not."""
     moves = np.zeros((hand.bodies, hand.bodies), dtype=bool)
     for body in range(1, hand.bodies):
         moves[body] = moves[hand.parent[body]]
@@ -59,20 +52,11 @@ def ancestors(hand: HandModel) -> NDArray[np.bool_]:
 def generalized_forces(
     hand: HandModel, bodies: Floats, body: NDArray[np.integer], points: Floats, forces: Floats
 ) -> Floats:
-    """Compute generalized forces on a hand's dofs, mimic joints folded in, from forces on its bodies.
-
-    By virtual work the torque on a dof is the sum over its joints of multiplier times joint torque.
-
-    Args:
-        hand: the hand.
-        bodies: (..., L, 7) body poses.
-        body: (..., C) the body of each point.
-        points: (..., C, 3) points in the frame of the poses [m].
-        forces: (..., C, E, 3) E forces at each point [N].
-
-    Returns:
-        (..., C, E, D) [N m, or N for prismatic dofs].
-    """
+    """Compute generalized forces (..., C, E, D) on a hand's dofs from forces on its bodies [N m, or N for prismatic
+    dofs].
+    By virtual work the torque on a dof is the sum over its joints of multiplier times joint torque. `bodies` (..., L,
+    7) are poses; `body` (..., C) is the body of each point. `points` (..., C, 3) [m] are in the frame of the poses; E
+    `forces` (..., C, E, 3) act at each point [N]."""
     axis = quat_rotate(bodies[..., 3:], hand.axis)[..., None, :, :]
     lever = np.asarray(points, float)[..., :, None, :] - bodies[..., None, :, :3]
     # axis . (lever x force) = force . (axis x lever)

@@ -40,25 +40,17 @@ from graspd.worker.hands.xacro import read_robot
 
 log = logging.getLogger(__name__)
 
-#: Density for the mass of a link whose URDF gives none, from the volume of its pieces [kg/m^3].
+#: Density for the mass of a link without a stated mass, from the volume of its pieces [kg/m^3].
 DENSITY = 1000.0
 
 
 def load_hand(
     files: Mapping[str, bytes], *, name: str, digest: str, options: Mapping[str, Any] | None = None, drag: bool = False
 ) -> HandModel:
-    """Load the hand in `files`.
-
-    Args:
-        files: the URDF, its meshes and optionally `asset.json` or `hand.json` (see `parse_options`).
-        name: name of the hand.
-        digest: digest of its files.
-        options: keys that override those in the files.
-        drag: whether its joints have the armature and dry friction in the files.
-
-    Raises:
-        HandError: the files describe no usable hand; the message names the fault and the fix.
-    """
+    """Load the hand in `files`: its URDF, its meshes and optionally `asset.json` or `hand.json` (see `parse_options`).
+    `digest` is that of the files; `options` are keys that override those in the files. With `drag`, its joints have the
+    armature and dry friction in the files.
+    Raises HandError: the files describe no usable hand; the message names the fault and the fix."""
     source = HandSource.read(files, options, name=name, digest=digest)
     hand = assemble(source)
     return replace(hand, drag=_drag(source.robot, hand)) if drag else hand
@@ -103,7 +95,7 @@ def assemble(source: HandSource) -> HandModel:
 
 
 def mounting_of(source: HandSource, hand: HandModel) -> tuple[HandModel | None, str]:
-    """Return the links above the hand's root, None if there are none, and why their shapes are unreadable.
+    """Return the links above the hand's root, None if there are none, and the reason for unreadable shapes.
     A fault above a hand does not make the hand unusable."""
     tree = mounting_tree(source.robot, hand.root_link, source.options)
     if tree is None:
@@ -123,10 +115,7 @@ def _drag(robot: Robot, hand: HandModel) -> Drag:
 
 def body_model(source: HandSource, tree: Tree) -> HandModel:
     """Build bodies, joints and pieces of a tree, without palm, fingers, closing and neighbours.
-
-    Raises:
-        HandError: no part can touch, or a mesh or a number cannot be used.
-    """
+    Raises HandError: no part can touch, or a mesh or a number cannot be used."""
     robot = source.robot
     base = str(PurePosixPath(source.main).parent).removeprefix(".")
     pieces = _pieces(source, tree, base)
@@ -207,7 +196,7 @@ def _joint_type(joint: Joint | None) -> JointType:
 
 
 def assumed_efforts(source: HandSource, dofs: Sequence[str]) -> list[str]:
-    """Return the dofs whose torque or force limit is stated neither by the robot nor by the options."""
+    """Return the dofs whose torque or force limit neither the robot nor the options state."""
     stated = source.options.effort
     if isinstance(stated, float):
         return []
@@ -250,17 +239,13 @@ def _masses(robot: Robot, tree: Tree, pieces: tuple[ConvexPiece, ...]) -> Floats
             mine = [p for p in pieces if p.link == link]
             mass = DENSITY * sum(volume(p.kind, p.size, p.vertices, p.faces) for p in mine)
         masses[body] += mass
-    # A body of empty frames only still needs a mass in simulations that move it.
+    # A body that consists of empty frames still needs a mass in simulations that move it.
     return np.maximum(masses, 1e-3)
 
 
 def hand_from_path(path: str | Path, options: Mapping[str, Any] | None = None, *, drag: bool = False) -> HandModel:
     """Load a hand for the command line: a built-in's name, URDF, folder, or ZIP; `drag`: see `load_hand`.
-
-    Raises:
-        NotFoundError: neither a file nor a built-in hand.
-        HandError: see `load_hand`.
-    """
+    Raises NotFoundError: neither a file nor a built-in hand. HandError: see `load_hand`."""
     name, files, stated = files_from_path(path)
     return load_hand(
         files,
@@ -289,10 +274,8 @@ def files_from_path(path: str | Path) -> tuple[str, dict[str, bytes], dict[str, 
 
 def with_drive(hand: HandModel, stated: Collection[str], assumed: Sequence[str]) -> HandModel:
     """Replace the defaults of revolute joints by those of sliding joints and jaws, unless stated.
-
-    A dof that moves pads by v [m/rad or 1] along their line gets the gain k v^2, summed over the pads, and the limit
-    f v. Each pad thus has the gain k [N/m] and the limit f [N], independent of the gearing.
-    """
+    A dof that moves pads by v [m/rad or 1] along their line gets the limit f v. Its gain is k v^2, summed over the
+    pads. Each pad thus has the gain k [N/m] and the limit f [N], independent of the gearing."""
     slide, jaws = slides(hand), jaws_of(hand)
     if jaws is None and not slide.any():
         return hand

@@ -1,8 +1,7 @@
 """Read a hand from MJCF with MuJoCo, which resolves defaults, classes, angles and inertias.
 
-Bodies become links; several joints of a body become a chain of joints with a link between each two. Elements that a
-hand does not need, and files outside the upload, never reach MuJoCo: see `worker.hands.mjcf_source`.
-"""
+Bodies become links. Several joints of a body become a chain of joints with links between them. Elements that a hand
+does not need, and files outside the upload, never reach MuJoCo: see `worker.hands.mjcf_source`."""
 
 from __future__ import annotations
 
@@ -25,7 +24,7 @@ from graspd.worker.hands.tree import joint_motion
 _FREE, _HINGE, _SLIDE = (
     int(kind) for kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 )
-#: Colour of a geom that states none; such a geom has its material's colour.
+#: Colour of a geom without a stated colour; such a geom has its material's colour.
 _NAMED_COLOUR: Final = np.array([0.5, 0.5, 0.5, 1.0])
 #: First group that MuJoCo's viewer does not draw.
 _HIDDEN_GROUP: Final = 3
@@ -35,11 +34,8 @@ _AT_ORIGIN_M: Final = 1e-12
 
 def read_mjcf(files: Mapping[str, bytes], main: str) -> Robot:
     """Read and check an MJCF model.
-
-    Raises:
-        HandError: MuJoCo rejects it, or it is no hand; the message names the fault.
-        LimitError: larger than a hand.
-    """
+    Raises HandError: MuJoCo rejects it, or it is no hand; the message names the fault. LimitError: larger than a
+    hand."""
     text, assets, notes = self_contained(files, main)
     try:
         model = mujoco.MjModel.from_xml_string(text, assets)
@@ -103,9 +99,7 @@ class _Reader:
 
     def body(self, body: int, parent: str, pose: Floats) -> None:
         """Add a body at a (7,) pose on link `parent`, and all bodies below it.
-
-        MuJoCo moves a body by its joints one after another, each about its own anchor in the body's frame.
-        """
+        MuJoCo moves a body by its joints one after another, each about its own anchor in the body's frame."""
         stack = [(body, parent, pose)]
         while stack:
             body, parent, pose = stack.pop()
@@ -139,7 +133,7 @@ class _Reader:
         moving = replace(
             still, type="prismatic" if slides else "revolute", axis=np.asarray(model.jnt_axis[joint], float)
         )
-        # A joint value counts from `ref`, the value in the pose of the file.
+        # A joint value counts from `ref`, its value in the pose of the file.
         origin = compose(origin, joint_motion(moving, -float(model.qpos0[model.jnt_qposadr[joint]])))
         follows = self._mimics.get(joint)
         if isinstance(follows, float):
@@ -173,7 +167,7 @@ class _Reader:
         first, count = int(model.body_geomadr[body]), int(model.body_geomnum[body])
         geoms = range(first, first + count) if count else range(0)
         touching = [g for g in geoms if model.geom_contype[g] or model.geom_conaffinity[g]]
-        # Some models define contacts by pairs only: then all geoms in the collision groups count.
+        # Some models define contacts only by pairs: then all geoms in the collision groups count.
         touching = touching or [g for g in geoms if self._bare and model.geom_group[g] >= _HIDDEN_GROUP]
         shown = [g for g in geoms if g not in touching and model.geom_group[g] < _HIDDEN_GROUP]
         shown = shown or [g for g in touching if model.geom_group[g] < _HIDDEN_GROUP]

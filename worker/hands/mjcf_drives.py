@@ -1,8 +1,7 @@
 """Drives and couplings of the joints of an MJCF model, from actuators, equalities, fixed tendons and closed loops.
 
 Couplings are linear in their drivers. A four-bar linkage is a tree with ends connected by `connect` constraints. The
-loops are solved over the drivers' ranges, and each passive joint is fitted by a line, with the resulting error.
-"""
+loops are solved over the drivers' ranges, and each passive joint is fitted by a line, with the resulting error."""
 
 from __future__ import annotations
 
@@ -102,11 +101,10 @@ class Couplings:
         return False
 
     def _couple_on_tendon(self, length: float, pulled: list[tuple[int, float]]) -> None:
-        """Couple two joints on a fixed tendon: c1 (q1 - q1_0) + c2 (q2 - q2_0) = length; the unactuated follows.
-
-        Limits take precedence over the tendon: a follower at its limit does not move, as in a finger with a
-        compliant end.
-        """
+        """Couple two joints on a fixed tendon: c1 (q1 - q1_0) + c2 (q2 - q2_0) = length; the joint without actuator
+        follows.
+        Limits take precedence over the tendon: a follower at its limit does not move, as in a finger with a compliant
+        end."""
         free = [pair for pair in pulled if pair[0] not in self.follows and pair[0] not in self._actuated]
         if not free or abs(free[-1][1]) < 1e-9:
             self.notes.append(f"a tendon of {' and '.join(self.name(joint) for joint, _ in pulled)} was left out")
@@ -128,10 +126,8 @@ class Couplings:
 
     def _add_tendons(self) -> None:
         """Couple joints that share one actuated tendon and have no other drive.
-
         Serial joints of one finger share the tendon according to contact. Parallel joints, the jaws of a gripper, bend
-        in the ratio of its pull on them: if they shared it freely, the object could move from side to side.
-        """
+        in the ratio of its pull on them. If jaws shared the tendon freely, the object could move from side to side."""
         alone = {pulled[0][0] for pulled in self._driven if len(pulled) == 1}
         for actuator, pulled in enumerate(self._driven):
             free = [(j, c) for j, c in pulled if j not in self.follows and j not in alone and abs(c) > 1e-9]
@@ -175,11 +171,8 @@ class Couplings:
 
     def _follow(self, group: list[int], joints: list[int], passive: list[int]) -> None:
         """Add the mimics of the passive joints in a group of loops.
-
-        Raises:
-            HandError: the group has no driver or several, does not close over its driver's range, or a joint depends
-                on the driver nonlinearly.
-        """
+        Raises HandError: the group has no single driver, or does not close over its driver's range, or a joint depends
+        on the driver nonlinearly."""
         held = ", ".join(map(self.name, joints))
         if round_ones := [j for j in joints if int(self.model.jnt_type[j]) not in _ONE_VALUE]:
             raise HandError(
@@ -187,7 +180,7 @@ class Couplings:
                 "solved; write equalities of joints instead of the loop"
             )
         drivers = [j for j in joints if j in self._actuated and j not in self.follows]
-        # Without an actuator in the loop, a joint that follows a joint outside drives it.
+        # Without an actuator in the loop, the joint that follows a joint outside is the driver.
         drivers = drivers or [j for j in joints if j in self.follows and not isinstance(self.follows[j], float)]
         if not drivers:
             raise HandError(f"the loop of {held} has no driver; give one of its joints an actuator")
@@ -219,7 +212,7 @@ class Couplings:
         lower, upper = self._range(driver)
         start = float(np.clip(self._rest(driver), lower, upper))
         values = np.linspace(lower, upper, _STEPS)
-        # From the model's initial value to both ends, each step starting from the last solution.
+        # From the model's initial value to both ends; each step starts from the last solution.
         order = np.concatenate([np.flatnonzero(values >= start), np.flatnonzero(values < start)[::-1]])
         solved = np.full((_STEPS, len(passive)), np.nan)
         rest = np.array([self._rest(joint) for joint in passive])
@@ -273,7 +266,7 @@ def _on_loop(model: Any, loop: int) -> list[int]:
 
 
 def chain_up(model: Any, body: int) -> list[int]:
-    """Return the bodies from this one up to the one on the world."""
+    """Return the bodies from this one up to the body on the world."""
     found = []
     while body:
         found.append(body)
@@ -323,12 +316,10 @@ def _anchors(model: Any, data: Any, loop: int) -> tuple[Floats, Floats]:
 
 def servos(model: Any, mimics: Mapping[int, Mimic | float], shared: Collection[int]) -> dict[int, tuple[float, float]]:
     """Return effort [N m or N] and stiffness [N m/rad or N/m] of each driven joint; 0: not stated.
-
     An actuator of gear g on a length l pulls with g F dl/dq at joint q. A position servo of gain k holds the joint with
-    k (g dl/dq)^2. On a joint dl/dq is 1. On a fixed tendon it is the joint's coefficient plus those of its followers
-    times their rates. If n joints share a tendon (`shared`), each is so stiff that n of them in series have the
-    tendon's gain.
-    """
+    k (g dl/dq)^2. On a joint dl/dq is 1. On a fixed tendon it is the joint's coefficient plus the coefficients of its
+    followers, times their rates. If n joints share a tendon (`shared`), each gets n times the tendon's gain, so that
+    their series has the tendon's gain."""
     found: dict[int, tuple[float, float]] = {}
     joint_of = {str(model.joint(j).name): j for j in range(model.njnt)}
     for actuator in range(model.nu):

@@ -1,8 +1,7 @@
-"""Sanitise MJCF for MuJoCo's own reader: one text that names no file, and the meshes that it needs.
+"""Sanitiser of MJCF for MuJoCo's reader: one text that names no file, and the meshes that it needs.
 
-MuJoCo reads any file on disk that a model names. So this module inserts includes, renames meshes of the hand's files,
-and removes all parts that a hand does not need: only what is listed here reaches MuJoCo.
-"""
+MuJoCo reads any file on disk that a model names. This module therefore inserts includes, renames meshes of the hand's
+files, and removes all parts that a hand does not need. Only the elements listed here reach MuJoCo."""
 
 from __future__ import annotations
 
@@ -39,12 +38,8 @@ _MESHES: Final = (".stl", ".obj", ".msh")
 
 def self_contained(files: Mapping[str, bytes], main: str) -> tuple[str, dict[str, bytes], list[str]]:
     """Return the model as one text, the mesh files it names, and notes for the user.
-
-    Raises:
-        HandError: not XML, not MJCF, an include or a mesh is missing or outside the upload, or an element would load
-            another model; the message names it.
-        LimitError: larger than the limits of this module.
-    """
+    Raises HandError: no XML, no MJCF, an include or mesh that is missing or outside the upload, or an element that
+    loads another model. LimitError: larger than the limits of this module."""
     root = parse_xml(files[main], main, "an MJCF model", "mujoco", limit_bytes=MAX_BYTES)
     _put_in_includes(root, files, main, main, [0, 0])
     folder = _mesh_folder(root)
@@ -61,7 +56,7 @@ def self_contained(files: Mapping[str, bytes], main: str) -> tuple[str, dict[str
         for name in _DROPPED & element.attrib.keys():
             del element.attrib[name]
         if element.tag == "default":
-            # MuJoCo refuses other attributes here; other readers ignore them.
+            # MuJoCo refuses other attributes here, which other readers ignore.
             element.attrib = {name: value for name, value in element.attrib.items() if name == "class"}
     notes = _passed_over(root)
     _prune(root)

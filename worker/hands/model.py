@@ -1,8 +1,7 @@
 """Model of a hand for the engine: tree of rigid bodies, map from dofs to joints, convex pieces.
 
-Links joined by fixed joints are merged into one body, so every body except the root has one moving joint.
-Frames: body frame = frame of the link that the moving joint carries; root frame = frame of the named root link.
-"""
+Links joined by fixed joints are merged into one body, so every body except the root has one moving joint. The body
+frame is the frame of the link that the moving joint carries. The root frame is the frame of the named root link."""
 
 from __future__ import annotations
 
@@ -88,9 +87,7 @@ class Drag:
 @dataclass(frozen=True)
 class HandModel:
     """Kinematic tree of L bodies with D independent degrees of freedom (dofs) that drive J moving joints.
-
-    Joint value of body l: ``multiplier[l] * q[dof[l]] + offset[l]`` (mimic chains and couplings are folded in).
-    """
+    Joint value of body l: ``multiplier[l] * q[dof[l]] + offset[l]``, with mimic chains and couplings folded in."""
 
     name: str
     digest: str
@@ -131,9 +128,9 @@ class HandModel:
     neighbours: frozenset[tuple[int, int]]
     """Pairs of bodies (a < b) whose contact is ignored: adjacent, or touching in every posture."""
     masses: Floats
-    """(L,) [kg] of each body, from the URDF or, if it gives none, from volume at 1000 kg/m^3."""
+    """(L,) mass of each body [kg], from the URDF or, without a stated mass, from volume at 1000 kg/m^3."""
     velocity: Floats = field(default_factory=lambda: np.zeros(0))
-    """(D,) limit of speed [rad/s or m/s], with those of mimicking joints folded in; 0 if not stated."""
+    """(D,) speed limit [rad/s or m/s], with the limits of mimicking joints folded in; 0 if not stated."""
     arm: tuple[Joint, ...] = ()
     """Joints, fixed ones too, from the root of the original robot to `root_link`, for export."""
     visuals: Visuals = NO_VISUALS
@@ -175,7 +172,7 @@ class HandModel:
         return np.asarray(q)[..., self.dof[body]] * self.multiplier[body] + self.offset[body]
 
     def reduce(self, joints: Floats) -> Floats:
-        """Compute dof values (..., D) from joint positions (..., J): each dof from the first joint it drives."""
+        """Compute dof values (..., D) from joint positions (..., J), each dof from the first joint it drives."""
         first = self.first_joint
         body = self.joint_body[first]
         return (np.asarray(joints)[..., first] - self.offset[body]) / self.multiplier[body]

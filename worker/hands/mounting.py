@@ -1,9 +1,8 @@
 """Mounting of a hand: links above its root whose poses follow from a grasp, except for wrist angles.
 
 The mounting is its own kinematic tree that starts at the hand's root and runs up the robot. It passes fixed joints,
-joints with one value, and at most `MAX_WRIST_JOINTS` joints of a wrist: revolute ones of limited range near the root.
-The first other joint belongs to an arm, whose poses a grasp does not determine.
-"""
+joints with one value, and at most `MAX_WRIST_JOINTS` wrist joints: revolute, of limited range, near the root. The first
+other joint belongs to an arm, whose poses a grasp does not determine."""
 
 from __future__ import annotations
 
@@ -20,8 +19,8 @@ from graspd.worker.hands.options import HandOptions
 from graspd.worker.hands.robot import Joint, Mimic, Robot, chain_to
 from graspd.worker.hands.tree import LEAST_RANGE, Body, Tree, joint_motion
 
-#: Most joints of a wrist, largest range of one [rad], and its largest distance from the root along the joints [m]. The
-#: last joint of an arm usually has a larger range.
+#: Largest number of joints of a wrist, largest range of each [rad], and its largest distance from the root along the
+#: joints [m]. The last joint of an arm usually has a larger range.
 MAX_WRIST_JOINTS: Final = 2
 MAX_WRIST_RANGE: Final = math.pi
 MAX_WRIST_M: Final = 0.1
@@ -41,7 +40,7 @@ def mounting_tree(robot: Robot, root: str, options: HandOptions) -> Tree | None:
         if value is None:
             if len(bodies) > MAX_WRIST_JOINTS or way > MAX_WRIST_M or not _of_wrist(joint):
                 break
-            # Relative to the child, the parent turns in reverse about the same axis, then has its offset.
+            # Relative to the child, the parent turns in reverse about the same axis; then its offset follows.
             bodies.append(Body(joint.parent, len(bodies) - 1, replace(joint, axis=-joint.axis), pose))
             pose = invert(joint.origin)
         else:
@@ -72,7 +71,8 @@ def _of_wrist(joint: Joint) -> bool:
 
 
 def _rigid(robot: Robot, joint: Joint, pose: Floats, options: HandOptions) -> dict[str, Floats]:
-    """Return the poses of a joint's parent, as given, and of links fixed to it except the joint's child."""
+    """Return the poses of a joint's parent, as given, and of the links fixed to this parent except the joint's
+    child."""
     found, stack = {joint.parent: pose}, [joint.parent]
     while stack:
         at = stack.pop()

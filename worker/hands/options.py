@@ -18,8 +18,8 @@ Vector = tuple[Finite, Finite, Finite]
 
 #: Default position gain of joints, Kp [N m/rad]: the value of the DexGraspBench protocol.
 DEFAULT_STIFFNESS: Final = 5.0
-#: Default for sliding joints [N/m] and each pad of any gripper: the same gain at a lever of 5 cm. Stiffer drives lose
-#: their force in the gap of half a millimetre that a grasp leaves, and in soft contacts.
+#: Default for sliding joints [N/m] and each pad of any gripper: the revolute default at a lever of 5 cm. Stiffer drives
+#: lose their force in the gap of half a millimetre that a grasp leaves, and in soft contacts.
 DEFAULT_LINEAR_STIFFNESS: Final = 2_000.0
 #: Default torque limit [N m] if the URDF gives none or 0: FRoGGeR's value for the Allegro hand.
 DEFAULT_EFFORT: Final = 0.7
@@ -77,10 +77,7 @@ class HandOptions(_Options):
 
 def parse_options(files: Mapping[str, bytes], extra: Mapping[str, Any] | None = None) -> HandOptions:
     """Return options of the hand in `files`: `extra` overrides `asset.json`, which overrides `hand.json`.
-
-    Raises:
-        HandError: one of them is not JSON, or a key is unknown or wrong; the message names it.
-    """
+    Raises HandError: one of them is not JSON, or a key is unknown or wrong; the message names it."""
     stated = {**stated_options(files, HandError), **(extra or {})}
     try:
         return HandOptions.model_validate({**_hand_json(files, stated.get("file")), **stated})
@@ -90,7 +87,7 @@ def parse_options(files: Mapping[str, bytes], extra: Mapping[str, Any] | None = 
 
 
 def _hand_json(files: Mapping[str, bytes], urdf: object) -> dict[str, Any]:
-    """Return options from a hand collection's notes, unless they are on another file than `urdf`, if known."""
+    """Return options from a hand collection's notes, unless the notes are on another file than `urdf`, if known."""
     if "hand.json" not in files:
         return {}
     options: dict[str, Any] = {}
@@ -114,6 +111,6 @@ def _hand_json(files: Mapping[str, bytes], urdf: object) -> dict[str, Any]:
 
 
 def _is_among(noted: str, files: Mapping[str, bytes], urdf: object) -> bool:
-    """Check whether notes refer to this URDF; in the same folder they use its bare name."""
+    """Check whether notes refer to this URDF; notes in the same folder use its bare name."""
     named = [name for name in files if PurePosixPath(name).name == PurePosixPath(noted).name]
     return bool(named) and PurePosixPath(str(urdf or noted)).name == PurePosixPath(noted).name

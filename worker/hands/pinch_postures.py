@@ -1,8 +1,7 @@
 """Pinch postures: whether a hand's surfaces oppose one another, and opposed postures by width.
 
-A hand holds between one finger, usually the thumb, and others with pads that face it. Sampling and random steps find
-such postures for all feasible widths.
-"""
+A hand holds between one finger, usually the thumb, and other fingers with pads that face it. Sampling and random steps
+find such postures for all feasible widths."""
 
 from __future__ import annotations
 
@@ -31,8 +30,8 @@ from graspd.worker.objects.memory_cache import cached_by_content
 POSTURES: Final = 160
 CROWD: Final = 25
 CLIMBS: Final = 100
-#: Least cosine of pads with the line between them, limit on the palm's cosine with it, and its least distance in front
-#: of the palm [m].
+#: Limits on the line between the pads: its least cosine with the pads, its largest cosine with the palm, and its least
+#: distance in front of the palm [m].
 FACING: Final = 0.75
 SQUARE: Final = 0.7
 AHEAD_M: Final = 0.02
@@ -40,17 +39,17 @@ AHEAD_M: Final = 0.02
 THINNEST_M: Final = 0.002
 #: Difference of width that costs as much as one radian of facing [m].
 WIDTH_M: Final = 0.02
-#: Spread about the pre-shape of dofs that do not close, and of fingers that close together: shares of a range.
+#: Spread about the pre-shape of dofs that do not close, and of fingers that close together, as shares of a range.
 SIDEWAYS: Final = 0.15
 UNEVEN: Final = 0.06
-#: Number of surface points, and of random postures, in the test whether a hand can hold anything.
+#: Number of surface points, and of random postures, in the test whether a hand can hold any object.
 _CHECKED_POINTS: Final = 512
 _CHECKED_AT_RANDOM: Final = 11
-#: Gap below which two surfaces hold nothing, and above which they hold nothing that a hand can lift [m].
+#: Gap below which two surfaces hold nothing, and gap above which they hold no object that a hand can lift [m].
 _GAP_M: Final = (0.004, 0.3)
 #: Least cosine between a normal and the direction to the other surface: within 60 degrees.
 _TOWARD: Final = 0.5
-#: Least change of a gap; a smaller one belongs to a rigid fork [m].
+#: Least change of a gap [m]; a smaller change belongs to a rigid fork.
 _CLOSING_M: Final = 0.003
 
 
@@ -61,7 +60,7 @@ class Oppositions:
     q: Floats
     """(K, D)"""
     axis: Floats
-    """(K, 3) unit, from the opposing finger's pad to the others'."""
+    """(K, 3) unit vector from the opposing finger's pad to the other pads."""
     middle: Floats
     """(K, 3) midpoint [m]."""
     width: Floats
@@ -81,7 +80,7 @@ class Oppositions:
 
     @classmethod
     def of(cls, q: Floats, seen: Any, good: NDArray[np.intp]) -> Oppositions:
-        """Select postures `good` of those seen, and sort them by width."""
+        """Select the evaluated postures `good`, and sort them by width."""
         good = good[np.argsort(seen.width[good], kind="stable")]
         return cls(q[good], seen.axis[good], seen.middle[good], seen.width[good])
 
@@ -89,7 +88,7 @@ class Oppositions:
     def kept_or_made(
         cls, kind: str, key: tuple[str, ...], make: Callable[[], Oppositions], *more: ModuleType
     ) -> Oppositions:
-        """Load postures from this machine's cache, or compute them with this code and `more`, and cache them."""
+        """Load postures from this machine's cache; else compute them with this code and `more`, and cache them."""
         return cls(**arrays_kept_or_made(kind, key, (*_code(), *more), lambda: vars(make())))
 
 
@@ -140,9 +139,9 @@ class _Seen:
     middle: Floats
     width: Floats
     facing: Floats
-    """(N,) cosine of the pads with the line between them, for the worse side."""
+    """(N,) cosine of the pads with the line between them; the lower value of both sides."""
     square: Floats
-    """(N,) cosine of the palm's approach with that line; 0: perpendicular."""
+    """(N,) cosine of the palm's approach with the line between the pads; 0: perpendicular."""
     ahead: Floats
     """(N,) distance of the middle in front of the palm [m]."""
 
@@ -190,7 +189,7 @@ def climbed(hand: HandModel, one: int, q: Floats, cost: Callable[[Floats], Float
 
 
 def random_postures(hand: HandModel, one: int, count: int) -> Floats:
-    """Return (count, D): dofs of one finger at random; joints of equal rank in the others close together."""
+    """Return (count, D): dofs of one finger at random; joints of equal rank in the other fingers close together."""
     rng = np.random.default_rng(one)
     finger, rank = _ranks(hand)
     opened = np.where(hand.closing >= 0, hand.lower, hand.upper)
@@ -216,11 +215,8 @@ def _ranks(hand: HandModel) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 
 def require_opposing(hand: HandModel) -> None:
-    """Refuse a hand that can hold nothing, before planning; cached in memory and on this machine.
-
-    Raises:
-        HandError: no two of its surfaces face each other and close; the message states the fix.
-    """
+    """Refuse a hand that cannot hold any object, before planning; cached in memory and on this machine.
+    Raises HandError: no two of its surfaces face each other and close; the message states the fix."""
     if _can_hold(hand):
         return
     shaped = {piece.body for piece in hand.pieces}
@@ -267,7 +263,7 @@ def opposes(hand: HandModel) -> bool:
 
 
 def _face_to_face(position: Floats, normal: Floats) -> tuple[np.ndarray, Floats]:
-    """Return (N, N) whether two points face each other over a gap, and the gap [m]."""
+    """Return a mask (N, N) of pairs of points that face each other over a gap, and the gaps [m]."""
     way = position[None] - position[:, None]
     gap = np.linalg.norm(way, axis=2)
     toward = np.einsum("ijk,ik->ij", way, normal) > _TOWARD * gap

@@ -1,7 +1,6 @@
 """Convex solids: tessellation, area, surface samples, signed distance, features (balls, rims, edges).
 
-All functions work in the solid's own frame; cylinders and capsules have their axis along z and are centred.
-"""
+All functions work in the solid's own frame; cylinders and capsules have their axis along z and are centred."""
 
 from __future__ import annotations
 
@@ -26,10 +25,7 @@ SEGMENTS = 32
 
 def hull(points: Floats) -> tuple[Floats, Ints]:
     """Compute corners (V, 3) and outward triangles (F, 3) of the convex hull of points (N, 3).
-
-    Raises:
-        HandError: the points lie in a plane.
-    """
+    Raises HandError: the points lie in a plane."""
     from scipy.spatial import ConvexHull, QhullError  # slow to load
 
     scale = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
@@ -98,7 +94,7 @@ def sample(
     if kind in ("sphere", "cylinder", "capsule"):
         return _sample_round(kind, size, count, rng)
     areas = face_areas(vertices, faces)
-    # Stratified over the faces: the number on each is its share, rounded up or down.
+    # Stratified over the faces: each face gets its share of the number, rounded up or down.
     ladder = (np.arange(count) + rng.random()) / max(count, 1) * areas.sum()
     face = np.minimum(np.searchsorted(np.cumsum(areas), ladder, side="right"), len(faces) - 1)
     points, normals = on_faces(vertices[faces[face]], *rng.random((2, count, 1))), face_vectors(vertices, faces[face])
@@ -127,10 +123,8 @@ def _sample_round(kind: str, size: tuple[float, ...], count: int, rng: np.random
 
 def signed_distance(kind: str, size: tuple[float, ...], vertices: Floats, faces: Ints, points: Floats) -> Floats:
     """Compute the distance (N,) of points (N, 3), negative inside.
-
     Exact inside every kind and everywhere for spheres and capsules; outside boxes, cylinders and hulls it is a lower
-    bound with the right sign.
-    """
+    bound with the right sign."""
     match kind:
         case "box":
             return (np.abs(points) - np.asarray(size) / 2).max(axis=1)
@@ -157,16 +151,14 @@ def hull_planes(vertices: Floats, faces: Ints) -> tuple[Floats, Floats]:
     return normals, np.einsum("ij,ij->i", normals, vertices[faces[keep, 0]])
 
 
-#: Cosine of normals from which on two triangles are one flat face: 0.1 degrees.
+#: Cosine of normals from which on two triangles count as one flat face: 0.1 degrees.
 COPLANAR: Final = 1 - 1.5e-6
 
 
 @dataclass(frozen=True)
 class HandFeatures:
     """F balls and rims and E edges of P convex pieces, fixed to the bodies of a hand.
-
-    A plane meets balls and rims first; a convex solid that penetrates a piece meets one of them or an edge.
-    """
+    A plane meets balls and rims first; a convex solid that penetrates a piece meets one of them or an edge."""
 
     body: NDArray[np.int32]
     """(F,)"""

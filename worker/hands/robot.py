@@ -1,4 +1,4 @@
-"""Common result of the readers of URDF and MJCF, which check every value: links with shapes, and a tree of joints."""
+"""Common result of the readers of URDF and MJCF, with checked values: links with shapes, and a tree of joints."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Shape:
     filename: str = ""
     """File of a mesh."""
     mesh: tuple[Floats, Ints] | None = None
-    """Vertices (V, 3) and triangles (F, 3) of a mesh that the robot's reader has loaded itself."""
+    """Vertices (V, 3) and triangles (F, 3) of a mesh that the robot's reader has loaded."""
     colour: tuple[float, float, float] | None = None
     """sRGB, 0 .. 1, of a visual element; None: not stated, or in the mesh file."""
 
@@ -76,7 +76,8 @@ class Joint:
     effort: float = 0.0
     """[N m or N]; 0: not stated."""
     mimic: Mimic | None = None
-    """Mimic relation; a URDF follower's own limits are ignored, as in ROS: most published ones are wrong."""
+    """Mimic relation. Own limits of a URDF follower are ignored, as in ROS: most published limits of followers are
+    wrong."""
     velocity: float = 0.0
     """Limit [rad/s or m/s]; 0: not stated."""
     stiffness: float = 0.0
@@ -86,7 +87,7 @@ class Joint:
     dry_friction: float = field(default=0.0, metadata=TOLD_IF_SET)
     """[N m or N]; 0: not stated."""
     fault: str = field(default="", metadata=TOLD_IF_SET)
-    """Error for a hand that moves by this joint; above a hand the joint is fixed and the fault is ignored."""
+    """Error for a hand that moves by this joint. Above a hand the joint is fixed and the fault is ignored."""
 
     @property
     def moves(self) -> bool:
@@ -118,11 +119,8 @@ def build_robot(
     tendons: Mapping[str, Mapping[str, float]] | None = None,
 ) -> Robot:
     """Build a robot from links and joints with checked values.
-
-    Raises:
-        HandError: duplicate names, joints that form no tree, mimics that form no chain, or nothing moves or can touch.
-        LimitError: more links or shapes than a hand has.
-    """
+    Raises HandError: duplicate names, joints that form no tree, mimics that form no chain, or nothing moves or can
+    touch. LimitError: more links or shapes than a hand has."""
     link_of, joint_of = _by_name(links, f"{filename}: duplicate link"), _by_name(joints, f"{filename}: duplicate joint")
     if len(link_of) > MAX_LINKS or sum(len(link.shapes) for link in link_of.values()) > MAX_SHAPES:
         raise LimitError(f"{filename}: more than {MAX_LINKS} links or {MAX_SHAPES} collision elements")
@@ -188,7 +186,7 @@ def _check_tree(links: dict[str, Link], joints: dict[str, Joint], filename: str)
 
 
 def _check_limits(joints: Iterable[Joint], filename: str) -> None:
-    """Check joint limits: CAD exporters write zero for unstated limits."""
+    """Check joint limits, since CAD exporters write zero for unstated limits."""
     limited = [joint for joint in joints if joint.moves and joint.type != "continuous" and joint.mimic is None]
     if limited and all(joint.lower == joint.upper == 0 for joint in limited):
         many = f"all {len(limited)} joints have" if len(limited) > 1 else f"joint {limited[0].name!r} has"

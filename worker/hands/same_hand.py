@@ -29,36 +29,37 @@ POSTURES: Final = 200
 _FITTED: Final = 40
 #: Largest distance of corresponding fingertips in models of one hand [m].
 TOLERANCE_M: Final = 1e-3
-#: Weight of a prior on fingertip positions in the other model, for hands with insufficient motion: jaws of a gripper
-#: only translate. In no posture does this prior move a fingertip by a nanometre.
+#: Weight of a prior on fingertip positions in the other model, for hands with little motion: a gripper's jaws only
+#: translate. The prior moves no fingertip by a nanometre in any posture.
 _PRIOR: Final = 1e-3
-#: Most evaluations of a fit to another hand; a fit to the same hand converges earlier or is as good by then.
+#: Largest number of evaluations of a fit to another hand. By then, a fit to the same hand has converged or is as good
+#: as needed.
 _LOOKS: Final = 15
 
 
 @dataclass(frozen=True)
 class SameHand:
-    """Mapping of the joints and base of `theirs` to those of `ours`."""
+    """Mapping of the joints and base of the model `theirs` to those of `ours`."""
 
     ours: HandModel
     theirs: HandModel
     joints: NDArray[np.intp]
-    """(J',) for each joint of theirs, the number of the joint of ours."""
+    """(J',) for each joint of `theirs`, the number of the joint of `ours`."""
     base: Floats
-    """(7,) pose of their root in our root's frame."""
+    """(7,) pose of the root of `theirs` in the root frame of `ours`."""
     fingertips_m: float
     """Largest distance of corresponding fingertips over random postures."""
 
     @cached_property
     def bodies(self) -> NDArray[np.intp]:
-        """(L',) for each body of theirs, the body of ours that the same joint carries; the root for the root."""
+        """(L',) for each body of `theirs`, the body of `ours` that the same joint carries; the root for the root."""
         out = np.zeros(self.theirs.bodies, np.intp)
         out[self.theirs.joint_body] = self.ours.joint_body[self.joints]
         return out
 
     @cached_property
     def frames(self) -> Floats:
-        """(L', 7) pose of each body of theirs in the frame of that body of ours."""
+        """(L', 7) pose of each body of `theirs` in the frame of the matching body of `ours`."""
         q = np.clip(0.0, self.ours.lower, self.ours.upper)
         mine = self.ours.expand(q)
         a = body_poses(self.ours, IDENTITY_POSE, mine)[0]
@@ -74,15 +75,11 @@ def same_hand(
     tolerance_m: float = TOLERANCE_M,
     seed: int = 0,
 ) -> SameHand:
-    """Match two models of a hand: ours, for which grasps were planned, and theirs.
-
+    """Match two models of a hand: `ours`, for which grasps were planned, and `theirs`.
     Joints are matched by `joint_map` (ours to theirs) or name, ignoring case and a common prefix of all names of a hand
     (`rh_`, `robot0:`). The bases are fitted for the best agreement of fingertips over random postures. A fingertip is
     the mean of the corners of a finger's last body.
-
-    Raises:
-        InputError: a joint has no match in the other model, or fingertips differ by more than `tolerance_m` [m].
-    """
+    Raises InputError: a joint has no match in the other model, or fingertips differ by more than `tolerance_m` [m]."""
     joints = _matched(ours, theirs, joint_map or {})
     tips = [body for body in ours.fingertips if body]
     rng = np.random.default_rng(seed)
@@ -146,10 +143,9 @@ def _middle(hand: HandModel, body: int) -> Floats:
 
 
 def _fit(where: Floats, poses: Floats, guess: Floats) -> tuple[Floats, Floats]:
-    """Fit the pose (7,) of the other base, and positions (T, 3) of fingertips in their body frames there.
-
-    Given: fingertips (N, T, 3) in our base frame, bodies (N, T, 7) in the other one, approximate positions (T, 3).
-    """
+    """Fit the pose (7,) of the other base, and positions (T, 3) of fingertips in the other model's body frames.
+    Given: fingertips (N, T, 3) in the own base frame, bodies (N, T, 7) in the other one, approximate positions (T,
+    3)."""
     from scipy.optimize import least_squares  # slow to load
 
     start = _placed(apply(poses, guess), where)

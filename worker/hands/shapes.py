@@ -1,9 +1,8 @@
 """Collision shapes of a robot as convex pieces.
-Primitives stay exact; a mesh becomes one hull, or several where one would cover surface that can touch.
+Primitives stay exact. A mesh becomes one hull, or several hulls where one would cover surface that can touch.
 
 The error of a mesh's pieces is the depth of the mesh surface beneath them, along the shortest free direction outward.
-It is the ninth decile over the surface that is visible from outside.
-"""
+The ninth decile over the visible outer surface counts."""
 
 from __future__ import annotations
 
@@ -38,12 +37,8 @@ def make_pieces(
     shape: Shape, *, body: int, pose: Floats, link: str, files: Mapping[str, bytes], base: str, hulls: Hulls
 ) -> list[ConvexPiece]:
     """Make the convex pieces of a collision element at `pose` (7,) in the body frame; several for a mesh with hollows.
-
     `hulls` are those of this hand's meshes so far, by name and scale: fingers often share a fingertip mesh.
-
-    Raises:
-        HandError: a mesh is missing, outside the upload, unreadable, flat or far too large.
-    """
+    Raises HandError: a mesh is missing, outside the upload, unreadable, flat or far too large."""
     if shape.kind != "mesh":
         vertices, faces = tessellate(shape.kind, shape.size)
         return [ConvexPiece(body, shape.kind, shape.size, pose, apply(pose, vertices), faces, link)]
@@ -83,16 +78,14 @@ def _mesh_hulls(name: str, scale: tuple[float, ...], data: bytes, link: str) -> 
 
 def _hulls(points: Floats, faces: Ints) -> list[tuple[Floats, Ints]]:
     parts = parts_of(points, faces)
-    # A hull includes all points of a file; some files have points that no face uses.
+    # Hulls use all points of a file, including points that no face uses.
     return [reduce_hull(part) for part in (parts if len(parts) > 1 else (points,))]
 
 
 def reduce_hull(points: Floats, limit: int = MAX_HULL_VERTICES) -> tuple[Floats, Ints]:
     """Compute a convex hull of points (N, 3) with at most `limit` corners and the volume of the full hull.
-
     Corners are added one by one at the largest distance to the full hull, then scaled about their centroid until the
-    volumes agree. The surface error has both signs, with half the size of an inscribed hull's error.
-    """
+    volumes agree. The surface error has both signs, with half the size of an inscribed hull's error."""
     vertices, faces = hull(points)
     if len(vertices) <= limit:
         return vertices, faces
@@ -118,9 +111,9 @@ def _outside(points: Floats, corners: Floats) -> Floats:
     return signed_distance("hull", (), *hull(corners), points)
 
 
-#: Error of a hull above which it is decomposed [m]: an object would rest that far off the finger.
+#: Error of a hull above which the mesh is decomposed [m]: an object would rest this far off the finger.
 MAX_ERROR_M: Final = 4e-3
-#: Most pieces of a link: each costs time in every distance query.
+#: Largest number of pieces of a link: each costs time in every distance query.
 MAX_PIECES: Final = 8
 _THRESHOLDS: Final = (0.1, 0.05)
 _COACD: Final = {
@@ -138,9 +131,9 @@ _FACES: Final = 1200
 _CPU_S: Final = 120
 _POINTS: Final = 200
 _SHARE: Final = 0.9
-#: Largest depth beneath the hull that is no hollow [m].
+#: Largest depth beneath the hull at which a surface is not hollow [m].
 _FLAT_M: Final = 5e-4
-#: The six axes and the eight diagonals, slightly rotated: meshes have many faces along the axes.
+#: The six axes and the eight diagonals, slightly rotated, since meshes have many faces along the axes.
 _TURN: Final = quat_to_matrix(np.array([0.9974, 0.0312, 0.0417, 0.0503]))
 _WAYS: Final = np.array([d for d in np.ndindex(3, 3, 3) if sum(k != 1 for k in d) in (1, 3)]) - 1.0
 _DIRECTIONS: Final = (_WAYS / np.linalg.norm(_WAYS, axis=1, keepdims=True)) @ _TURN.T
@@ -152,10 +145,7 @@ _MIN_EXTENT_M: Final = 1e-3
 
 def parts_of(vertices: Floats, faces: Ints) -> tuple[Floats, ...]:
     """Return corners of the convex pieces of a mesh, or all its corners if its hull is accurate.
-
-    Raises:
-        HandError: the decomposition exceeds its CPU time limit.
-    """
+    Raises HandError: the decomposition exceeds its CPU time limit."""
     whole: tuple[Floats, ...] = (vertices,)
     if _is_convex(vertices, faces):
         return whole
@@ -172,7 +162,7 @@ def parts_of(vertices: Floats, faces: Ints) -> tuple[Floats, ...]:
 
 
 def _decomposed(vertices: Floats, faces: Ints) -> tuple[tuple[Floats, ...], bool]:
-    """Return the pieces, and whether CoACD finished: a failed run may succeed later."""
+    """Return the pieces, and whether CoACD finished; a failed run may succeed later."""
     light = merged_and_thinned(vertices, faces, lambda count: 1 - _FACES / count)
     surface = _OpenSurface(*light)
     best: tuple[Floats, ...] = (vertices,)
@@ -183,14 +173,14 @@ def _decomposed(vertices: Floats, faces: Ints) -> tuple[tuple[Floats, ...], bool
         try:
             made = coacd_parts(*light, {"threshold": threshold, **_COACD}, _CPU_S)
         except WorkLimitExceeded as limit:
-            # A hand must have the same shapes as on a faster machine.
+            # A slow machine must not give a hand other shapes than a fast one.
             raise HandError(f"its convex decomposition needs {limit}; simplify it") from None
         sure &= bool(made)
         parts = tuple(part for part in made if len(part) > 3 and np.ptp(part, axis=0).min() > _MIN_EXTENT_M)
         if parts and (error := surface.error(parts)) < least:
             best, least = parts, error
         if len(made) >= MAX_PIECES:
-            # With a finer threshold CoACD merges the result to the same number of pieces, in twice the time.
+            # With a finer threshold CoACD needs twice the time for the same number of pieces.
             break
     return best, sure
 
@@ -218,7 +208,7 @@ class _OpenSurface:
         self._sees = np.array([~_hits(self._points, direction, corners) for direction in _DIRECTIONS])
 
     def error(self, parts: tuple[Floats, ...]) -> float:
-        """Return the ninth decile of the open surface's distance [m] to the outside of the union of the parts."""
+        """Return the ninth decile of the open surface's distances to the outside of the union of the parts [m]."""
         reached = self._sees.any(axis=0)
         if not reached.any():
             return 0.0
@@ -230,7 +220,7 @@ class _OpenSurface:
 
 
 def _hits(points: Floats, direction: Floats, corners: Floats) -> NDArray[np.bool_]:
-    """Check (P,) whether rays from points hit one of the triangles (F, 3, 3) (Moeller and Trumbore 1997)."""
+    """Return a mask (P,) of rays from points that hit one of the triangles (F, 3, 3) (Moeller and Trumbore 1997)."""
     a, first, second = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     across = np.cross(direction, second)
     determinant = np.einsum("ij,ij->i", first, across)

@@ -19,27 +19,23 @@ from graspd.worker.hands.model import ConvexPiece, HandModel, SurfacePoints
 from graspd.worker.objects.disk_cache import arrays_kept_or_made, content_of
 from graspd.worker.objects.memory_cache import cached_by_content
 
-#: Candidates per point; thinning keeps the one in five that spreads most evenly.
+#: Candidates per point. Thinning keeps one in five, evenly spread.
 OVERSAMPLING: Final = 5
 #: Least number of candidates on the whole hand, which determine the exterior area.
 MIN_CANDIDATES: Final = 30_000
 #: A point this deep inside another body at rest can never touch an object [m].
 BURIED_M: Final = 5e-4
-#: Two faces of one body this close are the same face [m].
+#: Two faces of one body closer than this are one face [m].
 COINCIDENT_M: Final = 1e-6
 
 
 def sample_surface(hand: HandModel, count: int, *, seed: int = 0) -> SurfacePoints:
     """Sample exactly `count` points on the union of the hand's pieces.
-
-    Area-uniform candidates are thinned to a blue-noise subset, body by body, by farthest-point selection; each point
-    then gets the area of its Voronoi cell among the candidates, so the areas sum to the exterior area. Parts inside
-    another piece carry no points. The same arguments give the same points, bit for bit.
-
-    Raises:
-        HandError: the hand has no outer surface.
-    """
-    # The shapes of a hand are available long before its closing.
+    Area-uniform candidates are thinned to a blue-noise subset, body by body, by farthest-point selection. Each point
+    gets the area of its Voronoi cell among the candidates, so the areas sum to the exterior area. Parts inside another
+    piece have no points. Equal arguments give the same points, bit for bit. Raises HandError: the hand has no outer
+    surface."""
+    # Shapes of a hand are known before its closing.
     return _kept(_Shapes(hand.pieces, body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0]), count, seed)
 
 
@@ -84,7 +80,7 @@ def _sample(shapes: _Shapes, count: int, seed: int) -> SurfacePoints:
     for body in np.flatnonzero(quota):
         mine = np.flatnonzero(candidates.body == body)
         spacing = np.sqrt(area_of_body[body] / quota[body])
-        # Normals enter the distance, so that the two sides of a thin plate do not thin each other out.
+        # Normals are part of the distance, so that the two sides of a thin plate do not thin each other out.
         place = np.hstack([candidates.position[mine], 0.5 * spacing * candidates.normal[mine]])
         picked = farthest_points(place, int(quota[body]))
         _, owner = cKDTree(place[picked]).query(place)
@@ -127,7 +123,7 @@ def piece_distance(piece: ConvexPiece, points: Floats) -> Floats:
 
 
 def _buried(hand: _Shapes, own: int, position: Floats, normal: Floats) -> NDArray[np.bool_]:
-    """Check (N,) whether points of piece `own` lie inside another piece or on a face of an earlier piece."""
+    """Return a mask (N,) of points of piece `own` inside another piece or on a face of an earlier piece."""
     mine = hand.pieces[own]
     above = position + COINCIDENT_M * normal
     below = position - COINCIDENT_M * normal
@@ -151,7 +147,7 @@ def _buried(hand: _Shapes, own: int, position: Floats, normal: Floats) -> NDArra
 
 
 def apportion(weights: Floats, count: int, available: NDArray[np.intp]) -> NDArray[np.int64]:
-    """Distribute `count` by largest remainder in proportion to weights (L,), within the available (L,)."""
+    """Distribute `count` by largest remainder in proportion to weights (L,), within the available numbers (L,)."""
     seats = np.zeros(len(weights), dtype=np.int64)
     while (left := count - int(seats.sum())) > 0:
         open_weights = np.where(seats < available, weights, 0.0)
@@ -174,7 +170,7 @@ def farthest_points(points: Floats, count: int) -> NDArray[np.intp]:
     for i in range(1, count):
         last = points[chosen[i - 1]]
         np.minimum(nearest, squares - 2 * (points @ last) + last @ last, out=nearest)
-        # Rounding may place the point itself slightly above another: it must not be chosen twice.
+        # Rounding may place the point itself slightly above another point, but it must not be chosen twice.
         nearest[chosen[i - 1]] = -1.0
         chosen[i] = int(np.argmax(nearest))
     return chosen

@@ -1,4 +1,4 @@
-"""Tendons: one drive pulls several joints. It commands their sum; contact determines the shares."""
+"""Tendons: drives that pull several joints. A drive commands the sum of the joints; contact determines their shares."""
 
 from __future__ import annotations
 
@@ -23,19 +23,15 @@ _SHADOW_FINGERS: Final = frozenset({"FF", "MF", "RF"})
 @dataclass(frozen=True)
 class Tendon:
     """A drive of several dofs: its length is the sum of coefficient times joint value.
-
-    At a pull F each joint gets the torque c F at any value: the drive moves the sum only.
-    """
+    At a pull F each joint gets the torque c F at any value: the drive moves only the sum."""
 
     name: str
     dofs: tuple[int, ...]
     coefficients: tuple[float, ...]
 
     def gain(self, stiffness: Floats) -> float:
-        """Compute the drive's gain [N m/rad of length] from its dofs' (D,), in series: 1 / sum(c^2 / k).
-
-        Commanding each joint by q + c F / k, for a torque c F, then commands the pull F of the tendon.
-        """
+        """Compute the drive's gain [N m/rad of length] from its dofs' gains (D,), in series: 1 / sum(c^2 / k).
+        A command of q + c F / k to each joint, for a torque c F, then commands the pull F of the tendon."""
         parts = zip(self.dofs, self.coefficients, strict=True)
         return 1.0 / sum(c * c / float(stiffness[d]) for d, c in parts)
 
@@ -45,7 +41,8 @@ class Tendon:
 
 
 def actuators(tendons: tuple[Tendon, ...], dofs: int) -> Floats:
-    """Return (A, D) length of each drive from the dofs' values, in dof order, a tendon at its first dof."""
+    """Return lengths (A, D) of the drives from the dofs' values, in dof order; a tendon is at the place of its first
+    dof."""
     rows = np.eye(dofs)
     others: list[int] = []
     for tendon in tendons:
@@ -59,10 +56,8 @@ def actuators(tendons: tuple[Tendon, ...], dofs: int) -> Floats:
 def tendons_of(
     robot: Robot, stated: Mapping[str, Mapping[str, float]] | None, dof_names: tuple[str, ...]
 ) -> tuple[Tendon, ...]:
-    """Return the tendons of a hand: those stated, else the description's, else those of its kind of hand.
-
-    Only joints that are degrees of freedom of the hand count; fewer than two make no tendon.
-    """
+    """Return the tendons of a hand: the stated ones, else the description's, else the known ones of a Shadow hand.
+    Only joints that are degrees of freedom of the hand count; fewer than two make no tendon."""
     said = stated if stated is not None else robot.tendons or known_tendons(robot)
     found = []
     for name, pulls in said.items():
@@ -73,7 +68,7 @@ def tendons_of(
 
 
 def known_tendons(robot: Robot) -> dict[str, dict[str, float]]:
-    """Return a Shadow hand's tendons by joint names and order: J1 + J2 of each finger but the thumb."""
+    """Return the tendons of a Shadow hand by its joint names and their order: J1 + J2 of each finger but the thumb."""
     found: dict[str, dict[str, float]] = {}
     fingers = set()
     for name, joint in robot.joints.items():
@@ -90,9 +85,7 @@ def known_tendons(robot: Robot) -> dict[str, dict[str, float]]:
 
 def check_tendons(robot: Robot, stated: Mapping[str, Mapping[str, float]]) -> None:
     """Check stated tendons.
-    Raises:
-        HandError: one names an unknown joint, pulls fewer than two, or shares one with another tendon.
-    """
+    Raises HandError: one names an unknown joint, pulls fewer than two, or shares one with another tendon."""
     seen: set[str] = set()
     for name, pulls in stated.items():
         for joint in pulls:

@@ -16,7 +16,7 @@ from graspd.worker.hands.options import HandOptions
 from graspd.worker.hands.robot import MAX_LENGTH_M, UNLIMITED_M, Joint, Mimic, Robot
 from graspd.worker.hands.tendons import check_tendons
 
-#: Share of its range that a drive may lose without a note.
+#: Share of its range that a drive may lose without a note to the user.
 _TOLD_CUT: Final = 0.01
 #: Largest position of a follower [rad], [m].
 _MOST: Final = (200 * math.pi, MAX_LENGTH_M)
@@ -59,11 +59,8 @@ class Tree:
 
 def build_tree(robot: Robot, options: HandOptions) -> Tree:
     """Build the body tree of a hand.
-
-    Raises:
-        HandError: an option names an unknown joint or link, nothing moves, or couplings leave a degree of freedom no
-            range.
-    """
+    Raises HandError: an option names an unknown joint or link, nothing moves, or couplings leave a degree of freedom no
+    range."""
     _check_names(robot, options)
     # A joint on a tendon follows nothing: it is free within its limits.
     pulled = {joint for pulls in (options.tendons or {}).values() for joint in pulls}
@@ -204,12 +201,12 @@ def _check_travel(dof: str, lower: float, upper: float, moving: dict[str, Mimic]
 
 
 def _binds(joint: Joint, drive: Mimic, robot: Robot, options: HandOptions) -> bool:
-    """Check whether a joint's own limits bind it; a URDF follower's do not, as in ROS: most are wrong."""
+    """Check whether a joint's own limits bind it. A URDF follower's limits do not, as in ROS: most are wrong."""
     return joint.name == drive.joint or robot.format != "URDF" or joint.name in options.couplings
 
 
 def passed_limits(robot: Robot, tree: Tree, options: HandOptions) -> list[str]:
-    """Return notes on joints that follow another beyond their own limits, which do not bind them."""
+    """Return notes on joints that follow another joint beyond their own limits, which do not bind them."""
     found = []
     for name in tree.joint_names:
         joint, drive = robot.joints[name], tree.drives[name]
@@ -271,7 +268,7 @@ def joint_motion(joint: Joint, value: float) -> Floats:
     return motion
 
 
-#: Largest reach of a finger from where the fingers of its hand branch [m]; legs and arms exceed it.
+#: Largest reach of a finger from the branching of its hand's fingers [m]; legs and arms exceed it.
 MAX_FINGER_M = 0.35
 #: Largest reach of a hand from its first joint [m].
 MAX_HAND_M = 0.5
@@ -279,10 +276,7 @@ MAX_HAND_M = 0.5
 
 def pick_root(robot: Robot, options: HandOptions) -> str:
     """Return the chosen root, else the robot's, moved past dropped links and joints of an arm or wrist.
-
-    Raises:
-        HandError: it is a whole robot, or an arm without a hand; the message names the hands in it.
-    """
+    Raises HandError: the robot has several hands, or is an arm without a hand; the message names the hands."""
     if options.root:
         return options.root
     root, drop = robot.root, set(options.drop)
@@ -311,7 +305,7 @@ def pick_root(robot: Robot, options: HandOptions) -> str:
 
 
 def hand_links(tree: _Moving, root: str) -> list[str]:
-    """Return links, from the root down, at which a hand begins: two or more short fingers branch."""
+    """Return the links, from the root down, at which a hand begins: two or more short fingers branch there."""
     found: list[str] = []
     queue = deque([root])
     while queue:
@@ -369,13 +363,13 @@ class _Moving:
 
 
 def _below_arm(tree: _Moving, root: str, options: HandOptions) -> str:
-    """Return the link where a hand on an arm begins: below the last joint before the fingers, or the root."""
+    """Return the link at which a hand on an arm begins, below the last joint before the fingers; else the root."""
     start, at = root, root
     palm = options.palm.link if options.palm else None
     while at != palm:
         onward = tree.onward(at)
         if len(onward) != 1:
-            # A tree that never branches is a single finger: nothing above it is an arm.
+            # A tree without branches is a single finger, so nothing above it is an arm.
             return start if onward else root
         (joint,) = onward
         at = joint.child

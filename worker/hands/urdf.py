@@ -1,8 +1,7 @@
-"""Reader of URDF and XML from untrusted sources. It checks every value, so later code does not.
+"""Reader of URDF and XML from untrusted sources. It checks every value; later code relies on these checks.
 
 The common URDF libraries accept reversed limits, NaN, unknown mimics and several roots, and resolve mimic chains
-wrongly; this reader refuses each with a message.
-"""
+wrongly; this reader refuses each with a message."""
 
 from __future__ import annotations
 
@@ -30,11 +29,8 @@ Colour = tuple[float, float, float]
 
 def read_urdf(data: bytes, filename: str = "the URDF") -> Robot:
     """Read and check a URDF.
-
-    Raises:
-        HandError: not XML, not a robot, or a value that no hand can have; the message names it.
-        LimitError: larger than the limits of this module.
-    """
+    Raises HandError: not XML, not a robot, or a value that no hand can have; the message names it. LimitError: larger
+    than the limits of this module."""
     robot = parse_xml(data, filename, "a URDF", "robot", limit_bytes=MAX_BYTES)
     notes: list[str] = []
     materials = {element.get("name", ""): _colour(element) for element in robot.findall("material")}
@@ -133,7 +129,7 @@ def _moving(element: ElementTree.Element, still: Joint, what: str, notes: list[s
     try:
         lower, upper, effort = _limits(element, still.type, what)
     except HandError:
-        # Limits of a follower do not bind it, so wrong limits of a follower do not matter.
+        # A follower's limits do not bind it, so wrong ones do not matter.
         if mimic is None:
             raise
         most = UNLIMITED_M if still.type == "prismatic" else math.pi
@@ -150,7 +146,7 @@ def _moving(element: ElementTree.Element, still: Joint, what: str, notes: list[s
 
 
 def _velocity(element: ElementTree.Element) -> float:
-    """Return the speed limit [rad/s or m/s]; 0 if no plausible one is stated: grasps do not need it."""
+    """Return the speed limit [rad/s or m/s]; 0 without a plausible one, since grasps do not need it."""
     limit = element.find("limit")
     try:
         value = abs(float(limit.get("velocity", "0"))) if limit is not None else 0.0
@@ -258,11 +254,8 @@ _MAX_PREFIXES: Final = 100
 
 def parse_xml(data: bytes, name: str, what: str = "", root: str = "", *, limit_bytes: int) -> Element:
     """Return the root element without its namespace.
-
-    Raises:
-        HandError: it is empty, not XML, or has another root element than `root`, if given, that begins `what`.
-        LimitError: larger than the limit.
-    """
+    Raises HandError: it is empty, not XML, or has another root element than `root`, with which a `what` begins.
+    LimitError: larger than the limit."""
     if len(data) > limit_bytes:
         raise LimitError(f"{name}: {len(data)} bytes of XML; at most {limit_bytes} are taken")
     text = text_of(data)

@@ -1,7 +1,6 @@
 """Visual elements of a hand's links with their colours and mesh files, loaded at the first use.
 
-Only pictures need them, so a faulty one cannot make a hand unusable: unreadable files are left out.
-"""
+Only pictures need visual elements. An unreadable file is therefore left out and does not make a hand unusable."""
 
 from __future__ import annotations
 
@@ -95,7 +94,7 @@ def lighter(mesh: VisualMesh, times: float) -> VisualMesh:
 
 
 def merged_and_thinned(vertices: Floats, faces: Ints, share: Callable[[int], float]) -> tuple[Floats, Ints]:
-    """Merge equal vertices and drop the `share` of the faces that their number gives; none if it is not positive."""
+    """Merge equal vertices, and drop the share of the faces that `share` gives for their number, if it is positive."""
     # Both are slow to load and not needed for cached results.
     import fast_simplification
     import trimesh
@@ -161,12 +160,9 @@ def _file_of(item: PlacedShape, files: Mapping[str, bytes], base: str) -> str:
 
 
 def find_mesh(filename: str, files: Mapping[str, bytes], base: str, link: str) -> str:
-    """Return the name in `files` of a URDF's mesh, see `read_reference`.
-    Else the only file of that name in any folder, ignoring case.
-
-    Raises:
-        HandError: it is missing, or lies outside the upload.
-    """
+    """Return the name in `files` of a URDF's mesh, see `read_reference`; else the only file of that name, ignoring
+    case.
+    Raises HandError: it is missing, or lies outside the upload."""
     try:
         reference = read_reference(filename, base)
     except InputError as error:

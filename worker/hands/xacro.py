@@ -1,8 +1,7 @@
 """Robot from its description in any format; xacro is expanded in an isolated child process.
 
-Xacro's expressions are Python. The child receives all files of the hand in memory, then gives up files, network and
-commands: see `worker.hands.xacro_child`.
-"""
+Expressions in xacro are Python. The child receives all files of the hand in memory, then loses access to files, network
+and commands: see `worker.hands.xacro_child`."""
 
 from __future__ import annotations
 
@@ -21,10 +20,10 @@ from graspd.worker.hands.robot import Robot
 from graspd.worker.hands.urdf import MAX_BYTES, read_urdf
 from graspd.worker.objects.stand_ins import refuse_stand_in
 
-#: CPU time limit; the largest hands on arms take a tenth of it [s].
+#: CPU time limit [s]; the largest hands on arms need a tenth of it.
 CPU_LIMIT_S: Final = 10
 MEMORY_LIMIT_BYTES: Final = 2**30
-#: Wall time limit, which ends a child that waits without computing [s].
+#: Wall time limit [s], which ends a child that waits without computing.
 _WALL_LIMIT_S: Final = 1800.0
 #: Files that an expansion may read; meshes are only named.
 _READ: Final = (".xacro", ".urdf", ".xml", ".yaml", ".yml")
@@ -32,12 +31,9 @@ _READ: Final = (".xacro", ".urdf", ".xml", ".yaml", ".yml")
 
 def expand(files: Mapping[str, bytes], main: str, arguments: Mapping[str, str]) -> bytes:
     """Expand a xacro file with values of its `<xacro:arg>` to a URDF.
-    Includes and `$(find PACKAGE)` are searched among the hand's files only.
-
-    Raises:
-        HandError: it cannot be expanded, or refers to files outside the hand's folder; the message states the reason.
-        OSError: the machine killed the child, or it neither computed nor ended: the file is not at fault.
-    """
+    Includes and `$(find PACKAGE)` are searched among the hand's files only. Raises HandError: the file cannot be
+    expanded, or refers to files outside the hand's folder. OSError: the machine killed the child, or the child neither
+    computed nor ended; the file is not at fault."""
     given = {
         "main": main,
         "arguments": dict(arguments),

@@ -1,9 +1,8 @@
 """Isolated expansion of xacro: `python -m graspd.worker.hands.xacro_child`, JSON object in and out.
 
-Expressions in xacro are Python and the library's guards can be bypassed, so there are three barriers. Names that lead
-out of an expression are refused. An audit hook refuses access to files, processes and the network. The kernel gives
-this process no new file descriptor, without which no file, socket or program opens.
-"""
+Expressions in xacro are Python, and the library's guards can be bypassed. This process therefore has three barriers.
+Names that lead out of an expression are refused. An audit hook refuses access to files, processes and the network. The
+kernel gives no new file descriptor, which every file, socket and program needs."""
 
 from __future__ import annotations
 
@@ -26,7 +25,7 @@ _TOP: Final = "/hand"
 _MAX_NODES: Final = 100_000
 #: Audit events that the interpreter raises itself when it evaluates an expression.
 _HARMLESS: Final = frozenset({"compile", "exec", "builtins.id", "object.__getattr__"})
-#: Part of Python's default text of an object: its address in memory.
+#: Memory address in Python's default text of an object.
 _ADDRESS: Final = re.compile(r" at 0x[0-9a-f]{6,}")
 #: Attributes that lead from a generator, a coroutine or a traceback to the frames around it.
 _FRAMES: Final = ("gi_", "cr_", "ag_", "f_", "tb_", "co_", "func_")
@@ -38,7 +37,7 @@ class Refused(Exception):
 
 def main() -> None:
     given = json.loads(sys.stdin.buffer.read())
-    # A file can make the library print without end; only the answer is needed.
+    # A file can make the library print without end; only the result is needed.
     answers, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)
     os.dup2(nowhere, 2)
@@ -98,7 +97,7 @@ def _expand(given: dict[str, Any]) -> str:
         raise Refused(f"asks for the environment variable {name!r}; write its value out")
 
     def evaluate(expression: str, symbols: dict[str, Any], scope: Any = None) -> Any:
-        # The table itself, which has the enclosing scopes; a copy would not.
+        # The table itself is changed: it has the enclosing scopes, a copy would not.
         symbols.update(__builtins__={})
         return eval(_checked(expression), symbols, scope)
 

@@ -15,7 +15,7 @@ from graspd.worker.objects.repair import RepairedMesh
 
 #: Simplification bound of the prepared mesh in the report [m]: that of the standard fidelity.
 REPORT_ERROR_M = 3e-4
-#: Distance of an object from its origin, in multiples of its size, above which there is a note.
+#: Distance of an object from its origin, in multiples of its size, above which a note is added.
 FAR = 10
 
 
@@ -23,13 +23,10 @@ def check_object(
     files: Mapping[str, bytes], name: str, *, face_error_m: float = REPORT_ERROR_M, **options: Any
 ) -> dict[str, Any]:
     """Check these files with `load_object`; options that are not None override `asset.json`.
-
-    Returns:
-        verdict: accept, repair or refuse; message: one line; repairs: changes; facts: measurements in SI units. For a
-        refusal that options fix: `problem`, the fault, and `options_suggested`, keys of `ObjectOptions` (None: a value
-        to choose); for its size also `units_suggested`, the likeliest first, with `lengths_m`, its longest extent in
-        each [m].
-    """
+    Return verdict (accept, repair or refuse), message (one line), repairs (changes), and facts (measurements in SI
+    units). A refusal that options fix also has `problem`, the fault, and `options_suggested`: keys of `ObjectOptions`,
+    with None for a value to choose. A refusal for its size has `units_suggested`, the likeliest first, and `lengths_m`,
+    the longest extent in each unit [m]."""
     try:
         settings = parse_options(files, options)
         main = main_file(files, settings)

@@ -32,14 +32,9 @@ class WorkLimitExceeded(Exception):
 
 def coacd_parts(vertices: Floats, faces: NDArray[Any], options: Mapping[str, Any], cpu_s: int) -> tuple[Floats, ...]:
     """Compute the corners (V, 3) of each convex piece with the arguments of `coacd.run_coacd`; none if CoACD fails.
-
     CoACD holds the interpreter lock, so it runs in a child and delays no heartbeat. The limit is one of CPU time [s]: a
-    busy machine gives the same pieces as an idle one.
-
-    Raises:
-        WorkLimitExceeded: CoACD needs more CPU time.
-        OSError: the machine did not let CoACD start or end. Substitute pieces would be another shape.
-    """
+    busy machine gives the same pieces as an idle one. Raises WorkLimitExceeded: CoACD needs more CPU time. OSError: the
+    machine did not let CoACD start or end; other pieces in their place would be another shape."""
     given = io.BytesIO()
     np.savez(given, vertices=vertices, faces=faces, options=np.array(json.dumps(dict(options))))
     command = [sys.executable, "-m", "graspd.worker.objects.convex", str(cpu_s)]
@@ -75,7 +70,7 @@ def load_parts(file: Path) -> tuple[Floats, ...] | None:
 
 
 def keep_parts(file: Path, parts: tuple[Floats, ...]) -> None:
-    """Save parts in a file; a folder that is not writable only costs time."""
+    """Save parts in a file; without a writable folder, they are computed again at the next use."""
     whole = io.BytesIO()
     arrays: dict[str, Any] = {f"{i:04}": part for i, part in enumerate(parts)}
     np.savez(whole, **arrays)
@@ -84,10 +79,10 @@ def keep_parts(file: Path, parts: tuple[Floats, ...]) -> None:
 
 
 def _decompose(cpu_s: int) -> None:
-    """Decompose the mesh on standard input onto standard output: npz in and out; a signal ends it after `cpu_s`."""
+    """Decompose the mesh on standard input to standard output, both npz; a signal ends the process after `cpu_s`."""
     hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
     resource.setrlimit(resource.RLIMIT_CPU, (cpu_s if hard == resource.RLIM_INFINITY else min(cpu_s, hard), hard))
-    # The library prints to standard output, which carries the result: redirect its output first.
+    # The library prints to standard output, which carries the result: its output is redirected first.
     result = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     import coacd

@@ -23,7 +23,7 @@ from graspd.service.model.libraries import version_of
 
 #: Libraries that affect the arrays.
 _LIBRARIES: Final = ("numpy", "scipy")
-#: Size limit of all entries of a kind; one has about 100 kB.
+#: Size limit of all entries of a kind [bytes]; an entry has about 100 kB.
 _LIMIT_BYTES: Final = 256 << 20
 
 Arrays = Mapping[str, NDArray[Any]]
@@ -38,10 +38,8 @@ def arrays_kept_or_made(
     fits: Callable[[Arrays], bool] = lambda _: True,
 ) -> Arrays:
     """Load arrays from a folder of the user's cache, or compute and cache them; the same bit for bit.
-
     All inputs that determine the arrays are in `terms`, besides the code of some modules. Errors of `make` are not
-    cached; loaded arrays that do not `fit` are recomputed.
-    """
+    cached. Loaded arrays that do not `fit` are recomputed."""
     address = digest_json([*terms, _revision(tuple(str(module.__file__) for module in code))])
     file = user_cache.folder(kind) / f"{address}.npz"
     if (held := user_cache.load(file)) is not None:
@@ -59,7 +57,7 @@ def arrays_kept_or_made(
 
 @lru_cache(maxsize=16)
 def _revision(files: tuple[str, ...]) -> str:
-    """Compute a digest of source files, libraries, and the processor type, which may change the last bits."""
+    """Compute a digest of source files, libraries, and the processor type, on which the last bits may depend."""
     whole = hashlib.sha256()
     for file in files:
         whole.update(Path(file).read_bytes())
@@ -74,10 +72,7 @@ TOLD_IF_SET: Final = MappingProxyType({"told_if_set": True})
 
 def content_of(model: Any) -> str:
     """Compute a digest of a dataclass without its name and its files' digest: arrays bit for bit.
-
-    Raises:
-        TypeError: a field contains neither numbers, strings, arrays, tuples and sets of these, nor a dataclass.
-    """
+    Raises TypeError: a field is no number, string, array, tuple or set of these, nor a dataclass."""
     whole = hashlib.sha256()
     for part in _parts({name: value for name, value in _told(model).items() if name not in _NAMES}):
         whole.update(len(part).to_bytes(8, "little"))

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from graspd.service.model.transforms import Floats
 from graspd.worker.objects.topology import Indices, face_vectors, on_faces
 
-#: Least number of pieces of a mesh, so that a piece is small relative to the mesh.
+#: Least number of pieces of a mesh, so that pieces are small relative to the mesh.
 _PIECES = 10_000
-#: Number of nearest pieces checked first; doubled until the answer is proven.
+#: Number of nearest pieces checked first, doubled until the result is proven.
 _CANDIDATES = 12
 _CHUNK = 256
 _MAX_VERTICES = 30_000
@@ -18,10 +18,8 @@ _MAX_VERTICES = 30_000
 
 class MeshDistance:
     """Exact distances to one mesh.
-
-    Its triangles are cut into pieces no longer than a fixed length. A point's distance to the best triangle of its
-    nearest pieces is proven if the next piece's centre is farther than that distance plus a piece's radius.
-    """
+    Its triangles are cut into pieces no longer than a fixed length. The best triangle of the nearest pieces gives a
+    distance. It is proven if the centre of the next piece is farther away by more than a piece's radius."""
 
     def __init__(self, vertices: Floats, faces: Indices) -> None:
         from scipy.spatial import cKDTree
@@ -46,9 +44,7 @@ class MeshDistance:
 
     def furthest(self, points: Floats) -> float:
         """Return the largest distance of any of the points (N, 3) to the surface [m].
-
-        Only points whose first upper bound exceeds the largest proven distance need their own proof.
-        """
+        Only points whose first upper bound exceeds the largest proven distance need a proof."""
         bounds = self(points, np.inf)
         order = np.argsort(-bounds)
         proven = 0.0
@@ -61,7 +57,7 @@ class MeshDistance:
 
 
 def small_pieces(corners: Floats, factor: float, count: int) -> tuple[Floats, float, NDArray[np.int64]]:
-    """Halve triangles (F, 3, 3) to sides of at most `factor` times the root of the area of one of `count` equal ones.
+    """Halve triangles (F, 3, 3) until no side exceeds `factor` times the root of the mean area of `count` pieces.
     Return the centres (P, 3) of the pieces, their largest radius, and the triangle (P,) of each."""
     a, b, c = np.moveaxis(corners, 1, 0)
     area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
@@ -112,9 +108,7 @@ def sample_faces(vertices: Floats, faces: Indices, count: int, seed: int = 0) ->
 
 def point_triangle_distance(points: Floats, triangles: Floats) -> Floats:
     """Compute the distance of points (..., 3) to triangles (..., 3, 3); leading axes broadcast.
-
-    The foot of the perpendicular if it falls inside, else the nearest point of the three sides.
-    """
+    The nearest point is the foot of the perpendicular if it is inside the triangle, else a point of the three sides."""
     a, b, c = triangles[..., 0, :], triangles[..., 1, :], triangles[..., 2, :]
     normal = np.cross(b - a, c - a)
     square = np.einsum("...i,...i", normal, normal)

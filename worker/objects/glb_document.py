@@ -34,10 +34,8 @@ class Document:
         face_colours: NDArray[Any] | None = None,
     ) -> dict[str, Any]:
         """Add a primitive of vertices (V, 3), faces (F, 3) and unit normals per face corner (F, 3, 3).
-
-        Colours are linear RGB: one for all, or one for each face (F, 3).
-        """
-        # A vertex on a crease is repeated for each of its normals; 127 steps per half axis are under half a degree.
+        Colours are linear RGB: one for all faces, or one for each face (F, 3)."""
+        # A vertex on a crease is repeated for each of its normals. 127 steps per half axis are below half a degree.
         small = np.round(127 * normals.reshape(-1, 3)).astype(np.int8)
         corners = np.concatenate([faces.reshape(-1, 1), small], axis=1)
         if face_colours is not None:

@@ -16,13 +16,13 @@ from graspd.worker.objects.topology import Indices
 
 Mesh = tuple[Floats, Indices]
 
-#: Largest mesh that is searched: beyond, the search would cost more than all other steps.
+#: Largest searched mesh [faces]: the search of a larger mesh would cost more than all other steps.
 MAX_FACES: Final = 120_000
 #: Largest number of pairs of near pieces; bounds memory and time.
 MAX_PAIRS: Final = 6_000_000
-#: An edge crosses a face if it extends beyond both sides by this share of the mesh's extent: touching is no crossing.
+#: An edge crosses a face if it extends beyond both sides by this share of the mesh's extent; touching does not count.
 DEPTH: Final = 1e-6
-#: ... at this least distance from the face's rim, as a share of its height: edges that meet do not cross.
+#: Least distance of a crossing from the face's rim, as a share of its height, so that edges that meet do not cross.
 _RIM: Final = 1e-6
 #: Halvings of a self-intersecting piece before the attempt ends.
 _HALVINGS: Final = 7
@@ -34,10 +34,8 @@ _CHUNK: Final = 200_000
 
 def crossings(vertices: Floats, faces: Indices) -> Indices | None:
     """Find pairs (P, 2) of intersecting faces without a common vertex; None: too many faces.
-
     Broad phase: faces cut into pieces of equal size, pieces with overlapping balls, then faces with overlapping boxes.
-    Narrow phase: an edge of one face through the interior of the other.
-    """
+    Narrow phase: an edge of one face through the interior of the other."""
     from scipy.spatial import cKDTree
 
     if len(faces) > MAX_FACES:
@@ -78,7 +76,8 @@ def _boxes_meet(corners: Floats, pairs: Indices) -> NDArray[np.bool_]:
 
 
 def _pass(edges_of: Floats, triangles: Floats, depth: float) -> NDArray[np.bool_]:
-    """Check (P,) whether an edge of one triangle (P, 3, 3) passes through the other, `depth` [m] deep."""
+    """Return a mask (P,) of pairs in which an edge of one triangle (P, 3, 3) passes `depth` [m] deep through the
+    other."""
     a, b, c = np.moveaxis(triangles, 1, 0)
     normal = np.cross(b - a, c - a)
     square = np.maximum(np.einsum("ij,ij->i", normal, normal), 1e-300)
@@ -98,11 +97,9 @@ def _pass(edges_of: Floats, triangles: Floats, depth: float) -> NDArray[np.bool_
 
 
 def untangle(vertices: Floats, faces: Indices) -> Mesh | None:
-    """Return the solid in which doubly enclosed volume counts once; None if that is not safe.
-
-    The mesh is halved until no piece intersects itself, and the pieces are united: no vertex moves. It is safe if the
-    result is closed, free of crossings and every point of its surface lies on the old surface.
-    """
+    """Return the solid in which doubly enclosed volume counts once; None if this is not safe.
+    The mesh is halved until no piece intersects itself, and the pieces are united; no vertex moves. It is safe if the
+    result is closed and free of crossings, and all of its surface lies on the old surface."""
     whole = mesh_geometry.to_manifold(vertices, faces)
     pieces = None if whole is None else _halved(whole, _HALVINGS)
     if pieces is None:
@@ -118,7 +115,7 @@ def untangle(vertices: Floats, faces: Indices) -> Mesh | None:
 
 
 def _halved(piece: Any, halvings: int) -> list[Any] | None:
-    """Cut a solid into parts that do not intersect themselves; None if that takes too many cuts."""
+    """Cut a solid into parts that do not intersect themselves; None if this takes too many cuts."""
     parts: list[Any] = []
     for part in piece.decompose():
         mesh = mesh_geometry.from_manifold(part)

@@ -19,7 +19,7 @@ T = TypeVar("T")
 
 
 def cached_by_content(size: int) -> Callable[[Callable[P, T]], Callable[P, T]]:
-    """Cache the last `size` results of a function; its calls wait for each other."""
+    """Cache the last `size` results of a function. Concurrent calls wait for each other."""
 
     def decorate(make: Callable[P, T]) -> Callable[P, T]:
         known: LRUCache[Hashable, T] = LRUCache(size)

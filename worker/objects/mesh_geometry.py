@@ -1,9 +1,7 @@
 """Geometry of closed meshes: exact mass properties, corner normals, float64 booleans by manifold3d.
 
-An object has two frames with the same axes: the file's, in which poses are stored, and the centred one, in which the
-engine works. The centred frame is in the middle of the mesh's bounding box, so results have the same bits wherever the
-file's origin is.
-"""
+An object has two frames with the same axes. Poses are stored in the file's frame; the engine works in the centred
+frame, in the middle of the mesh's bounding box. Results therefore have the same bits for every origin of the file."""
 
 from __future__ import annotations
 
@@ -31,9 +29,7 @@ class MassProperties:
 
 def mass_properties(vertices: Floats, faces: FaceIndices) -> MassProperties:
     """Integrate over the tetrahedra between the faces and one point (Tonon 2004).
-
-    The point is the mean vertex, so that a mesh far from its origin loses no digits.
-    """
+    The point is the mean vertex, so that a mesh far from its origin loses no digits."""
     origin = vertices.mean(axis=0)
     a, b, c = np.moveaxis(vertices[faces] - origin, 1, 0)
     six_volumes = np.einsum("ij,ij->i", a, np.cross(b, c))
@@ -55,17 +51,15 @@ def signed_volume(vertices: Floats, faces: FaceIndices) -> float:
     return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6)
 
 
-#: Faces that meet at a larger angle [deg] keep their own normals: averaging over an edge rounds a cylinder's rim by
+#: Faces that meet at a larger angle [deg] keep their own normals. Averaging over an edge rounds a cylinder's rim by
 #: millimetres, the largest single effect on grasp quality.
 CREASE_DEG = 40.0
 
 
 def corner_normals(vertices: Floats, faces: Ints, crease_deg: float = CREASE_DEG) -> Floats:
     """Compute unit normals (F, 3, 3).
-
     The normal of a corner is the mean normal of the faces at its vertex, weighted by their angle there. Only faces
-    inclined to the corner's own face by less than the crease angle count.
-    """
+    inclined to the corner's own face by less than the crease angle count."""
     from scipy.sparse import csr_matrix
 
     face_normals = face_vectors(vertices, faces)
@@ -101,7 +95,7 @@ def _corner_angles(corners: Floats) -> Floats:
     return np.arccos(np.clip(cosine, -1, 1))
 
 
-#: Tolerance of a gap's bound as a share of it: coordinates of files are rounded.
+#: Tolerance of a gap's bound, as a share of the bound, since coordinates of files are rounded.
 _ROUNDING: Final = 1e-3
 
 
@@ -123,9 +117,7 @@ def from_manifold(solid: Any) -> tuple[Floats, Indices]:
 
 def unite(parts: list[tuple[Floats, Indices]], holes: list[tuple[Floats, Indices]]) -> Any | None:
     """Unite outward meshes and subtract the holes (outward too); None if one of them is no solid.
-
-    A part inside a hole does not belong to the solid around the hole: it stays.
-    """
+    A part inside a hole does not belong to the solid around the hole, so it stays."""
     solids: list[Any] = [to_manifold(*part) for part in parts]
     cuts: list[Any] = [to_manifold(*hole) for hole in holes]
     if any(solid is None for solid in solids + cuts):
@@ -157,7 +149,7 @@ def groups(pieces: list[Any], gap: float) -> list[list[Any]]:
 
 
 def _nested(a: Any, b: Any) -> bool:
-    """Check whether one of two outer shells contains the other, which is then loose in a cavity."""
+    """Check whether one of two outer shells contains the other, which then lies loose in a cavity."""
     small, large = sorted((a, b), key=lambda one: float(one.volume()))
     return bool((small - large).is_empty())
 
@@ -166,8 +158,8 @@ def _apart(low: Floats, high: Floats, i: int) -> Floats:
     return np.asarray(np.linalg.norm(np.maximum(0, np.maximum(low[i] - high[i + 1 :], low[i + 1 :] - high[i])), axis=1))
 
 
-#: Digits of the longest extent to which coordinates are rounded, so that no sliver collapses; and the fewest digits
-#: considered for a mesh of decimals.
+#: Digits of the longest extent to which coordinates are rounded, so that no sliver collapses; and least number of
+#: digits of a mesh of decimals.
 DIGITS: Final = 9
 LEAST_DIGITS: Final = 5
 
@@ -186,13 +178,11 @@ class CentredMesh:
 
 def centred(points: Floats) -> CentredMesh:
     """Centre points (V, 3), rounded so that they do not depend on the origin.
-
-    If all coordinates are decimals within the precision of the file's numbers, they become these decimals: a mesh of
-    decimals is identical at every distance that the numbers resolve.
-    """
+    If all coordinates are decimals within the precision of the file's numbers, they become these decimals. A mesh of
+    decimals is then identical at every distance that the numbers resolve."""
     low, extent = points.min(axis=0), float(np.ptp(points, axis=0).max())
     farthest = np.abs(points).max()
-    # Files of 32-bit numbers are recognised by numbers that survive the conversion.
+    # Numbers that survive the conversion to 32 bits identify files of 32-bit numbers.
     with np.errstate(over="ignore"):
         single = bool((points == points.astype(np.float32)).all())
     resolution = float(np.spacing(np.float32(farthest) if single else farthest))
@@ -204,7 +194,7 @@ def centred(points: Floats) -> CentredMesh:
         steps, scale = (points - low) * finest, finest
     steps = np.rint(steps)
     ends = steps.min(axis=0) + steps.max(axis=0)
-    # Twice the distance from the middle in whole steps: only one division rounds, equally for every scale.
+    # Twice the distance from the middle is a whole number of steps: only the division rounds, equally for every scale.
     return CentredMesh((2 * steps - ends) / (2 * scale), low + ends / (2 * scale), resolution)
 
 
@@ -218,7 +208,7 @@ def carried(pose: ArrayLike, by: ArrayLike) -> Floats:
 
 def to_centre(pose: ArrayLike, centre: ArrayLike) -> Floats:
     """Convert poses (..., 7) of the file's frame to the centred frame, at `centre` (3,) in it.
-    They are on a grid, so that the round trip gives the same bits."""
+    The result is on a grid, so that the round trip gives the same bits."""
     return moved(carried(pose, centre), np.zeros(3))
 
 

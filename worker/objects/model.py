@@ -1,8 +1,7 @@
 """Model of an object for the engine: a closed, outward, simplified triangle mesh with mass properties.
 
 All data are in the frame of the uploaded mesh, in metres; `ObjectModel.centred` is relative to its middle, for the
-engine: see `worker.objects.mesh_geometry`.
-"""
+engine: see `worker.objects.mesh_geometry`."""
 
 from __future__ import annotations
 
@@ -89,10 +88,7 @@ class ObjectModel:
         self, *, mass: float | None = None, density: float | None = None, friction: float | None = None
     ) -> ObjectModel:
         """Return the object with another mass [kg], or density [kg/m^3], and friction; None: unchanged.
-
-        Raises:
-            MeshError: the mass would exceed `MOST_KG`.
-        """
+        Raises MeshError: the mass would exceed `MOST_KG`."""
         if mass is None:
             mass = self.mass if density is None else density * self.volume
         if mass > MOST_KG:

@@ -23,10 +23,7 @@ UNITS: Final = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": 0.0254}
 
 def parse_options(files: Mapping[str, bytes], extra: Mapping[str, Any] | None = None) -> ObjectOptions:
     """Parse options of the object in `files`; `extra` (without None values) overrides its `asset.json`.
-
-    Raises:
-        MeshError: `asset.json` is not JSON, or a key is unknown or wrong; the message names it.
-    """
+    Raises MeshError: `asset.json` is not JSON, or a key is unknown or wrong; the message names it."""
     stated = stated_options(files, MeshError)
     given = {key: value for key, value in (extra or {}).items() if value is not None}
     if given.keys() & {"mass", "density"}:
@@ -49,11 +46,8 @@ def stated_options(files: Mapping[str, bytes], error: type[AssetError]) -> dict[
 
 
 def as_asked(obj: ObjectModel, request: JobOptions) -> ObjectModel:
-    """Return the object with mass and friction of the job, of its own, or of level dexgraspbench.
-
-    Raises:
-        MeshError: the mass would exceed 100 kg.
-    """
+    """Return the object with the job's mass and friction, else its own; at level dexgraspbench with the published ones.
+    Raises MeshError: the mass would exceed 100 kg."""
     if request.validation == "dexgraspbench":
         return obj.published
     return obj.weighing(mass=request.mass, density=request.density, friction=request.object_friction)

@@ -34,7 +34,7 @@ from graspd.worker.objects.options import OF_MATTER, parse_options
 from graspd.worker.objects.repair import RepairedMesh, repair
 from graspd.worker.objects.topology import Indices
 
-#: Generic file names: objects of such a set differ by their folders.
+#: Generic file names. Objects with such files are named by their folders.
 PLAIN_STEMS: Final = ("clean", "mesh", "model", "textured", "nontextured", "simplified")
 #: Libraries that affect a prepared object.
 _LIBRARIES: Final = ("numpy", "scipy", "manifold3d", "fast-simplification")
@@ -43,18 +43,11 @@ _LIBRARIES: Final = ("numpy", "scipy", "manifold3d", "fast-simplification")
 def load_object(
     files: Mapping[str, bytes], *, name: str, digest: str, face_error_m: float, options: Mapping[str, Any] | None = None
 ) -> ObjectModel:
-    """Load the object in `files`.
-
-    Args:
-        files: the mesh (STL, OBJ, PLY, OFF or GLB) and optionally `asset.json` (see `ObjectOptions`).
-        name: name of the object.
-        digest: digest of its files.
-        face_error_m: the prepared surface lies within this distance of the uploaded one [m]; 0: no simplification.
-        options: keys that override those of `asset.json`.
-
-    Raises:
-        MeshError: the mesh cannot be used; the message names the fault and the fix.
-    """
+    """Load the object in `files`: a mesh (STL, OBJ, PLY, OFF, GLB or DAE) and optionally `asset.json` (see
+    `ObjectOptions`).
+    `digest` is that of the files; `options` are keys that override those of `asset.json`. The prepared surface lies
+    within `face_error_m` of the uploaded one [m]; 0: no simplification. Raises MeshError: the mesh cannot be used; the
+    message names the fault and the fix."""
     settings = parse_options(files, options)
     main = main_file(files, settings)
     shape = settings.model_dump_json(exclude=set(OF_MATTER))
@@ -82,7 +75,7 @@ def main_file(files: Mapping[str, bytes], options: ObjectOptions) -> str:
 
 @lru_cache(maxsize=8)
 def _prepared(main: str, data: bytes, options_json: str, face_error_m: float) -> ObjectModel:
-    """Prepare with caches by content: batches of a job use the same object, and commands the same few."""
+    """Prepare with caches by content: batches of a job share an object, and repeated commands use few objects."""
     terms = [Path(main).suffix.lower(), options_json, repr(face_error_m), hashlib.sha256(data).hexdigest(), revision()]
     file = user_cache.folder("objects") / f"{digest_json(terms)}.npz"
     if (held := user_cache.load(file)) is not None:
@@ -100,7 +93,7 @@ def repaired_mesh(main: str, data: bytes, options: ObjectOptions) -> RepairedMes
 
 @lru_cache(maxsize=2)
 def _repaired(main: str, data: bytes, options_json: str) -> RepairedMesh:
-    """Repair with a cache: the result is the same for every bound of the simplification."""
+    """Repair with a cache: the result does not depend on the bound of the simplification."""
     soup = read_mesh(main, data)
     try:
         return repair(soup, ObjectOptions.model_validate_json(options_json))
@@ -146,11 +139,7 @@ def object_from_path(
     path: str | Path, face_error_m: float = 3e-4, options: Mapping[str, Any] | None = None
 ) -> ObjectModel:
     """Load an object for the command line: name of a built-in, a mesh file, or a ZIP.
-
-    Raises:
-        NotFoundError: neither a file nor a built-in object.
-        MeshError: see `load_object`.
-    """
+    Raises NotFoundError: neither a file nor a built-in object. MeshError: see `load_object`."""
     name, files, stated = files_from_path(path)
     return load_object(
         files,
@@ -187,8 +176,9 @@ def name_of(path: Path) -> str:
 
 @lru_cache(maxsize=1)
 def revision() -> str:
-    """Compute a digest of this package's source, its libraries, and the processor type.
-    The processor may change the last bits. A change of the preparation thus invalidates cached objects."""
+    """Compute a digest of this package's source, its libraries, and the processor type, on which the last bits may
+    depend.
+    A change of the preparation thus invalidates cached objects."""
     whole = hashlib.sha256()
     for file in sorted(Path(__file__).parent.rglob("*.py")):
         whole.update(file.read_bytes())
@@ -197,37 +187,35 @@ def revision() -> str:
 
 Mesh = tuple[Floats, Indices]
 
-#: Number of faces up to which meshes are not simplified: fewer would not make a query faster.
+#: Number of faces up to which meshes are not simplified: queries of smaller meshes are not faster.
 FEW_FACES: Final = 64
 #: Meshes with more faces are first reduced to about this number.
 MANY_FACES: Final = 40_000
 #: The search ends when two targets differ by less than this factor.
 STEP: Final = 1.12
-#: Surface samples, besides the vertices, at which trials must stay within this share of the bound ...
+#: Number of surface samples, besides the vertices, at which trials must stay within the second value's share of the
+#: bound.
 SAMPLES: Final = 4000
 MARGIN: Final = 0.9
-#: ... and samples at which the returned mesh is measured.
+#: Number of samples at which the deviation of the returned mesh is measured.
 DENSE_SAMPLES: Final = 30_000
-#: Aggressiveness of the collapse: the slowest that reaches its target, with the least error and fewest broken meshes.
+#: Aggressiveness of the edge collapse: the lowest that reaches its target. Its error is least, and few meshes break.
 PATIENCE: Final = 3
 
 
 def simplify(vertices: Floats, faces: Indices, error_m: float, *, closed: bool = True) -> tuple[Floats, Indices, float]:
     """Find the coarsest mesh whose surface lies within `error_m` of the given one, both ways.
-
-    Quadric edge collapse (Garland & Heckbert 1997) to a bisected number of faces; each trial is measured and, for
-    closed meshes, must be an oriented 2-manifold with as many shells as the original. If no trial passes, manifold3d's
-    edge collapse is used; if that gains nothing, the mesh stays unchanged.
-
-    Returns:
-        vertices, faces and the measured deviation [m].
-    """
+    Quadric edge collapse (Garland & Heckbert 1997) reduces the mesh to a bisected number of faces. Each trial is
+    measured. For closed meshes it must be an oriented 2-manifold with as many shells as the original. If no trial
+    passes, manifold3d's edge collapse is used; if that gains nothing, the mesh stays unchanged. Return vertices, faces
+    and the measured deviation [m]."""
     if error_m <= 0 or len(faces) <= FEW_FACES:
         return vertices, faces, 0.0
     limit = MARGIN * error_m
     original = ReferenceMesh(vertices, faces, closed)
     if len(faces) > MANY_FACES:
-        # A fifth of the error gives a mesh that is quick to compare with; the triangle inequality leaves the rest.
+        # A mesh within a fifth of the error is quick to compare with. By the triangle inequality the rest of the error
+        # remains.
         start = _rollout(original, MANY_FACES, limit / 5)
         if start is not None:
             original, limit = ReferenceMesh(*start, closed), limit * 4 / 5
@@ -260,7 +248,7 @@ class ReferenceMesh:
         self._points = surface_points(vertices, faces, SAMPLES)
 
     def accepts(self, mesh: Mesh) -> bool:
-        """Check whether a mesh is closed, outward and in as many shells as the original, if that is closed."""
+        """Check whether a mesh is as good as a closed original: closed, outward, and in as many shells."""
         if not self.closed:
             return True
         return (
@@ -273,7 +261,7 @@ class ReferenceMesh:
     def within(self, mesh: Mesh, limit: float) -> bool:
         """Check whether two surfaces lie within `limit` [m], both ways, over vertices and even samples."""
         back, own = MeshDistance(*mesh), surface_points(*mesh, SAMPLES)
-        # A few points reject most meshes that are too coarse; all points are checked only if these pass.
+        # A few points reject most meshes that are too coarse. All points are checked only if these pass.
         return all(
             float(distance(points[::step], limit).max()) <= limit
             for step in (16, 1)
@@ -283,9 +271,7 @@ class ReferenceMesh:
 
 def _rollout(original: ReferenceMesh, target: int, error_m: float) -> Mesh | None:
     """Return a mesh of about `target` faces if it is valid and within the bound.
-
-    A collapse that breaks the surface at one number of faces often succeeds at the next, so a few numbers are used.
-    """
+    A collapse that breaks the surface at one number of faces often succeeds at the next, so a few numbers are used."""
     for count in (target, int(target * 1.02) + 2, int(target * 1.05) + 4):
         mesh = _collapse(original.vertices, original.faces, count)
         if mesh is None or not original.accepts(mesh):
@@ -311,7 +297,7 @@ def _collapse(vertices: Floats, faces: Indices, target: int) -> Mesh | None:
         return None
     mesh = topology.compact(np.asarray(points, dtype=float) * scale + middle, triangles)
     if (topology.edge_faces(mesh[1])[1] > 2).any():
-        # A tunnel that collapsed to an edge: splitting the edge closes the tunnel.
+        # A tunnel that collapsed to an edge is closed by splitting the edge.
         mesh = topology.part_double_edges(*topology.split_edges(*mesh))
     return mesh
 

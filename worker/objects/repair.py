@@ -1,7 +1,6 @@
 """Repair the triangles of a file to one closed, outward solid, or raise an error with the fix.
 
-Every change is reported: silent repairs would make a dataset inexplicable later.
-"""
+Every change is reported: after silent repairs, results of a dataset could not be explained."""
 
 from __future__ import annotations
 
@@ -28,7 +27,7 @@ MIN_EXTENT_M: Final = 1e-3
 #: Range of extents of graspable objects, and the median extent of YCB's [m], for hints on units.
 HAND_SIZES_M: Final = (0.02, 0.6)
 TYPICAL_SIZE_M: Final = 0.12
-#: Largest gap between parts of one rigid body [m]: assemblies leave such gaps between joined parts.
+#: Largest gap between parts of one rigid body [m]; assemblies have such gaps between joined parts.
 JOINED_M: Final = 1e-3
 #: Vertices closer than this share of the longest extent are merged.
 MERGE: Final = 1e-8
@@ -40,7 +39,7 @@ HOLE: Final = 0.03
 DEBRIS: Final = 1e-6
 #: Spacing of coordinates at the mesh's position above which there is a warning [m].
 COARSE_M: Final = 1e-4
-#: Mean wall thickness [m] below which there is a warning: a wall can pass between hand points.
+#: Mean wall thickness [m] below which a warning is given: a thinner wall can pass between hand points.
 THIN_M: Final = 2.5e-3
 #: Points, besides the vertices, at which the repaired surface is compared with the original.
 _SAMPLES: Final = 4000
@@ -48,7 +47,7 @@ _SAMPLES: Final = 4000
 
 @dataclass(frozen=True)
 class RepairedMesh:
-    """Mesh in metres with a list of changes and of anomalies that are valid."""
+    """Mesh in metres, with a list of changes and a list of accepted anomalies."""
 
     vertices: Floats
     """(V, 3) relative to the middle of the mesh."""
@@ -69,10 +68,7 @@ class RepairedMesh:
 
 def repair(soup: Soup, options: ObjectOptions) -> RepairedMesh:
     """Convert the soup to a solid in metres.
-
-    Raises:
-        MeshError: wrong units, no volume, holes, several components; the message states the fix.
-    """
+    Raises MeshError: wrong units, no volume, holes, several components; the message states the fix."""
     try:
         given = _to_metres(soup, options)
         mesh = _solid(given, options)
@@ -136,7 +132,7 @@ def _coarse(given: CentredMesh, unit: float) -> str:
 
 
 def _fitting_units(extent: float) -> dict[str, float]:
-    """Return units in which a length of the file suits a hand, and that length [m]; the likeliest first."""
+    """Return the units in which a length of the file suits a hand, each with the length [m]; the likeliest first."""
     sizes = {unit: extent * metres for unit, metres in UNITS.items()}
     low, high = HAND_SIZES_M
     fitting = {unit: size for unit, size in sizes.items() if low <= size <= high}
@@ -157,7 +153,7 @@ def _clean(mesh: RepairedMesh) -> RepairedMesh:
     doubled = topology.repeated(faces) if len(faces) else np.zeros(0, dtype=bool)
     faces = faces[~doubled]
     slivers = topology.degenerate(vertices, faces) if len(faces) else np.zeros(0, dtype=bool)
-    # A face without area may join a long edge with two short ones: it is dropped only if no edge opens.
+    # A face without area may join a long edge with two short ones. It is dropped only if no edge opens.
     if slivers.any() and topology.open_edges(faces[~slivers]) <= topology.open_edges(faces):
         faces = faces[~slivers]
     else:
@@ -205,7 +201,7 @@ def _weld(mesh: RepairedMesh) -> RepairedMesh:
 
 
 def _fill_pinholes(mesh: RepairedMesh) -> RepairedMesh:
-    """Fill each small hole with a fan; the whole mesh stays open if one is large."""
+    """Fill each small hole with a fan; if one hole is large, all holes stay open."""
     extent = float(np.ptp(mesh.vertices, axis=0).max())
     loops = [loop for loop in _rims(mesh.faces) or [] if len(loop) > 2]
     if not loops or any(np.ptp(mesh.vertices[loop], axis=0).max() > HOLE * extent for loop in loops):
@@ -249,7 +245,7 @@ def _open(mesh: RepairedMesh, options: ObjectOptions) -> RepairedMesh:
 
 
 def _resolve_components(mesh: RepairedMesh, options: ObjectOptions) -> RepairedMesh:
-    """Drop debris, orient components outward, unite overlapping ones; the user chooses among several."""
+    """Drop debris, orient components outward, and unite overlapping ones; options select among several components."""
     shells = topology.components(mesh.faces)
     parts = [topology.compact(mesh.vertices, mesh.faces[shells == k]) for k in range(shells.max() + 1)]
     volumes = np.array([signed_volume(*part) for part in parts])
@@ -280,7 +276,7 @@ def _unite(
     turned: bool,
     options: ObjectOptions,
 ) -> RepairedMesh:
-    """Unite shells to one solid: shells wound against the largest are cavities if they lie inside it."""
+    """Unite shells to one solid; shells wound against the largest one are cavities if they lie inside it."""
     if turned:
         mesh = mesh.but(mesh.vertices, mesh.faces[:, ::-1], "winding turned outward")
     boxes = [(p[0].min(axis=0), p[0].max(axis=0)) for p in parts]
@@ -318,7 +314,7 @@ def _unite(
         how = "lie apart" if len(groups) > 1 else f"touch or lie within {1e3 * JOINED_M:g} mm"
         mesh = replace(mesh, notes=(*mesh.notes, f"{len(pieces)} parts that {how} are one rigid body"))
     before = sum(signed_volume(*p) for p in positives) - sum(signed_volume(*p) for p in holes)
-    # Parts that only share a face keep their volume when united; their faces inside the solid are removed.
+    # Parts that only share a face keep their volume when united, but their faces inside the solid are removed.
     if abs(united.volume() - before) > 1e-6 * before or len(pieces) < len(positives):
         return mesh.but(
             *mesh_geometry.from_manifold(united), f"united {len(parts)} touching or intersecting components"
@@ -328,7 +324,7 @@ def _unite(
 
 
 def _resolve_self_intersections(mesh: RepairedMesh) -> RepairedMesh:
-    """Count doubly enclosed volume once if that leaves the outer surface unchanged; else add a note."""
+    """Count doubly enclosed volume once if the outer surface stays unchanged; else add a note."""
     found = crossings(mesh.vertices, mesh.faces)
     if found is None or not len(found):
         return replace(mesh, self_intersections=None if found is None else 0)

@@ -1,4 +1,4 @@
-"""Files in place of the expected ones: pointers, error pages, archives with the suffix of a mesh."""
+"""Files in place of expected ones: pointers, error pages, archives with the suffix of a mesh."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ _MESHES: Final = {
 
 
 def refuse_stand_in(name: str, data: bytes, error: type[InputError]) -> None:
-    """Raise `error` if a file is known not to match its suffix: the message names its kind and the fix."""
+    """Raise `error` if a file does not match its suffix; the message names its kind and the fix."""
     head = data[:1024].removeprefix(b"\xef\xbb\xbf").lstrip()
     # The 80 bytes at the beginning of a binary STL may be any text.
     for pattern, what, fix in _BINARIES if b"\0" in head else _TEXTS + _BINARIES:
@@ -69,7 +69,7 @@ def refuse_stand_in(name: str, data: bytes, error: type[InputError]) -> None:
 
 
 def other_format(name: str, data: bytes) -> str | None:
-    """Return the other mesh format of a file that its reader refuses, and the fix."""
+    """Return the true mesh format of a file that its reader refuses, and the fix; None if unknown."""
     own, head = PurePosixPath(name).suffix.lower(), data[:4096].lstrip()
     for suffix, pattern in _MESHES.items():
         if suffix != own and pattern.match(head):

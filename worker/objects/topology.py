@@ -1,7 +1,6 @@
 """Topology of a triangle mesh: merging, degenerate and duplicate faces, winding, edges, components.
 
-All functions are pure: vertices (V, 3) and faces (F, 3) in, new arrays out.
-"""
+All functions are pure: vertices (V, 3) and faces (F, 3) in, new arrays out."""
 
 from __future__ import annotations
 
@@ -26,7 +25,7 @@ def merge_vertices(vertices: Floats, faces: Indices, tolerance: float) -> tuple[
     vertices, faces = vertices[used], faces.reshape(-1, 3)
     cells = np.round((vertices - vertices.min(axis=0)) / tolerance).astype(np.int64)
     _, first, inverse = np.unique(cells, axis=0, return_index=True, return_inverse=True)
-    # Keep the file's order: sorted cells would shuffle vertices needlessly.
+    # Keep the file's order: vertices in the order of sorted cells would be shuffled.
     order = np.argsort(first, kind="stable")
     rank = np.empty(len(first), dtype=np.int64)
     rank[order] = np.arange(len(first))
@@ -75,9 +74,7 @@ def degenerate(vertices: Floats, faces: Indices) -> Mask:
 
 def repeated(faces: Indices) -> Mask:
     """Return a mask (F,) of faces to drop so that each set of three vertices is used at most once.
-
-    Two coincident faces of opposite winding enclose nothing: both are dropped if the surface stays closed.
-    """
+    Two coincident faces of opposite winding enclose nothing: both are dropped if the surface stays closed."""
     key = np.sort(faces, axis=1)
     _, group, size = np.unique(key, axis=0, return_inverse=True, return_counts=True)
     group = group.reshape(-1)
@@ -105,7 +102,7 @@ def repeated(faces: Indices) -> Mask:
 
 
 def _edge_keys(faces: Indices, *, directed: bool = False) -> Indices:
-    """Encode each edge (3F,) as a number, in the order of `directed_edges`: far faster to sort than pairs."""
+    """Encode each edge (3F,) as a number, in the order of `directed_edges`; numbers sort far faster than pairs."""
     edges = directed_edges(faces)
     edges = edges if directed else np.sort(edges, axis=1)
     return (edges[:, 0] << 32) | edges[:, 1]
@@ -135,13 +132,13 @@ def open_edges(faces: Indices) -> int:
 
 
 def _by_edge(faces: Indices) -> tuple[Indices, Indices, Indices]:
-    """Return the directed edges (3F,) sorted by undirected edge, and first place and number (E,) of each edge's."""
+    """Return the directed edges (3F,) sorted by undirected edge, and each edge's first place and number (E,)."""
     index, counts = edge_faces(faces)
     return np.argsort(index, kind="stable"), np.cumsum(counts) - counts, counts
 
 
 def pair_faces(faces: Indices) -> tuple[Indices, Indices, Mask]:
-    """Return the two faces at each manifold edge, (M,) and (M,), and (M,) whether their windings agree."""
+    """Return the two faces at each manifold edge, (M,) and (M,), and a mask (M,) of edges with equal windings."""
     order, starts, counts = _by_edge(faces)
     pairs = starts[counts == 2]
     one, two = order[pairs], order[pairs + 1]
@@ -151,7 +148,7 @@ def pair_faces(faces: Indices) -> tuple[Indices, Indices, Mask]:
 
 
 def parts_of_graph(one: Indices, other: Indices, count: int) -> NDArray[np.int32]:
-    """Number the connected parts (N,) of `count` nodes; edges join nodes `one` (E,) with `other` (E,)."""
+    """Number the connected parts (N,) of `count` nodes; edges join nodes `one` (E,) with nodes `other` (E,)."""
     from scipy.sparse import coo_matrix  # slow to load, and a prepared object needs none
     from scipy.sparse.csgraph import connected_components
 
@@ -172,10 +169,8 @@ def components(faces: Indices) -> Indices:
 
 def unify_winding(faces: Indices) -> tuple[Indices, bool]:
     """Flip faces so that neighbours agree; return whether that was possible (not on a Moebius strip).
-
-    Each face is two nodes, as it is and flipped; an edge joins the nodes that agree. A component of this graph is one
-    consistent choice; a face connected with its own flipped copy belongs to a non-orientable surface.
-    """
+    Each face is two nodes, as it is and flipped; an edge joins nodes that agree. A component of this graph is one
+    consistent choice. A face connected with its own flipped copy belongs to a non-orientable surface."""
     count = len(faces)
     one, two, agree = pair_faces(faces)
     cross = np.where(agree, 0, count)
@@ -183,7 +178,7 @@ def unify_winding(faces: Indices) -> tuple[Indices, bool]:
     columns = np.concatenate([two + cross, two + count - cross])
     label = parts_of_graph(rows, columns, 2 * count)
     orientable = bool((label[:count] != label[count:]).all())
-    # Choose the option of a patch that flips fewer faces: the majority of the file is usually right.
+    # A patch has two choices; the one that flips fewer faces is taken, since most of a file is usually right.
     low = np.minimum(label[:count], label[count:])
     as_is = label[:count] == low
     share = np.bincount(low, as_is, minlength=2 * count) * 2 >= np.bincount(low, minlength=2 * count)
@@ -193,9 +188,7 @@ def unify_winding(faces: Indices) -> tuple[Indices, bool]:
 
 def split_edges(vertices: Floats, faces: Indices) -> tuple[Floats, Indices]:
     """Split edges with more than two faces: vertices there are duplicated, one for each fan of faces.
-
-    Faces at a crowded edge are paired as neighbours around the edge that enclose material between them.
-    """
+    Faces at a crowded edge are paired as neighbours around the edge that enclose material between them."""
     order, starts, counts = _by_edge(faces)
     count, edges = len(faces), directed_edges(faces)
     simple = starts[counts == 2]
@@ -206,7 +199,7 @@ def split_edges(vertices: Floats, faces: Indices) -> tuple[Floats, Indices]:
         one.append(pairs[:, 0])
         two.append(pairs[:, 1])
     a, b = np.concatenate(one), np.concatenate(two)
-    # Half-edge k F + f runs from corner k of face f to corner k + 1; its partner runs the other way.
+    # Half-edge k F + f runs from corner k of face f to corner k + 1; its partner runs in the opposite direction.
     start, end = _corner(a, count), _corner(b, count)
     after, before = _corner(a, count, 1), _corner(b, count, 1)
     rows, columns = np.concatenate([start, after]), np.concatenate([before, end])
@@ -216,10 +209,8 @@ def split_edges(vertices: Floats, faces: Indices) -> tuple[Floats, Indices]:
 
 
 def part_double_edges(vertices: Floats, faces: Indices) -> tuple[Floats, Indices]:
-    """Separate edges between the same two vertices: all but one get a vertex in the middle.
-
-    Such edges are valid on a surface with a tunnel, but in a list of faces they look like one edge with four faces.
-    """
+    """Separate edges between the same two vertices: all but one edge get a vertex in the middle.
+    Such edges are valid on a surface with a tunnel, but in a list of faces they look like one edge with four faces."""
     order, starts, counts = _by_edge(faces)
     count, edges = len(faces), directed_edges(faces)
     points, extra, touched = [vertices], [], set[int]()
@@ -246,7 +237,7 @@ def _corner(half: Indices, count: int, step: int = 0) -> Indices:
 
 
 def _pairs_around(vertices: Floats, faces: Indices, edges: Indices, half: Indices) -> list[tuple[int, int]]:
-    """Pair half-edges at one edge: sorted by angle, each face is joined to the next one behind its back."""
+    """Pair half-edges at one edge: sorted by angle, each face is joined to the next face behind its back."""
     a, b = np.sort(edges[half[0]])
     axis = vertices[b] - vertices[a]
     axis /= max(float(np.linalg.norm(axis)), 1e-300)
@@ -255,11 +246,11 @@ def _pairs_around(vertices: Floats, faces: Indices, edges: Indices, half: Indice
     flat = apex - (apex @ axis)[:, None] * axis
     x = flat[0] / max(float(np.linalg.norm(flat[0])), 1e-300)
     angle = np.arctan2(flat @ np.cross(axis, x), flat @ x)
-    # Parts that touch have coincident faces: the one with its material before it comes first.
+    # Parts that touch have coincident faces; the face with its material before it comes first.
     angle = np.round(np.where(angle <= -np.pi + _SAME_ANGLE, np.pi, angle) / _SAME_ANGLE)
     order = np.lexsort((edges[half, 0] != a, angle))
     forward = edges[half[order], 0] == a
-    # A face that runs a -> b has its material on the side of smaller angle: it closes with the face before it.
+    # The material of a face that runs a -> b is on the side of smaller angle, so it closes with the face before it.
     closing = [k for k in range(len(order)) if forward[k] and not forward[k - 1]]
     if 2 * len(closing) != len(order):
         return []

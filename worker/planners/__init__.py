@@ -53,10 +53,7 @@ def synthesize(
     options: Mapping[str, Any] | None = None,
 ) -> GraspSet:
     """Plan grasps with the named method and its `options`; see `Planner`.
-
-    Raises:
-        InputError: the object does not fit into the gripper; see `fitting_pairs`.
-    """
+    Raises InputError: the object does not fit into the gripper; see `fitting_pairs`."""
     fitting_pairs(hand, obj)
     return planner(method, options, in_scenes=wanted.placed is not None)(hand, obj, wanted, run)
 

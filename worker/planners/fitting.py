@@ -1,7 +1,6 @@
 """Check before planning whether an object fits between the jaws of a gripper.
 
-Two opposite fingers can hold an object at two surface points whose normals point in opposite directions.
-"""
+Two opposite fingers can hold an object at two surface points with opposite normals."""
 
 from __future__ import annotations
 
@@ -25,10 +24,7 @@ FIT_M: Final = 0.001
 
 def fitting_pairs(hand: HandModel, obj: ObjectModel) -> Pairs | None:
     """Return pairs of opposite points that fit between the jaws of a hand; None if the hand is no gripper.
-
-    Raises:
-        InputError: no pair fits; the message names the joint and its opening.
-    """
+    Raises InputError: no pair fits; the message names the joint and its opening."""
     jaws = jaws_of(hand)
     if jaws is None:
         return None
@@ -44,10 +40,10 @@ def fitting_pairs(hand: HandModel, obj: ObjectModel) -> Pairs | None:
     )
 
 
-#: Number of surface points from which rays are cast, and the standard deviation of their tilt from the normal [rad].
+#: Number of surface points from which rays are cast; standard deviation of the rays' tilt from the normal [rad].
 _POINTS: Final = 768
 _TILT: Final = 0.08
-#: Cosine of the angle between a line and the surface normal at its exit: 20 degrees.
+#: Least cosine of the angle between a line and the surface normal at its exit: 20 degrees.
 _OPPOSITE_COS: Final = 0.94
 #: Least thickness that can be held [m].
 _THINNEST_M: Final = 5e-4
@@ -56,7 +52,7 @@ _CHUNK: Final = 64
 
 @dataclass(frozen=True)
 class Pairs:
-    """P pairs of points (P, 3), object frame [m]. The space between them may be hollow: fingers grasp it from
+    """P pairs of points (P, 3), object frame [m]. The space between two points may be hollow: fingers grasp from
     outside."""
 
     start: Floats

@@ -1,5 +1,5 @@
 """Cache of proposal networks in this process, by digest: a method's option names a network without a file.
-The digest is that of a local file, or of the service's asset."""
+The digest belongs to a local file or to the service's asset."""
 
 from __future__ import annotations
 

@@ -21,8 +21,8 @@ from graspd.worker.simulation.environment import PlacedGrasps
 
 #: Scores (N,) of N grasps, in their scenes or around a free object (None). Smaller is better: below 1 a grasp holds at
 #: half friction, below 2 at full friction; from 2 on, more candidates are worth their cost. The third argument is the
-#: score to beat for each grasp, inf if there is none. A rollout may stop early if it cannot beat this score.
-#: Several threads may call it at once.
+#: score to beat for each grasp, inf without one. A rollout may stop early if it cannot beat this score. Several threads
+#: may call the function at once.
 Rollout = Callable[[GraspSet, PlacedGrasps | None, NDArray[np.float64]], NDArray[np.float64]]
 
 
@@ -52,17 +52,11 @@ class PlanRequest:
 
 class Planner(Protocol):
     """Plans `wanted.count` grasps of a hand on an object.
-
-    A grasp depends only on seed, batch and its index within the batch, not on the other grasps. On the CPU, results
-    are bit-identical.
-    `run.progress(done, total, message)` may be called often; `run.cancelled()` is polled between launches.
-    `wanted.placed` is None except for methods with `in_scenes`.
-
-    Raises:
-        TaskCancelled: `run.cancelled()` returned True.
-        InputError: the pair cannot be grasped at all, with the reason.
-        NoStartFound: in scenes, no grasp has a start and `wanted.others_have_place` is false.
-    """
+    A grasp depends only on seed, batch and its index within the batch, not on the other grasps. On the CPU, results are
+    bit-identical. `run.progress(done, total, message)` may be called often; `run.cancelled()` is polled between
+    launches. `wanted.placed` is None except for methods with `in_scenes`. Raises TaskCancelled: `run.cancelled()`
+    returned True. InputError: the pair cannot be grasped; the message has the reason. NoStartFound: in scenes, no grasp
+    has a start and `wanted.others_have_place` is false."""
 
     def __call__(self, hand: HandModel, obj: ObjectModel, wanted: PlanRequest, run: ExecutionContext) -> GraspSet: ...
 
@@ -76,10 +70,9 @@ class BatchRequest:
 class BatchPlanner(Protocol):
     """Plans several batches of a hand on an object in one launch, with one fidelity and on one device.
     All batches are around a free object, or all are in scenes with the same supports and neighbours
-    (`PlacedGrasps.fixed`).
-
-    Each batch equals the result of the `Planner` for this batch alone; on the CPU bit for bit. The result of a failed
-    batch is its error: TaskCancelled if its own `run.cancelled()` returned True. The other batches continue."""
+    (`PlacedGrasps.fixed`). Each batch equals the result of the `Planner` for this batch alone; on the CPU bit for bit.
+    The result of a failed batch is its error: TaskCancelled if its own `run.cancelled()` returned True. The other
+    batches continue."""
 
     def __call__(
         self, hand: HandModel, obj: ObjectModel, asked: Sequence[BatchRequest]
@@ -111,7 +104,7 @@ class Method:
     options: type[Options] = Options
     """Class of its options."""
     uses: tuple[str, ...] = ()
-    """Settings of `Fidelity` that affect its grasps; the others are ignored."""
+    """Settings of `Fidelity` that affect its grasps; other settings are ignored."""
     joined: Callable[[Any], BatchPlanner] | None = None
     """Factory of the planner of several batches in one launch; None: batches are planned one by one."""
     files: Mapping[str, Callable[[Path], str]] = field(default_factory=dict)

@@ -37,10 +37,7 @@ def method_names() -> list[str]:
 
 def method(name: str) -> Method:
     """Return the method of a name; other packages cannot replace graspd's own names.
-
-    Raises:
-        InputError: unknown method, or a package's entry point that cannot be loaded or is no `Method`.
-    """
+    Raises InputError: unknown method, or a package's entry point that cannot be loaded or is no `Method`."""
     if name in PLANNERS:
         module, attribute = PLANNERS[name]
         with imports():
@@ -60,10 +57,7 @@ def method(name: str) -> Method:
 
 def planner(name: str, options: Mapping[str, Any] | None = None, *, in_scenes: bool = False) -> Planner:
     """Return the planner of a method with its options; strings are parsed as the option's type.
-
-    Raises:
-        InputError: unknown method, unknown option or value out of range; or `in_scenes`, which the method cannot do.
-    """
+    Raises InputError: unknown method, unknown option or value out of range; or the method does not plan `in_scenes`."""
     known = method(name)
     if in_scenes and not known.in_scenes:
         able = ", ".join(one for one in method_names() if method(one).in_scenes)
@@ -89,8 +83,8 @@ def _options(name: str, options: Mapping[str, Any] | None) -> Options:
 
 
 def of_this_machine(name: str, options: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Replace files in a local user's options by digests and cache the files in this process.
-    Raise InputError for an unknown method, or a file that cannot be used."""
+    """Replace files in a local user's options by digests, and cache the files in this process.
+    Raises InputError: unknown method, or a file that cannot be used."""
     files, given = method(name).files, dict(options or {})
     return given | {key: files[key](Path(str(value))) for key, value in given.items() if key in files}
 

@@ -1,8 +1,7 @@
 """Parts of a batch, one per CPU thread: Warp releases the GIL while a kernel runs.
 
-Warp's CPU backend runs a launch on the calling thread, so several threads use all cores. On a GPU a batch is one part;
-it is halved until memory suffices. A grasp's result does not depend on its part.
-"""
+Warp's CPU backend runs a launch on the calling thread, so several threads use all cores. On a GPU a batch is one part,
+halved until the memory suffices. A grasp's result does not depend on its part."""
 
 from __future__ import annotations
 
@@ -52,8 +51,8 @@ def cut(count: int, run: ExecutionContext, *, least: int = 1) -> list[range]:
 
 def run_parts(parts: list[range], work: Callable[[range], T]) -> list[T]:
     """Run `work` on every part, each in its own thread; return the results in order.
-    A part that exceeds a GPU's memory is split in two, repeatedly if needed, down to single grasps. The halves run one
-    after the other, so there may be more results than parts."""
+    A part that exceeds a GPU's memory is halved, repeatedly if needed, down to single grasps. Halves run in sequence,
+    so there may be more results than parts."""
     if len(parts) == 1:
         return _fitted(parts[0], work)
     with ThreadPoolExecutor(len(parts), thread_name_prefix="synthesize") as pool:
@@ -69,7 +68,7 @@ def _fitted(part: range, work: Callable[[range], T]) -> list[T]:
         log.warning(
             "too little memory on the GPU for %d grasps in one launch; two launches follow: %s", len(part), error
         )
-    # The error is freed by now, and with it the stack frames that held earlier allocations.
+    # The error is freed by now, and with it stack frames that held earlier allocations.
     gc.collect()
     middle = part.start + len(part) // 2
     return [*_fitted(range(part.start, middle), work), *_fitted(range(middle, part.stop), work)]

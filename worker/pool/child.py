@@ -1,8 +1,7 @@
 """Process of a `worker.pool.pool.Pool`: `python -m graspd.worker.pool.child [MODULE ...] FD`.
 
-It takes work from the socket with that file descriptor until the peer closes it. Data shared by several work items are
-cached by key; the pool names the keys to evict. The modules are imported before the first item.
-"""
+The process takes work from the socket with this file descriptor until the peer closes it. Data shared by several work
+items are cached by key; the pool names the keys to evict. The modules are imported before the first item."""
 
 from __future__ import annotations
 

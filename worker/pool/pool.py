@@ -1,10 +1,9 @@
-"""Pool of processes on this machine, one core each; `worker.pool.child` is their side.
+"""Pool of processes on this machine, one core each; `worker.pool.child` is the process itself.
 
 Threads share Python's lock: work that holds it for a tenth of its time does not fill 16 cores. Processes are started
-fresh, since a CUDA context and the threads of an engine do not survive a fork. They end with their parent, however it
-ends, because their pipe closes. The library's `ProcessPoolExecutor` would import the program that calls
-`graspd.synthesize` once more in each of them.
-"""
+fresh, since a CUDA context and the threads of an engine do not survive a fork. Every end of the parent closes their
+pipe, at which they end. The library's `ProcessPoolExecutor` would import the program that calls `graspd.synthesize`
+once more in each process."""
 
 from __future__ import annotations
 
@@ -95,11 +94,9 @@ class Pool(AbstractContextManager["Pool"]):
         done: Callable[[int], None] = lambda number: None,
     ) -> list[Any]:
         """Compute `work(shared, part)` for all parts, in their order; `work` is importable, without side effects.
-
         Each process receives the pickled `shared` once, under its `key`. `done` receives the number of each finished
-        part, in another thread. Raises ProcessLost: a process ended during a part. TaskCancelled: `cancelled` returned
-        True, or the pool was closed. An error of a part abandons the others.
-        """
+        part, in another thread. An error of a part abandons the other parts. Raises ProcessLost: a process ended during
+        a part. TaskCancelled: `cancelled` returned True, or the pool was closed."""
         self.start()
         request = _Request(work, key, shared, done)
         with self._changing:
@@ -142,7 +139,7 @@ class Pool(AbstractContextManager["Pool"]):
 
 
 class _Place:
-    """One process at a time, and the keys in its cache. `end` may be called by another thread."""
+    """A place of the pool: one process at a time, and the keys in its cache. Any thread may call `end`."""
 
     def __init__(self, modules: Sequence[str]) -> None:
         self._modules = tuple(modules)

@@ -1,10 +1,9 @@
 """Engine of a worker: the process that owns the device and runs tasks one by one.
 
-The worker (`worker.process.main`) first sends a `Setup` over a pipe, then orders of the form (name, argument):
-`service` (compares store and Redis), `check` (answer: `ready`), `task` (`done`, then `idle`) and `end`. An answer may
-be an error, `refused`. `stop` with a reason is accepted at any time. The engine also sends `facts` for the list of
-workers (including progress) and `event`. It does not access Redis.
-"""
+Over a pipe the worker (`worker.process.main`) first sends a `Setup`, then orders of the form (name, argument).
+`service` compares store and Redis. `check` is answered by `ready`, `task` by `done` and then `idle`; `end` ends the
+process. An answer may be an error, `refused`. `stop` with a reason is accepted at any time. The engine also sends
+`facts` for the list of workers (including progress) and `event`. It does not access Redis."""
 
 from __future__ import annotations
 
@@ -57,7 +56,7 @@ class Engine:
         table: Mapping[Stage, StageFunction] | None = None,
         check: Check | None = None,
     ) -> None:
-        """`table`: function of each stage; `check`: test of their engines; the real ones by default."""
+        """`table` has the function of each stage, `check` tests their engines; the real ones by default."""
         self._connection, self._setup = connection, setup
         self._table, self._check = table, check
         self._speaking = threading.Lock()
@@ -108,7 +107,8 @@ class Engine:
 
     def _admitted(self) -> bool:
         """Check the engine before the first task; with `Setup.patient`, wait in quarantine until it passes."""
-        # Only the most expensive stage: others load with their first task, and are checked after failures.
+        # Only the most expensive stage is checked. Other stages load with their first task, and are checked after
+        # failures.
         stages = self._setup.stages
         first = (Stage.SYNTHESIZE,) if Stage.SYNTHESIZE in stages else stages
         fit = self._fitness.try_engine(first) or (self._setup.patient and self._wait_in_quarantine(first))
@@ -150,7 +150,7 @@ class Engine:
             try:
                 word, about = self._connection.recv()
             except (EOFError, OSError, TypeError):
-                # The worker is gone, so the task can stop. TypeError: closed by the other thread between two reads.
+                # The worker ended, so the task can stop. TypeError: the other thread closed the pipe between two reads.
                 word, about = "end", StopReason.LEASE_LOST
             with self._changing:
                 if word in ("stop", "end"):
@@ -165,12 +165,12 @@ class Engine:
                 return
 
     def _say(self, word: str, about: Any) -> None:
-        with self._speaking, suppress(OSError):  # a worker that is gone
+        with self._speaking, suppress(OSError):  # the worker has ended
             self._connection.send((word, about))
 
 
 class TaskResources:
-    """Resources of a task besides its message; a worker that grew too large (leaks) is replaced."""
+    """Resources of a task besides its message. A worker that grew too large (leaks) is replaced."""
 
     def __init__(self, settings: Settings, store: Store, device: Device) -> None:
         self.settings = settings
@@ -219,7 +219,7 @@ class TaskResources:
 
 
 def resident_mb(pid: int | None = None) -> float:
-    """Return the resident memory of this process or another [MiB].
+    """Return the resident memory of this process or another one [MiB].
     If the system does not report it: this process's peak, or 0 for another process."""
     try:
         pages = int(Path(f"/proc/{pid or 'self'}/statm").read_text().split()[1])
@@ -244,7 +244,7 @@ def main(table: Mapping[Stage, StageFunction] | None = None, check: Check | None
 
 
 def end() -> None:
-    """Exit at once: finalising Warp and its kernels takes seconds, and nothing is left to save."""
+    """Exit at once: finalising Warp and its kernels takes seconds, and no state needs saving."""
     atexit._run_exitfuncs()
     sys.stderr.flush()
     os._exit(0)

@@ -1,14 +1,11 @@
 """Fitness of a worker: an unfit one returns tasks, to save their attempts, and goes into quarantine.
 
-A worker is unfit if
+A worker is unfit in two cases. Its engine fails the check, before the first task or after a task failed for another
+reason than its input. Or several different tasks fail here in a row, while other workers did two of them.
 
-- its engine fails the check, before the first task or after a task failed for another reason than its input; or
-- several different tasks fail here in a row, and two of them were meanwhile done by other workers.
-
-In quarantine it is listed with the reason and gets no tasks. It repeats its check after increasing pauses and resumes
-when it passes. If it does not, or if the check cannot find the fault, its process ends, and a fresh one starts with a
-check.
-"""
+A worker in quarantine is listed with the reason and gets no tasks. It repeats its check after increasing pauses and
+resumes when the check passes. If it does not pass, or cannot find the fault, the process ends and a fresh one starts
+with a check."""
 
 from __future__ import annotations
 
@@ -30,7 +27,7 @@ from graspd.worker.process.selfcheck import EngineError
 log = logging.getLogger(__name__)
 Check = Callable[[Collection[Stage]], None]  # check of the engine for some stages; raises EngineError
 PAUSES_S: Final = (2.0, 5.0, 10.0, 20.0)  # pauses before the checks of a worker in quarantine [s]
-#: This many tasks that failed here and succeeded elsewhere make a worker unfit.
+#: Number of tasks that failed here and succeeded elsewhere, from which on a worker is unfit.
 _DONE_ELSEWHERE: Final = 2
 _REMEMBERED: Final = 16
 _LOSSES_BYTES: Final = 2**16
@@ -41,7 +38,7 @@ _OF_THE_TASK: Final = (InputError, TaskRefused, DamagedError)
 
 def first_loss(task: str) -> bool:
     """Check whether this is the first loss of a GPU or pool process over a task on this machine.
-    The first loss is no failed attempt of the task. Later losses are, so that a task that causes them ends."""
+    The first loss is no failed attempt of the task. Later losses count, so that a task that causes them ends."""
     file = user_cache.folder("gpus") / f"{hashlib.sha256(task.encode()).hexdigest()[:32]}.lost"
     if user_cache.load(file) is not None:
         return False
@@ -51,7 +48,7 @@ def first_loss(task: str) -> bool:
 
 class Fitness:
     def __init__(self, store: Store, check: Check | None = None) -> None:
-        """Without `check` only results of other workers decide."""
+        """Without `check`, only results of other workers decide."""
         self._store = store
         self._check = check
         self._failed: dict[str, tuple[Stage, str]] = {}
@@ -73,7 +70,7 @@ class Fitness:
         self._failed.clear()
 
     def doubt(self, message: Message, error: Exception) -> str:
-        """Return why a failure is due to this worker and not the task; "" if that is unknown."""
+        """Return the reason why a failure is due to this worker and not to the task; "" if it is unknown."""
         if isinstance(error, _OF_THE_TASK):
             return ""
         if self.try_engine((message.stage,)):

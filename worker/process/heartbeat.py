@@ -19,7 +19,7 @@ from graspd.service.queue.rq_queue import list_worker, unlist_worker
 from graspd.service.telemetry import HeartbeatFile
 
 log = logging.getLogger(__name__)
-#: Interval of heartbeats if three fit a lease [s]: a cancelled task must stop within two seconds, and each heartbeat
+#: Interval of heartbeats if three fit a lease [s]. A cancelled task must stop within two seconds, and each heartbeat
 #: reads the key of cancellations.
 BEAT_S: Final = 0.8
 _SHORTEST_INTERVAL_S: Final = 0.1  # least interval between two updates [s]
@@ -27,7 +27,7 @@ _ANSWER_S: Final = 3.0  # longest wait for a response of Redis [s]
 
 
 class Heartbeat:
-    """Sends heartbeats from its own thread and connection, both free while the worker waits for others."""
+    """Sends heartbeats from its own thread and connection, which stay free while the worker waits."""
 
     def __init__(
         self,
@@ -38,8 +38,8 @@ class Heartbeat:
         alive: Path | None = None,
         is_stopped: Callable[[], bool] = lambda: False,
     ) -> None:
-        """`lease_s`: lifetime of the registration after a heartbeat [s]; `alive`: a file that is touched with each one;
-        `is_stopped`: whether the worker hangs although this thread runs: then there is no heartbeat."""
+        """`lease_s` is the lifetime of the registration after a heartbeat [s]; each heartbeat touches the file `alive`.
+        No heartbeat is sent while `is_stopped` returns True: the worker hangs, although this thread runs."""
         self._connection: Any = connect(url, patience=0, timeout_s=_ANSWER_S)
         self._facts, self._lease_s = asdict(beat), lease_s
         self._alive, self._is_stopped = HeartbeatFile(alive), is_stopped
@@ -56,7 +56,7 @@ class Heartbeat:
         self._changed.set()
 
     def stop(self) -> None:
-        """End the registration and record that this worker is not lost; no-op before the first heartbeat."""
+        """End the registration and record a regular end; no-op before the first heartbeat."""
         if self._thread.ident is None:
             return
         self._over.set()

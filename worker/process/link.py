@@ -84,7 +84,7 @@ def start_engine(setup: Setup, program: Sequence[str] = (sys.executable, "-m", "
     Call it from the main thread: the kernel ties a child to the thread that starts it."""
     ours, process = start_child([sys.executable, "-m", "graspd.service.run.launch", str(os.getpid()), *program])
     link = Link(ours, process)
-    # The values only: the library that reads settings takes 8 MiB per process.
+    # Only the values are sent: the library that reads settings takes 8 MiB per process.
     values: Any = SimpleNamespace(**dict(setup.settings), resolved_store_url=setup.settings.resolved_store_url)
     ours.send(replace(setup, settings=values))
     return link

@@ -1,9 +1,8 @@
 """Worker process: RQ's worker, which renews the lease of a task while a separate engine runs it.
 
 The engine (`worker.process.engine`) is its own process and lives as long as the worker: a CUDA context does not survive
-a fork, and a new process for each task would load kernels and meshes every time. The worker shares no interpreter lock
-with it, so neither a kernel compilation nor a busy machine can starve the lease.
-"""
+a fork. A new process for each task would load kernels and meshes every time. The worker shares no interpreter lock with
+the engine, so neither a kernel compilation nor a busy machine can prevent the renewal of the lease."""
 
 from __future__ import annotations
 
@@ -98,7 +97,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         except GraspdError as error:
             log.warning("the engine refuses a task: %s", error)
         except EngineLost as error:
-            # As after a kill of this process: the lease remains, and the controller detects that it expires.
+            # As after a kill of this process, the lease remains, and the controller detects its expiry.
             log.error("this worker ends: %s", error)
             os._exit(1)
         self._give_back(job)
@@ -168,7 +167,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
             self._engine.say("stop", StopReason.CANCELLED if is_cancelled else StopReason.LEASE_LOST)
 
     def _give_back(self, job: Any) -> None:
-        """Remove the task from Redis; waits while Redis refuses writes because its disk is full."""
+        """Remove the task from Redis; wait while Redis refuses writes because its disk is full."""
         if not job.exists(job.id, self.connection):
             log.info("task %s was taken from this worker, which was too slow", job.id.rpartition("-")[0])
         execution, told = self.execution, False
@@ -189,7 +188,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
                 time.sleep(_REFUSED_PAUSE_S)
 
     def dequeue_job_and_maintain_ttl(self, *args: Any, **options: Any) -> Any:
-        """Return the next task, or None if none waits. Invalid entries of the queue are skipped."""
+        """Return the next task, or None if no task waits. Invalid entries of the queue are skipped."""
         while True:
             try:
                 found = super().dequeue_job_and_maintain_ttl(*args, **options)
@@ -204,7 +203,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
                 log.warning("an entry of the queue cannot be read: %s", error)
 
     def reorder_queues(self, reference_queue: Any) -> None:
-        """Choose the queue of the next task; RQ calls this after each task it took."""
+        """Choose the queue of the next task. RQ calls this function after each task."""
         self._taken += 1
         queues = {queue.name: queue for queue in self.queues}
         self._ordered_queues = [queues[name] for name in queue_names(self._stages, self._taken, ability=own_ability())]
@@ -215,7 +214,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         self._heartbeat.update(state="stopping")
 
     def subscribe(self) -> None:
-        """Disable RQ's command channel: it fails after a reconnect, and lets any Redis client stop workers."""
+        """Disable RQ's command channel. It fails after a reconnect, and lets any Redis client stop workers."""
 
 
 def run_worker(
@@ -228,10 +227,8 @@ def run_worker(
     start: StartEngine = start_engine,
 ) -> bool:
     """Run tasks until a stop is requested; with `burst` until none came for `idle_s` [s], with `max_tasks` that many.
-
     Return False if the worker ended because of a failure. Raises InputError: there is no such device. BusyError: Redis
-    belongs to another service than the store. QueueUnavailable, StoreUnavailable: at the start.
-    """
+    and store belong to different services. QueueUnavailable, StoreUnavailable: at the start."""
     does_all = not burst and max_tasks is None
     name = f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(3)}"
     queue = open_queue(settings, patience=_PATIENCE)
@@ -248,7 +245,7 @@ def run_worker(
         worker = GraspWorker(queue, engine, heart, stages=stages, name=name, limit_s=settings.task_timeout_s)
         worker.check_service()
         heart.start()
-        # It holds no task yet: a signal ends it at once, gracefully. RQ sets a handler of its own later.
+        # It holds no task yet, so a signal may end it at once. RQ sets its own handler later.
         signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
         if not worker.admit():
             return False

@@ -64,7 +64,7 @@ class Runner:
 
     def run(self, raw: Mapping[str, Any], context: TaskContext) -> Event | None:
         """Run a task; return the event for the controller, None if the task no longer belongs to this worker.
-        Raises TaskRefused: the message cannot be read, so there is no task to fail."""
+        Raises TaskRefused: the message cannot be read, so there is no task that could fail."""
         message = parse_message(raw)
         with bind(**_subjects(message)):
             return self._run(message, raw, context)
@@ -73,7 +73,7 @@ class Runner:
         started, clock = timestamp(), time.monotonic()
         try:
             if lacking := own_ability().lacks(need_of(message)):
-                # For another worker: the controller reports tasks that no present worker can do.
+                # The task is for another worker. The controller reports tasks that no present worker can do.
                 return self._event(EventKind.DEFERRED, message, message=f"this worker cannot run it: {lacking}")
             return self._do(message, context)
         except TaskCancelled:
@@ -140,7 +140,7 @@ class Runner:
         return is_there and context.store.exists(names.shard_file(message.stage, message.output))
 
     def _lost(self, message: Message, context: TaskContext) -> ShardManifest | None:
-        """Return the manifest of a shard that was made before but whose file is lost."""
+        """Return the manifest of a shard that was made before but has lost its file."""
         if isinstance(message, IngestMessage) or not shard_exists(context.store, message.stage, message.output):
             return None
         return load_manifest(context.store, message.stage, message.output)
@@ -193,7 +193,7 @@ def parse_message(raw: Mapping[str, Any]) -> Message:
     """Parse the message of a queue entry; raise TaskRefused if it is invalid."""
     try:
         model = message_type(raw)
-        # A newer schema may have more fields; those that identify the task must exist, so that it can be refused.
+        # A newer schema may have more fields. Fields that identify the task must exist, so that it can be refused.
         known = {field.alias or name for name, field in model.model_fields.items()}
         return model.model_validate({key: value for key, value in renamed(dict(raw)).items() if key in known})
     except (ValidationError, AttributeError) as error:
@@ -209,7 +209,7 @@ def _subjects(message: Message) -> dict[str, Any]:
 
 
 def output_of(message: Message) -> str:
-    """Return the output of a task: a shard id, or kind and digest of the asset it checks."""
+    """Return the output of a task: a shard id, or kind and digest of the checked asset."""
     return message.output if isinstance(message, TaskMessage) else f"{message.kind.value}/{message.digest}"
 
 

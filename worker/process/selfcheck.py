@@ -1,8 +1,7 @@
 """Self-check of a worker: whether its engine loads and gives plausible results.
 
 Each stage's engine runs on a ball: a grasp is validated and measured, a drop simulated, a picture rendered. This also
-loads or compiles the kernels, so the first task does not wait for them.
-"""
+loads or compiles the kernels, so the first task does not wait for them."""
 
 from __future__ import annotations
 
@@ -67,7 +66,7 @@ def _check_scene(run: ExecutionContext) -> None:
     from graspd.worker.scenes import drop
 
     height = drop(_ball(), count=1, seed=0)["scene/object_pose"][0, 2]
-    # The pose is that of the ball's frame, with its centre as origin: the ball lies on the table, within its facets.
+    # The pose is that of the ball's frame, with its centre as origin. The ball rests on the table within its facets.
     _expect(abs(height - _RADIUS_M) < 0.1 * _RADIUS_M, f"a ball comes to rest at a height of {height:.3g} m")
 
 

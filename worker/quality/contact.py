@@ -14,7 +14,8 @@ from graspd.worker.hands.model import HandModel
 LINK_CONTACT_M: Final = 0.002
 #: Cap of contact distances in the contact distance consistency [m] (DexGraspBench's contact margin).
 CONSISTENCY_CAP_M: Final = 0.010
-#: Most contacts of a wrench space: the cost of its hull grows with their number, its radius hardly grows.
+#: Largest number of contacts of a wrench space: with more contacts the cost of its hull grows, but its radius hardly
+#: does.
 MAX_CONTACTS: Final = 20
 
 
@@ -22,7 +23,7 @@ def contact_area_cm2(distance: Floats, area: Floats, thresholds_m: Floats) -> Fl
     """Compute the hand area (B, T) within each threshold (T,) of the object's surface, on either side [cm^2].
     The distances (B, N) are signed [m]; each point represents an `area` (N,) [m^2]."""
     near = np.abs(distance)
-    # One row at a time: the rounding of a matrix product depends on its number of rows.
+    # Row by row, since the rounding of a matrix product depends on its number of rows.
     return np.stack([np.where(near < t, area, 0.0).sum(axis=-1) for t in thresholds_m], axis=-1) * 1e4
 
 
@@ -50,7 +51,8 @@ def spread_contacts(
 
 
 def _farthest(points: Floats, inside: NDArray[np.bool_], count: int) -> NDArray[np.intp]:
-    """Select points (S, count) by the rule of `farthest_points` from each set (S, W, K), if `inside` (S, W)."""
+    """Select points (S, count) by the rule of `farthest_points` from each set (S, W, K), among those `inside` (S,
+    W)."""
     rows = np.arange(len(points))
     mean = np.einsum("sw,swk->sk", inside.astype(float), points) / np.maximum(inside.sum(axis=1), 1)[:, None]
     start = np.where(inside, ((points - mean[:, None]) ** 2).sum(axis=2), -1.0)
@@ -86,7 +88,7 @@ def finger_of_body(hand: HandModel) -> NDArray[np.int32]:
 
 
 def contact_distance_consistency_mm(hand: HandModel, body_distance: Floats) -> Floats:
-    """Compute CDC (B,): largest minus least finger distance, each within [0, 10 mm] (DexGraspBench) [mm]."""
+    """Compute CDC (B,): largest minus least finger distance, each capped to 0 .. 10 mm (DexGraspBench) [mm]."""
     finger = finger_of_body(hand)
     least = [body_distance[:, finger == f].min(axis=1) for f in np.unique(finger[finger >= 0])]
     if not least:

@@ -21,10 +21,10 @@ _PAIRS: Final = 4096
 
 
 def explained_variance(posture: Posture) -> Floats:
-    """Compute the explained variance of (translation, rotation vector, joints), largest first.
+    """Compute the explained variance of (translation, rotation vector, joints), largest first; empty for fewer than 2
+    grasps.
     The entries are shares of variance along the principal components. Diversity D is the first entry: near 1, all
-    grasps vary along one line; lower is more diverse. Units stay metres and radians, as in DexGraspBench. Empty for
-    fewer than 2 grasps."""
+    grasps vary along one line; lower is more diverse. Units stay metres and radians, as in DexGraspBench."""
     if len(posture) < 2:
         return np.zeros(0)
     features = np.hstack(
@@ -39,7 +39,7 @@ def explained_variance(posture: Posture) -> Floats:
 def hand_points(hand: HandModel, posture: Posture) -> Floats:
     """Return the positions (N, P, 3) of the same `POINTS` surface points in N postures, object frame [m].
     The distance of two grasps is the mean distance of these points [m]. It covers the hand's pose and its joints, each
-    weighted by the motion that it causes. Grasps that are equivalent by an object's symmetry still count as different.
+    weighted by the motion that it causes. Grasps that an object's symmetry makes equivalent still count as different.
     """
     points = sample_surface(hand, POINTS)
     poses = body_poses(hand, posture.hand_pose, posture.joint_positions)
@@ -62,7 +62,7 @@ def nearest(points: Floats) -> float | None:
     middles = cKDTree(points.mean(axis=1))
     near = np.asarray(middles.query(middles.data, k=2)[1])
     rows = np.arange(len(points))
-    # If mean points coincide, the first neighbour need not be the point itself.
+    # If mean points coincide, the first neighbour may be another point than the point itself.
     bound = float(distances(points, rows, np.where(near[:, 0] == rows, near[:, 1], near[:, 0])).min())
     # The mean distance of points is at least the distance of their means.
     pairs = middles.query_pairs(bound, output_type="ndarray")

@@ -8,10 +8,11 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-#: Deepest hand-object penetration [mm]: about the deformation of a finger pad under load, and a fifth of the limit of
-#: the field's protocols (10 mm).
+#: Deepest hand-object penetration [mm]: about the deformation of a finger pad under load, and a fifth of the field's
+#: usual limit of 10 mm.
 MAX_PENETRATION_MM: Final = 2.0
-#: Deepest hand-hand penetration [mm]: collision shapes of neighbouring links overlap by about this much in hand models.
+#: Deepest hand-hand penetration [mm]: in hand models, collision shapes of neighbouring links overlap by about this
+#: much.
 MAX_SELF_PENETRATION_MM: Final = 3.0
 #: Fewest links in contact: a single link cannot hold an object against gravity in every direction.
 MIN_CONTACT_LINKS: Final = 2

@@ -13,17 +13,14 @@ _Z: Final = 1.959963984540054
 
 def wilson(part: int, whole: int) -> tuple[float, float]:
     """Return the 95 % interval of a share (Wilson 1927); at shares 0 and 1 it has a width, unlike a bootstrap's.
-
-    Raises:
-        ValueError: `whole` is 0, or less than `part`.
-    """
+    Raises ValueError: `whole` is 0, or less than `part`."""
     bounds = binomtest(part, whole).proportion_ci(method="wilson")
     return float(bounds.low), float(bounds.high)
 
 
 def wilson_of_mean(total: float, count: int) -> tuple[float, float]:
     """Return the 95 % interval of the mean of `count` values from 0 to 1 that sum to `total`.
-    It is Wilson's interval for a share. It is wide enough: among values from 0 to 1, zeros and ones spread most."""
+    Wilson's interval for a share is wide enough: of all values from 0 to 1, zeros and ones spread most."""
     mean, grown = total / count, 1 + _Z**2 / count
     middle = (mean + _Z**2 / (2 * count)) / grown
     half = _Z / grown * math.sqrt(max(0.0, mean * (1 - mean)) / count + _Z**2 / (4 * count**2))

@@ -73,7 +73,7 @@ class PostureData:
 
     def touching_links(self, posture: Posture) -> NDArray[np.int32]:
         """Count (N,) bodies of posed hands with points closer to the object than `LINK_CONTACT_M`.
-        The quality table also tests object points, so it counts at least as many."""
+        The quality table also tests object points, so its number is at least as large."""
         return contact_links(self._gaps(posture, LINK_CONTACT_M, self.points.body.numpy()))
 
     def finger_gaps(self, posture: Posture, reach: float) -> Floats:

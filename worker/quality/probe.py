@@ -27,10 +27,10 @@ from graspd.worker.simulation.kernels import distance as kernels
 from graspd.worker.simulation.launches import launch
 from graspd.worker.simulation.sampling import object_samples
 
-#: Number of hand points that measure contact area and penetration; the optimiser uses points of other seeds.
+#: Number of hand points that measure contact area and penetration; the optimiser uses other points.
 HAND_POINTS: Final = 2000
 OBJECT_POINTS: Final = 3000
-#: Seed of a held-out sample: metrics must not be measured at the points of the optimisation.
+#: Seed of a held-out sample, since metrics must not be measured at the points of the optimisation.
 SEED: Final = 7919
 #: Distances are capped at this [m].
 REACH_M: Final = 0.012
@@ -58,7 +58,7 @@ class NearestPoints:
 
 @dataclass(frozen=True)
 class Distances(NearestPoints):
-    """Nearest points, and distances of P pieces and of the hand from itself."""
+    """Nearest points, the distances of P pieces from the object, and the depth of the hand in itself."""
 
     piece_distance: Floats
     """(B, P) least distance of an object point to each piece, at most `REACH_M`; negative: inside."""
@@ -122,7 +122,7 @@ class Probe:
                 return {"coarse": self._query(points.reshape(-1, 3))[0].reshape(counts).astype(np.float32)}
 
             if wp.get_device().is_cpu:
-                # Cached on disk: every process needs it at its start, and it depends on the object alone.
+                # Cached on disk: every process needs the grid at its start, and it depends on the object alone.
                 terms = (obj.content, binary_name(kernels))
                 kept = arrays_kept_or_made(
                     "coarse_grids", terms, (sys.modules[__name__],), make, fits=lambda kept: _is_grid(kept, counts)
@@ -156,8 +156,8 @@ class Probe:
 
     def body_gaps(self, hand_pose: Floats, joint_positions: Floats, *, reach: float = REACH_M) -> Floats:
         """Return the least signed distance (P, L) of each body's points from the object in P postures.
-        Distances are at most `reach`; inf where a body has no points. Equals `signed_distance` of `posed_points`, but
-        is faster for many postures."""
+        Distances are at most `reach`; inf where a body has no points. The result equals `signed_distance` of
+        `posed_points`, but is faster for many postures."""
         posed = posed_bodies(self.hand, hand_pose, joint_positions, self.device)
         shape = (len(hand_pose), self.hand.bodies)
         with wp.ScopedDevice(self.device):
@@ -194,13 +194,13 @@ class Probe:
         )
 
     def facing(self, found: NearestPoints) -> NDArray[np.bool_]:
-        """Return the points (B, N) whose hand surface faces the object: only there can it press."""
+        """Return a mask (B, N) of points whose hand surface faces the object; other points cannot press."""
         cosine = np.einsum("bni,bni->bn", found.hand_normals, found.normal)
         facing: NDArray[np.bool_] = cosine < FACING_COS
         return facing
 
     def body_distance(self, found: Distances) -> Floats:
-        """Return the least distance (B, L) between each body and the object, from points of both [m]."""
+        """Return the least distance (B, L) between each body and the object, from body points and object points [m]."""
         least = np.full((len(found.bodies), self.hand.bodies), REACH_M)
         for body in range(self.hand.bodies):
             mine = self.points.body == body
@@ -252,7 +252,7 @@ def _by_body(points: SurfacePoints, bodies: int) -> Any:
         mine = position[first[body] : first[body + 1]]
         if len(mine):
             middle[body] = (mine.min(axis=0) + mine.max(axis=0)) / 2
-            # Slightly more than the farthest: kernels round.
+            # Slightly more than the largest distance, since kernels round.
             extent[body] = np.linalg.norm(mine - middle[body], axis=1).max() + 1e-6
     out = kernels.BodyPoints()
     out.first, out.position = wp.array(first, dtype=wp.int32), wp.array(position, dtype=wp.vec3d)

@@ -2,16 +2,15 @@
 
 Types are those of Napier (1956) and of the GRASP taxonomy (Feix et al., IEEE THMS 2016), by opposition (Iberall 1987):
 
-- power, palm opposition: the palm touches, or at least two digits wrap: they touch with more than their last links,
-  and not by a side;
-- lateral, side opposition: at least half of the touching digits do so by a side;
-- precision, pad opposition: all others in which two digits touch.
+- power, palm opposition: the palm touches, or at least two digits wrap. A wrapping digit touches with more than its
+last link, and not by a side;
+- lateral, side opposition: at least half of the touching digits touch by a side;
+- precision, pad opposition: two digits touch, and neither other type applies.
 
 They are tested in this order. A *digit* is a chain of bodies that ends in a fingertip; all other bodies are palm. A
-digit touches *by a side* if more than half of its surface within 2 mm of the object faces along the axis of its
-flexion, within 45 degrees. A jaw has no side, so a gripper's grasps are of type precision, or power where its palm
-touches.
-"""
+digit touches *by a side* if most of its surface within 2 mm of the object faces along its axis of flexion. The
+tolerance is 45 degrees. A jaw has no side, so a gripper's grasps are of type precision, or power where its palm
+touches."""
 
 from __future__ import annotations
 
@@ -51,7 +50,7 @@ from graspd.worker.quality.wrench_space import measure_spaces, wrenches
 
 Columns = dict[str, NDArray[np.generic]]
 
-#: Contact thresholds [m]: a tight one from the literature, that of the paper (Table 2), and that of DDGC.
+#: Contact thresholds [m]: a small one from the literature, that of the paper (Table 2), and that of DDGC.
 DEFAULT_THRESHOLDS_M: Final = (0.002, 0.005, 0.009)
 DEFAULT_FRICTION: Final = 1.0
 #: Grasps per thread at a time: few enough for a quick cancellation, enough to fill a kernel launch.
@@ -76,7 +75,7 @@ class _Pair:
 
 _pairs: LRUCache[str, _Pair] = LRUCache(4)
 _lock = threading.Lock()
-# Their library reports solids that outlive the interpreter as leaks.
+# manifold3d reports solids that outlive the interpreter as leaks.
 atexit.register(_pairs.clear)
 
 
@@ -90,22 +89,16 @@ def measure(
     every_volume: bool = False,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> dict[str, NDArray[np.generic]]:
-    """Compute the quality columns of a base shard for N grasps, at the posture of contact.
+    """Compute the quality columns of a base shard for N grasps at contact: `MEASURES`, thresholds, and the planner's
+    stability loss.
+    Raises InputError: no thresholds, or one beyond `REACH_M`. TaskCancelled: `run.cancelled()` returned True.
 
     Args:
         friction: Coulomb coefficient of the wrench space.
         thresholds_m: T contact thresholds, at most `REACH_M` [m].
-        every_volume: compute the volume at all thresholds. Otherwise only at the index's threshold, nan at the others:
-            a volume takes ten times as long as an epsilon.
-        run: receives the number of finished grasps; polled for cancellation between chunks.
-
-    Returns:
-        `quality/...` datasets: those of `MEASURES`, the thresholds and the planner's stability loss.
-
-    Raises:
-        InputError: no thresholds, or one beyond `REACH_M`.
-        TaskCancelled: `run.cancelled()` returned True.
-    """
+        every_volume: compute the volume at all thresholds; otherwise only at the index's threshold, nan at the others.
+            A volume takes ten times as long as an epsilon.
+        run: receives the number of finished grasps; polled for cancellation between chunks."""
     thresholds = np.asarray(thresholds_m, float)
     if thresholds.ndim != 1 or not len(thresholds) or (thresholds <= 0).any() or (thresholds > REACH_M).any():
         raise InputError(
@@ -189,7 +182,8 @@ class _Chunk:
         return epsilon.reshape(count.shape), volume.reshape(count.shape)
 
     def shared_volume(self) -> Floats:
-        # A face of the object may enter a piece between object points, up to half a diagonal of their grid from them.
+        # Between object points, a face of the object may enter a piece; each face is within half a diagonal of the
+        # grid.
         near = self.found.piece_distance < self.pair.probe.sample_spacing
         if self.pair.volume.exact:
             near = self.pair.overlap.of(self.found, near)
@@ -238,10 +232,10 @@ def grasp_types(probe: Probe, found: Distances) -> NDArray[np.int32]:
 def _touching_with_sides(
     probe: Probe, found: Distances, finger: NDArray[np.int32], digits: NDArray[np.int32]
 ) -> NDArray[np.bool_]:
-    """Check (B, digits) whether more than half of a digit's near points are on its sides."""
+    """Return a mask (B, digits) of digits with more than half of their near points on their sides."""
     hand, points = probe.hand, probe.points
     near = np.where(np.abs(found.distance) < LINK_CONTACT_M, points.area, 0.0)
-    # Axes about which bodies close, 0 for others. A body turns about its joint's axis, constant in its frame.
+    # Axes about which bodies close, 0 for other bodies. The axis of a body's joint is constant in the body's frame.
     bends = (hand.joint_type == JointType.REVOLUTE) & (hand.dof >= 0)
     bends &= np.where(hand.dof >= 0, hand.closing[hand.dof], 0.0) != 0
     axes = np.where(bends[:, None], hand.axis, 0.0)

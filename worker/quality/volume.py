@@ -1,7 +1,6 @@
-"""Volume shared by hand and object: exact boolean of solids, or voxels where the object is not closed.
+"""Volume shared by hand and object, the pieces that may share it, and the depth of penetration.
 
-Also the pieces that may share volume, and the depth of penetration.
-"""
+The volume is an exact boolean of solids, or counted in voxels where the object is not closed."""
 
 from __future__ import annotations
 
@@ -22,9 +21,9 @@ from graspd.worker.simulation.device import to_xyzw
 from graspd.worker.simulation.kernels import crossing as kernels
 from graspd.worker.simulation.launches import launch
 
-#: Edge of a voxel in the fallback [m]: the error is at most half an edge times the surface of the shared volume.
+#: Edge of a voxel [m]: the error is at most half an edge times the surface of the shared volume.
 VOXEL_M: Final = 5e-4
-#: Solids are built in millimetres: manifold3d uses single precision, whose tolerance suits numbers around 100.
+#: Solids are built in millimetres: the tolerance of manifold3d's single precision suits numbers around 100.
 _UNIT: Final = 1e3
 
 
@@ -61,7 +60,7 @@ class SharedVolume:
         parts = [part for part in (self._object ^ solid for solid in posed) if not part.is_empty()]
         if not parts:
             return 0.0
-        # Intersections rarely overlap, so their union is cheap; a union of whole pieces is expensive.
+        # Intersections rarely overlap, so their union is cheap. A union of whole pieces is expensive.
         whole = parts[0] if len(parts) == 1 else m3d.Manifold.batch_boolean(parts, m3d.OpType.Add)
         return float(whole.volume()) / _UNIT**3 * 1e6
 
@@ -99,15 +98,14 @@ def _solid(vertices: Floats, faces: NDArray[np.int32]) -> m3d.Manifold | None:
     return solid if feasible else None
 
 
-#: Planes are distinct if they differ in this many digits [m, and of unit normals].
+#: Planes are distinct if they differ in this many digits (of metres, and of unit normals).
 _DIGITS: Final = 7
 
 
 class Overlap:
     """Conservative overlap test of a hand's pieces with a closed object.
-    A piece is excluded only if it shares no volume: no face of the object reaches into it, none of its corners is in
-    the object, and no part of the object is in it. The test is conservative: a face also counts as reaching in if only
-    a plane through one edge of each would separate it."""
+    A piece is excluded only if no face of the object reaches into it and neither body contains a part of the other. A
+    face also counts as reaching in if only a plane through one edge of each would separate both."""
 
     def __init__(self, hand: HandModel, probe: Probe) -> None:
         self._probe = probe
@@ -167,14 +165,14 @@ def _planes(piece: ConvexPiece) -> Floats:
     length = np.linalg.norm(normal, axis=1)
     normal = normal[length > 0] / length[length > 0, None]
     offset = (normal @ piece.vertices.T).max(axis=1)
-    # Select one of the planes that are equal up to rounding, without rounding it.
+    # Select one unrounded plane among planes that are equal up to rounding.
     _, first = np.unique(np.round(np.column_stack([normal, offset]), _DIGITS), axis=0, return_index=True)
     return np.column_stack([normal, offset])[first]
 
 
 def penetration_depth(found: Distances) -> Floats:
     """Return the deepest penetration (B,), of hand points in the object and object points in the hand [m].
-    One direction alone misses cases: a thin wall passes between hand points, a small fingertip between object
+    One direction alone is not enough: a thin wall passes between hand points, a small fingertip between object
     points."""
     hand_in_object = np.maximum(0.0, -found.distance).max(axis=1)
     return np.asarray(np.maximum(hand_in_object, np.maximum(0.0, -found.piece_distance).max(axis=1)))

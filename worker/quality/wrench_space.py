@@ -1,12 +1,11 @@
 """Grasp wrench space by the conventions of GraspIt! (Miller & Allen 2004): epsilon and volume.
 
-Epsilon follows Ferrari & Canny 1992. Each contact's friction cone is a pyramid of 8 edges with unit normal component,
-f = n + mu (cos a t1 + sin a t2). The torque of an edge about the centre of mass is divided by the object's largest
+Epsilon follows Ferrari & Canny 1992. Each contact's friction cone is a pyramid of 8 edges with unit normal component: f
+= n + mu (cos a t1 + sin a t2). The torque of an edge about the centre of mass is divided by the object's largest
 radius. The space is the convex hull of all edges: normal forces sum to at most 1 (L1).
 
-Epsilon is the radius of the largest ball around the origin inside the space: 0 where the origin is not inside (GraspIt!
-reports -1 there). Flat spaces have epsilon 0 and volume 0.
-"""
+Epsilon is the radius of the largest ball around the origin inside the space. It is 0 where the origin is not inside
+(GraspIt!: -1). Flat spaces have epsilon 0 and volume 0."""
 
 from __future__ import annotations
 
@@ -29,7 +28,7 @@ MANY: Final = 24
 
 
 def tangents(normals: Floats) -> tuple[Floats, Floats]:
-    """Return two unit tangents (..., 3), t1 x t2 = n; along the coordinate axes where the normal is."""
+    """Return two unit tangents (..., 3), t1 x t2 = n; they are along coordinate axes if the normal is."""
     n = np.asarray(normals, float)
     axis = np.eye(3)[np.argmin(np.abs(n), axis=-1)]
     t1 = cross(n, axis)
@@ -61,7 +60,7 @@ def measure_spaces(
 ) -> tuple[Floats, Floats]:
     """Compute epsilon and volume (S,) of many wrench spaces of edge wrenches (S, N, E, D).
     Each space uses its first `contacts` (S,) contacts. The volume is nan where `with_volume` (S,) is false: epsilon
-    alone has the same accuracy, in a tenth of the time."""
+    alone is as accurate, in a tenth of the time."""
     epsilon, volume = np.full((2, len(edge_wrenches)), np.nan)
     none = np.asarray(contacts) == 0
     epsilon[none], volume[none] = 0.0, 0.0
@@ -101,7 +100,7 @@ def _flat(points: Floats) -> bool:
 #: Random shift of the points, as a share of the largest coordinate, so that no 7 of them lie in one hyperplane. Smaller
 #: shifts leave slivers with planes dominated by rounding; larger ones distort. On cubes the volume is off by 4e-8.
 JOGGLE: Final = 1e-8
-#: Most facets that exist at once: 160 random points have some 13,000.
+#: Largest number of simultaneous facets: 160 random points have some 13,000.
 CAPACITY: Final = 40_000
 #: Entries of the hash table of ridges; inserting one point creates some thousands at most.
 _TABLE: Final = 1 << 16
@@ -155,15 +154,10 @@ _workspace = _Workspace()
 
 def measure_hulls(clouds: Floats, count: NDArray[np.integer], whole: NDArray[np.bool_]) -> tuple[Floats, Floats]:
     """Compute inner radius and volume of many hulls, in one launch.
-
-    Args:
-        clouds: (H, P, 6) points, P at most `MAX_POINTS`; each hull uses its first `count` (H,).
-        whole: (H,) whether the volume is wanted. Otherwise only the part of the hull nearest to the origin is built,
-            in a tenth of the time, with an equally exact radius.
-
-    Returns:
-        Distance (H,) from the origin to the nearest facet, at most 0 where the origin is outside, and volume (H,), nan
-        where it is not wanted. Both are nan where there is no closed hull of at most `CAPACITY` facets."""
+    Each hull uses the first `count` (H,) of its points `clouds` (H, P, 6), P at most `MAX_POINTS`. Where `whole` (H,)
+    is false, only the hull's part nearest to the origin is built. The radius is equally exact, in a tenth of the time.
+    Return the distance (H,) from the origin to the nearest facet, at most 0 for an outside origin. Also return the
+    volume (H,), nan for a part. Both are nan where there is no closed hull of at most `CAPACITY` facets."""
     radius, volume = np.full((2, len(clouds)), np.nan)
     some = np.flatnonzero(np.asarray(count) > _DIMENSION)
     if not len(some):
@@ -218,7 +212,8 @@ def _grown(
 def _simplices(
     points: Floats, own: NDArray[np.bool_], count: NDArray[Any]
 ) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Return the corners (H, 7) of simplices, each farthest from the span of those before, and flat hulls (H,)."""
+    """Return the corners (H, 7) of simplices, each farthest from the span of earlier corners, and a mask (H,) of flat
+    hulls."""
     rows = np.arange(len(points))
     mean = points.sum(axis=1) / count[:, None]
     far = np.where(own, ((points - mean[:, None]) ** 2).sum(axis=2), -1.0)

@@ -36,7 +36,7 @@ ALL: Final = "all"
 
 
 def parse_channels(words: Iterable[str]) -> tuple[str, ...]:
-    """Return the channels in fixed order, without duplicates; `all` stands for every one.
+    """Return the channels in fixed order, without duplicates; `all` stands for every channel.
     Raises InputError: a channel is unknown."""
     wanted = {word.strip() for word in words if word.strip()}
     if unknown := sorted(wanted - {*EXTRA_CHANNELS, ALL}):
@@ -46,8 +46,9 @@ def parse_channels(words: Iterable[str]) -> tuple[str, ...]:
 
 
 def occlusion_ratio(segmentation: NDArray[np.uint8], alone: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Return the occluded share (V,) of the object's pixels; nan: not in the picture.
-    `segmentation` (V, H, W) labels the scene, `alone` (V, H, W) are the object's pixels with nothing else in it."""
+    """Return the occluded share (V,) of the object's pixels; nan: the object is not in the picture.
+    `segmentation` (V, H, W) labels the scene, `alone` (V, H, W) are the object's pixels in a picture of the object
+    alone."""
     whole = alone.sum(axis=(1, 2)).astype(float)
     seen = (alone & (segmentation == OBJECT)).sum(axis=(1, 2))
     return np.where(whole > 0, 1.0 - seen / np.maximum(whole, 1.0), np.nan).astype(np.float32)

@@ -1,8 +1,7 @@
 """Pinhole cameras: poses, projection, and cameras from a user's JSON file.
 
 Camera frame: x right, y down, z forward (OpenCV). Extrinsics E = [R | t] map table to camera: x_camera = R x + t. Pixel
-(column i, row j) covers [i, i + 1) x [j, j + 1): its centre is (i + 0.5, j + 0.5).
-"""
+(column i, row j) covers [i, i + 1) x [j, j + 1): its centre is (i + 0.5, j + 0.5)."""
 
 from __future__ import annotations
 
@@ -22,7 +21,7 @@ FIELD_OF_VIEW: Final = np.radians(40.0)
 BASELINE_M: Final = 0.06
 ELEVATION: Final = (np.radians(18.0), np.radians(62.0))  # elevation of a sampled camera above the table [rad]
 FILL: Final = (0.7, 1.0)  # share of the smaller field of view that the object's bounding ball fills
-NEAREST_M: Final = 0.25  # below this distance a stereo pair does not have the whole object in both pictures [m]
+NEAREST_M: Final = 0.25  # at smaller distances one picture of a stereo pair may cut the object off [m]
 AIM_JITTER: Final = 0.15  # largest distance of the optical axis from the object's centre, in bounding radii
 
 
@@ -100,10 +99,8 @@ def sample_hemisphere(
     centre: Floats, radius: float, *, views: int, field_of_view: float, rng: np.random.Generator
 ) -> list[Floats]:
     """Sample extrinsics of cameras around a ball (centre, radius [m]) that fills the field of view [rad].
-
     They are on a hemisphere: azimuths are stratified, one per sector of 360 / views degrees; elevations are uniform in
-    area within `ELEVATION`.
-    """
+    area within `ELEVATION`."""
     turn = rng.uniform(0, 2 * np.pi)
     extrinsics = []
     for view in range(views):
@@ -177,11 +174,10 @@ class _File(_Model):
 
 
 def read_cameras(path: Path) -> GivenCameras:
-    """Load cameras from a JSON file.
-
-    All keys are optional: `width`, `height` [px]; `intrinsics`, a 3 x 3 matrix or `fx fy cx cy` [px]; `cameras`, a list
-    of `{"extrinsics": 4 x 4}` (table to camera) or `{"eye": [x, y, z], "target": [x, y, z]}` (table frame [m]).
-    Raises InputError: the file cannot be read, or describes no possible camera."""
+    """Load cameras from a JSON file. All keys are optional.
+    `width`, `height` [px]. `intrinsics`: a 3 x 3 matrix or `fx fy cx cy` [px]. `cameras`: a list of `{"extrinsics": 4 x
+    4}` (table to camera) or `{"eye": [x, y, z], "target": [x, y, z]}` (table frame [m]). Raises InputError: the file
+    cannot be read, or describes no possible camera."""
     try:
         file = _File.model_validate_json(path.read_bytes())
     except OSError as error:

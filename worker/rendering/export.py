@@ -17,7 +17,7 @@ from graspd.service.store.shards import Shard
 from graspd.worker.rendering.annotate import BACKGROUND, OBJECT, TABLE
 
 DepthFormat = Literal["exr", "png"]
-#: One step of a 16-bit depth PNG [m]: reaches 6.5 m; 0 is nothing.
+#: One step of a 16-bit depth PNG [m]: it reaches 6.5 m; 0 means no surface.
 PNG_STEP_M: Final = 1e-4
 _EYES: Final = ("mono", "left", "right")
 #: Datasets and their file names in Replicator's BasicWriter.
@@ -25,15 +25,12 @@ _DISTANCES: Final = {"image/depth": "distance_to_image_plane", "image/distance":
 
 
 def export_images(views: Shard, folder: Path, *, depth: DepthFormat = "exr") -> list[Path]:
-    """Write every picture of a views shard, with the file names of Replicator's BasicWriter.
-
-    Per picture: `rgb_NNNN.png` (8 bits), `distance_to_image_plane_NNNN.exr` (float32 [m], channel Z, inf: nothing) or
-    `.png` (16 bits, steps of 0.1 mm, 0: nothing), `semantic_segmentation_NNNN.png` (8 bits, the labels themselves) and
-    `view_NNNN.json`; where the shard has them `distance_to_camera_NNNN`, `normals_NNNN.exr` (half, X Y Z) and
-    `rgb_hand_NNNN.png`. Once: `labels.json`.
-
-    The folder is created if absent. Return the files.
-    Raises InputError: the folder cannot be written, or has such files already."""
+    """Write every picture of a views shard, with the file names of Replicator's BasicWriter; return the files.
+    Per picture `rgb_NNNN.png` (8 bits), `semantic_segmentation_NNNN.png` (8 bits, the labels themselves),
+    `view_NNNN.json` and depth: `distance_to_image_plane_NNNN.exr` (float32 [m], channel Z, inf: nothing) or `.png` (16
+    bits, steps of 0.1 mm, 0: nothing). If the shard has them: `distance_to_camera_NNNN`, `normals_NNNN.exr` (half, X Y
+    Z), `rgb_hand_NNNN.png`. Once `labels.json`. The folder is created if absent. Raises InputError: the folder cannot
+    be written, or has such files already."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

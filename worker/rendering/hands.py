@@ -61,12 +61,12 @@ class MovingSolid:
 @cached(LRUCache(16), key=lambda hand: hand.content, lock=threading.Lock())
 def hand_parts(hand: HandModel) -> tuple[MovingSolid, ...]:
     """Return the visual meshes of a hand in their colours; for bodies without any, collision pieces.
-    Where no visual element states a colour, palm, fingers and fingertips have default appearances."""
+    Without a stated colour, palm, fingers and fingertips have default appearances."""
     return tuple(_drawn(hand))
 
 
 def drawn_parts(hand: HandModel, *, mounted: bool) -> tuple[MovingSolid, ...]:
-    """Return the drawn solids of a hand, if `mounted` with the links above its root (bodies renumbered)."""
+    """Return the drawn solids of a hand; if `mounted`, with the links above its root (bodies renumbered)."""
     above = hand.mounting if mounted else None
     return hand_parts(hand) + (() if above is None else hand_parts(above))
 

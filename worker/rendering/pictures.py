@@ -26,7 +26,7 @@ THREE_SIDES: Final = tuple(np.radians([-35.0, 85.0, 205.0]).tolist())
 ELEVATION: Final = np.radians(20.0)
 FIELD_OF_VIEW: Final = np.radians(24.0)
 SAMPLES: Final = 12
-#: Hand parts farther than this from the object's hull are not framed: a forearm may leave the picture [m].
+#: Hand parts farther than this from the object's hull are not framed [m]: a forearm may leave the picture.
 NEAR_M: Final = 0.14
 _TOGETHER: Final = 16  # grasps traced together: bounds the memory
 
@@ -57,10 +57,8 @@ def grasp_pictures(
     samples: int = SAMPLES,
 ) -> NDArray[np.uint8]:
     """Render N grasps, root poses (N, 7) in the object frame and joints (N, J), from A sides: (N, A, H, W, 3) sRGB.
-
     Azimuths [rad] are about the object's z axis; 0 looks across the direction in which the palm approaches. The hand's
-    convex pieces frame the picture of this size [px].
-    Raises TaskCancelled: `run.cancelled()` returned True."""
+    convex pieces frame the picture of this size [px]. Raises TaskCancelled: `run.cancelled()` returned True."""
     hand_pose = moved(np.atleast_2d(np.asarray(hand_pose, float)), np.negative(obj.centre))
     obj = obj.centred
     joints = np.atleast_2d(np.asarray(joint_positions, float))
@@ -121,7 +119,7 @@ def studio_shot(
     toward_lamp: Floats = TOWARD_LAMP,
 ) -> CameraShot:
     """Return cameras (V, 4, 4) in studio light that turns with azimuths (worlds,) [rad], so that no side is dark.
-    `world` (V,): that of each camera; by default its own."""
+    `world` (V,) is the world of each camera; by default its own."""
     return CameraShot(
         world=(np.arange(len(angles)) if world is None else world).astype(np.int32),
         extrinsics=cameras,
@@ -155,7 +153,7 @@ def fit_camera(near: Floats, angle: float, k: Floats, size: tuple[int, int], *, 
     flat = np.cos(elevation)
     direction = np.array([np.cos(angle) * flat, np.sin(angle) * flat, np.sin(elevation)])
     distance = 4.0 * float(np.linalg.norm(near - centre, axis=1).max())
-    # Perspective changes with the distance; three rounds converge to a per cent.
+    # Perspective changes with the distance; after three rounds the error is below a per cent.
     for _ in range(3):
         camera = Cameras(*size, k, look_at(centre + distance * direction, centre)[None])
         (pixels,), _ = camera.project(near)

@@ -43,7 +43,7 @@ _COLUMNS: Final = 3
 _CLOSING_SHARE: Final = 0.6
 _ARROW: Final = Appearance(hexadecimal("#dd7432"), roughness=0.5)
 _ARROW_SHARE: Final = 0.4  # length of the arrow over the largest extent of the hand
-#: Views towards the palm, from the side on which the approach points right and from the other side [rad].
+#: Views towards the palm [rad]: from the side on which the approach points right, and from the opposite side.
 _HAND_AZIMUTHS: Final = tuple(np.radians([32.0, 122.0]).tolist())
 _OBJECT_AZIMUTHS: Final = tuple(np.radians([-50.0, 40.0, 130.0]).tolist())
 

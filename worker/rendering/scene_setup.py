@@ -1,7 +1,6 @@
 """Setup of a render before its cameras: random properties of each scene, and stages for tracing.
 
-Materials and lights are random but pleasing.
-"""
+Materials and lights are random but pleasing."""
 
 from __future__ import annotations
 
@@ -44,7 +43,8 @@ from graspd.worker.rendering.scenery import (
 )
 from graspd.worker.rendering.tracer import Tracer
 
-#: Draws of a camera: the first that sees this share of the object past the supports is used, else the best.
+#: Draws of a camera. The first that sees the second value's share of the object past the supports is used, else the
+#: best.
 _DRAWS: Final = 32
 _SEEN: Final = 0.8
 #: Depth of things that a pass does not show [m].
@@ -124,7 +124,7 @@ class Setting:
         self.object_pose = np.asarray(poses, float)[:, 0]
         self._poses = np.stack([scene.poses for scene in scenes])
         self.looks = [scene.looks for scene in scenes]
-        # One height of the lamp for all scenes of a call; each scene turns under it, so azimuths differ.
+        # All scenes of a call share one height of the lamp. Each scene turns under it, so azimuths differ.
         elevation = np.radians(np.random.default_rng([seed, 2**31]).uniform(40.0, 65.0))
         self.shot = CameraShot(
             world=np.repeat(np.arange(len(poses), dtype=np.int32), plan.placements * plan.eyes),
@@ -191,7 +191,7 @@ class _Scene:
         self.turn = float(rng.uniform(0, 2 * np.pi))
         yaw = rng.uniform(0, 2 * np.pi)
         self.poses = np.concatenate([slab_poses(supports, centre, yaw), poses])
-        # Drawn last: neighbours and walls do not change the appearance of the rest.
+        # Drawn last, so that neighbours and walls do not change the appearance of the rest.
         others = [object_look(rng) for _ in objects[1:]]
         walls = table_look(rng) if len(supports) > 1 else table
         self.looks: list[Appearance] = [
@@ -202,7 +202,7 @@ class _Scene:
 
 
 def _unhidden(draw: Callable[[], Sequence[Floats]], supports: Supports, points: Floats) -> Sequence[Floats]:
-    """Draw cameras that see the points past boxes; each is redrawn until it does."""
+    """Draw cameras that see the points past boxes; a camera without a free view is drawn again."""
     drawn = list(draw())
     if not any(isinstance(s, BoxSupport) for s in supports):
         return drawn

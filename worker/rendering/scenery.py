@@ -79,14 +79,14 @@ class CameraShot:
     turn: Floats  # (worlds,) angle about z by which each world is turned under the lamp [rad]
     lamps: Sequence[Lamp]  # one per world
     normals: bool = False
-    shaded: bool = True  # False: trace rays without shading, to measure the cost of the bare ray tracer
+    shaded: bool = True  # False: rays without shading, to measure the cost of the bare ray tracer
 
 
 Supports = Sequence[HalfSpace | BoxSupport]
 
 TABLE_SIZE: Final = (1.2, 0.9, 0.04)  # a half-space is drawn as a slab whose top is its plane [m]
 TABLE: Final = (HalfSpace(),)  # default support of objects
-_FAR_M: Final = 0.35  # a slab lies below the origin; below the object if that is farther away [m]
+_FAR_M: Final = 0.35  # depth of a slab below the origin, or below a lower object [m]
 
 
 def slabs(supports: Supports) -> list[Box]:

@@ -186,7 +186,7 @@ def _depth(views: Arrays, view: int) -> Image.Image:
     finite = depth[np.isfinite(depth)]
     if finite.size == 0:
         return Image.fromarray(depth_colours(depth, 0.0, 1.0))
-    # The far table would dominate the range; the object's surroundings matter.
+    # The distant table would dominate the range, but the object's surroundings matter.
     near, far = float(finite.min()), float(np.percentile(finite, 90))
     if solid.any():
         far = max(float(depth[solid].max()), min(far, float(depth[solid].max()) * 1.4))

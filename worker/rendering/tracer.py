@@ -2,8 +2,7 @@
 
 A picture is a sum of passes. Every pass sends one ray through each pixel with one directional light. Rays vary inside
 the pixel (anti-aliasing), and the light varies over the lamp's disc or over the sky (soft shadows). Pass 0 goes through
-the pixel centres; depth, normals and shape indices come from it alone.
-"""
+the pixel centres; depth, normals and shape indices come from it alone."""
 
 from __future__ import annotations
 
@@ -31,7 +30,7 @@ from graspd.worker.rendering.kernels import exposure, rays
 from graspd.worker.rendering.kernels.shading import Light, Material
 from graspd.worker.rendering.scenery import Appearance, Box, CameraShot, Pictures, Solid
 
-#: Pixels between two cancellation checks: a core traces them in a fifth of a second, and a GPU holds them at once.
+#: Pixels between two cancellation checks: a fifth of a second for a core, and a number that fits into a GPU.
 PIXELS_OF_A_CORE: Final = 100_000
 PIXELS_OF_A_GPU: Final = 4_000_000
 #: Margin of bounds around their solid, so that rounding in float32 loses no ray [m].
@@ -84,10 +83,8 @@ class Tracer:
 
     def shoot(self, shot: CameraShot, run: ExecutionContext = DEFAULT_CONTEXT) -> Pictures:
         """Trace all cameras.
-
         The threads of `run` share the rows of each picture; a GPU takes many pictures at once. `run` receives finished
-        pictures and is polled before each launch.
-        Raises TaskCancelled: `run.cancelled()` returned True."""
+        pictures and is polled before each launch. Raises TaskCancelled: `run.cancelled()` returned True."""
         cuda = wp.get_device(self.device).is_cuda
         threads = 1 if cuda else min(run.cores, shot.height)
         count, pixels = len(shot.world), len(shot.world) * shot.height * shot.width
@@ -107,7 +104,7 @@ class _Film:
         self._tracer, self._shot, device = tracer, shot, tracer.device
         passes = light_passes(shot.samples, shot.toward_lamp)
         self._passes = _structs(passes, exposure.LightPass, device)
-        # Worlds turn under the lamp: in their frames, lamp and sky turn the other way.
+        # Worlds turn under the lamp, so in their frames lamp and sky turn in the opposite direction.
         back = quat_from_axis_angle(np.array([0.0, 0.0, 1.0]), -np.asarray(shot.turn))
         toward = quat_rotate(back[:, None], np.array([one.toward for one in passes]))
         self._toward = wp.array(toward, dtype=wp.vec3f, device=device)
@@ -148,7 +145,7 @@ class _Film:
 
 
 def _structs(things: Sequence[Any], struct: Any, device: str) -> Any:
-    """Return an array of Warp structs, filled from each thing's attributes of the same names."""
+    """Return an array of Warp structs, filled from attributes of equal names."""
     kind = np.dtype(struct.numpy_dtype())
     rows = [tuple(getattr(thing, name) for name in kind.names or ()) for thing in things]
     return wp.array(np.array(rows, kind), dtype=struct, device=device)
@@ -190,7 +187,7 @@ def _on_disc(axis: Floats, k: int, count: int) -> Floats:
 
 
 def _on_sky(k: int, count: int) -> Floats:
-    # Uniform over the sky above the horizon haze: low lights would cast long streaks.
+    # Uniform over the sky above the haze of the horizon, since low lights would cast long streaks.
     height, angle = 1.0 - (1.0 - SKY_EDGE) * (k + 0.5) / count, _GOLDEN * k
     level = np.sqrt(1.0 - height**2)
     return np.array([level * np.cos(angle), level * np.sin(angle), height])

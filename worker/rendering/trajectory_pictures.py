@@ -92,10 +92,8 @@ def way_pictures(
     samples: int = SAMPLES,
 ) -> NDArray[np.uint8]:
     """Render N grasps, F postures each in the frame of the object at rest, from A sides: (N, A, F, H, W, 3) sRGB.
-
-    Sides are ordered by how much of object and fingers they show. `whole` frames the whole hand; else parts far from
-    the object may leave the picture.
-    Raises TaskCancelled: `run.cancelled()` returned True."""
+    Sides are ordered by how much of object and fingers they show. `whole` frames the whole hand; otherwise parts far
+    from the object may leave the picture. Raises TaskCancelled: `run.cancelled()` returned True."""
     if not frames:
         return np.zeros((0, sides, 0, size[1], size[0], 3), np.uint8)
     stage = _Stage(hand, obj, around, len(frames[0]), run, np.inf if whole else NEAR_M)
@@ -165,10 +163,8 @@ class _Stage:
 
     def _best_sides(self, world: int, near: Floats, first: float, count: int) -> list[tuple[float, float]]:
         """Return azimuth and height [rad] of the sides that show most, apart from one another.
-
-        The score is the visible part of object and hand, each as a share of the most that any side shows, from labels
-        alone. Ties go to the side that looks across the palm's approach.
-        """
+        The score sums the visible parts of object and hand, counted in labels, each over its largest value of all
+        sides. Ties go to the side that looks across the palm's approach."""
         sides = [(first + 2 * np.pi * a / _AROUND, h) for h in _HEIGHTS for a in range(_AROUND)]
         centre = 0.5 * (near.min(axis=0) + near.max(axis=0))
         far = 1.15 * float(np.linalg.norm(near - centre, axis=1).max()) / np.sin(FIELD_OF_VIEW / 2)

@@ -22,7 +22,7 @@ from graspd.worker.rendering.scene_setup import CameraPlan, Setting
 from graspd.worker.rendering.scenery import TABLE, Pictures, Supports
 from graspd.worker.scenes.neighbours import Neighbours
 
-SAMPLES: Final = 12  # passes per picture; half of them light the scene with the lamp, half with the sky
+SAMPLES: Final = 12  # passes per picture; the lamp lights half of them, the sky the other half
 
 Arrays = dict[str, NDArray[np.generic]]
 
@@ -56,6 +56,7 @@ def render(
     extras: Extras = NO_EXTRAS,
 ) -> Arrays:
     """Render every scene from sampled or given cameras, all in one launch per pass.
+    Raises InputError: a count or size is out of range. TaskCancelled: `run.cancelled()` returned True.
 
     Args:
         obj: the object.
@@ -70,14 +71,8 @@ def render(
         extras: further channels, given cameras, other objects, a hand.
 
     Returns:
-        The datasets of a views shard, V = S * views * (2 if stereo else 1) pictures: scene by scene, placement by
-        placement, left before right. Labels come from the ray through the pixel's centre; the table is a surface like
-        any other in `image/depth`.
-
-    Raises:
-        InputError: a count or size is out of range.
-        TaskCancelled: `run.cancelled()` returned True.
-    """
+        Columns of a views shard with V = S * views * (2 if stereo else 1) pictures, by scene, placement and eye.
+        Labels come from the ray through the pixel's centre; in `image/depth` the table is a surface like any other."""
     poses = np.asarray(object_pose, float).reshape(-1, 7)
     plan = CameraPlan(views, width, height, baseline_m if stereo else None, extras.cameras)
     if plan.placements < 1 or width < 1 or height < 1 or samples < 2 or len(poses) == 0:
@@ -107,7 +102,7 @@ def annotate(setting: Setting, pictures: Pictures, obj: ObjectModel, channels: S
     cameras = Cameras(plan.width, plan.height, shot.intrinsics, shot.extrinsics)
     count, poses = len(shot.world), setting.object_pose[shot.world][:, None]
     segmentation = (pictures.shape + 1).astype(np.uint8)
-    # Occluded vertices and those outside the picture count too.
+    # Occluded vertices, and vertices outside the picture, also count.
     pixels, _ = cameras.project(apply(poses, obj.vertices))
     rotation, shift = shot.extrinsics[:, :3, :3], shot.extrinsics[:, None, :3, 3]
     corners = np.einsum("vij,vpj->vpi", rotation, apply(poses, box_corners(obj.vertices))) + shift

@@ -27,7 +27,7 @@ _TABLE: Final = Obstacle.half_space(UP, 0.0)
 
 
 class Rejection(IntEnum):
-    """Reason to reject a grasp in a scene; if several apply, the first in this order."""
+    """Reason to reject a grasp in a scene; if several reasons apply, the first one."""
 
     NONE = 0
     TABLE_AT_CONTACT = 1
@@ -40,25 +40,17 @@ def transfer(
     hand: HandModel, grasp: Posture, pregrasp: Posture, object_pose: Floats, neighbours: Neighbours | None = None
 ) -> dict[str, NDArray[np.generic]]:
     """Transfer every grasp to every scene and compute the clearance of the hand and its mounting.
-
-    The wrist of a mounting takes the first angles that clear the table; neighbours are ignored in this choice.
-
-    Args:
-        grasp: N postures at contact, object frame.
-        pregrasp: N postures before contact, object frame; the hand moves in a straight line from pregrasp to grasp.
-        object_pose: (S, 7) rest poses in the table frame.
-        neighbours: other objects on the table, which the hand must also avoid.
+    The wrist of a mounting takes the first angles that clear the table; neighbours are ignored in this choice. Grasps
+    and pregrasps are N postures in the object frame; the hand moves in a straight line from pregrasp to grasp.
+    `object_pose` (S, 7) are rest poses in the table frame. The hand must also avoid `neighbours`, other objects on the
+    table. Raises InputError: grasps and pregrasps differ in number.
 
     Returns:
-        Datasets of the scene shard with K = S N rows, scene-major: `grasp/base_index`, `grasp/scene_index`,
-        `grasp/hand_pose` (K, 7), `grasp/table_clearance_m` (K,): height of the hand's lowest point from pregrasp to
-        grasp; `grasp/contact_table_clearance_m` (K,): the same at the grasp alone; `grasp/valid` (K,): 1
-        where both are at least `MARGIN_M`; `grasp/rejection` (K,): a `Rejection`. With neighbours also
-        `grasp/neighbour_clearance_m` (K,); for hands on a wrist also `grasp/wrist_positions` (K, U).
-
-    Raises:
-        InputError: grasps and pregrasps differ in number.
-    """
+        Columns of the scene shard with K = S N rows, scene by scene: `grasp/base_index`, `grasp/scene_index`,
+        `grasp/hand_pose` (K, 7). `grasp/table_clearance_m` (K,) is the height of the hand's lowest point from pregrasp
+        to grasp, `grasp/contact_table_clearance_m` (K,) its height at the grasp alone. `grasp/valid` (K,) is 1 where
+        both are at least `MARGIN_M`; `grasp/rejection` (K,) is a `Rejection`. With neighbours also
+        `grasp/neighbour_clearance_m` (K,); for hands on a wrist also `grasp/wrist_positions` (K, U)."""
     if len(grasp) != len(pregrasp):
         raise InputError(f"{len(grasp)} grasps come with {len(pregrasp)} pregrasps; each grasp needs its own")
     poses = np.asarray(object_pose, float).reshape(-1, 7)
@@ -139,7 +131,7 @@ def _mounting_clearance(
     hand: HandModel, grasp: Posture, pregrasp: Posture, object_pose: Floats
 ) -> tuple[Floats, Floats]:
     """Return wrist angles (S, N, K) and heights (S, N, 2) of the mounting's lowest point [m]; inf without a mounting.
-    The two heights are those at contact and on the approach, as in `_clearance`."""
+    The heights are those at contact and on the approach, as in `_clearance`."""
     path = approach(grasp, pregrasp).hand_pose.reshape(len(grasp), PATH_POSTURES, 7)
     angles, heights = [], []
     for pose in object_pose:

@@ -18,9 +18,9 @@ from graspd.worker.simulation.environment import Obstacle
 
 #: Least gap between an object and a wall [m].
 GAP: Final = 0.01
-#: With `faces all`, faces on which a smaller share of the drops comes to rest are skipped.
+#: Least probability of a resting face with `faces all`.
 LEAST_PROBABILITY: Final = 0.03
-#: Tolerated penetration of an object into its support [m]: rest poses are exact, those of files are rounded.
+#: Tolerated penetration of an object into its support [m]: rest poses are exact, but poses in files are rounded.
 SUNK: Final = 5e-4
 
 
@@ -40,14 +40,9 @@ def room_in(spec: SceneSpec) -> tuple[float, float] | None:
 
 def rest_poses(spec: SceneSpec, obj: ObjectModel, *, count: int, seed: int) -> dict[str, Floats]:
     """Compute the object's rest poses in `count` scenes (`faces all`: one for each stable face).
-
-    Returns:
-        `scene/object_pose` (S, 7) in the scene frame, `scene/rest_probability` (S,), `scene/drop_seconds` (S,).
-
-    Raises:
-        SceneError: the object does not fit between the supports, or a support penetrates it.
-        MeshError: it never comes to rest.
-    """
+    Return `scene/object_pose` (S, 7) in the scene frame, `scene/rest_probability` (S,), `scene/drop_seconds` (S,).
+    Raises SceneError: the object does not fit between the supports, or a support penetrates it. MeshError: it never
+    comes to rest."""
     if spec.target is not None:
         poses = np.tile(np.asarray(spec.target, float), (count, 1))
         found = {
@@ -70,7 +65,7 @@ def rest_poses(spec: SceneSpec, obj: ObjectModel, *, count: int, seed: int) -> d
 
 def _each_face(obj: ObjectModel, seed: int) -> dict[str, Floats]:
     """Return one scene per stable face on which at least `LEAST_PROBABILITY` of drops end.
-    Faces on which the object rolls are used only if there is no other."""
+    Faces on which the object rolls are used only if every face is such a face."""
     faces = resting_faces(obj)
     stable = faces.stable
     share = reference_share(obj, stable.tolist())
@@ -98,7 +93,8 @@ def turned(pose: Floats, angle: float) -> Floats:
 
 
 def inside(obj: ObjectModel, pose: Floats, size: tuple[float, float], rng: np.random.Generator) -> Floats:
-    """Move the pose to a random place in a rectangle x by y [m] about the origin; SceneError: it does not fit."""
+    """Move the pose to a random place in a rectangle x by y [m] about the origin. Raises SceneError: it does not
+    fit."""
     corners = quat_rotate(pose[3:], obj.hull_vertices)[:, :2]
     low, high = corners.min(axis=0), corners.max(axis=0)
     room = np.asarray(size) / 2 - GAP

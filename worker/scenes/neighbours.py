@@ -1,10 +1,8 @@
-"""Several objects in a scene: dropped together on a table, or placed beside one at rest.
+"""Several objects in a scene: dropped together on a table, or placed beside one at rest; clearance of hands from them.
 
-Also the clearance of hands from neighbours. Collision shapes are convex hulls. They are exact against the table and
-conservative between objects, since no object is ever placed in another object's hollow.
-
-An object placed beside another has its rest pose from a drop of its own, so its pose is exact. Position and rotation
-about the vertical are drawn until its hull is clear of walls and of the other objects.
+Collision shapes are convex hulls. They are exact against the table and conservative between objects, since no object is
+ever placed in another object's hollow. An object placed beside another has its rest pose from its own drop, so its pose
+is exact. Position and rotation about the vertical are drawn until its hull is clear of walls and of all other objects.
 """
 
 from __future__ import annotations
@@ -48,8 +46,8 @@ TIMEOUT_S: Final = 6.0
 RING: Final = (1.0, 1.25)
 #: Largest distance of resting neighbours from the middle of the table [m].
 NEIGHBOUR_REACH: Final = 0.4
-#: Laying an object flat raises it by the penetration of MuJoCo's soft contacts; a larger rise means that the object
-#: lay on another one [m].
+#: Laying an object flat raises it by the penetration of MuJoCo's soft contacts. A larger rise [m] means that the object
+#: lay on another object.
 MAX_LIFT: Final = 0.003
 #: Clearances are capped at this [m].
 FARTHEST_M: Final = 0.1
@@ -72,17 +70,10 @@ class Neighbours:
 
 def drop_together(obj: ObjectModel, neighbours: Sequence[ObjectModel], *, count: int, seed: int) -> dict[str, Floats]:
     """Drop an object and its neighbours onto a table until all rest, `count` times.
-
     The object falls in the middle, the neighbours around it. Drops are redone if an object does not come to rest, rolls
-    away, or leans or lies on another. Scene i depends on the objects, the seed and i alone.
-
-    Returns:
-        As `worker.scenes.simulate.drop`, and `scene/neighbour_pose` (S, M, 7).
-
-    Raises:
-        InputError: count or seed is negative, or there are too many neighbours.
-        MeshError: a hull is flat, or the objects never come to rest.
-    """
+    away, or leans or lies on another object. Scene i depends on the objects, the seed and i alone. Return the columns
+    of `worker.scenes.simulate.drop`, and `scene/neighbour_pose` (S, M, 7). Raises InputError: count or seed is
+    negative, or there are too many neighbours. MeshError: a hull is flat, or the objects never come to rest."""
     if count < 0 or seed < 0 or not 1 <= len(neighbours) <= MOST_NEIGHBOURS:
         raise InputError(
             f"scenes with neighbours need 1 to {MOST_NEIGHBOURS} of them and no negative number; "
@@ -160,7 +151,8 @@ class _Heap:
         return None
 
     def _at_rest(self, seconds: float, rng: np.random.Generator) -> tuple[Floats, int, float] | None:
-        """Return the poses laid flat; None if an object leans, lies on another, rolled away or would overlap."""
+        """Return the poses laid flat; None if an object leans, lies on another one, rolled away or would overlap
+        one."""
         flat, first = [], -1
         for k, (obj, pose) in enumerate(zip(self.objects, self.data.qpos.reshape(-1, 7).copy(), strict=True)):
             pose[3:] /= np.linalg.norm(pose[3:])
@@ -216,13 +208,13 @@ def _add_piece(spec: Any, body: Any, name: str, piece: ConvexPiece) -> None:
         add_shape(spec, body.add_geom(), piece, name)
 
 
-#: Least gap between two objects [m]; from walls the least gap is `GAP`, as for the object.
+#: Least gap between two objects [m]; the least gap from walls is `GAP`, as for the object.
 BETWEEN: Final = 0.005
 #: Number of draws of all neighbours of a scene, and of each neighbour.
 _DRAWS: Final = 32
 _PLACES: Final = 100
-#: Largest distance of a neighbour's centre from the object's, as a multiple of the sum of both bounding radii. Each
-#: failed draw increases it by this amount.
+#: Largest distance of a neighbour's centre from the object's, as a multiple of the sum of both bounding radii. After
+#: each failed draw it grows by this amount.
 _REACH: Final = 1.25
 _FARTHER: Final = 0.1
 
@@ -239,15 +231,9 @@ def lay_beside(
 ) -> tuple[Floats, Floats]:
     """Place M neighbours beside an object; return poses (S, 7) of the object and (S, M, 7).
     All are `BETWEEN` apart and clear of supports. Scene i depends on the objects, the supports, the seed and i alone.
-
-    Args:
-        again: pose (7,) of the object in scene i at attempt k.
-        others: the neighbours; each rests on z = 0.
-        within: sides x and y of a rectangle about the origin; all neighbours stay inside [m].
-
-    Raises:
-        SceneError: the neighbours do not all fit.
-        MeshError: a neighbour never comes to rest, or is flat."""
+    `again` returns the pose (7,) of the object in scene i at attempt k. `others` are the neighbours; each rests on z =
+    0. All stay inside the rectangle `within` about the origin, with sides x and y [m]. Raises SceneError: the
+    neighbours do not all fit. MeshError: a neighbour never comes to rest, or is flat."""
     # Copies of one object must not rest in the same pose.
     seeds = [int(np.random.SeedSequence([seed, 1 + k]).generate_state(1)[0]) for k in range(len(others))]
     resting = [drop(one, count=count, seed=own)["scene/object_pose"] for one, own in zip(others, seeds, strict=True)]
@@ -333,8 +319,8 @@ class _Hulls:
 
 
 def _beyond(support: Obstacle, corners: Floats) -> bool:
-    """Check whether one plane of a support separates it from a hull: upward planes at no gap, others at `GAP`.
-    A plane separates two convex bodies. False if only a plane through one edge of each would separate them."""
+    """Check whether one plane of a support separates it from a hull: upward planes at no gap, other planes at `GAP`.
+    Two convex bodies may be apart although none of these planes separates them: then the result is False."""
     room = (corners @ support.planes[:, :3].T - support.planes[:, 3]).min(axis=0)
     least = np.where(support.planes[:, 2] > 1 - 1e-6, -SUNK, GAP)
     return bool((room >= least).any())

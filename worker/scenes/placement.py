@@ -26,13 +26,14 @@ from graspd.worker.simulation.environment import Neighbour, Obstacle, Scenes
 from graspd.worker.validation.decomposition import decompose
 from graspd.worker.validation.model import add_mesh
 
-#: Most convex pieces of a neighbour. Hollows may be filled, since no hand reaches into a neighbour's hollow.
+#: Largest number of convex pieces of a neighbour. Hollows may be filled, since no hand reaches into a neighbour's
+#: hollow.
 MOST_PIECES: Final = 8
 
 
 def neighbour_of(obj: ObjectModel) -> Neighbour:
     """Return an object as a neighbour: convex pieces, merged by least added volume to `MOST_PIECES`.
-    Raise MeshError for a flat object."""
+    Raises MeshError: the object is flat."""
     if any(obj.centre):
         middle, by = neighbour_of(obj.centred), np.array([*obj.centre, 1.0, 0, 0, 0])
         pieces = tuple(piece + by[:3] for piece in middle.pieces)
@@ -52,7 +53,8 @@ def _neighbour(obj: ObjectModel) -> Neighbour:
 
 
 def joined_pieces(pieces: Sequence[Floats], most: int = MOST_PIECES) -> tuple[Floats, ...]:
-    """Merge pieces until at most `most` remain; each step joins the two whose common hull adds the least volume."""
+    """Merge pieces until at most `most` remain; each step joins the two pieces whose common hull adds the least
+    volume."""
     left = list(pieces)
     volume = [union_volume((piece,)) for piece in left]
 
@@ -76,18 +78,9 @@ def scenes_of(
     spec: SceneSpec, obj: ObjectModel, others: Sequence[ObjectModel] = (), *, count: int, seed: int
 ) -> tuple[Scenes, dict[str, Floats]]:
     """Create `count` scenes from a specification (with `faces all`, one for each stable face).
-
-    Args:
-        others: the objects of `spec.neighbours`, in that order.
-
-    Returns:
-        The scenes, and `scene/object_pose` (S, 7), `scene/rest_probability` (S,), `scene/drop_seconds` (S,) and, where
-        there are neighbours, `scene/neighbour_pose` (S, M, 7).
-
-    Raises:
-        SceneError: objects overlap, or do not fit.
-        MeshError: an object never comes to rest, or is flat.
-    """
+    `others` are the objects of `spec.neighbours`, in this order. Return the scenes, and `scene/object_pose` (S, 7),
+    `scene/rest_probability` (S,), `scene/drop_seconds` (S,); with neighbours also `scene/neighbour_pose` (S, M, 7).
+    Raises SceneError: objects overlap, or do not fit. MeshError: an object never comes to rest, or is flat."""
     whole, poses = _scenes_of(
         _centred_spec(spec, obj, others), obj.centred, [other.centred for other in others], count=count, seed=seed
     )
@@ -198,7 +191,7 @@ def gaps_between(things: Sequence[Neighbour], poses: Floats, farthest: float = 0
     return gaps
 
 
-#: Most faces of a simplified hull, and the excess over its piece below which no more faces are added [m].
+#: Largest number of faces of a simplified hull; excess over its piece at which it has enough faces [m].
 MOST_PLANES: Final = 48
 ENOUGH_M: Final = 1e-3
 #: Corners closer than this are merged [m].
@@ -206,13 +199,11 @@ _SAME_M: Final = 1e-7
 
 
 def outer_solid(corners: Floats) -> tuple[Obstacle, float]:
-    """Return a convex solid of at most `MOST_PLANES` faces around points (V, 3).
-
-    It begins as the bounding box of the points. While it exceeds their hull by more than `ENOUGH_M`, its farthest
-    corner is cut off along the hull's face that is farthest from this corner. It never cuts into the hull.
-
-    Return the solid, and its largest excess over the points' hull [m]; raise MeshError if the points lie in a plane.
-    """
+    """Return a convex solid of at most `MOST_PLANES` faces around points (V, 3), and its largest excess over their hull
+    [m].
+    The solid begins as the bounding box of the points. While it exceeds their hull by more than `ENOUGH_M`, its
+    farthest corner is cut off along the hull's face that is farthest from this corner. It never cuts into the hull.
+    Raises MeshError: the points lie in a plane."""
     from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
     try:

@@ -1,8 +1,7 @@
 """Static rest of a convex hull on a plane: its stable faces, and the next face onto which it tips.
 
-A rigid body touches a plane only with its convex hull. A resting face is therefore a face of the hull whose polygon
-contains the projection of the centre of mass (Goldberg et al., "Part pose statistics", 1999).
-"""
+A rigid body touches a plane only with its convex hull. A resting face is therefore a face of the hull. Its polygon
+contains the projection of the centre of mass (Goldberg et al., "Part pose statistics", 1999)."""
 
 from __future__ import annotations
 
@@ -22,9 +21,9 @@ if TYPE_CHECKING:
 COPLANAR_ANGLE = np.radians(0.05)
 #: A face is stable if the centre of mass projects at least this share of the hull's size inside its polygon.
 STABILITY_MARGIN = 1e-4
-#: Resting faces whose normals differ by less than this count as one: scanned flat bottoms fall into many facets [rad].
+#: Resting faces whose normals differ by less than this [rad] count as one, since scanned flat bottoms have many facets.
 SAME_FACE_ANGLE = np.radians(2.0)
-#: Uncertainty of the surface, in convex pieces and in real objects [m].
+#: Uncertainty of the surface of convex pieces and of real objects [m].
 CHANGE_M = 1e-3
 #: The object rolls if such a change of its surface may turn it by more than this [rad].
 ROLLS = np.radians(20.0)
@@ -39,15 +38,15 @@ class RestingFaces:
     offset: Floats
     """(C,) normal . x of the face's plane [m]."""
     successor: Ints
-    """(C,) face the object tips to when placed on this one; the face itself where it is stable."""
+    """(C,) face onto which the object tips when placed on this face; the face itself where it is stable."""
     height: Floats
     """(C,) height of the centre of mass above each face [m]."""
     sides: Ints
     """(E, 2) pairs of adjacent faces; a row is one edge of its first face."""
     margin: Floats
-    """(E,) distance from that edge to the projected centre of mass, positive inside the face [m]."""
+    """(E,) distance from this edge to the projected centre of mass, positive inside the face [m]."""
     width: Floats
-    """(E,) width of the face across that edge [m]."""
+    """(E,) width of the face across this edge [m]."""
 
     @property
     def stable(self) -> Ints:
@@ -55,8 +54,8 @@ class RestingFaces:
 
     def looseness(self, face: int) -> tuple[float, float]:
         """Return how far the object may turn [rad] and its centre of mass sink [m] after a tilt of `face`.
-        The tilt is that of a change of the surface by `CHANGE_M`; the object tips over all edges that this tilt
-        moves the centre of mass across."""
+        The tilt follows from a change of the surface by `CHANGE_M`. The object tips over all edges that the tilted
+        centre of mass crosses."""
         from scipy.sparse import csr_array  # slow to import
         from scipy.sparse.csgraph import breadth_first_order
 
@@ -78,8 +77,8 @@ class RestingFaces:
 
 
 def rolling_poses(obj: ObjectModel, poses: Floats) -> int:
-    """Count the rest poses (S, 7) on a table in which the object may roll, because its surface is round there.
-    A change of its surface by `CHANGE_M` may turn it by more than `ROLLS`."""
+    """Count the rest poses (S, 7) on a table in which the object may roll, because its surface is round there. A change
+    of its surface by `CHANGE_M` may then turn it by more than `ROLLS`."""
     faces = resting_faces(obj.centred)
     return sum(faces.rolls(settle(faces, pose[3:])[0]) for pose in np.asarray(poses, float))
 
@@ -172,5 +171,5 @@ def lay_flat(faces: RestingFaces, face: int, pose: Floats) -> Floats:
 
 
 def same_face(faces: RestingFaces, face: int, others: Ints) -> Ints:
-    """Check which of the `others` are the same resting face, within `SAME_FACE_ANGLE`."""
+    """Return a mask of the `others` that are the same resting face, within `SAME_FACE_ANGLE`."""
     return faces.normal[np.asarray(others, int)] @ faces.normal[face] > np.cos(SAME_FACE_ANGLE)

@@ -1,7 +1,6 @@
 """Drops of an object onto a table: MuJoCo simulates the convex hull until it comes to rest.
 
-Only the hull can touch a plane, so it is the whole collision model; mass and inertia are those of the true mesh.
-"""
+Only the hull can touch a plane, so it is the whole collision model; mass and inertia are those of the true mesh."""
 
 from __future__ import annotations
 
@@ -29,7 +28,7 @@ from graspd.worker.scenes.rest import RestingFaces, lay_flat, resting_faces, sam
 #: Density of the object; its value has no effect on the motion of a free body on a plane [kg/m^3].
 DENSITY: Final = 500.0
 TIMESTEP_S: Final = 0.002
-#: At rest, no point of the object moves faster than this during a whole window.
+#: At rest, no point of the object moves faster than this during a whole window [m/s].
 REST_SPEED: Final = 0.01
 REST_WINDOW_S: Final = 0.1
 TIMEOUT_S: Final = 4.0
@@ -37,13 +36,13 @@ TIMEOUT_S: Final = 4.0
 DROP_HEIGHT: Final = (0.005, 0.05)
 #: An object that rests farther than this from the middle of the table has rolled away [m].
 REACH: Final = 0.25
-#: Largest rotation that may lay the object flat on its face; a larger one means that it was not at rest [rad].
+#: Largest rotation that may lay the object flat on its face [rad]; a larger one means that it was not at rest.
 MAX_SETTLE_ANGLE: Final = np.radians(5.0)
 MAX_ATTEMPTS: Final = 50
-#: Number of drops behind `scene/rest_probability`; a share of 64 drops has a standard deviation of at most 6 %.
+#: Number of drops behind `scene/rest_probability`: the standard deviation of a share is at most 6 %.
 REFERENCE_DROPS: Final = 64
 _REFERENCE_SEED: Final = 2**31
-#: Friction: sliding 0.8; torsional and rolling friction (lengths, m) at which a can or a ball comes to rest, as on
+#: Sliding friction, then torsional and rolling friction [m]. With these values a can or a ball comes to rest, as on
 #: cloth.
 _CONTACT: Final[dict[str, Any]] = {"friction": [0.8, 0.005, 0.002], "condim": 6, "solref": [0.006, 1]}
 
@@ -66,19 +65,12 @@ class _Table:
 
 def drop(obj: ObjectModel, *, count: int, seed: int) -> dict[str, Floats]:
     """Drop an object onto a table until it rests, `count` times.
-
-    A drop is repeated with a new sample if it times out, if the object rolls away, or if no resting face is stable
-    under a change of the surface by one millimetre. An object that rolls is laid on a steady face, see `steadied`.
-    Scene i depends only on the object, the seed and i.
-
-    Returns:
-        `scene/object_pose` (S, 7) with the lowest point of the object at z = 0; `scene/rest_probability` (S,), the
-        share of `REFERENCE_DROPS` reference drops (plus this one) on the same face; `scene/drop_seconds` (S,).
-
-    Raises:
-        InputError: count or seed is negative.
-        MeshError: the hull is flat, or the object never comes to rest.
-    """
+    A drop is repeated with a new sample if it times out, or if the object rolls away. It is also repeated if no resting
+    face stays stable under a change of the surface by one millimetre. An object that rolls is laid on a steady face,
+    see `steadied`. Scene i depends only on the object, the seed and i. Return `scene/object_pose` (S, 7) with the
+    lowest point of the object at z = 0, and `scene/drop_seconds` (S,). `scene/rest_probability` (S,) is the share of
+    `REFERENCE_DROPS` reference drops (plus this one) on the same face. Raises InputError: count or seed is negative.
+    MeshError: the hull is flat, or the object never comes to rest."""
     if count < 0 or seed < 0:
         raise InputError(f"scenes and seed must not be negative; got {count} scenes, seed {seed}")
     table = _build(obj.centred)
@@ -99,8 +91,8 @@ def steadied(
     obj: ObjectModel, faces: RestingFaces, face: int, pose: Floats, rng: np.random.Generator
 ) -> tuple[int, Floats]:
     """Return the face on which a centred object stays after coming to rest on `face`, and its pose (7,).
-    If it may roll there, draw one of the steady faces of the reference drops, with their frequency. If the object is
-    round on all of these faces, its pose is unchanged."""
+    If it may roll there, one of the steady faces of the reference drops is drawn, with their frequency. If the object
+    is round on all of these faces, its pose is unchanged."""
     if not faces.rolls(face) or not (steady := _steady_faces(obj)):
         return face, pose
     chosen = int(rng.choice(steady))
@@ -218,7 +210,7 @@ def _run(table: _Table) -> float | None:
     model, data, quiet = table.model, table.data, 0
     for step in range(round(TIMEOUT_S / TIMESTEP_S)):
         mujoco.mj_step(model, data)
-        # Linear velocity of the frame's origin, angular velocity in the body frame: it bounds the speed of any point.
+        # Linear velocity of the frame's origin and angular velocity in the body frame bound the speed of any point.
         spin = data.qvel[3:]
         centre_velocity = data.qvel[:3] + quat_rotate(data.qpos[3:], np.cross(spin, table.obj.centre_of_mass))
         speed = np.linalg.norm(centre_velocity) + table.obj.radius * np.linalg.norm(spin)

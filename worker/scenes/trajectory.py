@@ -5,8 +5,7 @@ mounting must be clear as well, at wrist angles that are constant over the traje
 `body_room`, with more tolerance for fingertips that may touch a support. They are exact for half-spaces. For boxes and
 neighbours' pieces they are distances of the hand's features from planes: exact at corners, else a lower bound.
 
-The approach in a scene has a direction and an opening of the hand without contact with object and obstacles.
-"""
+In a scene, the approach has a direction and an opening of the hand without contact with object and obstacles."""
 
 from __future__ import annotations
 
@@ -31,7 +30,7 @@ from graspd.worker.simulation.mounting import mounting_room, wrist_room
 from graspd.worker.simulation.obstacles import obstacle_room
 
 _POINTS: Final = 600
-#: Around a free object: tilts of the retreat from the palm's own direction [rad], and the number of sides of each tilt.
+#: Around a free object: tilts of the retreat from the palm's own direction [rad], and number of sides of each tilt.
 TILTS: Final = (0.4, 0.8, 1.2)
 SIDES: Final = 8
 #: Points of hand and object in the check of a trajectory around a free object.
@@ -59,7 +58,7 @@ class Trajectory:
     touching: NDArray[np.bool_]
     """(N,) whether the open hand touches the object on its approach."""
     wrist: Floats
-    """(N, K) angles of the wrist above the hand's root; K is 0 where it has none."""
+    """(N, K) angles of the wrist above the hand's root; K is 0 without a wrist."""
     mounting: Floats
     """(N,) least clearance of the hand's mounting at the grasp, while the hand closes, and on the lift [m].
     On the approach the mounting counts as part of the hand."""
@@ -77,7 +76,8 @@ class Trajectory:
 
 
 def plan_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet, placed: PlacedGrasps) -> Trajectory:
-    """Plan each grasp's trajectory in its scene: the first free direction of retreat, else the one with most space."""
+    """Plan each grasp's trajectory in its scene: the first free direction of retreat, else the one with most
+    clearance."""
     probe = probe_of(hand, obj, hand_points=_POINTS, object_points=64)
     count, scenes, which = len(grasps), placed.scenes, np.asarray(placed.index, np.intp)
     rise = RISE_M * np.array([scene.up for scene in scenes])[which]
@@ -107,8 +107,8 @@ def plan_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet, placed: Placed
 
 def plan_free_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet) -> Trajectory:
     """Plan trajectories around a free object: a retreat of `STANDOFF_M` without contact with the object.
-    The palm's own direction of retreat is tested first, then directions with larger and larger tilt. `lift` is the
-    squeeze posture after that retreat, with the object in hand. Without obstacles all clearances are infinite."""
+    The palm's own direction of retreat is tested first, then directions with increasing tilt. `lift` is the squeeze
+    posture after this retreat, with the object in hand. Without obstacles all clearances are infinite."""
     hand_points, object_points = _FREE_POINTS
     probe = probe_of(hand, obj, hand_points=hand_points, object_points=object_points)
     nowhere = PlacedGrasps((), IDENTITY_POSE[None], np.zeros(len(grasps), np.intp))
@@ -159,7 +159,8 @@ def _coming(
     probe: Probe, pregrasp: Posture, scene: Environment, ways: Sequence[Floats]
 ) -> tuple[Floats, Floats, NDArray[np.bool_], Floats]:
     """Return approaches along the first free direction of `ways`, (n, 3) each, or else the one with most clearance.
-    The result has waypoints (n, W, 7), least clearance (n,), contact with the object (n,), and direction (n, 3)."""
+    The result has waypoints (n, W, 7), least clearance (n,), a mask (n,) of contact with the object, and direction (n,
+    3)."""
     count, looks = len(pregrasp), (WAYPOINTS - 1) * LOOKS + 1
     best = np.full(count, -np.inf)
     least = np.zeros(count)
@@ -173,7 +174,7 @@ def _coming(
         postures = Posture(poses.reshape(-1, 7), joints)
         room = obstacle_room(probe.hand, postures, [scene]).reshape(len(open_), looks).min(axis=1)
         gap = _gaps(probe, postures).reshape(len(open_), looks)
-        # The pregrasp itself may be closer than the margin; the approach may be as close, but not closer.
+        # The pregrasp itself may be closer than the margin; the approach may then be as close, but not closer.
         hits = gap[:, :-1].min(axis=1) < np.minimum(OBJECT_MARGIN_M, gap[:, -1]) - 5e-4
         score = np.minimum(room, MARGIN_M) - hits
         better = score > best[open_]
@@ -197,7 +198,7 @@ OBJECT_MARGIN_M: Final = 0.001
 OBJECT_WANTED_M: Final = 0.004
 #: On its approach the hand may be closer to the object than at its pregrasp, by at most this [m].
 NEARER_M: Final = 5e-4
-#: Number of postures stored on the approach, from standoff to pregrasp; number of checks between two of them; number of
+#: Number of postures stored on the approach, from standoff to pregrasp. Number of checks between two of them. Number of
 #: checks while the hand closes to the pregrasp.
 WAYPOINTS: Final = 6
 LOOKS: Final = 4
@@ -212,8 +213,8 @@ def come_open(
     probe: Probe, pregrasp: Posture, wide: Floats, wrist: Floats, placed: PlacedGrasps
 ) -> tuple[Floats, Floats, Floats, NDArray[np.bool_]]:
     """Return approaches with the hand as wide open as possible, its fingers away from the object.
-    Waypoints (n, W, 7), joints (n, J), least clearance of hand and mounting at wrist angles (n, K) from obstacles (n,),
-    and whether the hand touches the object (n,)."""
+    The result has waypoints (n, W, 7), joints (n, J), least clearance (n,) from obstacles, and a mask (n,) of hands
+    that touch the object. Clearance includes the mounting at wrist angles (n, K)."""
     count = len(pregrasp)
     up = np.array([scene.up for scene in placed.scenes])[placed.index]
     back = -quat_rotate(pregrasp.hand_pose[:, 3:], probe.hand.palm.approach)
@@ -253,7 +254,8 @@ def _seen(
     free = room.reshape(count, looks).min(axis=1)
     rows = np.flatnonzero(free >= MARGIN_M)
     if (mounting := probe.hand.mounting) is not None and len(rows):
-        # A mounting is thicker than a finger: half as many checks suffice, and only if the hand itself is clear.
+        # A mounting is thicker than a finger, so half as many checks suffice; it is checked only if the hand itself is
+        # clear.
         mounted = wrist_room(mounting, poses[rows, :looks:2], wrist[rows], scenes, which[rows])
         free[rows] = np.minimum(free[rows], mounted)
     # Larger distances count equally.
@@ -264,7 +266,7 @@ def _seen(
     for part in (fingers, ~fingers):
         if part.any():
             near = gap[..., part].min(axis=2)
-            # The pregrasp itself may be closer than preferred; the approach may be as close, but not closer.
+            # The pregrasp itself may be closer than preferred; the approach may then be as close, but not closer.
             short = near[:, :-1].min(axis=1) - np.minimum(OBJECT_WANTED_M, near[:, -1] - NEARER_M)
             least = np.minimum(least, OBJECT_WANTED_M + short)
     return free, least

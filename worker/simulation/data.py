@@ -1,8 +1,7 @@
 """Data of a simulation: hands to the device and back, arrays for a capacity of hands, schedule tables.
 
-All per-iteration values (dilation, weights, rates) are in tables on the device, read at a counter on the device, so an
-iteration is the same list of launches each time.
-"""
+All per-iteration values (dilation, weights, rates) are in tables on the device, read at a counter on the device. An
+iteration is therefore the same list of launches each time."""
 
 from __future__ import annotations
 
@@ -54,7 +53,7 @@ class Data:
     """Arrays for up to `capacity` hands of a model; `worker.simulation.record` has the operations."""
 
     def __init__(self, model: Model, capacity: int, *, serial: bool | None = None) -> None:
-        """`serial`: threads of a launch run in order, as on a CPU; else contacts are sorted before they are
+        """`serial`: threads of a launch run in order, as on a CPU. Otherwise contacts are sorted before they are
         summed, which gives the same bits."""
         self.device, self.capacity = model.device, capacity
         self.serial = not wp.get_device(model.device).is_cuda if serial is None else serial
@@ -122,8 +121,7 @@ class Data:
         self.active.assign(active)
 
     def set_scenes(self, index: NDArray[np.integer[Any]]) -> None:
-        """Set the scene (n,) of each hand, an index into the model's obstacles; -1: none.
-        States do not change it."""
+        """Set the scene (n,) of each hand, an index into the model's obstacles; -1: none. States do not change it."""
         padded = np.full(self.capacity, -1, dtype=np.int32)
         padded[: len(index)] = index
         self.scene.assign(padded)

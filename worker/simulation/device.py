@@ -136,10 +136,8 @@ class DeviceObject:
     @classmethod
     def create(cls, obj: ObjectModel, device: str, *, samples: Floats, phong_alpha: float, cell: float) -> DeviceObject:
         """Upload an object with points (S, 3) on its surface, object frame [m].
-
-        `phong_alpha` is 0 for flat faces, 1 for full Phong projection; `cell` the cell size of the distance grid [m],
-        0: none, every distance is exact.
-        """
+        `phong_alpha` is 0 for flat faces, 1 for full Phong projection. `cell` is the cell size of the distance grid
+        [m]; 0: no grid, every distance is exact."""
         with wp.ScopedDevice(device):
             points = wp.array(obj.vertices - obj.centre_of_mass, dtype=wp.vec3)
             mesh = wp.Mesh(points=points, indices=wp.array(obj.faces.ravel(), dtype=wp.int32))
@@ -165,7 +163,7 @@ class DeviceObject:
         )
 
     def thinned(self, count: int) -> DeviceObject:
-        """Return the object with its first `count` samples: farthest-point samples are even at any length."""
+        """Return the object with its first `count` samples, which are as even as all farthest-point samples."""
         if count >= len(self.samples):
             return self
         with wp.ScopedDevice(self.device):
@@ -177,7 +175,7 @@ class DeviceObject:
 def sorted_samples(samples: Floats) -> Any:
     """Sort points (S, 3) [m] by the cells of a grid, on the current Warp device."""
     low = samples.min(axis=0)
-    # At most 64 cells a side: a large object has larger ones.
+    # At most 64 cells a side, so a large object has larger cells.
     size = max(SAMPLE_CELL_M, float((samples.max(axis=0) - low).max()) / 64)
     cell = np.floor((samples - low) / size).astype(int)
     shape = cell.max(axis=0) + 1

@@ -1,8 +1,7 @@
 """Environment of an object: the convex obstacles of a scene that a hand must avoid.
 
-An obstacle is an intersection of half-spaces: a table top has one, a board or a wall six, a neighbour's convex piece as
-many as its hull has faces. Frames are the object's, as everywhere in planning.
-"""
+An obstacle is an intersection of half-spaces: one for a table top, six for a board or a wall. A neighbour's convex
+piece has one per face of its hull. Frames are the object's, as everywhere in planning."""
 
 from __future__ import annotations
 
@@ -21,7 +20,7 @@ from graspd.worker.objects.mesh_geometry import to_centre
 from graspd.worker.objects.model import ObjectModel
 
 UP: Final = np.array([0.0, 0.0, 1.0])  # direction against gravity in the scene frame
-#: Length of a hand's straight approach to its pregrasp, and of the lift [m].
+#: Length [m] of a hand's straight approach to its pregrasp, and of the lift.
 STANDOFF_M: Final = 0.10
 RISE_M: Final = 0.10
 #: Least clearance of a hand from obstacles [m]; fingertips may be closer to a support that allows it.
@@ -45,7 +44,7 @@ class Obstacle:
 
     @classmethod
     def half_space(cls, normal: Sequence[float] | Floats, offset: float) -> Obstacle:
-        """Return everything below the plane n.x = offset; the normal need not have unit length.
+        """Return all points below the plane n.x = offset; the normal need not have unit length.
         Raises InputError: the normal is zero or not finite."""
         n = np.asarray(normal, float)
         length = float(np.linalg.norm(n))
@@ -76,7 +75,7 @@ class Obstacle:
         return replace(self, planes=planes, corners=quat_rotate(pose[3:], self.corners) + pose[:3])
 
     def seen_from(self, pose: Floats) -> Obstacle:
-        """Return the obstacle, given in an outer frame, in the frame that is at `pose` (7,) in it."""
+        """Return an obstacle given in an outer frame, in the frame at `pose` (7,) of the outer frame."""
         return self.moved(invert(pose))
 
     def distance(self, points: Floats) -> Floats:

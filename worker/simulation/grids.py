@@ -1,8 +1,7 @@
 """Distance grid of an object with the lists of near faces of its cells, cached on disk.
 
-Both depend on the object alone and take a fifth of a process's first grasp, so later processes read a CPU's grid. A GPU
-computes them faster than a file is read.
-"""
+Both depend on the object alone and take a fifth of a process's time to its first grasp. Later processes on a CPU read
+the file. A GPU computes them faster than a file is read."""
 
 from __future__ import annotations
 
@@ -25,22 +24,20 @@ Arrays = Mapping[str, NDArray[Any]]
 
 FIELD_REACH: Final = 0.06  # largest distance from the surface that is looked up [m]
 LISTED_M: Final = 0.004  # cells within this distance plus the grid's error of the surface list their nearest faces [m]
-_MOST_CELLS: Final = 96  # most cells a side: a large object has a coarser grid, whose larger error is accounted for
+_MOST_CELLS: Final = 96  # largest number of cells a side; the larger error of a coarser grid is accounted for
 
 
 def add_grid(skin: Any, obj: ObjectModel, mesh: Any, cell: float) -> None:
     """Add the distance grid and the lists of its cells to a surface, on the current Warp device.
-
     `skin` is a `surface.Surface` with `cells.faces`; `mesh` is its `warp.Mesh`, vertices about the centre of mass;
-    `cell` is the cell size of the grid [m].
-    """
+    `cell` is the cell size of the grid [m]."""
     low = obj.vertices.min(axis=0) - obj.centre_of_mass - FIELD_REACH
     high = obj.vertices.max(axis=0) - obj.centre_of_mass + FIELD_REACH
     cell = max(cell, float((high - low).max()) / _MOST_CELLS)
     shape = tuple(int(n) for n in np.ceil((high - low) / cell).astype(int) + 1)
     skin.field_origin = wp.vec3(*low)
     skin.field_cell = cell
-    # A distance has slope at most 1: trilinear interpolation between corners is off by less than half a diagonal.
+    # A distance has slope at most 1, so trilinear interpolation between corners is off by less than half a diagonal.
     skin.field_error = 0.5 * cell
 
     def fill() -> None:
@@ -136,7 +133,7 @@ def _summed(group: NDArray[np.integer[Any]], rows: Floats) -> Floats:
 
 
 def list_cells(faces: Any, mesh: Any, field: Any, low: Any, size: float, within: float) -> Any:
-    """List the `faces` of `faces_of` for grid cells within `within` of the surface.
+    """List the `faces` of `faces_of` for grid cells closer to the surface than `within`.
     `low` is the first corner of the grid `field`."""
     cells = nearest.Cells()
     cells.faces = faces

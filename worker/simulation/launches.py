@@ -24,7 +24,7 @@ class Launches:
         self._graph: Any = None
 
     def add(self, kernel: Any, dim: int | tuple[int, ...], *, inputs: list[Any], outputs: list[Any]) -> None:
-        """Append a launch over `dim`; its arrays live as long as the list does."""
+        """Append a launch over `dim`; its arrays live as long as the list."""
         command = wp.launch(kernel, dim, inputs=inputs, outputs=outputs, device=self.device, record_cmd=True)
         self._commands.append((kernel.key.rpartition(".")[2], command))
         self._calls.append(_packed(command))
@@ -94,10 +94,8 @@ def _counted() -> Iterator[None]:
 
 def _packed(command: Any) -> Callable[[], object]:
     """Return a function that runs a recorded launch on the CPU.
-
-    Warp packs the arguments each time, under the interpreter's lock: a twentieth of an iteration of a few hands, for
-    which other threads wait. Here they are packed once, as Warp does it.
-    """
+    Warp packs the arguments at each launch, under the interpreter's lock: a twentieth of an iteration of a few hands,
+    for which other threads wait. Here they are packed once, as by Warp."""
     if not command.device.is_cpu or command.adjoint or command.block_dim > 1:
         return partial(command.launch)
     bounds, *values = command.params

@@ -15,14 +15,14 @@ from graspd.worker.simulation.device import DeviceHand, DeviceObject
 from graspd.worker.simulation.kernels import contact, pieces
 from graspd.worker.simulation.obstacles import DeviceObstacles
 
-#: Weights of points are areas in units of 1/800 of the hand's surface: the loss does not depend on their number.
+#: Weights of points are areas in units of 1/800 of the hand's surface, so the loss does not depend on their number.
 REFERENCE_POINTS: Final = 800
 REFERENCE_SAMPLES: Final = 2000  # number of object samples at which each has weight 1
 #: Number of hand points against other links at which each has weight 1.
 REFERENCE_SELF_POINTS: Final = 1000
 SOLVERS: Final = {"direct": contact.direct, "jacobi": contact.jacobi, "gauss_seidel": contact.gauss_seidel}
 NEAR_GAP: Final = 4e-3  # contacts with at most this gap are listed for the direct solver: four steps of the object [m]
-CPU_LANE: Final = 64  # points per thread: on the CPU a thread costs as much as a point; on CUDA every point has its own
+CPU_LANE: Final = 64  # points per thread on the CPU, where starting a thread costs as much as a point; on CUDA 1
 MAX_DILATION: Final = 0.1  # largest dilation of a schedule [m]
 
 
@@ -45,8 +45,8 @@ class LossOptions:
     limit_weight: float = 0.0
     self_margin: float = 1e-3
     pull: float = 0.0
-    """Attraction of points without contact, as strong as the penetration term at this depth [m].
-    It fades with their distance."""
+    """Depth at which penetration has the same force as the attraction of points without contact [m].
+    The attraction fades with their distance."""
     pull_length: float = 0.013  # distance over which the attraction falls to 1/e [m]
     simulate: bool = True  # False: no simulation; every point near the object is attracted. A control for benchmarks
 
@@ -58,7 +58,7 @@ class Model:
     hand: DeviceHand
     obj: DeviceObject
     options: LossOptions
-    obstacles: DeviceObstacles | None  # obstacles that the hands must avoid; None: none
+    obstacles: DeviceObstacles | None  # obstacles that the hands must avoid; None: there are none
     count: int  # hand points
     point_body: Any
     point_position: Any

@@ -19,7 +19,7 @@ from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.simulation.environment import CLEAR_M, Environment
 from graspd.worker.simulation.obstacles import MARGIN_M, obstacle_room
 
-#: Numbers of points of a mounting: outermost ones in that many directions, then corners spread over it.
+#: Numbers of points of a mounting: outermost points in so many directions, then corners spread over it.
 OUTERMOST: Final = 20
 SPREAD: Final = 40
 TRIES: Final = 4  # wrist positions of a hand whose exact clearances are computed
@@ -29,15 +29,10 @@ def mounting_room(
     hand: HandModel, poses: Floats, scenes: Sequence[Environment], which: NDArray[np.integer[Any]] | None = None
 ) -> tuple[Floats, Floats]:
     """Choose wrist angles that stay constant while the hand moves; return the mounting's clearance.
-
-    `poses` (N, P, 7) are those of the root of each of N hands, object frame; `which` (N,) the scene of each, by default
-    the first. The search ends at a clearance of `CLEAR_M`.
-
-    Returns:
-        (N, K) wrist angles: the first of `wrist_positions` with enough clearance of points and mounting, else those
-        with the largest clearance of points; and (N,) least clearance of the mounting from obstacles at all poses
-        [m]. Without a mounting K is 0 and the clearance inf.
-    """
+    `poses` (N, P, 7) are root poses of N hands, object frame; `which` (N,) has the scene of each hand, by default the
+    first. The search ends at a clearance of `CLEAR_M`. Return wrist angles (N, K): the first of `wrist_positions` with
+    enough clearance of points and mounting, else those with the largest clearance of points. Also return the least
+    clearance (N,) of the mounting from obstacles at all poses [m]. Without a mounting K is 0 and the clearance inf."""
     mounting, count = hand.mounting, len(poses)
     if mounting is None:
         return np.zeros((count, 0)), np.full(count, np.inf)
@@ -54,8 +49,9 @@ def mounting_lack(
     room: float = 0.0,
     exact: bool = True,
 ) -> Floats:
-    """Return the clearance (N,) missing at mountings for `MARGIN_M` + `room` [m], at root poses (N, 7).
-    It is at least 0, at the best wrist angles. `exact`: check the mounting itself, not only its points."""
+    """Return the clearance (N,) missing at mountings for `MARGIN_M` + `room` [m], at root poses (N, 7) and their best
+    angles.
+    It is at least 0. `exact`: check the mounting itself, not only its points."""
     mounting, wanted = hand.mounting, MARGIN_M + room
     if mounting is None or not len(poses):
         return np.zeros(len(poses))
@@ -93,8 +89,8 @@ def _solved(
 
 
 def point_room(mounting: HandModel, poses: Floats, scenes: Sequence[Environment], which: NDArray[np.intp]) -> Floats:
-    """Return the least clearance (N, W) of a mounting's points over root poses (N, P, 7) [m].
-    W wrist positions; scenes `which` (N,). The mounting itself has no more, except near edges and corners of solids."""
+    """Return the least clearance (N, W) of a mounting's points over root poses (N, P, 7), at W wrist positions [m].
+    Scenes are `which` (N,). The mounting itself has no more clearance, except near edges and corners of solids."""
     points = points_of(mounting)
     out = np.full((len(poses), len(points)), np.inf)
     for scene in np.unique(which):

@@ -78,12 +78,10 @@ def body_room(
     hand: HandModel, postures: Posture, scenes: Sequence[Environment], which: NDArray[np.integer[Any]] | None = None
 ) -> Floats:
     """Return signed distances (P, L) of the hand's bodies from the nearest obstacle [m]; inf: no obstacle.
-
     Posture i is in the scene `which[i]`, by default in the first one. Fingertips may be closer to some supports than
     `CLEAR_M`. Their distance from such a support is increased by the difference, so a hand is clear if no distance is
     below `CLEAR_M`. Distances are exact from half-spaces, and from solids that the hand does not penetrate. Near edges
-    and corners of solids, distances of links with hulls are lower bounds. Distances from solids are at most `FAR_M`.
-    """
+    and corners of solids, distances of links with hulls are lower bounds. Distances from solids are at most `FAR_M`."""
     which = np.zeros(len(postures), np.int32) if which is None else np.asarray(which, np.int32)
     out = _half_space_room(hand, postures, scenes, which)
     tips = np.isin(np.arange(hand.bodies), hand.fingertips)
@@ -142,9 +140,8 @@ class DeviceObstacles:
         margin: float | Floats = MARGIN_M,
     ) -> DeviceObstacles:
         """Upload obstacles in the object frame.
-
-        `centre` (3,) is the object's centre of mass; `margin` the clearance [m] of all features, or (L,) of each body.
-        """
+        `centre` (3,) is the object's centre of mass; `margin` the clearance [m] of all features, or (L,) of each
+        body."""
         found = hand.features
         kept = np.broadcast_to(np.asarray(margin, float), hand.bodies)[found.body]
         sorted_ = [sorted(scene.obstacles, key=lambda o: len(o.corners) > 0) for scene in scenes]
@@ -192,12 +189,12 @@ def _feature_ball(features: HandFeatures, piece: int) -> tuple[Floats, float]:
     """Return centre (body frame) and radius [m] of a ball around the features of a piece."""
     rows = slice(features.first[piece], features.first[piece + 1])
     middle, radius = _sphere(features.centre[rows])
-    # Slightly larger: kernels round.
+    # Slightly larger, since kernels round.
     return middle, radius + float(features.radius[rows].max(initial=0.0)) + 1e-6
 
 
 def _sphere(corners: Floats) -> tuple[Floats, float]:
-    """Return a bounding sphere; that of unbounded bodies is unused."""
+    """Return a bounding sphere; for unbounded bodies it is unused."""
     if not len(corners):
         return np.zeros(3), 0.0
     centre = (corners.min(axis=0) + corners.max(axis=0)) / 2

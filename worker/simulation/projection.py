@@ -19,23 +19,23 @@ from graspd.worker.simulation.record import record_placement
 
 CAPACITY: Final = 1024  # residuals per grasp and iteration
 CUDA_LANE: Final = 16  # residuals per GPU thread that are added to the equations
-BETTER_M: Final = 1e-5  # a state is better than another if its penetration is less by more than this [m]
+BETTER_M: Final = 1e-5  # least reduction of penetration by which a state is better than another one [m]
 
 
 @dataclass(frozen=True)
 class ProjectionOptions:
     """Clearances of the projection, in metres."""
 
-    near: float = 2e-4  # hand points closer to the object than this are moved ...
-    target: float = 3.5e-4  # ... to this distance
+    near: float = 2e-4  # hand points closer to the object than this are moved to `target`
+    target: float = 3.5e-4  # distance of moved points
     hold: float = 2e-3  # points closer than this are contacts, moved to `hold_target` with weight `hold_weight`
     hold_target: float = 5e-4
     hold_weight: float = 0.02
     sample_near: float = 2.5e-4  # object samples closer to a link than this are moved to `target`
     self_near: float = 2e-4
     self_target: float = 5e-4
-    obstacle_near: float = 2e-4  # hand features closer to an obstacle than their margin plus this are moved ...
-    obstacle_target: float = 5e-4  # ... to their margin plus this
+    obstacle_near: float = 2e-4  # hand features closer to an obstacle than their margin plus this are moved
+    obstacle_target: float = 5e-4  # distance of moved features beyond their margin
     damping: float = 1e-3  # damping per residual
     scale: tuple[float, float, float] = (1.0, 12.5, 25.0)
     """Translation [m], rotation and joints [rad] that move a hand's surface equally: levers of 8 and 4 cm."""

@@ -1,7 +1,6 @@
 """Operations on hands as recorded launches: one iteration is the gradient of the loss, then a step.
 
-`record_*` records a whole list for the data's current schedule; `add_*` appends one part. No data leaves the device.
-"""
+`record_*` records a whole list for the data's current schedule; `add_*` appends one part. No data leaves the device."""
 
 from __future__ import annotations
 
@@ -28,7 +27,7 @@ OPTIMIZERS: Final = ("adam", "gd")
 
 def record_placement(m: Model, d: Data, *, room: float = 0.0, within: float | None = None) -> Launches:
     """Record contacts and penetration depths only; `room` is added to each feature's margin [m].
-    `within`: only contacts within this distance are needed, exactly [m]; it does not change the depths."""
+    `within`: contacts need to be exact only within this distance [m]; it does not change the depths."""
     out = Launches(m.device)
     add_poses(out, m, d)
     add_distances(out, m, d, within=within)
@@ -49,7 +48,7 @@ def record_evaluation(m: Model, d: Data) -> Launches:
 
 def record_iteration(m: Model, d: Data, optimizer: str, *, patience: int = 0) -> Launches:
     """Record one iteration: gradient and step.
-    With a `patience`, a grasp without improvement for so many iterations is switched off and costs nothing more.
+    With a `patience`, a grasp without improvement for so many iterations is switched off and costs no more time.
     Raises InputError: unknown optimizer."""
     out = record_evaluation(m, d)
     add_step(out, m, d, optimizer, patience=patience)

@@ -1,7 +1,6 @@
 """The contact step in float64 NumPy, written for clarity: the reference of the kernels and of studies.
 
-Contacts (N, 3), motions (6) as linear and angular parts. Distances and free motions may have leading axes.
-"""
+Contacts (N, 3), motions (6) as linear and angular parts. Distances and free motions may have leading axes."""
 
 from __future__ import annotations
 

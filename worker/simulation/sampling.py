@@ -15,7 +15,8 @@ from graspd.worker.objects.model import ObjectModel
 
 #: Edges between faces that turn by more than this have their own samples: they enter links between surface samples.
 SHARP_EDGE_COS = np.cos(np.radians(35.0))
-#: Random points per selected sample, and fewer of them above so many samples: the cost grows with the product of both.
+#: Random points per selected sample; fewer points above the third value's number of samples, since cost grows with the
+#: product of both.
 CANDIDATES, FEWER_CANDIDATES, MANY = 6, 3, 8_000
 
 

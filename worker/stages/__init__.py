@@ -1,4 +1,4 @@
-"""Stages turn a task into a shard. Only here do store and queue meet the engine."""
+"""Stages turn a task into a shard. Only this package connects store and queue with the engine."""
 
 from __future__ import annotations
 

@@ -66,7 +66,7 @@ def object_of(store: Store, message: TaskMessage) -> ObjectModel:
     def load() -> ObjectModel:
         obj = prepared_object(store, digest, name=name, face_error_m=error)
         if not store.exists(names.asset_model(AssetKind.OBJECT, digest)):
-            # The model is the same, whichever fidelity comes first.
+            # The model does not depend on which fidelity comes first.
             shown = prepared_object(store, digest, name=name, face_error_m=SHOWN_ERROR_M)
             publish_model(store, AssetKind.OBJECT, shown)
         return as_asked(obj, request)
@@ -112,7 +112,7 @@ def beside_attributes(message: TaskMessage) -> dict[str, Attribute]:
 
 
 def _cached(key: Hashable, load: Callable[[], Any]) -> Any:
-    # Tasks of one pair start at the same time: one of them loads.
+    # Tasks of one pair start at the same time; one of them loads the asset.
     with _lock:
         if key not in _cache:
             _cache[key] = load()
@@ -164,7 +164,7 @@ def _fetch(store: Store, key: str, file: Path) -> None:
         data = get_sealed(store, key)
     except (NotFoundError, DamagedError):
         return
-    # A folder that is not writable only costs time.
+    # Without a writable folder, the pieces are computed again at the next use.
     with suppress(OSError):
         write_whole(file, [data])
 

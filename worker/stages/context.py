@@ -90,8 +90,8 @@ def shard_of(
     message: TaskMessage, output: Output, *, device: str, seconds: float, worker: str, lost: ShardManifest | None = None
 ) -> tuple[ShardManifest, bytes]:
     """Build the shard of a stage: its manifest and its HDF5 bytes.
-    Time and worker of `lost`, the manifest of the file that this one replaces, are retained.
-    Raises InputError: the columns do not fit the schema."""
+    The new file keeps time and worker of `lost`, the manifest of the file that it replaces. Raises InputError: the
+    columns do not fit the schema."""
     kind = SHARD_KINDS[message.stage]
     request = message.request
     attributes: dict[str, Attribute] = {
@@ -122,13 +122,11 @@ def shard_of(
 
 def batch_seed(message: TaskMessage) -> int:
     """Compute the seed of this stage for this batch.
-
-    Batches, hands and objects must not repeat each other's materials, lamps and cameras. Methods do: with identical
-    pictures, networks trained on grasps of two methods can be compared.
-    """
+    Batches, hands and objects must not repeat each other's materials, lamps and cameras. Methods share them: with
+    identical pictures, networks trained on grasps of two methods can be compared."""
     pair = [message.hand_digest, message.object_digest]
     return int(digest_json([message.request.seed, message.stage, message.batch, *pair])[:8], 16) % 2**31
 
 
-#: A stage makes the arrays of a shard or, like ingest, writes its result itself.
+#: Makes the arrays of a shard or, like ingest, writes its result itself.
 StageFunction = Callable[[Any, TaskContext], Output | None]

@@ -1,5 +1,5 @@
-"""Self-test of a hand: grasps of three plain objects of suitable size.
-They are validated free at level standard and lifted off a table."""
+"""Self-test of a hand: grasps of three plain objects of suitable size. Grasps are validated free at level standard, and
+lifted off a table."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ TABLE_SCENES: Final = 2
 OF_OPENING: Final = 0.55
 OF_REACH: Final = 0.5
 WIDTH_M: Final = (0.012, 0.08)
-STRONG_N: Final = 1000.0  # sum of normal forces of a second squeeze, for the payload: actuators reach their limits [N]
+STRONG_N: Final = 1000.0  # sum of normal forces of a second squeeze [N]: for the payload, actuators reach their limits
 #: A servo that goes from zero to its limit within less fingertip motion presses with arbitrary force [m].
 SOFT_M: Final = 0.0015
 log = logging.getLogger(__name__)
@@ -71,7 +71,7 @@ class SelfTest:
     table: float
     table_n: int
     best: BestGrasp | None = None  # None: no grasp held
-    lost: float = 0.0  # share of failed grasps that lost the object during closing; the others slip under the pushes
+    lost: float = 0.0  # share of failed grasps that lost the object during closing; in other ones the pushes move it
     give_m: float = math.inf  # fingertip motion within which its stiffest servo goes from zero to its limit [m]
     limit: Limit | None = None  # payload on a table at full actuator force; None: it lifts nothing
 
@@ -111,7 +111,7 @@ def failed(reason: str, says: str = "suspicious") -> dict[str, Any]:
 
 
 def tried_softly(hand: Callable[[], HandModel], run: ExecutionContext = DEFAULT_CONTEXT) -> dict[str, Any]:
-    """Return the facts of a self-test; no grasp, or a failed test, is reported and not raised.
+    """Return the facts of a self-test; a test without a grasp, or with an error, is reported and not raised.
     Raises TaskCancelled: `run.cancelled()` returned True."""
     try:
         return self_test(hand(), run).facts()
@@ -210,7 +210,7 @@ def _best(obj: ObjectModel, found: ValidatedBatch) -> BestGrasp | None:
     rows = np.flatnonzero(columns["quality/success"] == 1)
     if not len(rows):
         return None
-    # Thin pads at two places give epsilon 0 at any threshold: then the least motion under the pushes decides.
+    # Thin pads at two places give epsilon 0 at any threshold; the least motion under the pushes then decides.
     ranks = [(float(columns["quality/epsilon"][k].max()), -float(columns["quality/verdict_margin"][k])) for k in rows]
     row = max(range(len(rows)), key=ranks.__getitem__)
     return BestGrasp(obj, found.grasps.grasp.take(rows[[row]]), ranks[row])
@@ -229,7 +229,7 @@ def fitting_width(hand: HandModel) -> float:
 
 
 def _tip(hand: HandModel, body: int, pose: Floats) -> Floats:
-    """Return a finger's end [m]: its last joint, or its pad if a single joint at the base closes it."""
+    """Return a finger's end [m]: its last joint, or its pad if one joint at the base closes it."""
     closing, at = 0, body
     while at > 0:
         closing += int(hand.closing[hand.dof[at]] != 0)

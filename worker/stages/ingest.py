@@ -28,20 +28,20 @@ from graspd.worker.stages.context import TaskContext
 
 #: Address space of the child [bytes]: the largest accepted meshes need about a tenth of it.
 MEMORY_LIMIT_BYTES: Final = 4 * 2**30
-#: CPU time [s], since wall time of the same file grows on a busy machine. A child that waits instead of computing ends
-#: by the task's time limit, and the check is retried.
+#: CPU time limit [s]; wall time of the same file grows on a busy machine. For a child that waits without computing, the
+#: task's time limit ends the check, which is then retried.
 CPU_LIMIT_S: Final = 25
 _PASSED_ON: Final = ("PATH", "HOME", "LANG", "TMPDIR", "PYTHONPATH", "LD_LIBRARY_PATH", "VIRTUAL_ENV")
 _OUT_OF_MEMORY: Final = ("MemoryError", "bad_alloc", "Cannot allocate", "failed to map")
 _FINDING_BYTES: Final = 2**20
 _MODEL: Final = "model.glb"
 _MODEL_BYTES: Final = 2**24
-#: A longer check leaves no CPU time for the model within the limit; the first task with the asset makes the model.
+#: CPU time of a check above which none is left for the model [s]; the first task with the asset then makes the model.
 _MODEL_CPU_S: Final = 8.0
 
 
 def run(message: IngestMessage, context: TaskContext) -> None:
-    """Check the asset and write `check.json`, for refusals too."""
+    """Check the asset and write `check.json`, also for a refusal."""
     files = _files(message, context)
     found, model = check_in_child(message.kind, message.name, files, context)
     if found["verdict"] != "refuse" and load_asset(context.store, message.kind, message.digest).self_test:
@@ -83,7 +83,7 @@ def check_in_child(
         source.write_bytes(pack(files))
         arguments = [kind.value, name, str(source), str(target), str(memory_bytes), str(cpu_s)]
         command = [sys.executable, "-m", "graspd.worker.stages.ingest", *arguments]
-        # A file of limited size: a full pipe would block the child, and reading from one has no limit.
+        # A file of limited size: a full pipe would block the child, and reading from a pipe has no limit.
         with (
             errors.open("wb") as stderr,
             subprocess.Popen(
@@ -101,12 +101,12 @@ def check_in_child(
             why = f"the result of the check exceeds {_FINDING_BYTES >> 20} MiB; simplify it, or shorten its names"
             return _refused(kind, name, why), b""
         if target.is_file():
-            # A complete result counts even if the model after it failed; a truncated one does not parse.
+            # A complete result counts even if the model after it failed. A truncated result does not parse.
             with contextlib.suppress(ValueError):
                 found, model = dict(json.loads(target.read_bytes())), target.with_name(_MODEL)
                 return found, model.read_bytes() if code == 0 and model.is_file() else b""
         if os.strerror(errno.ENOSPC) in complaint:
-            # No verdict on the file: the check is retried once there is disk space.
+            # The file gets no verdict: the check is retried once there is disk space.
             raise OSError(errno.ENOSPC, f"{os.strerror(errno.ENOSPC)} to check {name}")
         if code == -signal.SIGKILL:
             raise OSError(f"the check of {name} was killed; the machine may lack memory")
@@ -147,7 +147,7 @@ def _refused(kind: AssetKind, name: str, why: str) -> dict[str, Any]:
 
 
 def _child(kind: str, name: str, source: str, target: str, memory_bytes: str, cpu_s: str) -> None:
-    # The hard limit stays: its signal equals that of a machine out of memory, and children have their own limits.
+    # The hard limit stays, since its signal equals that of a machine out of memory. Children have their own limits.
     resource.setrlimit(resource.RLIMIT_CPU, (int(cpu_s), resource.getrlimit(resource.RLIMIT_CPU)[1]))
     limits = {resource.RLIMIT_AS: int(memory_bytes), resource.RLIMIT_CORE: 0, resource.RLIMIT_FSIZE: _MODEL_BYTES}
     for limit, value in limits.items():

@@ -1,12 +1,11 @@
 """Models for viewers: hands and objects as binary glTF, made with an upload's check or at first use.
 
-``python -m graspd.worker.stages.models`` writes those of the built-in hands and objects into `service/builtin/models/`.
+``python -m graspd.worker.stages.models`` writes the models of built-in hands and objects to `service/builtin/models/`.
 
-Node `extras` contain the joint tree, so a viewer can pose the hand from the joint positions of a shard: a node's pose
+Node `extras` contain the joint tree, so a viewer can pose the hand from the joint positions of a shard. A node's pose
 is parent * rest pose * motion about `axis`. Points of the hand's surface are POINTS primitives. For a body drawn with
 visual meshes, `extras` name the mesh of its collision shapes, which no node draws. The document's `extras` contain
-facts, link frames, joint drives and pads of the hand.
-"""
+facts, link frames, joint drives and pads of the hand."""
 
 from __future__ import annotations
 
@@ -35,7 +34,8 @@ from graspd.worker.objects.mesh_geometry import corner_normals
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import load_object
 
-#: Tolerance of a displayed object [m]: that of the standard fidelity, so that the display shows the grasped mesh.
+#: Tolerance of a displayed object [m]. It is the standard fidelity's tolerance, so that the display shows the grasped
+#: mesh.
 SHOWN_ERROR_M: Final = Fidelity().face_error_m
 _BUILTIN: Final = Path(__file__).parents[2] / "service" / "builtin" / "models"
 
@@ -62,8 +62,8 @@ def write_builtins() -> None:
 
 
 SURFACE_POINTS: Final = 3000  # hand points from which a viewer measures the distance to the object
-MAX_FACES: Final = 60_000  # most triangles of all visual meshes of a hand, so that a browser draws them at once
-PAD_POINTS: Final = 60  # most points of a pad
+MAX_FACES: Final = 60_000  # largest number of triangles of a hand, so that a browser draws them at once
+PAD_POINTS: Final = 60  # largest number of points of a pad
 _GREY: Final = (0.45, 0.5, 0.55)  # sRGB of parts without a colour, if other parts have one
 
 

@@ -1,4 +1,4 @@
-"""Tasks of several batches: each batch is made as if alone; their rows are concatenated in a shard."""
+"""Tasks of several batches: each batch is made as if alone, and a shard concatenates their rows."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def batches_of(message: TaskMessage) -> list[TaskMessage]:
 
 
 def joined(message: TaskMessage, made: Sequence[Output], *, base_rows: Sequence[range] = ()) -> Output:
-    """Join the outputs of batches, with equal columns except for rechecks; that of a single batch is unchanged.
+    """Join the outputs of batches, which have equal columns except for rechecks; a single output is unchanged.
     Columns that refer to rows of the base shard follow `base_rows`, the rows of each batch in it."""
     if len(made) == 1:
         return made[0]
@@ -64,7 +64,7 @@ def joined(message: TaskMessage, made: Sequence[Output], *, base_rows: Sequence[
 
 
 def base_rows(base: Shard, message: TaskMessage) -> list[range]:
-    """Return the rows of each batch of a task in its base shard. Raises DamagedShard: it has other batches."""
+    """Return the rows of each batch of a task in its base shard. Raises DamagedShard: the shard has other batches."""
     said = base.attributes.get("batch_rows")
     counts = [len(base.arrays["grasp/hand_pose"])] if said is None else json.loads(str(said))
     if len(counts) != len(sizes_of(message)):
@@ -73,8 +73,9 @@ def base_rows(base: Shard, message: TaskMessage) -> list[range]:
 
 
 def _summed(told: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Combine the records of several batches; other planner records are those of the first batch.
-    Counts and seconds are summed, shares averaged with the numbers of planned grasps as weights."""
+    """Combine the records of several batches.
+    Counts and seconds are summed. Shares are averaged, weighted with the numbers of planned grasps. Other planner
+    records are those of the first batch."""
     found = dict(told[0])
     planned = [one.get("planned", 0) for one in told]
     for name, value in told[0].items():

@@ -1,4 +1,4 @@
-"""Stage scene: before grasps that are planned in scenes, else after them, with their clearance."""
+"""Stage scene: before grasps that are planned in scenes; otherwise after the grasps, with their clearance."""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
             empty_on=(NoStartFound,) if scenes else (),
         )
     except InputError as error:
-        # Errors of hand and object have their own classes; here no hand reaches into the scene.
+        # Errors of hand and object have their own classes; the classes below mean that no hand reaches into the scene.
         if scenes and type(error) in (InputError, NoStartFound):
             raise SceneError(str(error)) from None
         raise
@@ -113,7 +113,7 @@ def _scenes(message: TaskMessage, columns: dict[str, NDArray[Any]], context: Tas
 
 
 def _check_hope(message: TaskMessage, batch: int, found: ValidatedBatch, *, in_scenes: bool) -> None:
-    """Stop a job whose first batch finds nothing: the others would not either."""
+    """Stop a job whose first batch finds nothing, since the other batches would find nothing either."""
     request, limit = message.request, found.limit
     if batch or request.want == "candidates" or len(found.grasps):
         return

@@ -1,9 +1,9 @@
 """Convex decomposition of objects by CoACD (Wei et al. 2022), with a check of its quality, cached on disk.
 
-The validator's engine simulates only the pieces. Pieces that fill a hollow therefore falsify every verdict on it.
-Count, volume ratio and excess are stored with every verdict; pieces with a large excess are refused. The excess is the
-volume added by the union of the pieces, divided by the object's surface area: the mean height of the added material.
-"""
+The validator's engine simulates only the pieces. Pieces that fill a hollow therefore falsify every verdict on the
+object. Count, volume ratio and excess are stored with every verdict; pieces with a large excess are refused. The excess
+is the volume added by the union of the pieces, divided by the object's surface area: the mean height of the added
+material."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ MAX_EXCESS_M: Final = 2e-3
 #: CoACD's concavity thresholds from coarse to fine; the first that gives good pieces is used.
 THRESHOLDS: Final = (0.1, 0.05, 0.03)
 MAX_PIECES: Final = 64
-#: CoACD's preprocessing is off: it inflates near-convex scans by 9 to 17 % and takes a minute; meshes are closed here.
+#: CoACD's preprocessing is off: it inflates near-convex scans by 9 to 17 % and takes a minute. Meshes are closed here.
 _COACD: Final = {
     "preprocess_mode": "off",
     "resolution": 1000,
@@ -63,7 +63,7 @@ class ConvexPieces:
     vertices: tuple[Floats, ...]
     """One (V, 3) array of corners per piece, object frame [m]."""
     volume_ratio: float
-    """Volume of the union divided by the object's."""
+    """Volume of the union over the object's volume."""
     excess_m: float
     """Mean height of the union above the object's surface [m]."""
     digest: str
@@ -85,18 +85,13 @@ class ConvexPieces:
 
 def decompose(obj: ObjectModel, *, cache: Path | None = None) -> ConvexPieces:
     """Return the convex pieces of an object, from the cache if possible.
-
-    Args:
-        cache: cache folder; by default `$XDG_CACHE_HOME/graspd/convex`.
-
-    Raises:
-        MeshError: the mean excess of the best pieces is above `MAX_EXCESS_M`.
-    """
+    The cache folder is by default `$XDG_CACHE_HOME/graspd/convex`.
+    Raises MeshError: the mean excess of the best pieces is above `MAX_EXCESS_M`."""
     pieces = _load_or_make(obj.centred, piece_file(obj, cache))
     if pieces.excess_m > MAX_EXCESS_M:
         raise MeshError(
             f"{obj.name}: its {len(pieces)} convex pieces have {pieces.volume_ratio:.2f} times its volume and "
-            f"stand out {pieces.excess_m * 1e3:.1f} mm (limit {MAX_EXCESS_M * 1e3:g} mm); it cannot be validated"
+            f"an excess of {pieces.excess_m * 1e3:.1f} mm (limit {MAX_EXCESS_M * 1e3:g} mm); it cannot be validated"
         )
     if any(obj.centre):
         pieces = replace(pieces, vertices=tuple(part + obj.centre for part in pieces.vertices))

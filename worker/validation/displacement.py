@@ -1,9 +1,8 @@
 """Simulated displacement of an object in a rigid hand during 0.15 s of gravity (Hasson et al. 2019).
 
-The hand is fixed in its grasp posture. The object has 1 kg and friction 3; gravity acts along -z of its frame for 35
-steps of 1/240 s. In free fall it would move by 10.7 cm. The protocol was made for PyBullet, with a restitution of 0.5;
-MuJoCo has no restitution.
-"""
+The hand is fixed in its grasp posture. The object has 1 kg and friction 3. Gravity acts along -z of its frame for 35
+steps of 1/240 s. In free fall it would move by 10.7 cm. The protocol was made for PyBullet with a restitution of 0.5;
+MuJoCo has no restitution."""
 
 from __future__ import annotations
 
@@ -68,7 +67,7 @@ def _model(hand: HandModel, obj: ObjectModel, pieces: ConvexPieces) -> Any:
     spec.option.gravity = [0, 0, -GRAVITY]
     friction = [FRICTION, 0.005, 1e-4]
     for b in range(hand.bodies):
-        # Mocap bodies move only on command, so one model serves all grasps.
+        # Mocap bodies move only by command, so one model serves all grasps.
         body = spec.worldbody.add_body(name=f"body{b}", mocap=True)
         for i, piece in enumerate(hand.pieces):
             if piece.body == b:

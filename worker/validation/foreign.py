@@ -1,8 +1,7 @@
-"""Verdicts in another model of the same hand: grasps planned with one model are validated in the other.
+"""Verdicts in another model of the same hand: grasps planned with one model are validated in the other model.
 
 The other model provides the mechanism: shapes, masses, joint frames, limits, couplings, armature and dry friction. The
-grasp's own model provides the controller: commanded postures, gains, torque limits and, with the gains, the damping.
-"""
+grasp's own model provides the controller: commanded postures, gains, torque limits and, with the gains, the damping."""
 
 from __future__ import annotations
 
@@ -26,15 +25,16 @@ from graspd.worker.validation.variant import nearest
 
 @dataclass(frozen=True)
 class ForeignVerdicts:
-    """Verdicts on the same N grasps in the model they were planned with and in another."""
+    """Verdicts on the same N grasps in the model they were planned with and in another model."""
 
     nominal: Verdicts
     foreign: Verdicts
     same: SameHand
 
     def facts(self) -> dict[str, Any]:
-        """Return validation_hand, the other model's name; fingertips_mm, the distance of its fingertips from those of
-        the grasp's model; foreign_key, the terms of its verdicts; and `share_counts`."""
+        """Return the facts of both validations, with `share_counts`.
+        validation_hand: name of the other model. fingertips_mm: distance between the fingertips of both models.
+        foreign_key: terms of the verdicts in the other model."""
         a, b = self.nominal.success == 1, self.foreign.success == 1
         return {
             "validation_hand": self.same.theirs.name,
@@ -52,9 +52,9 @@ class ForeignVerdicts:
 
 
 def share_counts(held: Mapping[str, int]) -> dict[str, Any]:
-    """Return shares from counts of grasps that hold in both models, in one alone, or in neither; None: no grasps.
-    foreign_held: the counts. agreement: share of grasps with the same verdict in both models. foreign_share: share of
-    nominally held grasps that also hold in the other model. foreign_gsr: share of all grasps that hold in it."""
+    """Return shares of grasps from their counts: held in both models, in one model, or in neither; None: no grasps.
+    foreign_held: the counts. agreement: share of grasps with equal verdicts in both models. foreign_share: share of
+    nominally held grasps that hold in the other model. foreign_gsr: share of all grasps that hold in it."""
     n, nominal = sum(held.values()), held["both"] + held["nominal"]
 
     def share(part: int, whole: int) -> float | None:
@@ -85,10 +85,10 @@ def foreign_verdicts(
 
 
 def driven_as(same: SameHand) -> HandModel:
-    """Return the other model with the gains and limits of `same.ours`. A dof with gain k and limit e that moves n
-    joints by m_i gives each joint the gain k / (n m_i^2) and the limit e / (n |m_i|). Conversely, its gain and limit
-    are sum(m_i^2 k_i) and sum(|m_i| e_i) of its joints. So the drive along the joints' common motion is the same,
-    whether a model couples them or connects them by a tendon."""
+    """Return the other model with the gains and limits of `same.ours`.
+    Let a dof with gain k and limit e move n joints by m_i. Each joint then gets the gain k / (n m_i^2) and the limit e
+    / (n |m_i|). Conversely, a dof's gain and limit are sum(m_i^2 k_i) and sum(|m_i| e_i) of its joints. The drive along
+    the joints' common motion is thus the same in a model that couples them and in a model with a tendon."""
     ours, theirs = same.ours, same.theirs
     dof, rate = ours.dof[ours.joint_body], ours.multiplier[ours.joint_body]
     joints = np.bincount(dof, minlength=ours.dofs)[dof]
@@ -103,7 +103,7 @@ def driven_as(same: SameHand) -> HandModel:
 
 def in_other_model(same: SameHand, grasps: GraspSet) -> GraspSet:
     """Return the grasps as postures of the other model: base transformed, joints matched by name.
-    Where joints are coupled in the other model but not in ours, they take the nearest feasible values."""
+    Joints that only the other model couples take the nearest feasible values."""
 
     def posture(part: Posture) -> Posture:
         pose, joints = compose(part.hand_pose, same.base), part.joint_positions[:, same.joints]

@@ -21,12 +21,12 @@ from graspd.worker.validation.decomposition import ConvexPieces
 
 Level = Literal["dexgraspbench", "standard", "fast"]
 
-#: Increase when a change of the protocol's or the scene's code, other than a constant, changes verdicts.
+#: Increase after changes of verdicts by the protocol's or the scene's code, other than its constants.
 REVISION: Final = 6
 
 _EARLY: Final = ("FIRST_LOOK_S", "INTERVAL_S", "SURE", "AHEAD", "LOST_ROTATION")
-#: Constants that affect a verdict, by module; below, those that only one level uses. Other constants of these modules
-#: affect no verdict.
+#: Constants that affect a verdict, by module; below, constants that only one level uses. Other constants of these
+#: modules affect no verdict.
 MOVES: Final[dict[ModuleType, tuple[str, ...]]] = {
     protocol: ("DIRECTIONS", "MAX_DISPLACEMENT_M", "MAX_ROTATION", "MAX_PENETRATION_M", "STAGES", "STAGE_S", "HOLD_S"),
     matter: ("ACCELERATION",),
@@ -71,9 +71,9 @@ def verdict_key(
     hand: HandModel, obj: ObjectModel, level: Level, hard: bool, *, pieces: ConvexPieces, prefilter: Sequence[Any] = ()
 ) -> str:
     """Return the digest of the terms of a verdict: everything that determines it except the grasp's postures.
-    It covers level, friction, masses, gains and torque limits, the rules of pregrasp and squeeze, shapes of the hand,
-    convex pieces of the object, the constants of `MOVES` and of the level, version of the engine; and `prefilter`,
-    the prefilter's terms if it is used."""
+    Terms are level, friction, masses, gains, torque limits, shapes of the hand, convex pieces of the object, and the
+    rules of pregrasp and squeeze. Further terms are the constants of `MOVES` and of the level, the version of the
+    engine, and `prefilter`: the prefilter's terms if it is used."""
     shapes = b"".join(np.round(p.vertices, 9).tobytes() + np.round(p.pose, 9).tobytes() for p in hand.pieces)
     return digest_json(
         {
@@ -106,7 +106,7 @@ def postures_key(terms: str, grasps: GraspSet) -> str:
 
 
 def _values(names: dict[ModuleType, tuple[str, ...]]) -> dict[str, Any]:
-    """Return named constants by the last part of their module's name; those of `opening` are postures'."""
+    """Return named constants by the last part of their module's name; constants of `opening` belong to `postures`."""
     out: dict[str, Any] = {}
     for part, there in names.items():
         group = out.setdefault((postures if part is opening else part).__name__.rpartition(".")[2], {})

@@ -1,11 +1,11 @@
 """The lift test: the object rests in its scene; the hand closes, squeezes, lifts and holds it.
 
-dexgraspbench: DexGraspBench's tabletop test as published: from the pregrasp, 1 N down, 10 cm up in 0.4 s, no hold.
+dexgraspbench: DexGraspBench's tabletop test as published. From the pregrasp 1 N acts down; then the hand rises 10 cm in
+0.4 s, without a hold.
 lift: the hand starts at its standoff and must touch nothing on its approach. Fingertips may touch supports, or press
 into them as deep as the scene allows. The hand rises smoothly in 0.8 s and holds for 2 s, with early termination as at
 level standard. Neighbours are free bodies on the table; they must not move by 2 cm or topple.
-The world frame of the simulation is the object frame at rest; the scene is placed around it accordingly.
-"""
+The world frame of the simulation is the object frame at rest; the scene is placed around it accordingly."""
 
 from __future__ import annotations
 
@@ -30,11 +30,12 @@ NEIGHBOUR_MOVED_M: Final = 0.02
 NEIGHBOUR_TILTED: Final = MAX_ROTATION
 #: Number of postures checked between two waypoints of an approach.
 LOOKS: Final = 4
-#: Largest penetration of the open hand into the object's convex pieces on its approach [m]: the pieces protrude by up
+#: Largest penetration of the open hand into the object's convex pieces on its approach [m]. The pieces protrude by up
 #: to this much from a surface that the hand does not touch. Supports are exact.
 OVERHANG_M: Final = 0.002
-#: Number of steps of the rise, their length [s], and the share of the rise after each: minimum jerk (Flash and Hogan,
-#: "The coordination of arm movements", 1985), at most 0.9 m/s2 for 10 cm in 0.8 s. The published test has 25 m/s2.
+#: Number of steps of the rise, their length [s], and the share of the rise after each step. The rise has minimum jerk
+#: (Flash and Hogan, "The coordination of arm movements", 1985). For 10 cm in 0.8 s it reaches 0.9 m/s2; the published
+#: test has 25 m/s2.
 RISING: Final = 100
 RISING_S: Final = 0.008
 #: Steps of the rise between two checks for a lost object.
@@ -58,7 +59,7 @@ class LiftOutcome(IntEnum):
 class LiftTest:
     outcome: LiftOutcome = LiftOutcome.NOT_TRIED
     margin: float = 0.0
-    """Worst displacement or rotation from the commanded pose over its limit, after the end of the lift."""
+    """Largest displacement or rotation from the commanded pose over its limit, after the end of the lift."""
     steps: int = 0
 
     @property
@@ -193,9 +194,8 @@ class Lift(Test):
 
     def _yielded(self) -> tuple[Floats, Floats] | None:
         """Return the root's position (3,) and its rotation (4,) relative to the command.
-        None: the root is fixed, or the object is not in the hand.
-        The protocol's weld yields by 10 degrees under the weight of a hammer, unlike an arm. An object that only
-        follows this deviation has not moved in the hand."""
+        None: the root is fixed, or the object is not in the hand. Unlike an arm, the protocol's weld yields by 10
+        degrees under the weight of a hammer. An object that only follows this deviation has not moved in the hand."""
         at = self.scene.root_qpos
         if at < 0 or not self._in_hand:
             return None

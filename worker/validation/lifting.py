@@ -28,7 +28,7 @@ LiftLevel = Literal["dexgraspbench", "lift"]
 #: Finished lifts, by `lift_of`.
 KnownLifts = dict[str, LiftTest]
 LEVELS: Final[tuple[LiftLevel, ...]] = get_args(LiftLevel)
-#: Increase when a change of the lift test's code, other than a constant, changes verdicts.
+#: Increase after changes of verdicts by the lift test's code, other than its constants.
 REVISION: Final = 5
 _MOVES: Final = {surroundings: ("RISE_M",), protocol: ("LOOKS", "OVERHANG_M", "LOSSES"), postures: ("ROOM_M", "WIDE")}
 
@@ -66,22 +66,18 @@ def validate_lifts(
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> LiftVerdicts:
     """Validate grasps by lifts out of their scenes; see `worker.validation.lift`.
+    Raises InputError: unknown level, or a grasp has no scene or approach. MeshError: the object has no usable convex
+    pieces. TaskCancelled: `run.cancelled()` returned True.
 
     Args:
         hand: the hand; its stiffness and effort are the actuators' gains and limits.
         obj: the object, with its mass and friction; `ObjectModel.published` has those of the protocol.
         grasps: N grasps with pregrasp, squeeze and, for level lift, approach.
-        placed: their scenes; `index` has one for each grasp.
+        placed: the grasps' scenes; `index` has the scene of each grasp.
         hard: sliding friction halved, torsional friction a tenth; also for supports.
         pieces: convex pieces of the object; by default its CoACD pieces.
         known: finished lifts of this hand, object and level, which are reused; new ones are added to it.
-        run: receives the number of finished grasps; polled for cancellation between grasps.
-
-    Raises:
-        InputError: unknown level, or a grasp has no scene or approach.
-        MeshError: the object has no usable convex pieces.
-        TaskCancelled: `run.cancelled()` returned True.
-    """
+        run: receives the number of finished grasps; polled for cancellation between grasps."""
     require_ways(grasps, placed, level)
     began = time.perf_counter()
     pieces = pieces or decompose(obj)
@@ -113,7 +109,7 @@ def validate_lifts(
 
 
 def lift_of(grasps: GraspSet, row: int, placed: PlacedGrasps, *, hard: bool) -> str:
-    """Return the digest of everything a lift depends on besides hand, object, level and fixed obstacles."""
+    """Return the digest of everything that determines a lift besides hand, object, level and fixed obstacles."""
     number = int(placed.index[row])
     around = [array[row] for array in (grasps.approach, grasps.coming) if array is not None]
     around += [placed.object_pose[number], placed.scenes[number].up, *placed.neighbours_of(number)]

@@ -31,15 +31,15 @@ HARD: Final = (0.5, 0.1)
 DAMPING_TIME: Final = 0.02
 HAND_SOLIMP: Final = (0.5, 0.99, 1e-4, 0.5, 2.0)
 HAND_SOLREF: Final = (0.005, 1.0)
-#: Time constant of couplings: stiffer than contacts, or a pressed finger would stretch them; 2 steps is MuJoCo's
-#: minimum.
+#: Time constant [s] and damping ratio of couplings. They are stiffer than contacts, or a pressed finger would stretch
+#: them; MuJoCo's minimum is 2 steps.
 COUPLING_SOLREF: Final = (0.008, 1.0)
 COUPLING_SOLIMP: Final = (0.98, 0.999, 1e-4, 0.5, 2.0)
 #: Features of today's MuJoCo that version 3.3.2, pinned by DexGraspBench, lacks. They are off here: several contacts
-#: for a pair of convex pieces, and a solver for each island of contacts.
+#: per pair of convex pieces, and a solver for each island of contacts.
 NOT_IN_3_3_2: Final = int(mujoco.mjtDisableBit.mjDSBL_MULTICCD) | int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
-#: Degrees of freedom from which sparse Jacobians cost less; MuJoCo's own rule is 60. With sparse Jacobians lifts take
-#: .77 of the time for 28 dofs (Allegro), .73 for 34 (Shadow), 1.09 for 20 (Barrett). Verdicts differ only by rounding.
+#: Degrees of freedom from which on sparse Jacobians cost less; MuJoCo's own rule is 60. Time of lifts with sparse
+#: Jacobians: .77 for 28 dofs (Allegro), .73 for 34 (Shadow), 1.09 for 20 (Barrett). Verdicts differ only by rounding.
 SPARSE: Final = 24
 #: A body without geometry has the inertia of a ball of this radius [m].
 _BARE_RADIUS: Final = 0.01
@@ -65,8 +65,8 @@ class MujocoOptions:
         return replace(self, friction=(slide * HARD[0], twist * HARD[1]))
 
 
-#: Coarse physics for clear cases at level fast. Up to 6 ms, two steps are shorter than the 12.5 ms time constant of
-#: contacts between hand and object, so contacts are as stiff as at 4 ms; at 8 ms they are softer.
+#: Coarse physics for clear cases at level fast. Contacts between hand and object have a time constant of 12.5 ms, above
+#: two steps of up to 6 ms. They are therefore as stiff as at 4 ms; at 8 ms they are softer.
 COARSE: Final = MujocoOptions(timestep=0.006, root="fixed")
 
 
@@ -107,7 +107,7 @@ class Scene:
     neighbours: tuple[FreeBody, ...]
     tip_geoms: NDArray[np.bool_]
     pressing: Floats
-    """(G,) depth by which fingertips on their approach may press into a geom [m]; above 0 where supports allow it."""
+    """(G,) allowed depth of fingertips on their approach in a geom [m]; above 0 where supports allow it."""
 
     @property
     def push(self) -> float:
@@ -267,7 +267,7 @@ def _add_joint(body: Any, hand: HandModel, b: int) -> None:
 
 def _mechanism(hand: HandModel, b: int, d: int) -> dict[str, Any]:
     """Return joint properties that the protocol lacks.
-    A tendon presses a joint permanently against its limit; the limit is therefore as stiff as a coupling."""
+    A tendon presses a joint permanently against its limit, so the limit is as stiff as a coupling."""
     found: dict[str, Any] = {}
     if hand.drag is not None:
         found |= {"armature": float(hand.drag.armature[b]), "frictionloss": float(hand.drag.dry_friction[b])}
@@ -396,7 +396,7 @@ def blend(a: Posture, b: Posture, row: int, share: float) -> tuple[Floats, Float
 
 
 def _add_tendon(spec: Any, hand: HandModel, tendon: Tendon, name: str, leading: NDArray[np.int32]) -> None:
-    """Add one actuator on the sum of joints; the joints are not coupled in any other way."""
+    """Add one actuator on the sum of joints, which are not coupled in any other way."""
     cord = spec.add_tendon(name=name)
     for d, pull in zip(tendon.dofs, tendon.coefficients, strict=True):
         cord.wrap_joint(f"joint{leading[d]}", pull)

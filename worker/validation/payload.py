@@ -1,18 +1,17 @@
-"""Payload of grasps: heaviest mass that each lifts or holds; shake test; limit and load capacity.
+"""Payload of grasps: heaviest mass that each grasp lifts or holds; shake test; limit and load capacity.
 
 The hand closes once around the object with its own mass. Then the mass is varied: the object hangs, or is pushed, until
-its motion decides. The search for the heaviest mass begins at the friction bound of the closed hand. Each
-test starts from the final state of the heaviest mass that passed.
+its motion decides. The search for the heaviest mass begins at the friction bound of the closed hand. Each test starts
+from the final state of the heaviest mass that passed.
 
 The shake moves a lifted object to and fro, first along x of the scene, then along y. In the simulation the hand is at
 rest and the inertial force of the motion acts on the object. Accelerations begin at zero; the constant velocity that
 this adds to the hand has no effect (Galilean invariance).
 
-Load capacity: the heaviest object that contact forces could bear within actuator limits and friction. One linear
-program per grasp: contact forces inside friction pyramids balance the weight and all torques about the centre of mass,
-and no drive exceeds its effort. It is an upper bound: it may choose forces that no controller can exert, and its
-pyramids enclose the cones. Forces against the palm, across joints, or towards a joint's stop cost no effort.
-"""
+Load capacity: the heaviest object that contact forces could bear within actuator limits and friction. Each grasp has
+one linear program. Contact forces inside friction pyramids balance the weight and all torques about the centre of mass,
+and no drive exceeds its effort. The result is an upper bound: it may contain forces that no controller can exert, and
+its pyramids enclose the cones. Forces against the palm, across joints, or towards a joint's stop cost no effort."""
 
 from __future__ import annotations
 
@@ -49,7 +48,7 @@ TOLD: Final = 1.03
 #: First mass as a share of the friction bound (median over the grasps of `benchmarks.payload`), and first step.
 FIRST: Final = 0.75
 STEP: Final = math.sqrt(2)
-#: Most stages of simulation per load.
+#: Largest number of stages of simulation per load.
 WATCHED: Final = 10
 
 
@@ -67,12 +66,12 @@ class _Weighed(Test):
         model.body_mass[body] = mass
         model.body_inertia[body] = self._inertia * (mass / self._own)
         # Contact stiffness depends on inverse inertias, which follow from the mass. The change also overwrites state in
-        # `data`, which the next restored state or the start of a grasp resets.
+        # `data`; the next restored state or the start of a grasp resets this state.
         mujoco.mj_setConst(model, self.data)
 
     def _bound(self, against: Floats) -> float:
         """Return the mass [kg] whose weight along -`against` (3,) the contacts of the closed hand bear.
-        This estimate uses their present normal forces and friction, which a load changes."""
+        The estimate uses present normal forces and friction, which a load changes."""
         contact, model = self.data.contact, self.scene.model
         at_object = model.geom_bodyid[contact.geom] == self.scene.object_body
         rows = np.flatnonzero(
@@ -181,13 +180,13 @@ def payloads(
     return measured(len(grasps), held, make, lambda test, row: test.payload(grasps, row), run=run, name="payload")
 
 
-#: Fewest grasps that must lift a light object before their payload counts as the hand's limit; with fewer, the grasps'
-#: shape may be the cause. The light object has the default mass, or this share of the wanted mass.
+#: Fewest grasps that must lift a light object before their payload counts as the hand's limit; otherwise the grasps'
+#: shape may be the cause. The light object has the default mass, or the second value's share of the wanted mass.
 LEAST: Final = 2
 LIGHT: Final = 1 / 8
-#: Number of grasps after which no further ones need to be tested.
+#: Number of grasps after which no more grasps are tested.
 ENOUGH: Final = 8
-#: Ratio of wanted mass to best payload from which on no further grasps are tested.
+#: Ratio of wanted mass to best payload from which on no more grasps are tested.
 HOPELESS: Final = 2.0
 
 
@@ -206,7 +205,7 @@ class Limit:
 
     @property
     def hopeless(self) -> bool:
-        """Whether the wanted payload is so far above the limit that no further grasps need to be tested."""
+        """Whether the wanted payload is so far above the limit that no more grasps are tested."""
         return self.grasps >= ENOUGH and self.wanted_kg is not None and self.wanted_kg > HOPELESS * self.lifts_kg
 
     @property
@@ -299,7 +298,7 @@ def shake_margins(
 
 
 _POINTS: Final = 600
-#: Hand points within this distance may make contact while the hand closes [m]; at most this many, widely spread.
+#: Hand points within this distance may make contact while the hand closes [m]; at most so many, widely spread.
 WITHIN_M: Final = 0.01
 MOST: Final = 32
 #: A joint closer to its limit than this share of its range rests on its stop.

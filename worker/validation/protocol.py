@@ -2,10 +2,9 @@
 
 dexgraspbench: as published. Each of the 6 pushes starts from the closed hand and is held for 2 s. The published test
 closes the hand anew for each push, with the same result.
-standard: the same physics; a push ends as soon as motion at twice the present rate would stay inside .8 of the limits
+standard: the same physics. A push ends as soon as motion at twice the present rate would stay inside .8 of the limits
 until 2 s.
-fast: coarser physics (fixed root, 6 ms); where the margin is not clear, level standard decides.
-"""
+fast: coarser physics (fixed root, 6 ms). Where the margin is not clear, level standard decides."""
 
 from __future__ import annotations
 
@@ -27,26 +26,26 @@ DIRECTIONS: Final = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0
 MAX_DISPLACEMENT_M: Final = 0.05
 MAX_ROTATION: Final = math.radians(15.0)
 MAX_PENETRATION_M: Final = 0.010
-#: Both motions (to the grasp, to the squeeze) have stages of equal length; a push is checked at intervals.
+#: The motions to the grasp and to the squeeze have stages of equal length. A push is checked at intervals.
 STAGES: Final = 10
 STAGE_S: Final = 0.04
 HOLD_S: Final = 2.0
 DEXGRASPBENCH_INTERVAL_S: Final = 0.2
-#: Sequential test: time of the first check, and interval. Earlier checks miss slow creep under a weak squeeze.
+#: Sequential test: time of the first check, and interval [s]. Earlier checks miss slow creep under a weak squeeze.
 FIRST_LOOK_S: Final = 0.08
 INTERVAL_S: Final = 0.04
-#: A push ends once motion at `AHEAD` times the present rate stays inside this share of the limits until 2 s. Of 502
-#: grasps of three hands, 76 of them lost within 2 s, this rule accepts 2 lost ones. So does a rule with the plain rate
-#: and half of the limits, which simulates 1.7 times as long.
+#: A push ends once motion at `AHEAD` times the present rate stays inside this share of the limits until 2 s. The rule
+#: was tested on 502 grasps of three hands, of which 76 are lost within 2 s: it accepts 2 lost ones. A rule with the
+#: plain rate and half of the limits accepts as many, but simulates 1.7 times as long.
 SURE: Final = 0.8
 AHEAD: Final = 2.0
 #: Share of the limits for extrapolated motion in a short test; below it the object counts as still.
 STILL: Final = 0.5
 #: Ratio to the limit of a state that is not finite.
 LOST: Final = 10.0
-#: Rotation during closing or rising above which the object is lost; no passing grasp reached half of it.
+#: Rotation during closing or rising above which the object is lost [rad]; no passing grasp reached half of it.
 LOST_ROTATION: Final = math.radians(30.0)
-#: Coarse physics are trusted if their worst displacement or rotation over its limit is outside this band. Their false
+#: Coarse physics are trusted if their largest displacement or rotation over its limit is outside this band. False
 #: accepts have small motion: a band that begins at 0.7 of the limit leaves nearly twice as many.
 FAST_BAND: Final = (0.3, 3.0)
 
@@ -72,7 +71,7 @@ class ValidatedBy(IntEnum):
 class Rollout:
     outcomes: list[Outcome] = field(default_factory=lambda: [Outcome.NOT_TRIED] * len(DIRECTIONS))
     margin: float = 0.0
-    """Worst displacement or rotation over its limit, after the end of the squeeze."""
+    """Largest displacement or rotation over its limit, after the end of the squeeze."""
     penetration_m: float = 0.0
     self_penetration_m: float = 0.0
     steps: int = 0
@@ -107,7 +106,7 @@ class Test:
         self._close(grasps, row)
         self._save()
         for direction in range(len(DIRECTIONS)):
-            # The simulation is deterministic: closing again would give this very state, bit for bit.
+            # The simulation is deterministic: closing again would give the same state, bit for bit.
             self._restore()
             self._push(direction)
             outcome = Outcome.HELD
@@ -128,7 +127,7 @@ class Test:
         if rollout.outcomes[0] is Outcome.PENETRATION:
             return rollout
         if not self._close(grasps, row, give_up=True) or self._validate(rollout) is not Outcome.HELD:
-            # Wrong only if a push brings the object back inside the limits, which none of 690 grasps did.
+            # The result is wrong only if a push brings the object back inside the limits. None of 690 grasps did so.
             rollout.margin = max(rollout.margin, self._excess())
             rollout.steps = self._steps
             return rollout.fail(Outcome.DIVERGED if void(self.data) else Outcome.LOST_WHILE_CLOSING)
@@ -146,7 +145,7 @@ class Test:
         self._steps = 0
         rollout = Rollout()
         rollout.penetration_m, rollout.self_penetration_m = self._depths(grasps.grasp, row)
-        # As published, the depth at the start of the simulation decides; the depth at the grasp is for information.
+        # As published, the depth at the start of the simulation decides. The depth at the grasp is for information.
         if max(self._depths(grasps.pregrasp, row)) > MAX_PENETRATION_M:
             return rollout.fail(Outcome.PENETRATION)
         return rollout
@@ -204,7 +203,8 @@ class Test:
         self.data.xfrc_applied[self.scene.object_body, :3] = self.scene.push * np.array(DIRECTIONS[direction])
 
     def _hold(self, rollout: Rollout) -> Outcome:
-        """Sequential test: reject if a limit is exceeded; accept if faster motion until 2 s would stay inside it."""
+        """Sequential test: reject if a limit is exceeded; accept if faster motion until 2 s would stay inside the
+        limit."""
         elapsed = FIRST_LOOK_S - INTERVAL_S
         self._run(elapsed)
         before, turned_before = self._offset(), self._motion()[1]

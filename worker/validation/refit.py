@@ -1,8 +1,7 @@
 """The same hand with other collision shapes, as in another author's model of it.
 
-hull: one convex hull per link; primitive: the best-fitting box, cylinder or capsule of each hull; capsule: a capsule
-for each piece whose width and thickness are similar. Any of these may also be grown or shrunk.
-"""
+hull: one convex hull per link. primitive: the best-fitting box, cylinder or capsule of each hull. capsule: a capsule
+for each piece whose width and thickness are similar. All of these may be grown or shrunk."""
 
 from __future__ import annotations
 
@@ -146,8 +145,8 @@ def _like(piece: ConvexPiece, kind: str) -> ConvexPiece:
 
 def _capsule(solid: float, across: float) -> tuple[float, float]:
     """Return radius and length of a capsule of a volume [m^3] and a variance across its axis [m^2].
-    The variance is at least the sphere's. A cylinder's variance is r^2 / 4, a ball's r^2 / 5. A capsule's is
-    r^2 (1 / 4 - s / 20), where s is its caps' share of the volume. The solution iterates: s grows with r^3 and has
+    The variance is at least the sphere's. A cylinder's variance is r^2 / 4, a ball's r^2 / 5. A capsule's variance is
+    r^2 (1 / 4 - s / 20), where s is the caps' share of the volume. The solution iterates: s grows with r^3 and has
     little effect on r."""
     radius = 2 * math.sqrt(across)
     for _ in range(20):
@@ -157,7 +156,7 @@ def _capsule(solid: float, across: float) -> tuple[float, float]:
 
 
 def _distance(one: ConvexPiece, piece: ConvexPiece) -> float:
-    """Return the mean distance of a piece's surface from a primitive's [m]."""
+    """Return the mean distance of a piece's surface from the surface of a primitive [m]."""
     points, _ = sample("hull", (), piece.vertices, piece.faces, _SAMPLES, np.random.default_rng(0))
     local = apply(invert(one.pose), points)
     return float(np.abs(signed_distance(one.kind, one.size, one.vertices, one.faces, local)).mean())
@@ -166,7 +165,7 @@ def _distance(one: ConvexPiece, piece: ConvexPiece) -> float:
 def _offset(vertices: Floats, by_m: float) -> Floats:
     """Return the corners of a convex solid with its faces moved outward by `by_m` [m].
     The result is the intersection of half-spaces along the face normals and, if growing, the mean normals at corners.
-    In these directions its support function is that of the Minkowski sum with a ball."""
+    In these directions it has the support function of the Minkowski sum with a ball."""
     from scipy.spatial import ConvexHull, HalfspaceIntersection
 
     scale = float(np.ptp(vertices, axis=0).max())

@@ -1,9 +1,8 @@
 """Robustness: verdicts in other models of the same hand and object, and with the object displaced.
 
-A grasp is validated in k models. Each departs from the nominal model along one axis (`variant`); axes alternate in
-random order. Models depend only on the seed and the grasp's own numbers: a grasp gets the same models in any set, and
-the first 8 of 16 models are the same as with 8.
-"""
+A grasp is validated in k models. Each model differs from the nominal model along one axis (`variant`); axes alternate
+in random order. Models depend only on the seed and the grasp's own numbers. A grasp therefore gets the same models in
+any set, and the first 8 of 16 models are the same as with 8."""
 
 from __future__ import annotations
 
@@ -81,7 +80,7 @@ def needed(wanted: float, models: int) -> int:
 
 
 def reaches(share: Floats, wanted: float) -> NDArray[np.bool_]:
-    """Check (N,) whether shares (N,) reach the wanted one; nan does not."""
+    """Return a mask (N,) of shares (N,) that reach the wanted one; nan does not."""
     return np.asarray(np.nan_to_num(share, nan=-1.0) >= wanted - _EXACT)
 
 
@@ -101,6 +100,7 @@ def robust(
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Robustness:
     """Validate grasps in models around the nominal one, by six pushes at level standard or by lifts.
+    Raises InputError: no scene or approach of each grasp. MeshError: the object has no usable convex pieces.
 
     Args:
         held: (N,) verdicts of the nominal model; only grasps with 1 are tested. By default all.
@@ -109,12 +109,7 @@ def robust(
         seed: of the models, with the grasp's own numbers.
         hard: at the hard protocol's friction.
         pieces: convex pieces of the object; by default its CoACD pieces.
-        run: receives the number of finished grasps; polled for cancellation between models.
-
-    Raises:
-        InputError: no scene or approach of each grasp.
-        MeshError: the object has no usable convex pieces.
-    """
+        run: receives the number of finished grasps; polled for cancellation between models."""
     if placed is not None:
         require_ways(grasps, placed, level)
     began = time.perf_counter()

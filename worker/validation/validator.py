@@ -41,7 +41,7 @@ class Verdicts:
     outcome: NDArray[np.uint8]
     """(N, 6) `Outcome` of each push +x -x +y -y +z -z; pushes after the first failure are not simulated."""
     margin: Floats
-    """(N,) worst displacement or rotation over its limit."""
+    """(N,) largest displacement or rotation over its limit."""
     penetration_depth_mm: Floats
     """(N,) penetration of hand and object, measured with the engine's convex pieces."""
     self_penetration_depth_mm: Floats
@@ -90,9 +90,9 @@ def validate(
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Verdicts:
     """Validate grasps by DexGraspBench's force-closure protocol; levels: see `worker.validation.protocol`.
-
     MuJoCo releases the GIL while it steps, so threads use a few cores; for many cores `run` has a process pool. If
-    `run` has a prefilter, it decides the clear cases, see `worker.validation.prefilter.prefilter`.
+    `run` has a prefilter, it decides the clear cases, see `worker.validation.prefilter.prefilter`. Raises InputError:
+    unknown level. MeshError: the object has no usable convex pieces. TaskCancelled: `run.cancelled()` returned True.
 
     Args:
         hand: the hand; its stiffness and effort are the actuators' gains and limits.
@@ -103,19 +103,13 @@ def validate(
         pieces: convex pieces of the object; by default its CoACD pieces.
         known: finished CPU rollouts with the same terms, which are reused; new ones are added to it.
         prefilter: result of `prefiltered` on these grasps with the same terms; None: it is computed.
-        run: receives the number of finished grasps; polled for cancellation between grasps.
-
-    Raises:
-        InputError: unknown level.
-        MeshError: the object has no usable convex pieces.
-        TaskCancelled: `run.cancelled()` returned True.
-    """
+        run: receives the number of finished grasps; polled for cancellation between grasps."""
     if level not in LEVELS:
         raise InputError(f"unknown level {level!r}; choose one of {', '.join(LEVELS)}")
     began = time.perf_counter()
     pieces = pieces or decompose(obj)
     prefilter_terms = first_terms(hand, level, run)
-    # The prefilter leaves only cases near a limit. For these, coarse physics would defer to level standard anyway.
+    # The prefilter leaves only cases near a limit. For such cases, coarse physics would defer to level standard anyway.
     of_the_cpu: Level = "standard" if prefilter_terms else level
     case = _Case(hand, obj, pieces, of_the_cpu, hard)
     terms = verdict_key(hand, obj, level, hard, pieces=pieces, prefilter=prefilter_terms)
@@ -236,7 +230,7 @@ class _Tests:
             return self._full.standard(grasps, row)
         rollout = self._coarse.standard(grasps, row)
         low, high = FAST_BAND
-        # Penetration has no margin: it is geometric, the same in coarse and full physics.
+        # Penetration has no margin: it is geometric, and equal in coarse and full physics.
         clear = rollout.outcomes[0] is Outcome.PENETRATION or not low < rollout.margin < high
         if clear and Outcome.DIVERGED not in rollout.outcomes:
             return rollout

@@ -1,8 +1,7 @@
 """Variants of the validator's model: other plausible shapes, drives, tendons, masses and poses.
 
 A `Variant` describes how a model departs from the nominal one. `draw` draws a variant, and `Models` validates in it:
-new shapes are recompiled, other numbers are changed in a copy.
-"""
+new shapes are recompiled, other numbers are changed in a copy."""
 
 from __future__ import annotations
 
@@ -103,12 +102,8 @@ def dealt(hand: HandModel, models: int, seed: tuple[int, ...]) -> list[Axis]:
 
 def draw(axis: Axis, hand: HandModel, rng: np.random.Generator) -> Variant:
     """Draw a variant of a hand along one axis.
-
-    Directions are uniform on the sphere, sizes uniform in their range, factors log-uniform.
-
-    Raises:
-        ValueError: no axis is given, or the hand has no couplings.
-    """
+    Directions are uniform on the sphere, sizes uniform in their range, factors log-uniform. Raises ValueError: no axis
+    is given, or the hand has no couplings."""
     match axis:
         case Axis.SHAPES:
             fits = {"own", *fits_of(hand)}
@@ -162,7 +157,7 @@ def _vector(rng: np.random.Generator, most: float) -> Vector:
 def recoupled(hand: HandModel, coupling: Coupling) -> HandModel:
     """Return the hand with another interpretation of its tendons; unchanged without tendons, or for other couplings.
     separate: each joint of a tendon gets the drive it would have without the tendon. ratio: joints of a tendon turn
-    together, by equal angles with their coefficients' signs; gain and limit are the sums over their drives."""
+    together, by equal angles with their coefficients' signs. Gain and limit are then the sums over their drives."""
     if not hand.tendons or coupling not in ("separate", "ratio"):
         return hand
     if coupling == "separate":
@@ -201,7 +196,7 @@ def recoupled(hand: HandModel, coupling: Coupling) -> HandModel:
 
 
 def nearest(hand: HandModel, joints: Floats) -> Floats:
-    """Return joint positions (N, J), feasible for a hand with fewer dofs, that are nearest to the given ones."""
+    """Return the joint positions (N, J), feasible for a hand with fewer dofs, nearest to the given ones."""
     dof, rate = hand.dof[hand.joint_body], hand.multiplier[hand.joint_body]
     drive = np.zeros((len(dof), hand.dofs))
     drive[np.arange(len(dof)), dof] = rate
@@ -243,13 +238,9 @@ class Models:
     def lift(
         self, grasps: GraspSet, row: int, placed: PlacedGrasps, variant: Variant, *, dexgraspbench: bool = False
     ) -> LiftTest:
-        """Lift a grasp in a variant; for the nominal one the result equals `validate_lifts` bit for bit.
-
-        Args:
-            grasps: the grasps, with their approach except at level dexgraspbench.
-            placed: the scenes of all grasps, with the supports and neighbours of these models.
-            dexgraspbench: run the published test instead of the full one.
-        """
+        """Lift a grasp in a variant; for the nominal variant the result equals `validate_lifts` bit for bit.
+        `grasps` have their approach except at level dexgraspbench. `placed` has the scenes of all grasps, with the
+        supports and neighbours of these models. `dexgraspbench`: run the published test instead of the full one."""
         number = int(placed.index[row])
         variant = upright(variant, placed.scenes[number].up)
         one, where = seen(self.obj, grasps, row, variant), placed.take(slice(row, row + 1))

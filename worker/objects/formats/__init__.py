@@ -37,12 +37,8 @@ _WITH_LOOKS: Final = (".obj", ".dae")
 
 def read_mesh(filename: str, data: bytes, nearby: Nearby = nothing_nearby) -> Soup:
     """Read vertices and triangles of a mesh file; the extension determines the format.
-    `nearby` returns material libraries and pictures by their names in the file.
-
-    Raises:
-        MeshError: unknown format, unreadable, no faces, a bad index or a coordinate that is not finite.
-        LimitError: more than `MAX_FACES` faces.
-    """
+    `nearby` returns material libraries and pictures by their names in the file. Raises MeshError: unknown format,
+    unreadable, no faces, a bad index or a coordinate that is not finite. LimitError: more than `MAX_FACES` faces."""
     suffix = PurePosixPath(filename).suffix.lower()
     reader = READERS.get(suffix)
     if reader is None:
@@ -53,13 +49,13 @@ def read_mesh(filename: str, data: bytes, nearby: Nearby = nothing_nearby) -> So
     text = _marked_text(data)
     refuse_stand_in(filename, text, MeshError)
     try:
-        # The check below finds invalid numbers; NumPy's warnings are not needed.
+        # The check below finds invalid numbers, so NumPy's warnings are not needed.
         with np.errstate(all="ignore"):
             return check_soup(reader(text, nearby) if suffix in _WITH_LOOKS else reader(text))
     except GraspdError as error:
         raise type(error)(f"{filename}: {other_format(filename, text) or error}") from None
     except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError, struct.error) as error:
-        # Readers rely on NumPy and json for malformed input: any error there is due to the file.
+        # Readers rely on NumPy and json for malformed input: any of their errors is due to the file.
         kind = suffix[1:].upper()
         word = _NO_NUMBER.search(str(error))
         what = f"{word[1]!r} is no number" if word else f"a number or word in it is not valid {kind}"

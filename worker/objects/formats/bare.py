@@ -90,7 +90,7 @@ class _Ascii:
     def read(self, element: _Element) -> tuple[dict[str, np.ndarray], _Lists]:
         rows = self._lines[self._at : self._at + element.count]
         if len(rows) < element.count:
-            raise MeshError(f"truncated: {element.count} rows of {element.name} are promised, {len(rows)} are there")
+            raise MeshError(f"truncated: {element.count} rows of {element.name} are stated, {len(rows)} are there")
         self._at += element.count
         if not any(p.count_type for p in element.properties):
             width = len(element.properties)
@@ -164,7 +164,7 @@ class _Binary:
 
     def _take(self, dtype: np.dtype, count: int) -> np.ndarray:
         if count < 0 or dtype.itemsize * count > len(self._body) - self._at:
-            raise MeshError("truncated: the header promises more than the file holds")
+            raise MeshError("truncated: the header states more data than the file has")
         values = np.frombuffer(self._body, dtype, count=count, offset=self._at)
         self._at += dtype.itemsize * count
         return values
@@ -188,8 +188,8 @@ def read_stl(data: bytes) -> Soup:
         raise MeshError("neither binary STL nor text with facets; export the mesh again")
     held = (len(data) - _HEADER) / _RECORD.itemsize
     if _promised(data) > held:
-        raise MeshError(f"truncated: the header promises {_promised(data)} faces, the file holds {int(held)}")
-    # Some exporters append their own data: the length in the header is complete.
+        raise MeshError(f"truncated: the header states {_promised(data)} faces, the file has {int(held)}")
+    # Some exporters append their own data; all faces stated in the header are present.
     return _binary(data, _promised(data))
 
 
@@ -242,12 +242,12 @@ def read_off(data: bytes) -> Soup:
     vertex_count, face_count = int(rows[0][0]), int(rows[0][1])
     check_face_count(face_count)
     if min(vertex_count, face_count) < 0 or vertex_count + face_count > len(rows) - 1:
-        raise MeshError(f"truncated: {vertex_count} vertices and {face_count} faces are promised, not all are there")
+        raise MeshError(f"truncated: not all of the stated {vertex_count} vertices and {face_count} faces are present")
     vertices = np.array([row[:3] for row in rows[1 : 1 + vertex_count]], dtype="S40").astype(float).reshape(-1, 3)
     faces = rows[1 + vertex_count : 1 + vertex_count + face_count]
     counts = np.array([int(row[0]) for row in faces], dtype=np.int64)
     for number, (count, row) in enumerate(zip(counts, faces, strict=True)):
         if not 0 <= count < len(row):
-            raise MeshError(f"face {number} promises {count} corners and has {len(row) - 1}")
+            raise MeshError(f"face {number} states {count} corners but has {len(row) - 1}")
     corners = [int(word) for row in faces for word in row[1 : 1 + int(row[0])]]
     return Soup(vertices, triangulate(vertices, counts, np.array(corners, dtype=np.int64)))

@@ -1,8 +1,7 @@
 """COLLADA: triangles of all meshes of the scene in metres, and their colours.
 A colour is the diffuse colour of the material or the mean of its picture.
 
-The file's unit is applied, its up axis is not, as in the viewers of ROS, for which such meshes are made.
-"""
+The file's unit is applied. Its up axis is ignored, as in the viewers of ROS, for which such meshes are made."""
 
 from __future__ import annotations
 
@@ -98,7 +97,7 @@ class _Library:
                 counts, order = _polygons(primitive, kind, stride)
                 corners = order[int(source.get("offset", "0")) :: stride]
                 if int(counts.sum()) != len(corners) or (counts < 0).any():
-                    raise MeshError("a primitive promises other corners than it has; export the mesh again")
+                    raise MeshError("the stated number of a primitive's corners is wrong; export the mesh again")
                 yield points, triangulate(points, counts, corners), primitive.get("material", "")
 
     def _points(self, reference: str | None) -> np.ndarray:
@@ -176,7 +175,7 @@ def _instances(root: Element, library: _Library) -> Iterator[tuple[str, np.ndarr
 
     for node, matrix in walk(scene.findall("node") if scene is not None else [], _matrix, below):
         if node.find("instance_controller") is not None:
-            raise MeshError("a skinned mesh is posed by its bones; apply the armature and export it without")
+            raise MeshError("a skinned mesh is posed by its bones; apply the armature and export it without bones")
         for instance in node.findall("instance_geometry"):
             bound = {
                 link.get("symbol", ""): link.get("target", "")

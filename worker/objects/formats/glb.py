@@ -1,7 +1,6 @@
 """GLB (binary glTF 2.0): triangles of all meshes of the scene, in its frame and metres, with colours.
 
-A colour is the base colour of the material, times the mean of its texture if that is in the file.
-"""
+A colour is the base colour of the material, times the mean of its texture if the file contains the texture."""
 
 from __future__ import annotations
 
@@ -18,12 +17,12 @@ from graspd.worker.objects.formats.obj import UNREADABLE, mean_colour
 from graspd.worker.objects.formats.soup import Part, Soup, soup_of, walk
 
 _INDEX_TYPES = {5121: "<u1", 5123: "<u2", 5125: "<u4"}
-#: Positions are floats, or with KHR_mesh_quantization integers that nodes or `normalized` scale.
+#: Positions are floats or, with KHR_mesh_quantization, integers that nodes or `normalized` scale.
 _POSITION_TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 _TRIANGLES = 4
 #: Extensions that contain or place vertices: refused by name wherever they occur.
 _GEOMETRY = ("KHR_draco_", "EXT_meshopt_", "KHR_meshopt_", "EXT_mesh_gpu_instancing")
-#: Extensions that move no vertex; any other one that a file requires is refused by name.
+#: Extensions that move no vertex; any other extension that a file requires is refused by name.
 _HARMLESS = ("KHR_mesh_quantization", "KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_", "KHR_xmp_")
 _UNKNOWN: Final = np.full(3, np.nan)
 
@@ -43,7 +42,7 @@ def _parts(document: dict[str, Any], binary: bytes) -> Iterator[Part]:
         shown = _item(document, "meshes", mesh)
         _refuse_morphs(shown)
         for part, primitive in enumerate(shown["primitives"]):
-            # Points and lines have no surface: CAD exporters add the edges of faces as lines.
+            # Points and lines have no surface; CAD exporters add the edges of faces as lines.
             if 0 <= primitive.get("mode", _TRIANGLES) < _TRIANGLES:
                 continue
             points, triangles = _primitive(document, binary, primitive)
@@ -86,7 +85,7 @@ def _instances(document: dict[str, Any]) -> Iterator[tuple[int, np.ndarray]]:
         _refuse_extensions(node)
         _refuse_morphs(node)
         if "skin" in node:
-            raise MeshError("a skinned mesh is posed by its bones; apply the armature and export it without")
+            raise MeshError("a skinned mesh is posed by its bones; apply the armature and export it without bones")
         if "mesh" in node:
             yield int(node["mesh"]), matrix
 
@@ -153,7 +152,7 @@ def _accessor(document: dict[str, Any], binary: bytes, index: Any, shape: str) -
 
 
 def _refuse_extensions(part: dict[str, Any]) -> None:
-    """Refuse extensions that replace the vertices; others that a file does not require are ignored."""
+    """Refuse extensions that replace the vertices; other extensions that a file does not require are ignored."""
     for name in part.get("extensions", {}):
         if name.startswith(_GEOMETRY):
             raise _refusal(name)
@@ -161,7 +160,7 @@ def _refuse_extensions(part: dict[str, Any]) -> None:
 
 def _refuse_morphs(part: dict[str, Any]) -> None:
     if any(part.get("weights", [])):
-        raise MeshError("a mesh has morph targets with weights; apply its shape keys and export it without")
+        raise MeshError("a mesh has morph targets with weights; apply its shape keys and export it without them")
 
 
 def _refusal(name: str) -> MeshError:

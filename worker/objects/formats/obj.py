@@ -25,7 +25,7 @@ def nothing_nearby(reference: str) -> bytes | None:
 
 def read(data: bytes, nearby: Nearby = nothing_nearby) -> Soup:
     """Read triangles of the polygons; negative indices count from the latest vertex.
-    A face has its corners' mean colour, or else that of its material."""
+    The colour of a face is its corners' mean colour, or else that of its material."""
     vertices: list[list[bytes]] = []
     shades: list[list[bytes]] = []
     corners: list[int] = []
@@ -73,7 +73,7 @@ def _material_colours(
     row = {name: 1 + number for number, name in enumerate(names)}
     palette = np.array([unknown, *(known.get(name, unknown) for name in names)])
     starts = np.array([first for first, _ in used])
-    # Polygons before the first `usemtl` have no material; each becomes as many triangles as in `triangulate`.
+    # Polygons before the first `usemtl` have no material; each gives as many triangles as in `triangulate`.
     material = np.array([0, *(row[name] for _, name in used)])
     of_polygon = material[np.searchsorted(starts, np.arange(len(counts)), side="right")]
     colours = palette[np.repeat(of_polygon, np.maximum(counts - 2, 0))]
@@ -101,7 +101,7 @@ def _lines(data: bytes) -> Iterable[bytes]:
     for raw in data.splitlines():
         line = raw.strip()
         if not line.startswith((b"usemtl", b"mtllib")):
-            # A comment that ends in a backslash, as a path may, does not continue on the next line.
+            # A comment that ends in a backslash, such as a path, does not continue on the next line.
             line = line.partition(b"#")[0].rstrip()
         line = pending + line
         if line.endswith(b"\\"):
@@ -121,7 +121,7 @@ Nearby = Callable[[str], bytes | None]
 
 
 def read_materials(data: bytes, nearby: Nearby) -> dict[bytes, Floats]:
-    """Read each material's sRGB colour (3,), 0 .. 1. Pictures override numbers; unreadable: skipped."""
+    """Read each material's sRGB colour (3,), 0 .. 1. Pictures override numbers; unreadable pictures are skipped."""
     found: dict[bytes, Floats] = {}
     name: bytes | None = None
     pictures = 0
@@ -167,10 +167,7 @@ UNREADABLE: Final = (ValueError, OSError, SyntaxError)
 
 def mean_colour(data: bytes) -> Floats:
     """Compute the sRGB mean (3,) of a PNG or JPEG, 0 .. 1.
-
-    Raises:
-        ValueError, OSError, SyntaxError: too large, or not such a picture (`UNREADABLE`).
-    """
+    Raises ValueError, OSError, SyntaxError: too large, or not such a picture (`UNREADABLE`)."""
     from PIL import Image  # few meshes have pictures, and every process reads meshes
 
     bomb = Image.DecompressionBombWarning

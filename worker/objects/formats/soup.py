@@ -50,7 +50,7 @@ Part = tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64], NDArra
 def walk(
     roots: Iterable[Node], matrix_of: Callable[[Node], Floats], below: Callable[[Node], Iterable[Node]]
 ) -> Iterator[tuple[Node, Floats]]:
-    """Yield each node of a scene with its 4x4 matrix; a node that is named twice is there twice."""
+    """Yield each node of a scene with its 4x4 matrix; a node that is named twice appears twice."""
     stack = [(node, np.eye(4), 0) for node in roots]
     visited = 0
     while stack:
@@ -107,7 +107,7 @@ def check_face_count(count: int) -> None:
 
 Ints = NDArray[np.int64]
 
-#: Limit on the sum of squared corner numbers of re-entrant polygons: triangulation takes up to 2 ns per unit of it.
+#: Limit on the sum of squared corner numbers of re-entrant polygons; triangulation needs up to 2 ns per unit.
 MAX_SQUARES: Final = 10**9
 #: Least area, relative to the polygon's, of a triangle that counts as against the polygon's winding.
 _AGAINST: Final = 1e-9
@@ -115,13 +115,9 @@ _AGAINST: Final = 1e-9
 
 def triangulate(vertices: Floats, counts: Ints, corners: Ints) -> Ints:
     """Triangulate polygons with `counts` corners each, concatenated in `corners`; return triangles (F, 3).
-
     A polygon is cut as a fan from its first corner, or by manifold3d's ear clipping if the fan would leave it. Faces
-    with fewer than three corners are dropped.
-
-    Raises:
-        LimitError: too many faces, or re-entrant polygons of too many corners.
-    """
+    with fewer than three corners are dropped. Raises LimitError: too many faces, or re-entrant polygons of too many
+    corners."""
     number = np.maximum(counts - 2, 0)
     check_face_count(int(number.sum()))
     starts, ends = np.cumsum(counts) - counts, np.cumsum(number)
@@ -141,7 +137,7 @@ def triangulate(vertices: Floats, counts: Ints, corners: Ints) -> Ints:
     for one in wrong:
         ring = corners[starts[one] : starts[one] + counts[one]]
         inside = manifold3d.triangulate([_flat(vertices[ring], whole[one])])
-        # A self-intersecting polygon may come back with fewer: it stays a fan.
+        # Clipping of a self-intersecting polygon may return fewer triangles; such a polygon stays a fan.
         if len(inside) == number[one]:
             triangles[ends[one] - number[one] : ends[one]] = ring[inside]
     return triangles

@@ -1,17 +1,16 @@
 """Antipodal starts: opposed fingers around a pair of surface points, opened slightly wider than the pair.
 
-The normals of the two surface points are opposite (antipodal points: Nguyen, "Constructing force-closure grasps",
-1988). Pairs are found by comparing samples of the surface with one another.
+Two surface points with opposite normals are antipodal (Nguyen, "Constructing force-closure grasps", 1988). Pairs are
+found by comparing samples of the surface with one another.
 
-A few outline points per posture give the distance by which a hand must rise to be clear of obstacles. This test is
-cheap enough for many more hands than the exact collision test.
+The distance by which a hand must rise to be clear of obstacles is computed from a few outline points per posture. This
+test is cheap enough for many more hands than the exact collision test.
 
 Around a free object, hands also start at random pairs that are no wider than the hand opens (`ReachSampling`). In most
-draws a finger or the palm penetrates the object: balls in the hand reject these draws before the simulation checks.
+draws a finger or the palm penetrates the object. A test of balls in the hand rejects such draws before the simulation.
 
 A fingertip is modelled as a ball with the thickness of the hand's thinnest fingertip, next to an end of a pair. Space
-for this ball is necessary for a grasp between opposed fingertips, but not sufficient.
-"""
+for this ball is necessary for a grasp between opposed fingertips, but not sufficient."""
 
 from __future__ import annotations
 
@@ -50,30 +49,30 @@ from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.mounting import OUTERMOST, points_of
 from graspd.worker.simulation.obstacles import MARGIN_M
 
-#: Number of surface samples that form pairs, and the least cosine between a pair's line and its normals: inside the
-#: friction cones at half friction. At half friction, with a cosine of 0.9 Allegro lifts .39 of
-#: grasps on six objects and Shadow .30; with 0.96 Allegro lifts .42 and Shadow .39.
+#: Number of surface samples that form pairs, and least cosine between a pair's line and its normals. Such lines are
+#: inside the friction cones at half friction. Share of grasps on six objects that lift at half friction, with a cosine
+#: of 0.9: Allegro .39, Shadow .30; with 0.96: Allegro .42, Shadow .39.
 SAMPLES: Final = 500
 ACROSS: Final = 0.96
 #: Least distance of the two points [m].
 THINNEST_M: Final = 0.002
 #: Clearance between pad and object, on each side [m].
 ROOM_M: Final = (0.003, 0.015)
-#: At this horizontal distance from the centre of mass [m] the probability of a pair falls by a factor of e. It is at
-#: least `FAR` times that of the best pair, but lower for steep pairs and pairs that are hard to reach. With 30 mm and
-#: 0.02 for `FAR`, Allegro holds 0.28 of grasps on six objects at half friction; with these values it holds 0.38.
+#: Horizontal distance from the centre of mass at which the probability of a pair falls by a factor of e [m], and least
+#: factor. The probability is lower for steep pairs and pairs that are hard to reach. Share of Allegro grasps on six
+#: objects held at half friction: 0.28 with 30 mm and a least factor of 0.02, 0.38 with these values.
 BESIDE_M: Final = 0.02
 FAR: Final = 0.005
 STEEP: Final = 0.5
 SELDOM: Final = 0.1
 #: Largest distance of the pads from the ends of the pair at which a candidate counts as close enough [m].
 NEAR_M: Final = 0.008
-#: Number of hands whose draws are compared at once; more would only need more memory.
+#: Number of hands whose draws are compared at once; a larger number needs more memory and saves no time.
 AT_ONCE: Final = 256
 #: Least cosine between an approach from above and the vertical, for flat objects.
 UPRIGHT: Final = 0.9
-#: Noise of the posture as a share of each joint's range; number of directions compared per draw; tolerances of postures
-#: narrower and wider than the drawn width [m].
+#: Noise of the posture as a share of each joint's range, and number of directions compared per draw. Tolerances of
+#: postures that are narrower, and of postures that are wider than the drawn width [m].
 NOISE: Final = 0.03
 WAYS: Final = 4
 ALIKE_M: Final = (0.002, 0.006)
@@ -119,7 +118,7 @@ class Openings:
     up: Floats
     """(3,) direction against gravity, object frame."""
     upright: bool
-    """Whether the hand approaches from above and grasps level pairs only."""
+    """Whether the hand approaches from above and grasps only level pairs."""
     within_reach: bool
     """Whether a pair is nearly level, clear of obstacles, and no wider than the hand opens.
     This is the geometric condition for a grasp between opposed fingers from above or from the side."""
@@ -183,7 +182,7 @@ class AntipodalHands:
     turn: Floats
     away: Floats
     deep: Floats
-    """(n,) distance of the pads beyond the pair; a larger one brings the palm nearer to the object [m]."""
+    """(n,) distance of the pads beyond the pair [m]; a larger distance brings the palm nearer to the object."""
 
     def q(self, hand: HandModel, normal: Floats) -> Floats:
         known = self.known.q[self.posture]
@@ -191,7 +190,7 @@ class AntipodalHands:
 
     def beside(self, moved: Floats) -> Floats:
         """Return the distance (n, ...) of the pair from pads that have moved by (n, ..., 3), sideways or ahead [m].
-        A pair nearer to the palm also lies between the fingers."""
+        A pair nearer to the palm is also between the fingers."""
         away = self.away.reshape(len(self.deep), *(1,) * (moved.ndim - 2), 3)
         off = moved - self.deep.reshape((*away.shape[:-1], 1)) * away
         along = np.einsum("n...i,ni->n...", off, self.away)
@@ -235,8 +234,8 @@ def promising(
     keep: int,
 ) -> tuple[NDArray[np.intp], Floats]:
     """Select the `keep` of C draws per hand that need the least rise to clear the obstacles, (n, keep).
-    Also return the distance of the pair from between the pads (n, keep) [m]. Close enough draws keep their order.
-    `uniform` (n, C, 6) and `ways`: see `across`; `room`: clearance in addition to the margin [m]."""
+    Also return the distance of the pair from the middle of the pads (n, keep) [m]. Draws below `NEAR_M` keep their
+    order. For `uniform` (n, C, 6) and `ways` see `across`; `room` is clearance in addition to the margin [m]."""
     count, draws, _ = uniform.shape
     outlines, off = outlines_of(hand, opening.known.q), np.zeros((count, draws))
     for rows in np.array_split(np.arange(count), 1 + count // AT_ONCE):
@@ -275,7 +274,7 @@ class PostureOutlines:
     def lacks(
         self, posture: NDArray[np.intp], turn: Floats, centre: Floats, scene: Environment, *, room: float
     ) -> Floats:
-        """Return the clearance (n,) missing at hands and mountings, relative to the margin plus `room` [m], at least 0.
+        """Return the clearance (n,) missing at hands and mountings, relative to the margin plus `room` [m]; at least 0.
         Hands have postures (n,), rotations (n, 3, 3) and palm centres (n, 3), object frame [m]."""
         place = np.matmul(self.points[posture], np.swapaxes(turn, -1, -2)) + centre[:, None]
         lack = np.zeros(len(posture))
@@ -285,7 +284,7 @@ class PostureOutlines:
         return np.maximum(lack, self._mounting_lacks(turn, centre, scene, MARGIN_M + room))
 
     def _mounting_lacks(self, turn: Floats, centre: Floats, scene: Environment, wanted: float) -> Floats:
-        """Return the clearance (n,) that mountings miss relative to `wanted`, at their best wrist position [m]."""
+        """Return the clearance (n,) missing at mountings relative to `wanted`, at their best wrist position [m]."""
         least = np.full(len(turn), np.inf if len(self.mounting) else 0.0)
         for points in self.mounting:
             rows = np.flatnonzero(least > 0.0)
@@ -365,10 +364,10 @@ DRAWS: Final = 512
 LOOKS: Final = 8
 #: Probability of a pair far from the centre of mass, relative to a pair through it.
 FAR_ACROSS: Final = 0.05
-#: Number of balls in the hand and their radius [m]: they touch its surface from inside and protrude from thinner links.
+#: Number of balls in the hand, and their radius [m]. They touch its surface from inside and protrude from thin links.
 BALLS: Final = 96
 BALL_M: Final = 0.005
-#: An object is small if all its pairs are narrower than this and than the smallest gap of the hand's pads [m].
+#: An object is small if all its pairs are narrower than this [m] and than the smallest gap of the hand's pads.
 SMALL_M: Final = 0.017
 #: Error of the grid's distances [m].
 SLACK_M: Final = 0.001

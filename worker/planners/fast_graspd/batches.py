@@ -1,7 +1,6 @@
 """Batches planned in one launch: the batch of each grasp, and which batches have stopped.
 
-A batch stops when it is cancelled or fails; the other batches continue.
-"""
+A batch stops when it is cancelled or fails; the other batches continue."""
 
 from __future__ import annotations
 
@@ -29,7 +28,7 @@ class Batches:
     """Grasps of several batches, one batch after the other; a row is a grasp."""
 
     def __init__(self, asked: Sequence[BatchRequest], obj: ObjectModel, warm: WarmStart | None = None) -> None:
-        """All batches have one fidelity; either all or none are in scenes, with the same supports and neighbours.
+        """All batches have one fidelity. Either all or none are in scenes, with the same supports and neighbours.
         In scenes, `warm` proposes the starts of hands; None: `scene_starts` finds them."""
         self.asked, self.warm = asked, warm
         wanted = [one.wanted for one in asked]
@@ -47,7 +46,7 @@ class Batches:
         self.index = np.concatenate([one.first + np.arange(one.count) for one in wanted])
         """(n,) number of each row within its batch."""
         self.opened = np.zeros(len(self.owner), bool)
-        """(n,) whether the hands of a row start more open than their pre-shape, because no start was clear in it."""
+        """(n,) whether the hands of a row start further open, because no start in their pre-shape was clear."""
         self.errors: dict[int, Exception] = {}
         """Errors of the batches that stopped."""
         known = self.fidelity
@@ -59,7 +58,7 @@ class Batches:
         """Free directions of each scene."""
         for owner, scenes in enumerate(placed):
             try:
-                # Either all or none: a scene's directions are found by its number.
+                # Either all batches have scenes or none has: the number of a scene selects its directions.
                 self.ways += [free_ways(scene, obj) for scene in scenes.scenes]
             except InputError as error:
                 self.ways += [np.zeros((0, 3))] * len(scenes.scenes)
@@ -111,7 +110,7 @@ class Batches:
         ]
 
     def rollout(self, grasps: GraspSet, rows: Rows, beat: Floats) -> Floats:
-        """Score (n,) grasps of these rows by their batches' rollouts; `beat` (n,): scores to improve on.
+        """Score (n,) grasps of these rows by their batches' rollouts; `beat` (n,): scores to beat.
         Grasps of stopped batches count as good enough."""
         owners, scores = self.owner[rows], np.zeros(len(grasps))
         placed = self.placed.take(rows) if self.placed is not None else None

@@ -24,7 +24,7 @@ COARSE_SELF_POINTS: Final = 400
 FINE_SELF_POINTS: Final = 1000
 COARSE_SAMPLES: Final = 1500
 #: Factor on the fidelity's object samples around a free object, and their maximum. Penetration between two samples is
-#: not detected; its median is .2 mm with the fidelity's own number.
+#: not detected; with the fidelity's own number its median is .2 mm.
 DENSER, DENSEST = 3, 12_000
 #: Number of pairs cached on the device.
 KEPT: Final = 4
@@ -49,13 +49,13 @@ class Pair:
 
     def model(self, side: PhaseGeometry, obstacles: DeviceObstacles | None = None, *, pulled: bool = True) -> Model:
         """Return the model of hand and object for a phase; among obstacles it has no attraction term.
-        There, fingers that could enclose the object stay away from the table."""
+        With attraction, fingers that could enclose the object would collide with the table."""
         options = self.options if obstacles is None and pulled else replace(self.options, pull=0.0)
         return Model.create(self.hand, side.obj, side.points, side.own, options, obstacles)
 
 
 def pair_of(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, device: str, *, in_scenes: bool = False) -> Pair:
-    """Return the pair, cached. If no projection out of a free object follows, samples are those of the fidelity."""
+    """Return the pair, cached. Without a projection out of a free object, samples are those of the fidelity."""
     count = fidelity.object_points
     if fidelity.polish_iterations and not in_scenes:
         count = max(count, min(DENSER * count, DENSEST))

@@ -2,10 +2,9 @@
 Most starts are antipodal; in the others the palm faces a random point of the object, as in `starts`.
 A start has `ROOM` more clearance from obstacles than the later margin, so that the optimisation can rotate the hand.
 
-Before the expensive phases `hindrance` tests whether each hand can leave its grasp: by opening and retreating along the
-approach, and by the lift when closed. A hand hooked around an edge holds well but cannot reach its grasp; a hand
-close below a board cannot lift.
-"""
+Before the expensive phases `hindrance` tests whether each hand can leave its grasp: open, along the approach, and
+closed, by the lift. A hand hooked around an edge holds well but cannot reach its grasp. A hand close below a board
+cannot lift."""
 
 from __future__ import annotations
 
@@ -43,17 +42,17 @@ from graspd.worker.simulation.mounting import mounting_lack
 ROOM: Final = 0.006
 #: Nearest and farthest distance of a palm from the random point in front of it [m].
 GAP: Final = (0.004, 0.02)
-#: Retreat steps after contact [m]: longer than for a free object, since fingers must not reach the table.
+#: Retreat steps after contact [m]. They are longer than for a free object, since fingers must not reach the table.
 RETREATS: Final = (0.0, 0.01, 0.02, 0.035, 0.055, 0.08, 0.11)
 #: Draws per start before the least penetrating one is selected.
 DRAWS: Final = 96
 #: Draws whose random numbers are drawn together.
 DRAWN: Final = 8
-#: Half the width of a palm [m], number of approach directions, and least cosine to the nearest free direction.
+#: Half the width of a palm [m], number of approach directions, and least cosine with the nearest free direction.
 PALM_RADIUS: Final = 0.04
 DIRECTIONS: Final = 256
 NEAR_WAY: Final = 0.98
-#: `REACHING` of `EVERY` starts of a grasp are antipodal, each from the best `REACHES` of `CANDIDATES` draws.
+#: `REACHING` of `EVERY` starts of a grasp are antipodal. Each comes from the best `REACHES` of `CANDIDATES` draws.
 EVERY: Final = 8
 REACHING: Final = 7
 REACHES: Final = 8
@@ -69,7 +68,7 @@ _AcrossPairs = list[tuple[NDArray[np.intp], AntipodalHands]]
 def free_ways(scene: Environment, obj: ObjectModel) -> Floats:
     """Return free approach directions (K, 3), unit vectors in the object frame.
     Along a free direction, a ball of a palm's width can move from the object by `STANDOFF_M` without contact with an
-    obstacle. Raise InputError if there is none."""
+    obstacle. Raises InputError: there is no free direction."""
     ways = spread_directions(DIRECTIONS)
     out = ((obj.hull_vertices - obj.centre_of_mass) @ ways.T).max(axis=0)
     path = out[:, None] + PALM_RADIUS + np.linspace(0.0, STANDOFF_M, 9)
@@ -94,11 +93,9 @@ def clear_scene_starts(
     model: Model, generators: list[np.random.Generator], *, each: int, placed: PlacedGrasps, ways: Sequence[Floats]
 ) -> tuple[HandState, Floats]:
     """Return a start for each generator, `each` per grasp, and its depth (n,) [m].
-    The start is the first clear draw, or the least deep one; for antipodal starts, the clear draw with the best placed
-    pair.
-
-    In a narrow scene some grasps find no clear start: they are returned as blocked, and the others form the batch.
-    `ways` are the `free_ways` of each scene."""
+    The start is the first clear draw, or the least deep one; antipodal starts take the clear draw with the best placed
+    pair. In a narrow scene some grasps find no clear start: they are returned as blocked, and the other grasps form the
+    batch. `ways` are the `free_ways` of each scene."""
     hand, obj = model.hand.model, model.obj.model
     probe = Probe(model, len(generators), room=ROOM)
     used = set(placed.index.tolist())
@@ -120,7 +117,7 @@ def clear_scene_starts(
         if not len(rows):
             break
         if number == normal.shape[1]:
-            # Most starts need a few draws: random numbers of later draws are generated on demand.
+            # Most starts need a few draws, so random numbers of later draws are generated on demand.
             normal = np.concatenate([normal, _normal(generators, rows, hand.dofs)], axis=1)
         reach = reaching[rows] & (number < REACHES)
         numbers = np.where(reach, order[rows, min(number, REACHES - 1)], number)
@@ -129,7 +126,7 @@ def clear_scene_starts(
         worth = off < beside[rows, None]
         worth[~reach | (depth[rows] > CLEAR)] = True
         found = _depths(probe, states, placed, scene[rows], worth)
-        # Select the nearest clear distance, or else the least deep.
+        # Select the nearest clear distance, or else the least deep one.
         clear = found <= CLEAR
         pick = np.where(clear.any(axis=1), clear.argmax(axis=1), found.argmin(axis=1))
         at = np.arange(len(rows)), pick
@@ -154,9 +151,8 @@ def _depths(
 ) -> Floats:
     """Return depths (n, len(RETREATS)) [m] of hands and mountings in scenes (n,); inf if not computed. Depths are
     computed inwards, from the farthest distance with `worth` (n, len(RETREATS)), while they are clear.
-
-    Most draws fail for reasons that no retreat fixes. A draw that is not clear at one distance is hardly ever
-    clear at a smaller one."""
+    Most draws fail for reasons that no retreat fixes. A draw that is not clear at one distance is hardly ever clear at
+    a smaller one."""
     found, open_ = np.full((len(scene), len(RETREATS)), np.inf), np.ones(len(scene), bool)
     for k in reversed(range(len(RETREATS))):
         left = np.flatnonzero(open_ & worth[:, k])
@@ -174,7 +170,7 @@ def _depths(
 def _mounting_lack(
     probe: Probe, states: HandState, placed: PlacedGrasps, scene: NDArray[np.intp], *, exact: bool
 ) -> Floats:
-    """Return the clearance (n,) that mountings in scenes (n,) miss relative to the margin plus `ROOM` [m]."""
+    """Return the clearance (n,) missing at mountings in scenes (n,), relative to the margin plus `ROOM` [m]."""
     hand, obj = probe.model.hand.model, probe.model.obj.model
     poses = posture_of(hand, obj, states).hand_pose
     return mounting_lack(hand, poses, placed.scenes, scene, room=ROOM, exact=exact)
@@ -189,9 +185,8 @@ def _raise(
     probe: Probe,
 ) -> Floats:
     """Raise draws `rows` in scenes (n,), at all distances, by the clearance missing at the nearest distance.
-    Return the distance (n, len(RETREATS)) of their pairs from between the pads [m], 0 for other draws.
-
-    Retreat steps are too coarse for low objects: fingers would end above the object, not beside it."""
+    Return the distance (n, len(RETREATS)) of their pairs from the middle of the pads [m], 0 for other draws. Retreat
+    steps alone are too coarse for low objects: fingers would end above the object, not beside it."""
     off = np.zeros((len(scene), len(RETREATS)))
     if not len(rows):
         return off
@@ -219,7 +214,7 @@ class _Around:
     def order(
         self, uniform: Floats, scene: NDArray[np.intp], reaching: NDArray[np.bool_], placed: PlacedGrasps
     ) -> tuple[NDArray[np.intp], Floats]:
-        """Return (n, REACHES) draws of antipodal hands, see `promising`; inf for other hands."""
+        """Return draws (n, REACHES) of antipodal hands, see `promising`; inf for other hands."""
         order, least = np.zeros((len(scene), REACHES), np.intp), np.full((len(scene), REACHES), np.inf)
         for s in np.unique(scene[reaching]):
             rows = np.flatnonzero(reaching & (scene == s))
@@ -232,8 +227,8 @@ class _Around:
     def draws(
         self, uniform: Floats, normal: Floats, scene: NDArray[np.intp], reach: NDArray[np.bool_]
     ) -> tuple[HandState, _AcrossPairs]:
-        """Return hands drawn in scenes (n,), n * len(RETREATS), at each distance; and the antipodal ones, `reach` (n,).
-        They depend on uniform (n, 7) and normal (n, 2 + D) random numbers."""
+        """Return hands drawn in scenes (n,), n * len(RETREATS) at each distance; and the antipodal hands, `reach` (n,).
+        Hands depend on uniform (n, 7) and normal (n, 2 + D) random numbers."""
         n, dofs = len(uniform), self.hand.dofs
         pivot, rotation, q, away = np.zeros((n, 3)), np.zeros((n, 4)), np.zeros((n, dofs)), np.zeros((n, 3))
         reaching = []
@@ -253,7 +248,7 @@ class _Around:
         return at_distances(pivot, rotation, q), reaching
 
     def _towards(self, uniform: Floats, normal: Floats, ways: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Place hands whose palms face random surface points; the result is like that of `across`, without a pair."""
+        """Place hands with palms towards random surface points; the result is like that of `across`, without a pair."""
         hand, obj = self.hand, self.obj
         corners, normals, sums = surface_of(obj)
         face = np.minimum(np.searchsorted(sums, uniform[:, 0]), len(sums) - 1)
@@ -269,7 +264,7 @@ class _Around:
 
 
 def _turned(away: Floats, ways: Floats, random: Floats) -> Floats:
-    """Return `away` (3,) if it is near a free direction, else rotate it towards a random free one until it is."""
+    """Return `away` (3,) if it is near a free direction; else rotate it towards a random free direction until it is."""
     if (ways @ away).max() >= NEAR_WAY:
         return away
     goal = ways[int(random[1] * len(ways))]
@@ -293,8 +288,8 @@ def _tilted(normals: Floats, angles: Floats) -> Floats:
 OUT: Final = ((0.2, 0.0), (0.3, 0.015), (0.4, 0.04))
 #: Tolerated depth [m]: the real opening of a hand can differ from this simple motion.
 TOLERATED_M: Final = 0.001
-#: Merit lost per metre of depth. The weight is small: hands that hold well enclose the object, and most of them leave
-#: it along another trajectory.
+#: Merit lost per metre of depth [1/m]. The weight is small: hands that hold well enclose the object, and most of them
+#: can leave it along another trajectory.
 WEIGHT: Final = 25.0
 DEEPEST_M: Final = 0.01
 #: Shares of the lift at which obstacles above are checked.
@@ -303,7 +298,8 @@ UP: Final = (0.5, 1.0)
 
 def hindrance(model: Model, state: HandState, placed: PlacedGrasps) -> Floats:
     """Compute the merit (n,) that hands lose for a blocked retreat or lift in their scenes.
-    It grows with the depth of the hand in object or obstacles on the trajectory, or of its mounting at the grasp."""
+    The loss grows with the depth of the hand in object or obstacles on the trajectory, and of its mounting at the
+    grasp."""
     hand, obj = model.hand.model, model.obj.model
     mounted = mounting_lack(hand, posture_of(hand, obj, state).hand_pose, placed.scenes, placed.index)
     deep = np.maximum(_back(model, state, placed.index), mounted)

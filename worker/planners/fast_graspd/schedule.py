@@ -18,22 +18,22 @@ from graspd.worker.simulation.projection import ProjectionOptions
 #: Rates of Adam: translation [m], rotation [rad], joints [rad].
 COARSE_RATES: Final = (2e-3, 2e-2, 4e-2)
 FINE_RATES: Final = (5e-4, 5e-3, 1e-2)
-#: The paper's rate of plain gradient descent, the same for all variables in SI units.
+#: The paper's rate of plain gradient descent, equal for all variables in SI units.
 PAPER_RATES: Final = (1e-3, 1e-3, 1e-3)
 #: Largest dilation of the object [m].
 DILATION: Final = 0.01
 SELF_WEIGHT: Final = 2e4
-#: Length of the attraction term, see `LossOptions` [m]. The term favours enclosing grasps, and more of them
-#: hold at half friction. Half this length hardly changes results of a Barrett hand; twice this length draws the slender
-#: fingers of a Shadow hand into thin walls.
+#: Length of the attraction term, see `LossOptions` [m]. The term favours enclosing grasps, of which more hold at half
+#: friction. Half this length hardly changes results of a Barrett hand. Twice this length pulls the slender fingers of a
+#: Shadow hand into thin walls.
 PULL: Final = 3e-4
-#: Projection around a free object: points are attracted from farther away than among obstacles, so more of the hand
-#: touches. The attraction adds about half of the penetration that the samples of `pairs.DENSER` remove.
+#: Projection around a free object. Points are attracted from farther away than among obstacles, so more of the hand
+#: touches. This adds about half of the penetration that the samples of `pairs.DENSER` remove.
 AROUND: Final = ProjectionOptions(hold=5e-3)
 
 
 def loss_options(fidelity: Fidelity) -> LossOptions:
-    """Return the simulation options of a fidelity; plain gradient descent has limits as a penalty, as in the paper."""
+    """Return the simulation options of a fidelity. As in the paper, plain gradient descent has limits as a penalty."""
     paper = fidelity.optimizer == "gd"
     return LossOptions(
         contact_solver=fidelity.contact_solver,
@@ -50,8 +50,8 @@ def loss_options(fidelity: Fidelity) -> LossOptions:
 
 
 def in_scene(fidelity: Fidelity) -> Fidelity:
-    """Return the fidelity for scenes: obstacles leave fewer good approaches, so more hands are needed.
-    Their starts have the object between the fingers, so few iterations suffice."""
+    """Return the fidelity for scenes. Obstacles leave fewer good approaches, so more hands are needed.
+    Starts have the object between the fingers, so few iterations suffice."""
     return fidelity.model_copy(
         update={
             "starts": min(5 * fidelity.starts // 2, 64),
@@ -72,7 +72,7 @@ def _decayed(rates: tuple[float, float, float], count: int, to: float) -> Floats
 
 
 def coarse_schedule(fidelity: Fidelity) -> Schedule:
-    """Return weights in which the dilation falls to 0 over the first four fifths, with penetration weight times 10."""
+    """Return weights: over the first four fifths the dilation falls to 0 and the penetration weight grows tenfold."""
     n = fidelity.coarse_iterations
     dilation = DILATION * np.clip(1.0 - np.arange(n) / max(0.8 * n, 1.0), 0.0, 1.0)
     if fidelity.optimizer == "gd":
@@ -95,7 +95,8 @@ class WarmStart(Protocol):
     """Starts of grasps in scenes."""
 
     def adapted(self, fidelity: Fidelity) -> Fidelity:
-        """Return the fidelity of `schedule.in_scene` with as many starts and finalists as these starts need."""
+        """Return the fidelity of `schedule.in_scene` with the numbers of starts and finalists that these starts
+        need."""
 
     def __call__(
         self,

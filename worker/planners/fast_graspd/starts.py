@@ -1,11 +1,10 @@
-"""Starts of hands: in every second start of a grasp the palm faces a random surface point nearby.
-The other starts are antipodal (`ReachSampling`); all are if the object is too small or too wide for the pads.
+"""Starts of hands. In every second start of a grasp the palm faces a random surface point nearby. The other starts are
+antipodal (`ReachSampling`). All are antipodal if the object is too small or too wide for the pads.
 
-A start must be free of contact: hands that start inside a thin wall never leave the wall.
+A start must be free of contact, since hands that start inside a thin wall never leave it.
 
 For a gripper a pair of opposite surface points is drawn. The jaws open slightly wider than the pair and are placed
-around it, at a random angle about the line through the points.
-"""
+around it, at a random angle about the line through the points."""
 
 from __future__ import annotations
 
@@ -35,10 +34,10 @@ from graspd.worker.simulation.data import Data, HandState
 from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.record import record_placement
 
-#: Distance of the palm from the surface [m]: nearest, farthest, then the retreat steps after contact.
+#: Distance of the palm from the surface: nearest and farthest [m]; then the retreat steps after contact.
 GAP: Final = (0.002, 0.012)
 RETREATS: Final = (0.0, 0.01, 0.02, 0.03)
-#: Palm distance of hands that open further to find a start: the object is already between their fingers.
+#: Palm distance of hands that open further to find a start, with the object already between their fingers [m].
 OPENED_GAP: Final = (0.004, 0.02)
 #: Tilt of the approach away from the surface normal, standard deviation [rad].
 TILT: Final = 0.25
@@ -153,7 +152,7 @@ class Probe:
 
 def sample_starts(model: Model, *, seed: int, batch: int, indices: range, each: int) -> HandState:
     """Sample collision-free starts of the grasps `indices` of a batch, `each` per grasp side by side.
-    Raise InputError where no draw of some grasp came within 10 mm of being clear."""
+    Raises InputError: no draw of some grasp came within 10 mm of being clear."""
     generators = [start_generator(seed, batch, i, k) for i in indices for k in range(each)]
     state, depth = clear_starts(model, generators, each=each)
     open_further(model, generators, state, depth, np.ones(len(depth), bool))
@@ -172,8 +171,8 @@ def no_place(model: Model) -> InputError:
 
 def clear_starts(model: Model, generators: list[np.random.Generator], *, each: int = 1) -> tuple[HandState, Floats]:
     """Return a start per generator, the least deep of its draws, and its depth (n,) [m]; most are clear.
-    Of the `each` starts of a grasp, every second one but not the first is antipodal if possible. All are if the object
-    is too small or too wide for the hand's pads."""
+    Every second of the `each` starts of a grasp, from the second on, is antipodal if possible. All are antipodal if
+    the object is too small or too wide for the hand's pads."""
     hand, obj = model.hand.model, model.obj.model
     count, jaws = len(generators), JawStarts.of(hand, obj)
     retreats = RETREATS if jaws is None else JAW_RETREATS
@@ -197,7 +196,7 @@ def clear_starts(model: Model, generators: list[np.random.Generator], *, each: i
 def open_further(
     model: Model, generators: list[np.random.Generator], state: HandState, depth: Floats, wanted: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """Retry starts that were not clear, among those `wanted` (n,), with more open hands.
+    """Retry starts that were not clear, among the `wanted` ones (n,), with hands further open.
     The pre-shape of some hands leaves no gap as wide as the object. `generators` continue from the state after
     `clear_starts`; better starts replace its results. Return a mask (n,) of the opened starts."""
     hand, obj = model.hand.model, model.obj.model
@@ -233,7 +232,7 @@ def _draw_until_clear(
             return
         states = drawn(rows)
         depth = probe.depths(states).reshape(len(rows), -1)
-        # Select the nearest clear distance, or else the least deep.
+        # Select the nearest clear distance, or else the least deep one.
         clear = depth <= CLEAR
         pick = np.where(clear.any(axis=1), clear.argmax(axis=1), depth.argmin(axis=1))
         found = states[np.arange(len(rows)) * depth.shape[1] + pick]
@@ -278,12 +277,12 @@ def put(states: HandState, rows: NDArray[np.intp], others: HandState) -> None:
 
 #: Clearance between each pad and the object [m]: least and most.
 ROOM_M: Final = (0.002, 0.005)
-#: Range of the pair's position ahead of the middle of the pads, as a share of their length; then the further retreat
-#: of the hand on contact.
+#: Range of the pair's position ahead of the middle of the pads, as a share of their length. Then the further retreat of
+#: the hand on contact [m].
 AHEAD: Final = (-0.25, 0.25)
 
 JAW_RETREATS: Final = (0.0, 0.25, 0.5, 0.75)
-#: Shortest and longest pad length for that share [m].
+#: Shortest and longest pad length to which this share refers [m].
 LENGTH_M: Final = (0.01, 0.05)
 #: Uniform numbers of one draw: pair, side, angle, clearance, place.
 UNIFORM: Final = 5

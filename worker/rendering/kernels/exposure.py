@@ -94,7 +94,7 @@ def expose(
             dark = (1.0 - visible) * wp.min(1.0, 2.0 * cosine) * (0.16 * one.lamp_weight + 0.14 * one.sky_weight)
             total += shading.backdrop(light, direction) * (1.0 - dark)
             continue
-        # Noise is most of the cost: it is computed once per pixel and reused for passes that hit the same shape.
+        # Noise is the largest cost: it is computed once per pixel and reused for passes that hit the same shape.
         colour = albedo
         if k == 0 or m.pattern == shading.TILES or seen != hit.shape:
             there = placed_in[world, hit.shape]

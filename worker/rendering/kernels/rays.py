@@ -1,8 +1,7 @@
 """Rays against solids, as Warp functions: the first hit, and occlusion.
 
-A world is a few solids in poses of their own: meshes with trees that all worlds share, and boxes in closed form. They
-are so few that a ray tests the bounds of each.
-"""
+A world is a few solids in their own poses: meshes with trees that all worlds share, and boxes in closed form. Solids
+are so few that a ray tests the bounds of each."""
 
 import warp as wp
 
@@ -83,13 +82,13 @@ def box_distance(half: wp.vec3f, origin: wp.vec3f, direction: wp.vec3f):
 def may_meet(
     placed: wp.array2d[PlacedSolid], world: wp.int32, origin: wp.vec3f, direction: wp.vec3f, spread: wp.float32
 ):
-    """Return a mask, bit k: a unit ray within `spread` of another one may hit solid k.
-    From the 64th on, bits are shared."""
+    """Return a mask with bit k set if a unit ray within `spread` of this one may hit solid k. Solids from the 64th on
+    share bits."""
     inverse = inverse_of(direction)
     near = wp.uint64(0)
     for k in range(placed.shape[1]):
         there = placed[world, k]
-        # Within the bounds, the deviation of a ray is largest at their farthest corner.
+        # Inside the bounds, a ray deviates most at their farthest corner.
         off = spread * wp.length(wp.max(wp.abs(there.lower - origin), wp.abs(there.upper - origin)))
         wide = wp.vec3f(off, off, off)
         if goes_through(there.lower - wide, there.upper + wide, origin, inverse, FAR):
@@ -148,7 +147,7 @@ def first_hit(
                 if distance >= 0.0 and distance < hit.distance:
                     hit.shape = k
                     hit.distance = distance
-                    # Towards the ray's origin, also from inside.
+                    # Towards the ray's origin, also for a hit from inside.
                     smooth = wp.vec3f()
                     smooth[axis] = -wp.sign(along[axis])
     if hit.shape >= 0:

@@ -1,10 +1,9 @@
 """Warp kernels. Gradients are hand-written: Warp's tape is silently wrong for loops updating locals.
 
-A kernel's arguments are the model (hand, object, points, options: all constant), hand data it reads, other inputs, data
-it writes, other outputs. Names end in `_in` or `_out`; an `_inout` argument is read and written and is an output.
-Quaternions are x y z w here, and here only. Each module compiles on first use and is cached on disk. The object frame
-of all kernels has its origin at the centre of mass.
-"""
+Arguments of a kernel begin with the constant model: hand, object, points, options. Hand data that it reads, other
+inputs, data that it writes, and other outputs follow. Names end in `_in` or `_out`; an `_inout` argument is read and
+written, and is an output. Quaternions are x y z w in these modules only. Each module compiles on first use and is
+cached on disk. The object frame of all kernels has its origin at the centre of mass."""
 
 from __future__ import annotations
 

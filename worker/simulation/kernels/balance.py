@@ -1,10 +1,9 @@
 """Non-negative least squares with a ridge, for many small systems at once.
 
-Each system is min |M x - t|^2 + s^2 |x|^2 over x >= 0, with R rows and K columns, R much less than K. Its minimum has
+Each system is min |M x - t|^2 + s^2 |x|^2 over x >= 0, with R rows and K columns, R much less than K. The minimum has
 s^2 x = max(0, M^T r) with the residual r = t - M x. So r minimises the convex, piecewise quadratic phi(r) = s^2 |r|^2 /
-2 + |max(0, M^T r)|^2 / 2 - s^2 t r: R unknowns instead of K. Newton's method ends at the exact minimum after finitely
-many steps, once the set of columns with M^T r > 0 stays the same.
-"""
+2 + |max(0, M^T r)|^2 / 2 - s^2 t r, with R unknowns instead of K. Newton's method ends at the exact minimum after
+finitely many steps, once the set of columns with M^T r > 0 stays the same."""
 
 import warp as wp
 
@@ -99,10 +98,8 @@ def nonnegative(
     sound_out: wp.array(dtype=wp.int32),
 ):
     """Solve B systems, launched over B.
-
-    `matrix` (B, K, R) holds their columns, `count` (B,) the number of used ones. `x` is (B, K); `feasible` (B,)
-    is 0 where the steps are not enough.
-    """
+    `matrix` (B, K, R) holds their columns, `count` (B,) the number of used ones. `x` is (B, K); `feasible` (B,) is 0
+    where the steps are not enough."""
     b = wp.tid()
     work = work_inout
     rows = matrix_in.shape[2]
@@ -116,7 +113,7 @@ def nonnegative(
     for k in range(count):
         work.used[b, k] = 0
     done = wp.int32(0)
-    # After a whole step that changes no column's part, r is the minimum.
+    # After a whole step without a change of the columns' set, r is the minimum.
     whole = wp.int32(0)
     for _step in range(STEPS):
         if done == 0:

@@ -16,8 +16,8 @@ class Chain:
     origin_q: wp.array(dtype=wp.quatd)
     axis: wp.array(dtype=wp.vec3d)
     dof: wp.array(dtype=wp.int32)
-    multiplier: wp.array(dtype=wp.float64)  # the joint's value: this times that of the dof
-    offset: wp.array(dtype=wp.float64)  # plus this
+    multiplier: wp.array(dtype=wp.float64)  # factor from the dof's value to the joint's value
+    offset: wp.array(dtype=wp.float64)  # added to this product
     tip: wp.array(dtype=wp.int32)  # 1: a fingertip
     first: wp.array(dtype=wp.int32)  # (L + 1,) features of a body
     centre: wp.array(dtype=wp.vec3d)  # (F,) body frame

@@ -1,15 +1,14 @@
 """One step of the object against the static hand, M times per grasp, and its gradient by distances.
 
-A simulation starts the object with velocity v_m; s0 = dt (v, omega) is its free motion. A hand point p at distance rho
-with outward object normal n has, after the object's motion s = (x, theta) about its centre of mass, the gap rho - j.s
-with j = (n, p x n). The violation is C = r - rho + j.s, where r is the dilation. Hand and object are in frictional
+A simulation starts the object with velocity v_m; s0 = dt (v, omega) is its free motion. A hand point p has the distance
+rho and the outward object normal n. After the object's motion s = (x, theta) about its centre of mass, its gap is rho -
+j.s with j = (n, p x n). The violation is C = r - rho + j.s, where r is the dilation. Hand and object are in frictional
 contact while C > 0 (paper, eq. 1 and section III-C). The loss of one simulation is (|x| + g |theta|) / |s0| with g the
 gyration radius; L_stable is the mean over m.
 
 Each kernel writes dL/drho. On active points it is the exact adjoint of the solve. On free points it is the leak: `leak`
 times the gradient on contact, fading with distance. `one_sided` selects only the leak that attracts the point to the
-object: with the paper's two-sided leak, opposite velocities cancel wherever nothing touches.
-"""
+object. With the paper's two-sided leak, opposite velocities cancel wherever nothing touches."""
 
 import warp as wp
 
@@ -139,12 +138,10 @@ def direct(
     adjoint_out: wp.array2d(dtype=vec6),
 ):
     """Solve order-independent compliant contact, in one 6 x 6 system. Launch over (B, M).
-
-    Minimises 1/2 (s - s0)' M (s - s0) + k/2 sum w_i max(0, C_i)^2 with friction of magnitude at most mu k w_i C_i, by
-    iteratively reweighted least squares: a sliding contact is a spring of stiffness k w_i mu C_i / |u_t|, a sticking
-    one a spring of stiffness k w_i. `near` (B, N) lists the contacts with a gap of at most `near_gap`: others are
-    ignored unless the object moves farther. `adjoint` (B, M) is the derivative of the loss by forces on the object.
-    """
+    Minimises 1/2 (s - s0)' M (s - s0) + k/2 sum w_i max(0, C_i)^2 with friction of at most mu k w_i C_i, by iteratively
+    reweighted least squares. A sliding contact is a spring of stiffness k w_i mu C_i / |u_t|, a sticking one of k w_i.
+    `near` (B, N) lists the contacts with a gap of at most `near_gap`: other contacts are ignored unless the object
+    moves farther. `adjoint` (B, M) is the derivative of the loss by forces on the object."""
     b, m = wp.tid()
     if hands_in.active[b] == 0:
         return
@@ -160,7 +157,7 @@ def direct(
         c0 = float(0.0)
         c1 = wp.vec3(0.0)
         c2 = wp.mat33(0.0)
-        # Bound on the motion of all points: points farther from the surface are skipped.
+        # Bound on the motion of all points; points farther from the surface are skipped.
         motion = wp.length(wp.vec3(s[0], s[1], s[2])) + wp.length(wp.vec3(s[3], s[4], s[5])) * physics_in.radius
         all_near = motion <= physics_in.near_gap
         count = contacts_in.count[b]
@@ -204,7 +201,7 @@ def direct_gradient(
     adjoint_in: wp.array2d(dtype=vec6),
     contacts_inout: Contacts,
 ):
-    """Compute dL/drho of each contact after `direct`, over all simulations in order. Over (B, N / lane)."""
+    """Compute dL/drho of each contact after `direct`, over all simulations in order. Launch over (B, N / lane)."""
     b, part = wp.tid()
     if hands_in.active[b] == 0:
         return
@@ -256,11 +253,9 @@ def gauss_seidel(
     end_out: wp.array2d(dtype=vec6),
 ):
     """Take the paper's step: one sweep of position-based dynamics over the contacts (Deul 2016), in order.
-
-    Contact i moves the object by -M^-1 j C / w along the normal, then against the slip of its point by at most mu times
-    that impulse. `states` (B, M, N) stores the object's motion before each contact for the reverse sweep.
-    `passes_in` is ignored, since `states` has room for one sweep. Launch over (B, M).
-    """
+    Contact i moves the object by -M^-1 j C / w along the normal. Friction then moves the object against the slip of the
+    contact's point, by at most mu times this impulse. `states` (B, M, N) stores the object's motion before each contact
+    for the reverse sweep. `passes_in` is ignored, since `states` has room for one sweep. Launch over (B, M)."""
     b, m = wp.tid()
     if hands_in.active[b] == 0:
         return
@@ -336,10 +331,8 @@ def jacobi(
     end_out: wp.array2d(dtype=vec6),
 ):
     """Take averaged Jacobi passes, each with the mean correction of all active contacts, in any order.
-
     `states` (B, M, >= passes) stores the motion before each pass. The summed (not averaged) form diverges with the
-    number of contacts. The count of active contacts is taken as constant by the adjoint. Launch over (B, M).
-    """
+    number of contacts. The adjoint takes the count of active contacts as constant. Launch over (B, M)."""
     b, m = wp.tid()
     if hands_in.active[b] == 0:
         return

@@ -4,7 +4,7 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
-#: Separations below this may be overlaps: positions of some decimetres round by a tenth of it [m].
+#: Separations below this may be overlaps [m]: positions of some decimetres round by a tenth of it.
 SLACK = wp.constant(wp.float32(1.0e-7))
 
 
@@ -23,7 +23,7 @@ class Solids:
 @wp.func
 def is_apart(solids: Solids, s: int, a: wp.vec3, b: wp.vec3, c: wp.vec3):
     """Check whether a plane of the solid, or the triangle's own, separates the triangle from the solid.
-    False if only a plane through an edge of each would."""
+    The result is False if only a plane through an edge of each would separate them."""
     apart = wp.bool(False)
     i = solids.first_plane[s]
     while i < solids.first_plane[s + 1] and not apart:

@@ -1,8 +1,7 @@
 """Distances for metrics: exact in sign and value, no smoothing, no gradient.
 
 `worker.simulation.kernels.surface` serves the optimiser (smoothed, cheap). This module serves validation: the distance
-of a point from the mesh itself, and its depth in the hand's convex pieces.
-"""
+of a point from the mesh itself, and its depth in the hand's convex pieces."""
 
 import warp as wp
 
@@ -42,7 +41,7 @@ class NearestPoint:
 
 @wp.func
 def coarse_distance(skin: Skin, p: wp.vec3):
-    """Return the distance at the node of the grid nearest to p, a point within it, and a bound on their separation."""
+    """Return the distance at the node of the grid nearest to point p of the grid, and a bound on their separation."""
     at = (p - skin.low) / skin.spacing
     x = wp.min(int(at[0] + 0.5), skin.coarse.shape[0] - 1)
     y = wp.min(int(at[1] + 0.5), skin.coarse.shape[1] - 1)
@@ -54,19 +53,17 @@ def coarse_distance(skin: Skin, p: wp.vec3):
 @wp.func
 def nearest(skin: Skin, p: wp.vec3, reach: wp.float32):
     """Return signed distance, closest point and gradient of the distance, an outward unit normal.
-
     Points outside the box [low, high] are only looked up within `reach`; farther ones get distance = reach, normal 0.
     The sign is ray parity, or the winding number for open meshes: both are right near creases. Between a node of
-    `coarse` and a point the distance changes at most by their separation. Points thereby known to be beyond reach are
-    not looked up, faces beyond that bound are not searched, and a sign that cannot change is not computed.
-    """
+    `coarse` and a point the distance changes at most by their separation. With this bound, points beyond reach are not
+    looked up, farther faces are not searched, and a certain sign is not computed."""
     out = NearestPoint()
     out.distance = reach
     out.closest = p
     out.normal = wp.vec3(0.0)
     low = skin.low
     high = skin.high
-    # The box encloses the object, so inside it the diagonal bounds the distance: no deep point is ever missed.
+    # The box encloses the object, so inside it the diagonal bounds the distance: no deep point is missed.
     inside = p[0] > low[0] and p[1] > low[1] and p[2] > low[2] and p[0] < high[0] and p[1] < high[1] and p[2] < high[2]
     known = float(0.0)
     within = reach
@@ -104,7 +101,7 @@ def nearest(skin: Skin, p: wp.vec3, reach: wp.float32):
             + v * skin.corner_normal[3 * face + 1]
             + (1.0 - u - v) * skin.corner_normal[3 * face + 2]
         )
-        # Beside an edge the face's normal is no contact direction; the direction to the edge is.
+        # Beside an edge, the direction of contact is the direction to the edge, not the face's normal.
         share = wp.min(gap / BLEND, 1.0)
         direction = (1.0 - share) * smooth
         if gap > 1.0e-9:

@@ -1,12 +1,11 @@
 """Convex hulls in six dimensions, grown point by point (beneath-beyond), for wrench spaces.
 
 A facet is a simplex of 6 points with the 6 facets across its ridges: `neighbour[f, k]` shares all corners of f but
-`vertex[f, k]`. Its plane n x = d, n outward, is scaled by size: n x - d is 6! times the volume of the simplex of the
+`vertex[f, k]`. Its plane n x = d has an outward n. It is scaled: n x - d is 6! times the volume of the simplex of the
 facet and x, negative inside. A new point sees the facets whose plane it is above. They are removed, and every ridge
-between a seen and an unseen facet spans a new one with the point. The new plane is a positive combination of the two
-old planes, by the relation between the determinants of six points out of eight (Grassmann, Pluecker). So no system of
-equations is solved and no root is computed.
-"""
+between a seen and an unseen facet spans a new facet with the point. The new plane is a positive combination of the two
+old planes (Grassmann and Pluecker: determinants of six points out of eight). No system of equations is solved and no
+root is computed."""
 
 import warp as wp
 
@@ -43,10 +42,8 @@ class Hull:
 @wp.func
 def climb(hull: Hull, start: int, x: vec6):
     """Return a facet that x is above, or -1 if x is inside; the hull contains the origin.
-
     Scale all planes to 1 at the origin. The plane that x is highest above is a corner of the polar polytope where a
-    linear function is greatest. Ascending from neighbour to neighbour ends there, as the simplex method does.
-    """
+    linear function is greatest. Ascending from neighbour to neighbour ends there, as the simplex method does."""
     here = start
     best = wp.dot(hull.normal[here], x) / hull.offset[here]
     at = wp.int32(-1)
@@ -225,7 +222,7 @@ def grow_whole(
     start = wp.int32(0)
     half = (count + 1) / 2
     for turn in range(count):
-        # Neighbours in a list are neighbours in space: taking every other one first leaves fewer facets to replace.
+        # Neighbours in a list are neighbours in space. If even places are inserted first, fewer facets are replaced.
         p = 2 * turn
         if turn >= half:
             p = 2 * (turn - half) + 1
@@ -255,12 +252,9 @@ def grow_to_nearest(
     stamp: int,
 ):
     """Grow the hull where it is nearest to the origin, until its nearest facet is the whole hull's.
-
-    Return the facet's distance, and 1 on failure. A facet with no point above it is a facet of the hull of all points.
-    No facet of the built part is nearer, and the whole hull contains the part. So the distance is that of the whole
-    hull, although little of it is built (Zheng, "An efficient algorithm for a grasp quality measure", IEEE T-RO 2013).
-    At most 0 for an outside origin.
-    """
+    Return the facet's distance, at most 0 for an outside origin, and 1 on failure. A facet with no point above it is a
+    facet of the hull of all points. No facet of the built part is nearer, and the whole hull contains the part. So this
+    distance is the whole hull's (Zheng, "An efficient algorithm for a grasp quality measure", IEEE T-RO 2013)."""
     top = wp.int32(7)
     spares = wp.int32(0)
     born = wp.int32(0)
@@ -312,10 +306,8 @@ def measure_hulls(
     result_out: wp.array2d(dtype=wp.float64),
 ):
     """Build one hull after the other from 7 facets: facet i omits corner i and neighbours all others.
-
-    Points are about a point inside the first simplex; distances are from `origin_in`. `result_out`:
-    least distance of a facet, at most 0 where the origin is outside; volume, nan where `whole_in` is 0; 1 if feasible.
-    """
+    Points are about a point inside the first simplex; distances are from `origin_in`. `result_out` has three numbers:
+    least distance of a facet, at most 0 for an outside origin; volume, nan where `whole_in` is 0; 1 if feasible."""
     hull = hull_inout
     for h in range(count_in.shape[0]):
         for i in range(7):

@@ -91,10 +91,8 @@ def forward(
 @wp.kernel
 def backward(tree_in: Tree, hands_inout: Hands, gradient_out: wp.array2d(dtype=wp.float32)):
     """Compute the gradient (B, 6 + D) of a loss from its gradient at bodies, wrenches.
-
     Wrenches are (force, torque about the object's origin). Columns: root translation, root rotation about the pivot
-    (world axes), dofs. Launch over B.
-    """
+    (world axes), dofs. Launch over B."""
     b = wp.tid()
     hands = hands_inout
     if hands.active[b] == 0:

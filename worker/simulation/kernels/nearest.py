@@ -1,10 +1,9 @@
 """The closest point of a triangle mesh by lists: grid cells near the surface list their nearest faces.
 
 No tree is traversed. Let D be the distance of a cell's centre from the surface, and h half the cell's diagonal. The
-nearest face to a point of the cell is at most D + 2 h from the centre. Faces are sorted by that distance k, so a point
-at e from the centre skips faces with k - e > its nearest so far. The sign is that of the angle-weighted normal of the
-feature with the closest point (Baerentzen & Aanaes 2005).
-"""
+nearest face to a point of the cell is at most D + 2 h from the centre. Faces are sorted by this distance k. A point at
+e from the centre skips faces with k - e > its nearest distance so far. The sign is that of the angle-weighted normal of
+the feature with the closest point (Baerentzen & Aanaes 2005)."""
 
 import warp as wp
 
@@ -169,7 +168,7 @@ def count_faces(
     query = wp.mesh_query_point_no_sign(mesh_in, centre, 1.0e3)
     if not query.result:
         return
-    # Half a diagonal is 0.866 of the cell's size; slightly more for rounding.
+    # Half a diagonal is 0.866 of the cell's size; slightly more is used because of rounding.
     radius = wp.length(wp.mesh_eval_position(mesh_in, query.face, query.u, query.v) - centre) + 1.74 * size_in
     radius_out[cell] = radius
     extent = wp.vec3(radius, radius, radius)

@@ -1,8 +1,7 @@
 """Hands against the obstacles of their scene: distances, penalties, residuals.
 
 The hand is represented by its features: corners of boxes and hulls, spheres and ends of capsules (balls), rims of
-cylinders. They are exact against half-spaces; for solids see `solids`.
-"""
+cylinders. They are exact against half-spaces; for solids see `solids`."""
 
 import warp as wp
 

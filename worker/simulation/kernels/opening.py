@@ -1,7 +1,6 @@
 """Opening of fingers around a grasp: direction, distance, and jams.
 
-Each finger is checked by itself, all hands at once; finished hands and fingers cost nothing more.
-"""
+Each finger is checked by itself, all hands at once; finished hands and fingers cost nothing more."""
 
 import warp as wp
 
@@ -110,7 +109,7 @@ def leave(
         force_inout[b, parent] = force_inout[b, parent] + force
         torque_inout[b, parent] = torque_inout[b, parent] + torque
     for d in range(dofs):
-        # A finger that hooks around an edge would leave by closing further, but must open.
+        # A finger hooked around an edge would leave the object by closing further, but it must open.
         if away_out[b, d] * fingers_in.closing[d] > wp.float64(0.0):
             away_out[b, d] = wp.float64(0.0)
         sweep_out.direction[b, d] = -fingers_in.closing[d]
@@ -196,7 +195,8 @@ def finger_clearance(
 
 @wp.kernel
 def measure_opening(wanted_in: wp.float32, step_in: wp.array(dtype=wp.int32), sweep_inout: Sweep):
-    """Select each finger's first clear step, or the farthest; stop hands with all fingers clear. Over B."""
+    """Select each finger's first clear step, or the step with the largest distance; stop hands with all fingers clear.
+    Over B."""
     b = wp.tid()
     if sweep_inout.going[b] == 0:
         return
@@ -220,7 +220,7 @@ def take_opening(
     plain_in: Sweep,
     open_out: wp.array2d(dtype=wp.float64),
 ):
-    """Write dofs (B, D) of each finger: plain if its clearance exceeds that of the first, or `stuck`.
+    """Write dofs (B, D) of each finger; they are plain if its clearance exceeds that of the first opening, or `stuck`.
     Launch over (B, D)."""
     b, d = wp.tid()
     open_out[b, d] = hands_in.q[b, d]

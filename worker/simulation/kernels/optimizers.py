@@ -31,7 +31,7 @@ def descend(
     hands_inout: Hands,
 ):
     """Take a step of Adam (Kingma & Ba 2015), or where `adam` is 0 of the paper's plain gradient descent.
-    Rates of translation, rotation, every dof; `clamp` 1: dofs stay inside their limits. Launch over B."""
+    Rates: translation, rotation, every dof. With `clamp` 1, dofs stay inside their limits. Launch over B."""
     b = wp.tid()
     if hands_inout.active[b] == 0:
         return
@@ -66,7 +66,7 @@ def descend(
 
 @wp.kernel
 def advance(iteration_inout: wp.array(dtype=wp.int32)):
-    """Count an iteration on the device: schedules are read there, so a captured graph is replayed. Over 1."""
+    """Count an iteration on the device, where schedules are read, so that a captured graph can be replayed. Over 1."""
     iteration_inout[0] = iteration_inout[0] + 1
 
 

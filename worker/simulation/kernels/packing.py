@@ -1,8 +1,7 @@
 """Packing of contacts in the order of their points, independent of thread order.
 
 On a CPU a launch runs its threads one after another, so a counter assigns slots in the order of points. On a GPU each
-point writes to its own index, with a mark; slots follow from counts of marks.
-"""
+point writes to its own index, with a mark; counts of marks determine the slots."""
 
 import warp as wp
 

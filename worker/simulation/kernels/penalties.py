@@ -19,12 +19,9 @@ def points_to_bodies(
     hands_inout: Hands,
     depth_inout: wp.array(dtype=wp.float32),
 ):
-    """Compute the wrench gradient on bodies from dL/drho, penetration and attraction term.
-
+    """Compute the wrench gradient on bodies from dL/drho, penetration and attraction term. Launch over (B, N / lane).
     Penetration: w sum w_i min(rho, 0)^2. Attraction: -2 w d l sum w_i exp(-rho / l) of points outside, with d = `pull`
-    and l = `pull_length` [m]. The distance grows along the object's outward normal (normals are taken as constant).
-    Launch over (B, N / lane).
-    """
+    and l = `pull_length` [m]. The distance grows along the object's outward normal (normals are taken as constant)."""
     b, part = wp.tid()
     if hands_inout.active[b] == 0:
         return
@@ -69,8 +66,8 @@ def joint_penalties(
 def near_share(
     reach_in: wp.float32, whole_in: wp.float32, contacts_in: Contacts, share_out: wp.array(dtype=wp.float32)
 ):
-    """Compute the share of the `whole` weight of a hand's points that is within `reach` [m].
-    Points are summed in order, so that the sum is the same on every device. Launch over B."""
+    """Compute the share of the `whole` weight of a hand's points that is within `reach` [m]. Launch over B.
+    Points are summed in order, so that the sum is the same on every device."""
     b = wp.tid()
     total = float(0.0)
     for i in range(contacts_in.count[b]):
@@ -81,7 +78,7 @@ def near_share(
 
 @wp.kernel
 def attract(pull_in: wp.float32, length_in: wp.float32, hands_in: Hands, contacts_inout: Contacts):
-    """Attract free points to the object, fading with distance: control without simulation. Over (B, N)."""
+    """Attract free points to the object, fading with distance: the control without simulation. Launch over (B, N)."""
     b, i = wp.tid()
     if hands_in.active[b] == 0 or i >= contacts_inout.count[b]:
         return

@@ -1,9 +1,8 @@
 """Gauss-Newton projection out of penetration: residuals of clearances, rows, normal equations.
 
-A residual is w (d - target) with a signed distance d; its row is the derivative of d by (root translation, root
-rotation about the pivot, dofs). d is the distance of a hand point to the object (normal n of the object), of an object
-sample to a link, or of a point of one link to another link.
-"""
+A residual is w (d - target) with a signed distance d. Its row is the derivative of d by (root translation, root
+rotation about the pivot, dofs). Distances are hand point to object (normal n of the object), object sample to link, and
+point of a link to another link."""
 
 import warp as wp
 
@@ -75,7 +74,7 @@ def point_residuals(
     hold_weight_in: wp.float32,
     residuals_out: Residuals,
 ):
-    """Emit residuals: points closer than `near` move to `target`, those within `hold` are weakly held.
+    """Emit residuals: points closer than `near` move to `target`, points within `hold` are weakly held.
     Launch over (B, N / lane)."""
     b, part = wp.tid()
     if hands_in.active[b] == 0:
@@ -253,8 +252,9 @@ def keep_best(
     best_inout: States,
     depth_inout: wp.array(dtype=wp.float64),
 ):
-    """Store hands with the least penetration so far, by more than `better` [m]; finish those without any.
-    Their residuals are reset. Launch over B."""
+    """Store hands with the least penetration so far, by more than `better` [m]; finish hands without any. Reset
+    residuals.
+    Launch over B."""
     b = wp.tid()
     if active_inout[b] == 0:
         return
@@ -286,9 +286,9 @@ def step(
     state_inout: States,
     hands_inout: Hands,
 ):
-    """Take a damped Gauss-Newton step, at most `longest` in units of `scale` (n,).
+    """Take a damped Gauss-Newton step, at most `longest` in units of `scale` (n,). Launch over B.
     (S H S + d I) x = -S g by Cholesky, motion S x; d is `damping` times the number of residuals. The equations are
-    reset. Launch over B."""
+    reset."""
     b = wp.tid()
     if hands_inout.active[b] == 0:
         return

@@ -1,8 +1,7 @@
 """Random hands around an object, between opposed fingers, until one is clear in a grid of distances.
 
-One thread draws for one start. A draw's numbers follow from the start's seed and the draw's number, so they do not
-depend on other draws. Hands are tested as balls.
-"""
+One thread draws for one start. A draw's numbers follow from the start's seed and the draw's number, not from other
+draws. Hands are tested as balls."""
 
 import warp as wp
 
@@ -140,7 +139,7 @@ def reach(
             number_out[b] = k
             pivot_out[b] = found.pivot
             rotation_out[b] = found.rotation
-            # A different sequence from the draw's, whose state belongs to it.
+            # A sequence different from the draw's own, whose state belongs to the draw.
             noise = wp.rand_init(seed_in[b] + 1, draws_in + k)
             for d in range(q_out.shape[1]):
                 q = grips_in.posture[found.posture, d] + grips_in.noise[d] * wp.randn(noise)

@@ -1,11 +1,10 @@
 """Links of a hand against solid obstacles: boxes, boards, neighbours' convex pieces.
 
 The nearest points of two separate convex bodies lie on a corner and a face or on two edges. If they overlap, a corner
-or an edge of one is in the other. So the link's features are tested against the obstacle, the obstacle's edges against
-the link, and the link's edges against the obstacle. Along a straight edge the signed distance from a convex body is a
-convex function. Its least value is found between two tangents below it: their intersection is a lower bound, so distant
-edges cost two evaluations.
-"""
+or an edge of one is in the other. Tested are therefore the link's features and edges against the obstacle, and the
+obstacle's edges against the link. Along a straight edge the signed distance from a convex body is a convex function.
+Its least value is found between two tangents below it: their intersection is a lower bound, so distant edges cost two
+evaluations."""
 
 import warp as wp
 
@@ -17,7 +16,7 @@ from graspd.worker.simulation.kernels.wrenches import add_wrench
 
 wp.set_module_options({"enable_backward": False})
 
-#: Evaluations between the tangents, and tolerance of the value at their intersection [m].
+#: Largest number of evaluations between the tangents, and tolerance of the value at their intersection [m].
 LOOKS = wp.constant(20)
 EXACT = wp.constant(wp.float32(1.0e-8))
 ON_FACE = wp.constant(wp.float32(1.0e-5))  # a point this far outside a plane's face counts as on it [m]
@@ -50,7 +49,7 @@ def meeting(t0: wp.float32, f0: wp.float32, g0: wp.float32, t1: wp.float32, f1: 
 @wp.func
 def balanced(n0: wp.vec3, g0: wp.float32, n1: wp.vec3, g1: wp.float32):
     """Return the gradient of the least value on an edge, with slopes g0 < 0 < g1 beside it.
-    At a bend it is neither side's own, but the mixture without a slope along the edge."""
+    At a bend it is the mixture of both sides' gradients without a slope along the edge."""
     share = g1 / (g1 - g0)
     return share * n0 + (1.0 - share) * n1
 
@@ -80,7 +79,7 @@ def least_on_edge(
     pieces: Pieces, piece: wp.int32, obstacles: Obstacles, k: wp.int32, a: wp.vec3, b: wp.vec3, limit: wp.float32
 ):
     """Return the place of edge a b nearest to a piece, or deepest in an obstacle, see `convex_distance`.
-    A value of at least `limit`: not nearer."""
+    A value of at least `limit` means that no place is nearer."""
     along = b - a
     at0 = convex_distance(pieces, piece, obstacles, k, a)
     at1 = convex_distance(pieces, piece, obstacles, k, b)

@@ -1,11 +1,10 @@
 """Signed distance of hand points to the mesh, smoothed by Phong projection (paper, section III-B).
 
-With the closest point b on a face, barycentric weights w_k, and corner normals n_k, the projection onto the tangent
-plane of corner k is pi_k(b) = b - ((b - v_k).n_k) n_k and the smoothed surface point is
-r* = (1 - alpha) b + alpha sum_k w_k pi_k(b)   (Boubekeur & Alexa 2008; the paper's formula drops the first b).
-The distance is sign |r - b| + (b - r*).n with n the interpolated normal: unlike sign |r - r*| it is continuous across
-the surface. Corner normals stop at creases, so boxes and cylinders keep their edges.
-"""
+Given are the closest point b on a face, barycentric weights w_k, and corner normals n_k. The projection onto the
+tangent plane of corner k is pi_k(b) = b - ((b - v_k).n_k) n_k. The smoothed surface point is
+    r* = (1 - alpha) b + alpha sum_k w_k pi_k(b)   (Boubekeur & Alexa 2008; the paper's formula drops the first b).
+The distance is sign |r - b| + (b - r*).n with n the interpolated normal. Unlike sign |r - r*| it is continuous across
+the surface. Corner normals stop at creases, so boxes and cylinders keep their edges."""
 
 import warp as wp
 
@@ -59,7 +58,7 @@ def smoothed(
     offset = point - closest
     gap = wp.length(offset)
     out.distance = sign * gap + surface.alpha * wp.dot(lift, smooth)
-    # Far from the surface the direction to the closest point is the gradient; on it that is 0/0.
+    # Far from the surface the gradient is the direction to the closest point; on the surface this direction is 0/0.
     share = wp.min(gap / 1.0e-3, 1.0)
     direction = (1.0 - share) * smooth
     if gap > 1.0e-9:
@@ -99,7 +98,7 @@ def cell_at(surface: Surface, x: wp.vec3):
 
 @wp.func
 def near_distance(surface: Surface, point: wp.vec3, reach: wp.float32):
-    """Return the result of `mesh_distance`, from the list of the point's cell if it has one."""
+    """Return the result of `mesh_distance`, from the list of the point's cell if the cell has one."""
     i, j, k, inside = cell_at(surface, (point - surface.field_origin) / surface.field_cell)
     if inside:
         ny = surface.field.shape[1] - 1
@@ -248,11 +247,9 @@ def gather(
     hands_in: Hands,
     contacts_inout: Contacts,
 ):
-    """Pack candidate contacts per grasp: hand points closer than dilation + keep.
-
-    `near` lists those with a gap of at most `near_gap`. With space for `mark` each point writes to its own index,
-    marked, for `packing.pack` to pack them. Launch over (B, N / lane).
-    """
+    """Pack candidate contacts per grasp: hand points closer than dilation + keep. Launch over (B, N / lane).
+    `near` lists contacts with a gap of at most `near_gap`. With space for `mark` each point writes to its own index,
+    marked, for `packing.pack`."""
     b, part = wp.tid()
     if hands_in.active[b] == 0:
         return

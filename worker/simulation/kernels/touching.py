@@ -1,5 +1,5 @@
-"""The object's surface near points of posed hands, and the forces that hold it there.
-Poses are in double precision, distances to the mesh in single."""
+"""The object's surface near points of posed hands, and the forces that hold the object there.
+Poses are in double precision, distances to the mesh in single precision."""
 
 import math
 
@@ -12,7 +12,7 @@ wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 EDGES = wp.constant(8)  # edges of a friction pyramid
 TURN = wp.constant(wp.float64(math.tau / 8))  # angle between adjacent edges
-FIRST_TORQUE = wp.constant(7)  # rows of a balance before those of the torques: the wrench and the sum of normal forces
+FIRST_TORQUE = wp.constant(7)  # rows of a balance before the torques: the wrench and the sum of normal forces
 
 
 @wp.struct
@@ -85,11 +85,10 @@ def choose(
     count_out: wp.array(dtype=wp.int32),
 ):
     """Choose at most C pressing points (B, C) of each hand, the most spread out. Launch over B.
-
-    Points press if closer than `near`, or than `far` on a finger (of each body, -1: none) without such points, and if
-    they face the object with a cosine below `facing`. Each chosen point is the farthest from those before it (Gonzalez
-    1985). `touches` (B, F), `list`, `least` (B, N) are scratch; `count` (B,) is their number.
-    """
+    Points press if they face the object with a cosine below `facing` and are closer than `near`. On a finger without
+    such points, `far` replaces `near`; `finger` has the finger of each body, -1: none. Each chosen point is the
+    farthest from earlier points (Gonzalez 1985). `touches` (B, F), `list`, `least` (B, N) are scratch; `count` (B,) is
+    their number."""
     b = wp.tid()
     limit = chosen_out.shape[1]
     for f in range(touches_out.shape[1]):
@@ -170,10 +169,8 @@ def columns(
     matrix_out: wp.array3d(dtype=wp.float64),
 ):
     """Compute columns (B, C * E, 7 + D) of the balance. Launch over (B, C).
-
-    Rows: the wrench of each edge of a contact's pyramid with unit normal force, torque over `radius`; `sum`; the
-    torques of the dofs that exert it over their limits.
-    """
+    Each edge of a contact's pyramid has unit normal force. Its rows are its wrench, with torque over `radius`; `sum`;
+    and the torques of the dofs that exert it, over their limits."""
     b, c = wp.tid()
     if c >= count_in[b]:
         return
@@ -215,8 +212,8 @@ def scale_torques(
     matrix_inout: wp.array3d(dtype=wp.float64),
     unit_out: wp.array(dtype=wp.float64),
 ):
-    """Divide torques of a balance by `unit` (B,), which gives the largest of them `weight`.
-    `count` (B,) becomes the number of columns instead of contacts. Launch over B."""
+    """Divide torques of a balance by `unit` (B,), with which the largest of them is `weight`. Launch over B.
+    `count` (B,) becomes the number of columns instead of contacts."""
     b = wp.tid()
     count = EDGES * count_inout[b]
     count_inout[b] = count
@@ -242,8 +239,9 @@ def hold(
     residual_out: wp.array(dtype=wp.float64),
     torque_out: wp.array2d(dtype=wp.float64),
 ):
-    """Compute the net wrench of forces in these shares (B, C * E) over the sum of their normal components.
-    Also the torques (B, D) that exert them at the sum `total`, or less within limits. Launch over B."""
+    """Compute the net wrench of forces in these shares (B, C * E) over the sum of their normal components. Launch over
+    B.
+    Also compute the torques (B, D) that exert them at the sum `total`, or at less within limits."""
     b = wp.tid()
     whole = wp.float64(0.0)
     for k in range(count_in[b]):

@@ -1,8 +1,7 @@
 """Wrenches on bodies, summed by many threads in integers, so that thread order changes no bit.
 
 A wrench is six counts of `UNIT`: force and torque about the object's origin. Float32 sums depend on their order,
-which differs between runs on a GPU.
-"""
+which differs between runs on a GPU."""
 
 import warp as wp
 

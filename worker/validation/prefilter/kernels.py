@@ -2,8 +2,7 @@
 
 A tick is the simulation between two checks (`protocol.INTERVAL_S`). After each tick every world checks its own object.
 Worlds do not wait for each other; a world takes the next grasp of the queue when its verdict is decided. Quaternions
-are w x y z, stored in `wp.quat` in this order as in MuJoCo Warp.
-"""
+are w x y z, stored in `wp.quat` in this order as in MuJoCo Warp."""
 
 from typing import Final
 
@@ -14,13 +13,13 @@ from graspd.worker.validation.protocol import Outcome
 
 wp.set_module_options({"enable_backward": False})
 
-#: A verdict is clear if the worst motion is below the first share of its limit, or above the second. For grasps that
-#: hold, margins of both engines differ by 0.11 at the 99th percentile (benchmarks.prefilter).
+#: A verdict is clear if the worst motion is below the first share of its limit, or above the second. Margins of held
+#: grasps differ by 0.11 between the engines, at the 99th percentile (benchmarks.prefilter).
 BAND: Final = (0.8, 1.2)
-#: Ticks of a push after it exceeds a limit; if the motion is then still in the band, the verdict is not clear.
+#: Ticks of a push after its motion exceeds a limit. If the motion is then still in the band, the verdict is not clear.
 PATIENCE: Final = 5
-#: Ticks (of `protocol.INTERVAL_S`) after which a grasp stays undecided. Grasps that hold take at least 32, 1 in 100 of
-#: them more than 47; a few slow ones would delay the whole launch.
+#: Number of ticks (of `protocol.INTERVAL_S`) after which a grasp stays undecided. Grasps that hold take at least 32, 1
+#: in 100 of them more than 47. A few slow grasps would delay the whole launch.
 MOST_TICKS: Final = 48
 #: Ticks of one stage of closing, of the whole closing, until the first check of a push, and of a whole push.
 STAGE = wp.constant(round(protocol.STAGE_S / protocol.INTERVAL_S))
@@ -38,7 +37,7 @@ LOST = wp.constant(int(Outcome.LOST_WHILE_CLOSING))
 DISPLACED = wp.constant(int(Outcome.DISPLACED))
 ROTATED = wp.constant(int(Outcome.ROTATED))
 DIVERGED = wp.constant(int(Outcome.DIVERGED))
-#: An exceeded limit is clear above this ratio, or final after this many ticks; a grasp ends after this many ticks.
+#: Ratio above which an exceeded limit is clear; ticks after which it is final; ticks after which a grasp ends.
 CLEAR = wp.constant(BAND[1])
 PATIENT = wp.constant(PATIENCE)
 MOST = wp.constant(MOST_TICKS)
@@ -93,7 +92,7 @@ class Worlds:
     before: wp.array(dtype=wp.vec3)
     turned_before: wp.array(dtype=wp.float32)
     qpos: wp.array2d(dtype=wp.float32)
-    """Closed state from which every push starts; likewise the next two."""
+    """Closed state from which every push starts; the next two arrays belong to it."""
     qvel: wp.array2d(dtype=wp.float32)
     warmstart: wp.array2d(dtype=wp.float32)
 
@@ -105,7 +104,7 @@ class WorldVerdicts:
     outcome: wp.array2d(dtype=wp.int32)
     """(N, 6)"""
     margin: wp.array(dtype=wp.float32)
-    """Worst displacement or rotation over its limit so far."""
+    """Largest displacement or rotation over its limit so far."""
     ticks: wp.array(dtype=wp.int32)
     overflow: wp.array(dtype=wp.int32)
 

@@ -5,9 +5,8 @@ only rejects: clear failures are final, all other grasps are validated on the CP
 both kinds are final. The prefilter is not used at level `dexgraspbench` or for lifts.
 
 The model is the validator's own, compiled once; data that differ between grasps (postures, commands, pushes) are
-arrays. A pool of worlds takes grasps from a queue on the device, so a launch stays full until the queue is empty, and
-one graph serves any number of grasps.
-"""
+arrays. A pool of worlds takes grasps from a queue on the device. A launch stays full until the queue is empty, and one
+graph serves any number of grasps."""
 
 from __future__ import annotations
 
@@ -42,13 +41,13 @@ log = logging.getLogger(__name__)
 
 #: One clear verdict in this many is also validated on the CPU.
 RECHECK_ONE_IN: Final = 50
-#: Increase when a change of the code, other than a constant, changes the prefilter's verdicts.
+#: Increase after changes of the prefilter's verdicts by its code, other than its constants.
 REVISION: Final = 1
 #: Pool sizes, for few grasps and for many; with arbitrary sizes nearly every launch would build a new pool.
 WORLDS: Final = {"cuda": (256, 1024), "cpu": (8, 32)}
 #: Number of cached pools, each with its model, arrays and graph, for the pairs validated last.
 _KEPT_POOLS: Final = 4
-#: Largest share of rechecked verdicts that the CPU may contradict (one more is allowed) while the prefilter is trusted.
+#: Largest share of rechecked verdicts that the CPU may contradict (plus one) while the prefilter is trusted.
 _MOST_CONTRADICTED: Final = 0.05
 
 
@@ -115,11 +114,7 @@ class WorldPool:
             self._allocate()
 
     def validate(self, grasps: GraspSet, run: ExecutionContext = DEFAULT_CONTEXT) -> PrefilterOutcomes:
-        """Run the test of level standard on N grasps.
-
-        Raises:
-            TaskCancelled: `run.cancelled()` returned True.
-        """
+        """Run the test of level standard on N grasps. Raises TaskCancelled: `run.cancelled()` returned True."""
         with wp.ScopedDevice(self.device):
             found = self._validate(grasps, run)
             lost = np.flatnonzero(found.overflow)
@@ -272,20 +267,15 @@ class PrefilterVerdicts:
         return sum(rollouts[row].success != held for row, held in self.rechecked.items())
 
     def believed(self, contradicted: int) -> bool:
-        """Check whether so few verdicts were contradicted that the others are trusted."""
+        """Check whether so few verdicts were contradicted that all other verdicts are trusted."""
         return contradicted <= max(1, _MOST_CONTRADICTED * len(self.rechecked))
 
 
 def first_terms(hand: HandModel, level: str, run: ExecutionContext) -> list[Any]:
     """Return the prefilter's terms for `verdict_key`; empty if it is not used for verdicts of this level.
-
-    It is not used for grippers: their flat pads touch over an area, where the engines distribute contacts differently.
-    It is not used for hands with tendons: the engines differ on a tenth of Shadow's grasps
-    (docs/explanation/quality.md).
-
-    Raises:
-        InputError: the prefilter is required but not installed.
-    """
+    The prefilter is not used for grippers: their flat pads touch over an area, where the engines distribute contacts
+    differently. It is not used for hands with tendons: the engines differ on a tenth of Shadow's grasps
+    (docs/explanation/quality.md). Raises InputError: the prefilter is required but not installed."""
     if run.prefilter == "off" or level not in ("standard", "fast"):
         return []
     if jaws_of(hand) is not None or hand.tendons:
@@ -355,7 +345,7 @@ CONTACTS: Final = 96
 ROWS: Final = 256
 #: Largest number of times that the capacity is doubled when it overflows.
 DOUBLINGS: Final = 3
-#: Overflows that drop contacts or constraints. The others are iteration limits, which MuJoCo has as well.
+#: Overflows that drop contacts or constraints. Other overflows are iteration limits, which MuJoCo also has.
 _VOIDING: Final = ("NEFC", "NJMAX_NNZ", "BROADPHASE", "NARROWPHASE", "CCD", "EPA_HORIZON")
 
 
