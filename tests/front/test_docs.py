@@ -18,11 +18,11 @@ import pytest
 import yaml
 
 import graspd
+from docs import commands
+from docs.commands import PAGES, Line, lines_of, main, run_page
 from graspd.service.run.supervisor import Supervisor
 from graspd.service.settings import Settings
-from tests import docs_commands
 from tests.conftest import PACKAGES, REPOSITORY
-from tests.docs_commands import PAGES, Line, lines_of, main, run_page
 from tests.shell import completed
 from tests.waiting import PATIENCE_S, until_a_worker_is_idle
 
@@ -95,7 +95,7 @@ def test_a_documented_command_that_fails_turns_the_run_red(tmp_path: Path, monke
     failing = "graspd hands check nowhere"
     good = f"graspd --version\n{failing}   # refused\n{failing}\n```\n\n```\ngraspd: there is no hand\n"
     page.write_text(f"```sh\n{good}```\n\n```sh\n{failing} a\ngraspd --version  # refused\n```\n")
-    monkeypatch.setattr(docs_commands, "PAGES", (page,))
+    monkeypatch.setattr(commands, "PAGES", (page,))
     assert main([]) == 1
     assert re.findall(r"^page\.md: (.*)", capsys.readouterr().out, re.MULTILINE) == [f"{failing} a", "graspd --version"]
     page.write_text(f"```sh\n{good}```\n")

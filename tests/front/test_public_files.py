@@ -14,9 +14,9 @@ from click.testing import CliRunner
 from packaging.specifiers import SpecifierSet
 
 import graspd
+from docs.commands import Line
 from graspd.service.model.version import PACKAGE_VERSION
 from tests.conftest import REPOSITORY
-from tests.docs_commands import Line
 from tests.shell import completed
 
 FORGE = REPOSITORY / ".github"

@@ -12,9 +12,9 @@ from benchmarks.results.__main__ import main
 from benchmarks.results.manifest import DOCS, INDEX, digests, faults, load, staleness, there
 from benchmarks.results.running import Runner
 from benchmarks.results.studies import BY_NAME, STUDIES, Study, is_raw
+from docs.commands import Line
 from graspd.service.model.version import STAGE_REVISIONS
 from tests.conftest import REPOSITORY
-from tests.docs_commands import Line
 from tests.shell import completed
 
 MOST_BYTES, MOST_LINES = 8_000_000, 6_000
