@@ -34,9 +34,10 @@ def _cursor(*key: Any) -> str:
 
 
 def _nasty(key: tuple[Any, ...]) -> list[str]:
-    """Cursors of the right shape with a part that no database takes, in each place."""
+    """Cursors of the right shape with a part that no database takes, in each place; and of no shape."""
     bad = {str: "\ud800", int: 2**63, float: 2**63}
-    return [_cursor(*key[:i], bad[type(part)], *key[i + 1 :]) for i, part in enumerate(key)] + [_cursor(-(2**70))]
+    shaped = [_cursor(*key[:i], bad[type(part)], *key[i + 1 :]) for i, part in enumerate(key)]
+    return [*shaped, _cursor(-(2**70)), "rubbish", "eyJ4IjoxfQ", "", "W10"]
 
 
 def test_a_cursor_of_somebody_s_own_making_is_refused(http: TestClient) -> None:

@@ -17,7 +17,6 @@ import pytest
 from graspd.service.index.queries.grasps import GraspFilter
 from graspd.service.index.rebuild import differences
 from graspd.service.model import names
-from graspd.service.model.errors import QueueUnavailable
 from graspd.service.model.planning import plan
 from graspd.service.model.states import Priority, Stage, State
 from graspd.service.pipeline import job_actions
@@ -28,6 +27,7 @@ from graspd.service.store.manifests import ShardManifest, load_shard
 from graspd.service.store.records import read_record
 from tests.fakes import record_of
 from tests.fakes import request as wanted
+from tests.service.conftest import is_up
 from tests.service.pipeline.datasets.makers import add_asset, cells_of
 from tests.service.pipeline.datasets.makers import wanted as wanted_dataset
 from tests.system.conftest import System, alive
@@ -245,7 +245,7 @@ def test_a_dataset_goes_on_after_everything_was_killed(start: Start) -> None:
             os.kill(pid, signal.SIGKILL)
     before = made(system)
     assert len(before) < 2 * len(OBJECTS)
-    system.until(lambda: _redis_answers(system), "Redis is started again")
+    system.until(lambda: is_up(system.services.queue), "Redis is started again")
     again, new = actions.create(system.services, request)
     assert not new and not again.state.is_final
     system.hold.unlink()
@@ -257,11 +257,3 @@ def test_a_dataset_goes_on_after_everything_was_killed(start: Start) -> None:
     assert differences(system.services.index, system.services.store) == []
     taken, _ = actions.snapshot(system.services, "kitchen")
     assert taken.complete and len(taken.shards) == len(after)
-
-
-def _redis_answers(system: System) -> bool:
-    try:
-        system.services.queue.ping()
-    except QueueUnavailable:
-        return False
-    return True

@@ -19,31 +19,20 @@ from graspd.service.pipeline.integrity import BAD_MANIFEST, FOREIGN, MISSING, NO
 from graspd.service.pipeline.repair import repair
 from graspd.service.queue.port import EventKind
 from graspd.service.run import commands, store_commands
-from graspd.service.settings import Settings
 from graspd.service.store.manifests import ShardManifest, load_manifest, load_shard
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.process.runner import Runner
 from graspd.worker.stages.context import TaskContext
 from tests.damage import cut, flip, overwrite, remove
-from tests.fakes import add_assets, fake_stages, request
-from tests.indexes import open_services
+from tests.fakes import fake_stages, request
+from tests.service.conftest import service
 
 SHARDS = 6
 
 
-def service_on(folder: Path, url: str) -> Iterator[Services]:
-    """A service without processes: a store, an SQLite index, a hand and an object."""
-    settings = Settings(data_dir=folder, store_url=url, retry_backoff_s=0.0, task_s=0.0)
-    made = open_services(settings)
-    add_assets(made)
-    yield made
-    made.close()
-
-
 @pytest.fixture(params=["files", pytest.param("s3", marks=pytest.mark.s3)])
 def services(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Services]:
-    is_remote = request.param == "s3"
-    yield from service_on(tmp_path, request.getfixturevalue("s3_url") if is_remote else (tmp_path / "store").as_uri())
+    yield from service(tmp_path, store_url=request.getfixturevalue("s3_url") if request.param == "s3" else None)
 
 
 def findings(services: Services) -> list[Damage]:

@@ -32,8 +32,9 @@ from graspd.service.store.records import put_record
 from graspd.service.store.store import Store, open_store
 from tests.damage import flipped, overwrite
 from tests.fakes import job_record, make_shard, record_of, request, tasks_of
+from tests.service.conftest import service
 from tests.service.pipeline.test_controller import Bench
-from tests.service.pipeline.test_integrity import findings, service_on, work_off
+from tests.service.pipeline.test_integrity import findings, work_off
 
 
 def batches(count: int, **changes: object) -> list[TaskMessage]:
@@ -82,7 +83,7 @@ def pack(store: Store, messages: Sequence[TaskMessage], *, dead: Sequence[TaskMe
 
 @pytest.fixture
 def services(tmp_path: Path) -> Iterator[Services]:
-    yield from service_on(tmp_path, (tmp_path / "store").as_uri())
+    yield from service(tmp_path)
 
 
 def submit(services: Services, batches: int) -> tuple[str, list[Any]]:

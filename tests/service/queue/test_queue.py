@@ -252,13 +252,6 @@ def test_one_leads_until_it_is_silent_or_resigns(queue: RqQueue) -> None:
     assert not queue.lead("b", 600)
 
 
-def test_a_controller_that_is_started_again_leads_at_once(rq_queue: RqQueue) -> None:
-    assert rq_queue.lead("node-1", 600)
-    again = RqQueue(rq_queue.connection)
-    assert not again.lead("node-2", 600)
-    assert again.lead("node-1", 600)
-
-
 def test_a_controller_of_graspd_0_2_holds_the_same_lease(rq_queue: RqQueue) -> None:
     rq_queue.connection.set(LEAD, "a keeper of 0.2", px=600_000)
     assert not rq_queue.lead("a", 600)

@@ -18,10 +18,10 @@ from graspd.service.run.doctor import backends
 from graspd.service.run.doctor.checks import Condition, Finding
 from graspd.service.settings import Settings
 from graspd.service.store.store import open_store
-from tests.fakes import add_assets, finish, request
-from tests.indexes import open_services
+from tests.fakes import finish, request
 from tests.memory_queue import MemoryQueue
 from tests.servers import PostgresServer, free_ports
+from tests.service.conftest import service
 from tests.service.index.test_index import fail
 
 Look = Callable[[], Finding]
@@ -29,12 +29,10 @@ Look = Callable[[], Finding]
 
 @pytest.fixture
 def kept(tmp_path: Path) -> Iterator[Services]:
-    services = open_services(Settings(data_dir=tmp_path))
-    add_assets(services)
-    finish(services, job_actions.submit(services, request(grasps=64))[0].id)
-    services.index.notes.set_complete()
-    yield services
-    services.close()
+    for services in service(tmp_path):
+        finish(services, job_actions.submit(services, request(grasps=64))[0].id)
+        services.index.notes.set_complete()
+        yield services
 
 
 @pytest.fixture(params=["rows", "names"])
