@@ -24,13 +24,8 @@ from tests.api.factories import zipped
 
 def test_the_options_of_a_hand_decide_its_check(http: TestClient, services: Services) -> None:
     urdf = builtin_files(AssetKind.HAND, "allegro")["allegro.urdf"]
-    options = hand_options(
-        palm="palm",
-        approach="0,0,1",
-        pre_shape=["index_proximal=0.5,middle_proximal=0.6"],
-        fix=["thumb_rotation=1.0"],
-        drop=["ring_proximal_link"],
-    )
+    joints = {"pre_shape": ["index_proximal=0.5,middle_proximal=0.6"], "fix": ["thumb_rotation=1.0"]}
+    options = hand_options(palm="palm", approach="0,0,1", drop=["ring_proximal_link"], **joints)
     file, said = {"file": ("mine.urdf", urdf)}, {"options": json.dumps(options)}
     digest = http.post("/v1/hands", files=file, data=said).json()["digest"]
     message = IngestMessage(schema_=1, task_id="i", kind=AssetKind.HAND, name="mine", digest=digest)

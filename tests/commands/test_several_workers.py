@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import threading
+from functools import partial
 from pathlib import Path
 
 from graspd.commands.worker import run_workers
@@ -22,10 +23,8 @@ PROGRAM = (
 
 def test_each_has_a_number_and_one_that_ends_comes_again(tmp_path: Path) -> None:
     stop = threading.Event()
-    program = (sys.executable, "-c", PROGRAM)
-    running = threading.Thread(
-        target=run_workers, args=(3, [str(tmp_path)], Settings(), stop), kwargs={"program": program}
-    )
+    run = partial(run_workers, 3, [str(tmp_path)], Settings(), stop, program=(sys.executable, "-c", PROGRAM))
+    running = threading.Thread(target=run)
     running.start()
 
     def notes(count: int) -> list[tuple[int, int]]:

@@ -44,9 +44,8 @@ def run(code: str, environment: dict[str, str], folder: Path) -> str:
 
 
 def test_the_page_runs_as_it_is_printed(environment: dict[str, str], tmp_path: Path) -> None:
-    blocks = re.findall(
-        r"```python\n(.*?)```", (REPOSITORY / "docs" / "reference" / "python.md").read_text(), re.DOTALL
-    )
+    page = (REPOSITORY / "docs" / "reference" / "python.md").read_text()
+    blocks = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     said = run("\n".join(blocks), environment, tmp_path)
     assert "<8 grasps of allegro on mug, 8 valid>" in said and "<8 grasps of barrett on mug, 8 valid>" in said
     assert "no_such_file.stl" in said
@@ -238,9 +237,8 @@ def test_a_question_is_answered_within_one_search_and_one_page(asked: dict[str, 
 
 
 #: What a browser fetches by itself: a link that a reader follows may lead anywhere.
-_FETCHED = re.compile(
-    r"<(?:script|img|iframe|source)[^>]* src=\"((?:https?:)?//[^\"]+)|<link[^>]* href=\"((?:https?:)?//[^\"]+)"
-)
+_FETCHED = re.compile(r"<(?:(?:script|img|iframe|source)[^>]* src|link[^>]* href)=\"((?:https?:)?//[^\"]+)")
+_IMPORTED = re.compile(r"(?:@import|url\()\s*[\"']?((?:https?:)?//[^\"')]+)")
 
 
 @pytest.fixture(scope="module")
@@ -248,9 +246,8 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     if not (find_spec("material") and find_spec("mkdocstrings")):
         pytest.skip("needs pip install '.[docs]'; make docs-site brings it")
     folder = tmp_path_factory.mktemp("site")
-    done = completed(
-        [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", folder], cwd=REPOSITORY
-    )
+    build = (sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet")
+    done = completed([*build, "--site-dir", folder], cwd=REPOSITORY)
     assert done.returncode == 0, done.stderr
     return folder
 
@@ -263,16 +260,8 @@ def test_every_page_of_the_docs_is_a_page_of_the_site(site: Path) -> None:
 
 
 def test_the_site_fetches_nothing_from_elsewhere(site: Path) -> None:
-    fetched = {
-        (str(page.relative_to(site)), one or other)
-        for page in site.rglob("*.html")
-        for one, other in _FETCHED.findall(page.read_text())
-    }
-    styles = {
-        (str(sheet.relative_to(site)), url)
-        for sheet in site.rglob("*.css")
-        for url in re.findall(r"(?:@import|url\()\s*[\"']?((?:https?:)?//[^\"')]+)", sheet.read_text())
-    }
+    fetched = {(page.name, url) for page in site.rglob("*.html") for url in _FETCHED.findall(page.read_text())}
+    styles = {(sheet.name, url) for sheet in site.rglob("*.css") for url in _IMPORTED.findall(sheet.read_text())}
     assert fetched | styles == set()
 
 

@@ -78,11 +78,9 @@ def index_url(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
         yield f"sqlite:///{tmp_path / 'index.sqlite'}"
 
 
-def service(
-    folder: Path, store: Store | None = None, queue: RqQueue | None = None, **settings: Any
-) -> Iterator[Services]:
+def service(folder: Path, store: Store | None = None, queue: RqQueue | None = None, **said: Any) -> Iterator[Services]:
     """A service without processes, with a hand `gripper` and an object `ball`; each batch is a task."""
-    wanted = Settings(data_dir=folder, **{"retry_backoff_s": 0.0, "task_s": 0.0, **settings})
+    wanted = Settings(data_dir=folder, **{"retry_backoff_s": 0.0, "task_s": 0.0, **said})
     made = open_services(wanted, store, queue)
     add_assets(made)
     yield made

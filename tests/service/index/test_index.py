@@ -63,10 +63,8 @@ def test_a_job_shows_progress_by_stage(services: Services) -> None:
     services.index.live.set_progress({task.id: (1.0, 4.0, "descending")})
     shown = services.index.jobs.get(job.id)
     assert shown.state is State.RUNNING
-    assert [(s.stage, s.tasks, s.running, s.done) for s in shown.stages] == [
-        ("synthesize", 2, 1, 0.25),
-        ("scene", 2, 0, 0),
-    ]
+    told = [(stage.stage, stage.tasks, stage.running, stage.done) for stage in shown.stages]
+    assert told == [("synthesize", 2, 1, 0.25), ("scene", 2, 0, 0)]
     finish(services, job.id)
     done = services.index.jobs.get(job.id)
     assert (done.state, done.grasps) == (State.SUCCEEDED, 64)

@@ -45,9 +45,8 @@ def shards(services: Services) -> list[ShardManifest]:
     job, _ = job_actions.submit(services, request(grasps=32 * SHARDS))
     work_off(services)
     assert services.index.jobs.get(job.id).state is State.SUCCEEDED
-    found = [
-        load_manifest(services.store, s.stage, s.id) for s in services.index.shards.page(job=job.id, limit=99).items
-    ]
+    listed = services.index.shards.page(job=job.id, limit=99).items
+    found = [load_manifest(services.store, shard.stage, shard.id) for shard in listed]
     return sorted(found, key=lambda manifest: manifest.batch)
 
 
@@ -75,13 +74,8 @@ def harm(services: Services, shards: list[ShardManifest]) -> dict[str, str]:
     remove(services.store, shards[2].key)
     overwrite(services.store, names.shard_manifest(shards[3].stage, shards[3].shard_id), b'{"x": 1}')
     remove(services.store, names.shard_manifest(shards[4].stage, shards[4].shard_id))
-    return {
-        shards[0].shard_id: "SHA-256",
-        shards[1].shard_id: "bytes, expected",
-        shards[2].shard_id: MISSING,
-        shards[3].shard_id: BAD_MANIFEST,
-        shards[4].shard_id: NO_MANIFEST,
-    }
+    told = ("SHA-256", "bytes, expected", MISSING, BAD_MANIFEST, NO_MANIFEST)
+    return {shard.shard_id: what for shard, what in zip(shards, told, strict=False)}
 
 
 def test_five_kinds_of_damage_are_five_findings(services: Services, shards: list[ShardManifest]) -> None:
@@ -96,9 +90,8 @@ def test_what_is_made_again_has_the_checksum_it_had(services: Services, shards: 
     harm(services, shards)
     repaired, left = repair(services, findings(services))
     # The worker of a file without a manifest may be about to put it.
-    assert [one.what for one in left] == [
-        f"{NO_MANIFEST}; its manifest may follow soon; run the command again in a minute"
-    ]
+    (one,) = left
+    assert one.what == f"{NO_MANIFEST}; its manifest may follow soon; run the command again in a minute"
     assert len(repaired) == 4
     work_off(services)
     for manifest in (*shards[:4], shards[5]):

@@ -218,7 +218,6 @@ def _restarted(queue: RqQueue) -> RqQueue:
     if isinstance(queue, MemoryQueue):
         queue.restart_consumer()
         return queue
-    assert isinstance(queue, RqQueue)
     return RqQueue(queue.connection)
 
 
@@ -318,9 +317,8 @@ def test_redis_keeps_nothing_of_a_finished_task(rq_queue: RqQueue) -> None:
 
 
 def test_a_killed_worker_leaves_nothing_in_redis(rq_queue: RqQueue) -> None:
-    worker = SimpleWorker(
-        queue_names(tuple(Stage)), connection=rq_queue.connection, name="dead", serializer=JSONSerializer
-    )
+    served = queue_names(tuple(Stage))
+    worker = SimpleWorker(served, connection=rq_queue.connection, name="dead", serializer=JSONSerializer)
     worker.register_birth()
     one_beat(rq_queue.connection, "dead")
     rq_queue.tidy()
