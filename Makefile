@@ -57,7 +57,7 @@ docs-site: $(STAMP) ## the documentation as a site in build/site, with search; w
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 docs-commands: $(STAMP) ## the commands that README and docs print, run as printed (hours; PAGE=name.md: one page)
-	$(BIN)/python -m tests.docs_commands $(PAGE)
+	$(BIN)/python -m docs.commands $(PAGE)
 
 results: $(STAMP) ## every figure and picture of the docs again, resumable (DATA=, SOURCES=, BEFORE=; QUICK=1: 20 minutes)
 	$(BIN)/python -m benchmarks.results $(if $(QUICK),--quick) $(if $(DATA),--data $(DATA)) \

@@ -87,21 +87,13 @@ def fake_scene(message: TaskMessage, context: TaskContext) -> Output:
 
 
 def _scenes_of_batch(message: TaskMessage) -> Output:
-    scenes, rows = message.request.scenes, message.request.scenes * message.count
-    if message.request.in_scene:
-        rows = 0
-    return Output(
-        {
-            "scene/object_pose": np.repeat(_POSE, scenes, axis=0),
-            "scene/rest_probability": np.ones(scenes),
-            "scene/drop_seconds": np.ones(scenes),
-            "grasp/base_index": np.arange(rows) % message.count,
-            "grasp/scene_index": np.arange(rows) // message.count,
-            "grasp/hand_pose": np.repeat(_POSE, rows, axis=0),
-            "grasp/table_clearance_m": np.full(rows, 0.01),
-            "grasp/valid": np.ones(rows),
-        }
-    )
+    scenes = message.request.scenes
+    rows = 0 if message.request.in_scene else scenes * message.count
+    made = {"scene/object_pose": np.repeat(_POSE, scenes, axis=0), "grasp/hand_pose": np.repeat(_POSE, rows, axis=0)}
+    made |= {"scene/rest_probability": np.ones(scenes), "scene/drop_seconds": np.ones(scenes)}
+    made |= {"grasp/table_clearance_m": np.full(rows, 0.01), "grasp/valid": np.ones(rows)}
+    base, scene = np.arange(rows) % message.count, np.arange(rows) // message.count
+    return Output(made | {"grasp/base_index": base, "grasp/scene_index": scene})
 
 
 def fake_stages() -> dict[Stage, Any]:
@@ -140,12 +132,10 @@ def make_task(services: Services, job: JobRecord, task: PlannedTask, **info: Any
     return made
 
 
-def finish(
-    services: Services, job: str, *, batches: int | None = None, stage: Stage | None = None, **info: Any
-) -> None:
+def finish(services: Services, job: str, *, batches: float = math.inf, stage: Stage | None = None, **info: Any) -> None:
     """The first tasks of a job, of one stage or all, done on the spot; see `make_task`."""
     for task in plan(record := record_of(services, job)):
-        if (batches is None or task.batch < batches) and stage in (None, task.stage):
+        if task.batch < batches and stage in (None, task.stage):
             make_task(services, record, task, **info)
 
 

@@ -44,9 +44,7 @@ class MemoryQueue(RqQueue):
     def ping(self) -> float:
         return 0.0
 
-    def enqueue(
-        self, messages: Sequence[Message], priority: Priority, *, again: bool = False, apart: bool = False
-    ) -> int:
+    def enqueue(self, messages: Sequence[Message], priority: Priority, *, again: bool = False, **_: object) -> int:
         known = {(m.task_id, m.attempt) for waiting in self._priorities.values() for m in waiting}
         if not again:
             known |= {(held.message.task_id, held.message.attempt) for held in self._held.values()}
@@ -64,19 +62,15 @@ class MemoryQueue(RqQueue):
         return {m.task_id for waiting in self._priorities.values() for m in waiting}
 
     def depths(self) -> dict[tuple[Priority, Stage], int]:
-        return {
-            (priority, s): sum(m.stage is s for m in waiting)
-            for priority, waiting in self._priorities.items()
-            for s in Stage
-        }
+        counts = {(one, stage): 0 for one in Priority for stage in Stage}
+        return counts | Counter((one, m.stage) for one, waiting in self._priorities.items() for m in waiting)
 
     def clear_untaken(self, present: Collection[WorkerBeat]) -> None:
         pass
 
     def leases(self) -> list[Lease]:
-        return [
-            Lease(held.message.task_id, held.message.attempt, held.key, str(held.beat)) for held in self._held.values()
-        ]
+        held = self._held.values()
+        return [Lease(one.message.task_id, one.message.attempt, one.key, str(one.beat)) for one in held]
 
     def holder(self, lease: Lease) -> tuple[str, Message | None]:
         held = self._held.get(lease.key)

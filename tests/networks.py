@@ -8,16 +8,8 @@ from graspd.service.store.network_file import NETWORK_FILE, ProposalNetwork, num
 
 DIGEST = "0" * 32
 #: A small job that sets out from a network, but for its options.
-LEARNED = {
-    "grasps": 3,
-    "fidelity": "draft",
-    "seed": 5,
-    "rechecks": 0,
-    "want": "candidates",
-    "scene": "table",
-    "scenes": 2,
-    "method": "learned",
-}
+LEARNED = {"grasps": 3, "fidelity": "draft", "seed": 5, "rechecks": 0, "want": "candidates"}
+LEARNED |= {"scene": "table", "scenes": 2, "method": "learned"}
 
 
 def random_network(

@@ -26,6 +26,8 @@ import obstore
 from obstore.store import S3Store
 from sqlalchemy import create_engine, make_url, text
 
+from tests.shell import completed
+
 _START_S: Final = 60.0
 _STOP_S: Final = 10.0
 _NOBODY: Final = 65534
@@ -202,9 +204,7 @@ class PostgresServer(Server):
             os.chown(password, _NOBODY, _NOBODY)
         initdb = [str(self._programs / "initdb"), "-D", str(data), "-U", "graspd", "--auth=scram-sha-256"]
         options = [f"--pwfile={password}", "--encoding=UTF8", "--locale=C", "--no-sync"]
-        done = subprocess.run(
-            [*initdb, *options], capture_output=True, text=True, check=False, cwd=self.folder, **self._user
-        )
+        done = completed([*initdb, *options], cwd=self.folder, **self._user)
         if done.returncode:
             raise MissingServer(f"PostgreSQL cannot make a database here: {(done.stderr or done.stdout)[-500:]}")
 

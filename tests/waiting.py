@@ -22,6 +22,15 @@ def until(met: Callable[[], Any], what: str, *, seconds: float = PATIENCE_S, log
         asked = time.monotonic()
 
 
+def answers(url: str, client: httpx.Client | None = None) -> bool:
+    """Whether a GET of it ends well."""
+    try:
+        got = client.get(url) if client else httpx.get(url, trust_env=False, timeout=60)
+    except httpx.HTTPError:
+        return False
+    return got.status_code == 200
+
+
 def until_a_worker_is_idle(address: str) -> None:
     """Until a worker of the service at an address takes tasks: a ready service may have some that still check their
     engine, which compiles kernels where none are kept."""

@@ -1,10 +1,7 @@
-"""The application as a whole: its socket, its imports, its OpenAPI document, its scrape."""
+"""The application as a whole: its socket, its OpenAPI document, its scrape."""
 
 import asyncio
 import socket
-import subprocess
-import sys
-from functools import cache
 from typing import Any
 from unittest.mock import Mock
 
@@ -69,41 +66,6 @@ def test_workers_are_counted_in_every_state_that_they_can_be_in() -> None:
     assert "graspd_controller_up 1.0" in text.splitlines()
     counts = {state: float(text.partition(f'graspd_workers{{state="{state}"}} ')[2].split()[0]) for state in expected}
     assert counts == expected
-
-
-HEAVY = ("warp", "newton", "trimesh", "mujoco", "scipy", "yourdfpy", "graspd.worker")
-
-
-@cache
-def modules_after(statement: str) -> frozenset[str]:
-    code = f"{statement}\nimport sys\nprint(*sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    parts = (name.split(".") for name in done.stdout.split())
-    return frozenset(".".join(part[:2]) if part[0] == "graspd" else part[0] for part in parts)
-
-
-SERVER = {"jinja2", "uvicorn", "fastapi", "starlette", "sqlalchemy", "redis"}
-OVERVIEW = """
-import contextlib, io, sys
-import graspd.cli
-sys.argv = ["graspd", "--help"]
-with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
-    graspd.cli.main()
-"""
-CLIENT = "from graspd.client import client, commands, add_commands, dataset_commands, access_commands, tag_commands"
-
-
-@pytest.mark.parametrize(
-    ("statement", "absent"),
-    [
-        ("import graspd.api.app", HEAVY),
-        (CLIENT, {*HEAVY, *SERVER}),
-        (OVERVIEW, {*HEAVY, "fastapi", "sqlalchemy", "h5py", "numpy"}),
-    ],
-    ids=["server", "client", "overview"],
-)
-def test_each_part_imports_no_more_than_it_needs(statement: str, absent: set[str]) -> None:
-    assert modules_after(statement).isdisjoint(absent)
 
 
 def test_every_error_is_a_problem_document_and_v1_may_need_a_key(http: TestClient) -> None:

@@ -11,16 +11,11 @@ from typing import Any
 import hypothesis
 import pytest
 import schemathesis
+from hypothesis import HealthCheck
 from pydantic import SecretStr
 from schemathesis import GenerationMode
 from schemathesis.checks import not_a_server_error
-from schemathesis.specs.openapi.checks import (
-    content_type_conformance,
-    response_headers_conformance,
-    response_schema_conformance,
-    status_code_conformance,
-    unsupported_method,
-)
+from schemathesis.specs.openapi import checks
 
 from graspd.api.app import create_app
 from graspd.service.queue.connection import connect
@@ -34,14 +29,9 @@ _EXAMPLES = (
     pytest.param(6, marks=pytest.mark.timeout(900)),
     pytest.param(1600, marks=[pytest.mark.slow, pytest.mark.timeout(4 * 3600)]),
 )
-_CHECKS = [
-    not_a_server_error,
-    status_code_conformance,
-    content_type_conformance,
-    response_headers_conformance,
-    response_schema_conformance,
-    unsupported_method,
-]
+_CHECKS = [not_a_server_error, checks.status_code_conformance, checks.content_type_conformance]
+_CHECKS += [checks.response_headers_conformance, checks.response_schema_conformance, checks.unsupported_method]
+_PHASES = (hypothesis.Phase.explicit, hypothesis.Phase.generate)
 #: Requests that follow the document, and requests that break it.
 _MODES = (GenerationMode.POSITIVE, GenerationMode.NEGATIVE)
 #: What parameters are made of no type's own accord: put in the place of every third one.
@@ -52,9 +42,8 @@ _NASTY_KEYS = ([2**63], ["\ud800", "x"], ["x", "\ud800"], [2**70, "x"], [None, N
 @pytest.fixture(scope="module")
 def document(tmp_path_factory: pytest.TempPathFactory, redis_server: str) -> Iterator[Any]:
     """The document of an application with jobs in every state, on a real Redis."""
-    settings = Settings(
-        data_dir=tmp_path_factory.mktemp("contract"), redis_url=SecretStr(redis_server), max_upload_bytes=1 << 20
-    )
+    folder = tmp_path_factory.mktemp("contract")
+    settings = Settings(data_dir=folder, redis_url=SecretStr(redis_server), max_upload_bytes=1 << 20)
     queue = RqQueue(connect(redis_server))
     queue.connection.flushdb()
     services = open_services(settings, queue=queue)
@@ -121,14 +110,7 @@ def test_every_answer_is_declared_and_none_is_a_500(document: Any, examples: int
 def _probe(operation: Any, examples: int) -> None:
     """Send what Hypothesis makes of one operation's parameters and body, and check what comes back."""
 
-    @hypothesis.settings(
-        max_examples=examples,
-        deadline=None,
-        derandomize=True,
-        database=None,
-        phases=[hypothesis.Phase.explicit, hypothesis.Phase.generate],
-        suppress_health_check=list(hypothesis.HealthCheck),
-    )
+    @hypothesis.settings(max_examples=examples, database=None, phases=_PHASES, suppress_health_check=list(HealthCheck))
     @hypothesis.given(case=hypothesis.strategies.one_of(*(operation.as_strategy(mode) for mode in _MODES)))
     def run(case: Any) -> None:
         case.call_and_validate(checks=_CHECKS)

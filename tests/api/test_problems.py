@@ -35,7 +35,7 @@ def test_a_field_in_error_is_pointed_at(http: TestClient) -> None:
         ({"seed": "x"}, "#/seed", "whole number"),
         ({"colour": "red"}, "#/colour", "is not known"),
         ({"views": 3}, "#", "scenes >= 1"),
-        ({"hand": "../etc"}, "#/hand", "letters, digits"),
+        ({"hand": "../etc"}, "#/hand", "at most 64 letters, digits, dots, dashes and underscores"),
         ({"scene": "tabel"}, "#/scene", "did you mean table?"),  # codespell:ignore tabel
         ({"scene": FLAT}, "#/scene", "must be more than 0.0001"),
         ({"scene": "bin", "method": "graspit"}, "#", "plans around free objects only"),

@@ -90,12 +90,10 @@ def test_options_go_over_guesses_drop_fingers_and_weigh() -> None:
     assert report["facts"]["mass_kg"] == pytest.approx(500 * report["facts"]["volume_m3"])
 
 
-@pytest.mark.parametrize(
-    "options", [("--approach", "1,2"), ("--approach", "a,b,c"), ("--fix", "thumb"), ("--pre-shape", "thumb=x")]
-)
-def test_an_option_that_cannot_be_read_is_the_callers_mistake(options: tuple[str, ...]) -> None:
-    result = CliRunner().invoke(build(), ["hands", "check", "allegro", *options])
-    assert result.exit_code == 2 and options[0] in result.stderr
+@pytest.mark.parametrize("option", ["--approach 1,2", "--approach a,b,c", "--fix thumb", "--pre-shape thumb=x"])
+def test_an_option_that_cannot_be_read_is_the_callers_mistake(option: str) -> None:
+    result = CliRunner().invoke(build(), ["hands", "check", "allegro", *option.split()])
+    assert result.exit_code == 2 and option.split()[0] in result.stderr
 
 
 @pytest.mark.parametrize(("kind", "name"), [("hands", "barrett"), ("objects", "mug")])

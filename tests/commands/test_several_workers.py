@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import threading
+from functools import partial
 from pathlib import Path
 
 from graspd.commands.worker import run_workers
@@ -22,10 +23,8 @@ PROGRAM = (
 
 def test_each_has_a_number_and_one_that_ends_comes_again(tmp_path: Path) -> None:
     stop = threading.Event()
-    program = (sys.executable, "-c", PROGRAM)
-    running = threading.Thread(
-        target=run_workers, args=(3, [str(tmp_path)], Settings(), stop), kwargs={"program": program}
-    )
+    run = partial(run_workers, 3, [str(tmp_path)], Settings(), stop, program=(sys.executable, "-c", PROGRAM))
+    running = threading.Thread(target=run)
     running.start()
 
     def notes(count: int) -> list[tuple[int, int]]:
@@ -63,10 +62,3 @@ def test_an_engine_ends_at_once_without_being_taken_apart() -> None:
     """Warp and its kernels take two seconds of computing for that: too long for a busy machine to wait for."""
     done = subprocess.run([sys.executable, "-c", _ENDING], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (0, "what waited was sent\n"), done.stderr
-
-
-def test_a_worker_is_there_before_its_engine_is() -> None:
-    """It says that it lives, and what it checks, before Warp, MuJoCo and the kernels are imported."""
-    code = "import sys, graspd.commands.worker, graspd.worker.process.main; print(*sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert not {"warp", "mujoco", "scipy", "trimesh", "newton"} & set(done.stdout.split())

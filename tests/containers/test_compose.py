@@ -32,19 +32,12 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Project]:
     except NoEngine as reason:
         pytest.skip(str(reason))
     (port,) = free_ports(1)
-    variables = {
-        "COMPOSE_PROFILES": "cpu,s3,postgres",
-        "GRASPD_VERSION": "test",
-        "REDIS_PASSWORD": "redispassword",
-        "GRASPD_PUBLISHED_PORT": str(port),
-        "GRASPD_THREADS": "1",
-        "GRASPD_STORE_URL": "s3://graspd",
-        "AWS_ACCESS_KEY_ID": "graspd",
-        "AWS_SECRET_ACCESS_KEY": "s3password",
-        "AWS_ENDPOINT_URL": "http://s3:8333",
-        "POSTGRES_PASSWORD": "postgrespassword",
-        "GRASPD_INDEX_URL": "postgresql+psycopg://graspd:postgrespassword@postgres:5432/graspd",
-    }
+    variables = {"COMPOSE_PROFILES": "cpu,s3,postgres", "GRASPD_VERSION": "test", "GRASPD_THREADS": "1"}
+    variables |= {"GRASPD_PUBLISHED_PORT": str(port), "REDIS_PASSWORD": "redispassword"}
+    variables |= {"GRASPD_STORE_URL": "s3://graspd", "AWS_ENDPOINT_URL": "http://s3:8333"}
+    variables |= {"AWS_ACCESS_KEY_ID": "graspd", "AWS_SECRET_ACCESS_KEY": "s3password"}
+    index = "postgresql+psycopg://graspd:postgrespassword@postgres:5432/graspd"
+    variables |= {"POSTGRES_PASSWORD": "postgrespassword", "GRASPD_INDEX_URL": index}
     made = Project(tmp_path_factory.mktemp("project"), variables)
     try:
         made.build()

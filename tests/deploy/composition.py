@@ -65,12 +65,8 @@ def environment(service: Mapping[str, Any], data: Path, moved: Mapping[str, str]
 
 
 def redis_command(service: Mapping[str, Any], server: Path, port: int, folder: Path) -> Sequence[str]:
-    where = {"bind": "127.0.0.1", "port": str(port), "dir": str(folder)}
-    return [
-        str(server),
-        *service["command"][1:],
-        *(part for name, value in where.items() for part in (f"--{name}", value)),
-    ]
+    where = ("--bind", "127.0.0.1", "--port", str(port), "--dir", str(folder))
+    return [str(server), *service["command"][1:], *where]
 
 
 #: The services, with a password that stands for any.

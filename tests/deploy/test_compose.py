@@ -21,9 +21,8 @@ PREFIXES = ("AWS_", "REDIS_", "REDISCLI_", "POSTGRES_", "FORWARDED_")
 
 
 def test_it_is_what_the_compose_specification_says() -> None:
-    done = completed(
-        [sys.executable, "-m", "check_jsonschema", "--builtin-schema", "vendor.compose-spec", str(composition.COMPOSE)]
-    )
+    check = (sys.executable, "-m", "check_jsonschema", "--builtin-schema", "vendor.compose-spec")
+    done = completed([*check, composition.COMPOSE])
     assert done.returncode == 0, done.stdout + done.stderr
 
 

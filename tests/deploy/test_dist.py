@@ -14,10 +14,8 @@ from graspd.service.model.version import PACKAGE_VERSION
 from tests.conftest import REPOSITORY
 from tests.shell import completed
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(find_spec("build") is None, reason="no `build`: pip install -e '.[release]'"),
-]
+NO_BUILD = pytest.mark.skipif(find_spec("build") is None, reason="no `build`: pip install -e '.[release]'")
+pytestmark = [pytest.mark.slow, NO_BUILD]
 #: What a user does first, from files of the package alone: templates, built-in hands.
 FIRST_STEPS = """
 import pathlib, graspd, graspd.api.dashboard.rendering
@@ -34,9 +32,7 @@ assert len(list(service.store.library.stored_assets(store))) >= 6
 
 
 def made(folder: Path) -> dict[str, Path]:
-    subprocess.run(
-        [sys.executable, str(REPOSITORY / "docker" / "dist.py"), str(folder)], check=True, capture_output=True
-    )
+    subprocess.run([sys.executable, REPOSITORY / "docker" / "dist.py", folder], check=True, capture_output=True)
     return {file.suffix: file for file in folder.iterdir()}
 
 
@@ -70,10 +66,7 @@ def test_the_wheel_works_outside_the_repository(first: dict[str, Path], tmp_path
     (packages / "libraries.pth").write_text(sysconfig.get_path("purelib") + "\n")
     code = FIRST_STEPS.format(place=str(tmp_path))
     subprocess.run([python, "-c", code], cwd=tmp_path, check=True)
-    help_text = subprocess.run(
-        [tmp_path / "venv" / "bin" / "graspd", "--help"], cwd=tmp_path, check=True, capture_output=True, text=True
-    )
-    assert "synth" in help_text.stdout
+    assert "synth" in completed([tmp_path / "venv" / "bin" / "graspd", "--help"], cwd=tmp_path).stdout
 
 
 def test_all_of_its_extras_can_be_installed_beside_it(first: dict[str, Path]) -> None:

@@ -20,14 +20,14 @@ from graspd.service.settings import Settings
 from tests.conftest import REPOSITORY
 from tests.deploy.composition import SERVICES, seconds
 from tests.deploy.slurm import directives
+from tests.deploy.test_compose import SETTINGS
+from tests.deploy.test_dockerfile import COMMANDS
 from tests.shell import completed
 
 FOLDER = REPOSITORY / "docker" / "kubernetes"
 VARIANTS = ("fixed-cpu", "fixed-gpu", "keda-cpu", "keda-gpu")
 #: What health checks run: a look at the age of a file, no process of ours.
 AGE_OF_THE_FILE = 'test -n "$(find "$GRASPD_HEARTBEAT_FILE" -mmin -1)"'
-SETTINGS = {f"GRASPD_{name.upper()}" for name in Settings.model_fields}
-COMMANDS = {name for name, *_ in graspd.cli.COMMANDS}
 Document = dict[str, Any]
 
 
@@ -271,7 +271,7 @@ def test_a_worker_makes_room_before_its_pod_is_killed_for_memory() -> None:
         assert int(values["GRASPD_WORKER_MAX_MEMORY_MB"]) < 1000 * limit_gb
 
 
-BURST = REPOSITORY / "docker" / "kubernetes" / "burst.yaml"
+BURST = FOLDER / "burst.yaml"
 SLURM = REPOSITORY / "docker" / "slurm"
 PAGE = (REPOSITORY / "docs" / "how-to" / "clusters.md").read_text()
 FILES = [BURST, *sorted(SLURM.iterdir())]
@@ -309,8 +309,7 @@ def test_a_batch_script_is_shell_and_asks_for_what_slurm_knows(script: str) -> N
 def test_the_kubernetes_job_is_valid_and_runs_as_the_workers_do() -> None:
     document = yaml.safe_load(BURST.read_text())
     kubernetes_validate.validate(document, "1.30", strict=True)
-    manifests = (REPOSITORY / "docker" / "kubernetes" / "fixed-cpu" / "workers.yaml").read_text()
-    fixed = next(yaml.safe_load_all(manifests))
+    fixed = _files()["fixed-cpu/workers.yaml"][0]
     ours, theirs = document["spec"]["template"]["spec"], fixed["spec"]["template"]["spec"]
     for same in ("serviceAccountName", "securityContext", "volumes"):
         assert ours[same] == theirs[same]

@@ -13,11 +13,11 @@ import promql_parser
 import pytest
 import yaml
 
+from docs.commands import Line
 from graspd.doctor import all_checks
 from graspd.service.model.series import SERIES
 from graspd.service.settings import Settings
 from tests.conftest import REPOSITORY
-from tests.docs_commands import Line
 from tests.shell import completed
 
 FOLDER = REPOSITORY / "docker" / "monitoring"

@@ -21,8 +21,8 @@ from graspd.service.settings import Settings
 from graspd.service.store.library import publish_builtins
 from tests.conftest import REPOSITORY
 from tests.deploy import composition
-from tests.fakes import add_assets, finish, request
-from tests.indexes import open_services
+from tests.fakes import finish, request
+from tests.service.conftest import service
 from tests.shell import completed
 
 TEXT: Final = "\n".join((REPOSITORY / "docs" / "how-to" / page).read_text() for page in ("install.md", "operations.md"))
@@ -46,14 +46,12 @@ def run_block(name: str, folder: Path, environment: Mapping[str, str]) -> subpro
 @pytest.fixture
 def kept(tmp_path: Path) -> Iterator[Services]:
     """A data folder with a finished job and one that has not begun."""
-    services = open_services(Settings(data_dir=tmp_path / "data"))
-    identify(services)
-    add_assets(services)
-    publish_builtins(services.store)
-    finish(services, job_actions.submit(services, request(grasps=64, scenes=1))[0].id)
-    job_actions.submit(services, request(grasps=32, seed=5))
-    yield services
-    services.close()
+    for services in service(tmp_path / "data"):
+        identify(services)
+        publish_builtins(services.store)
+        finish(services, job_actions.submit(services, request(grasps=64, scenes=1))[0].id)
+        job_actions.submit(services, request(grasps=32, seed=5))
+        yield services
 
 
 def names_of(folder: Path) -> set[str]:

@@ -8,7 +8,7 @@ import ssl
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import closing, suppress
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -30,7 +30,7 @@ from tests.deploy import composition
 from tests.servers import PostgresServer, S3Server, free_ports
 from tests.service.conftest import wait_for_redis
 from tests.shell import completed
-from tests.waiting import until
+from tests.waiting import answers, until
 
 
 @dataclass
@@ -48,27 +48,17 @@ class Topology:
         return composition.environment(found, self.folder / "data", {"redis:6379": f"127.0.0.1:{self.redis_port}"})
 
     def start(self, name: str, service: str, *command: str, **more: str) -> None:
+        place = {"env": self.environment(service) | more, "cwd": REPOSITORY}
         with (self.folder / f"{name}.log").open("ab") as log:
-            self.processes[name] = subprocess.Popen(
-                [sys.executable, "-m", *command],
-                env=self.environment(service) | more,
-                cwd=REPOSITORY,
-                stdout=log,
-                stderr=subprocess.STDOUT,
-            )
+            self.processes[name] = subprocess.Popen([sys.executable, "-m", *command], stdout=log, stderr=log, **place)
 
     def graspd(self, service: str, *arguments: str, **more: str) -> subprocess.CompletedProcess[str]:
-        return completed(
-            [sys.executable, "-m", "graspd", *arguments], env=self.environment(service) | more, cwd=REPOSITORY
-        )
+        command = [sys.executable, "-m", "graspd", *arguments]
+        return completed(command, env=self.environment(service) | more, cwd=REPOSITORY)
 
     def until_ready(self) -> None:
-        def answers(port: int) -> bool:
-            with suppress(httpx.HTTPError):
-                return httpx.get(f"http://127.0.0.1:{port}/readyz", timeout=60, trust_env=False).status_code == 200
-            return False
-
-        until(lambda: all(map(answers, self.ports)), "both APIs are ready", logs=self.logs)
+        urls = [f"http://127.0.0.1:{port}/readyz" for port in self.ports]
+        until(lambda: all(map(answers, urls)), "both APIs are ready", logs=self.logs)
 
     def stop(self) -> None:
         for process in self.processes.values():
@@ -222,14 +212,9 @@ def proxy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Proxy]:
         timeout=60,
         event_hooks={"request": [lambda request: request.extensions.update(sni_hostname=NAME)]},
     )
-
-    def answers() -> bool:
-        with suppress(httpx.HTTPError):
-            return client.get("/healthz").status_code == 200
-        return False
-
     try:
-        until(answers, "the API answers through the proxy", logs=(folder / "api.log").read_text)
+        is_up = lambda: answers("/healthz", client)  # noqa: E731
+        until(is_up, "the API answers through the proxy", logs=(folder / "api.log").read_text)
         yield Proxy(client, key, f"{NAME}:{secure}", plain)
     finally:
         client.close()

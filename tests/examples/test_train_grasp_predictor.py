@@ -140,9 +140,8 @@ def test_a_block_is_lifted_by_a_hand_across_it_alone(hand: HandModel) -> None:
     def over(sight: Sight, count: int, rng: np.random.Generator) -> Proposals:
         return across(hand, sight, count, squeeze=SQUEEZE, rng=rng)
 
-    lifted, missed = (
-        next(examined(hand, [exam], proposer, seed=0, epsilon=False))[1]["lift"] for proposer in (over, beside)
-    )
+    found = [next(examined(hand, [exam], proposer, seed=0, epsilon=False))[1] for proposer in (over, beside)]
+    lifted, missed = (one["lift"] for one in found)
     assert lifted >= 0.5
     assert missed == 0.0
 

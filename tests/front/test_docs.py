@@ -18,11 +18,11 @@ import pytest
 import yaml
 
 import graspd
+from docs import commands
+from docs.commands import PAGES, Line, lines_of, main, run_page
 from graspd.service.run.supervisor import Supervisor
 from graspd.service.settings import Settings
-from tests import docs_commands
 from tests.conftest import PACKAGES, REPOSITORY
-from tests.docs_commands import PAGES, Line, lines_of, main, run_page
 from tests.shell import completed
 from tests.waiting import PATIENCE_S, until_a_worker_is_idle
 
@@ -44,9 +44,8 @@ def run(code: str, environment: dict[str, str], folder: Path) -> str:
 
 
 def test_the_page_runs_as_it_is_printed(environment: dict[str, str], tmp_path: Path) -> None:
-    blocks = re.findall(
-        r"```python\n(.*?)```", (REPOSITORY / "docs" / "reference" / "python.md").read_text(), re.DOTALL
-    )
+    page = (REPOSITORY / "docs" / "reference" / "python.md").read_text()
+    blocks = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     said = run("\n".join(blocks), environment, tmp_path)
     assert "<8 grasps of allegro on mug, 8 valid>" in said and "<8 grasps of barrett on mug, 8 valid>" in said
     assert "no_such_file.stl" in said
@@ -95,7 +94,7 @@ def test_a_documented_command_that_fails_turns_the_run_red(tmp_path: Path, monke
     failing = "graspd hands check nowhere"
     good = f"graspd --version\n{failing}   # refused\n{failing}\n```\n\n```\ngraspd: there is no hand\n"
     page.write_text(f"```sh\n{good}```\n\n```sh\n{failing} a\ngraspd --version  # refused\n```\n")
-    monkeypatch.setattr(docs_commands, "PAGES", (page,))
+    monkeypatch.setattr(commands, "PAGES", (page,))
     assert main([]) == 1
     assert re.findall(r"^page\.md: (.*)", capsys.readouterr().out, re.MULTILINE) == [f"{failing} a", "graspd --version"]
     page.write_text(f"```sh\n{good}```\n")
@@ -238,9 +237,8 @@ def test_a_question_is_answered_within_one_search_and_one_page(asked: dict[str, 
 
 
 #: What a browser fetches by itself: a link that a reader follows may lead anywhere.
-_FETCHED = re.compile(
-    r"<(?:script|img|iframe|source)[^>]* src=\"((?:https?:)?//[^\"]+)|<link[^>]* href=\"((?:https?:)?//[^\"]+)"
-)
+_FETCHED = re.compile(r"<(?:(?:script|img|iframe|source)[^>]* src|link[^>]* href)=\"((?:https?:)?//[^\"]+)")
+_IMPORTED = re.compile(r"(?:@import|url\()\s*[\"']?((?:https?:)?//[^\"')]+)")
 
 
 @pytest.fixture(scope="module")
@@ -248,9 +246,8 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     if not (find_spec("material") and find_spec("mkdocstrings")):
         pytest.skip("needs pip install '.[docs]'; make docs-site brings it")
     folder = tmp_path_factory.mktemp("site")
-    done = completed(
-        [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", folder], cwd=REPOSITORY
-    )
+    build = (sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet")
+    done = completed([*build, "--site-dir", folder], cwd=REPOSITORY)
     assert done.returncode == 0, done.stderr
     return folder
 
@@ -263,16 +260,8 @@ def test_every_page_of_the_docs_is_a_page_of_the_site(site: Path) -> None:
 
 
 def test_the_site_fetches_nothing_from_elsewhere(site: Path) -> None:
-    fetched = {
-        (str(page.relative_to(site)), one or other)
-        for page in site.rglob("*.html")
-        for one, other in _FETCHED.findall(page.read_text())
-    }
-    styles = {
-        (str(sheet.relative_to(site)), url)
-        for sheet in site.rglob("*.css")
-        for url in re.findall(r"(?:@import|url\()\s*[\"']?((?:https?:)?//[^\"')]+)", sheet.read_text())
-    }
+    fetched = {(page.name, url) for page in site.rglob("*.html") for url in _FETCHED.findall(page.read_text())}
+    styles = {(sheet.name, url) for sheet in site.rglob("*.css") for url in _IMPORTED.findall(sheet.read_text())}
     assert fetched | styles == set()
 
 

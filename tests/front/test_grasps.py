@@ -48,11 +48,9 @@ def columns(count: int, *, scenes: int = 0, seed: int = 0) -> dict[str, Any]:
     return made
 
 
-def shard(
-    path: Path, count: int = 6, *, obj: str = "mug", joints: str = "abx", hand: str = "claw", **more: Any
-) -> Path:
+def shard(path: Path, count: int = 6, *, obj: str = "mug", joints: str = "abx", hand: str = "claw", **of: Any) -> Path:
     said = {"hand": hand, "object": obj, "joint_names": list(joints)}
-    path.write_bytes(write_shard("base", columns(count, **more), said))
+    path.write_bytes(write_shard("base", columns(count, **of), said))
     return path
 
 
@@ -172,27 +170,24 @@ def test_a_notebook_shows_the_best_as_a_small_picture(known: graspd.Grasps) -> N
     assert len(png) <= showing.PICTURE_BYTES and Image.open(io.BytesIO(png)).width > 2 * showing.EDGE
 
 
-def test_a_notebook_shows_a_table_where_nothing_can_be_drawn(
-    grasps: graspd.Grasps, known: graspd.Grasps, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_notebook_shows_a_table_of_an_unknown_hand(grasps: graspd.Grasps, tmp_path: Path) -> None:
     # The best valid one first; the hand called claw is nowhere.
     assert "<tbody><tr><td>5</td><td>yes</td><td>5</td>" in grasps._repr_html_()
     assert "<table>" in grasps[[]]._repr_html_()
     html = graspd.open(shard(tmp_path / "h.h5", obj="<script>", hand="<b>"))._repr_html_()
     assert "<script>" not in html and "<b>" not in html
-    for bound in ("PICTURE_S", "PICTURE_BYTES"):
-        with monkeypatch.context() as tight:
-            tight.setattr(showing, bound, -1)
-            html = known._repr_html_()
-            assert "<table>" in html and "<img" not in html
+
+
+@pytest.mark.parametrize("bound", ["PICTURE_S", "PICTURE_BYTES"])
+def test_a_picture_out_of_bounds_is_a_table(known: graspd.Grasps, bound: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(showing, bound, -1)
+    assert "<table>" in known._repr_html_() and "<img" not in known._repr_html_()
 
 
 def test_plot_is_a_picture_of_the_best(known: graspd.Grasps, grasps: graspd.Grasps) -> None:
     one, two = known.plot(1, edge=240), known.plot(2, edge=240)
-    seconds = [np.asarray(sheet)[100:340, 300:520] for sheet in (one, two)]
-    assert [bool(np.ptp(second, axis=(0, 1)).any()) for second in seconds] == [False, True], (
-        "the second cell has a grasp or none"
-    )
+    cells = [np.asarray(sheet)[100:340, 300:520] for sheet in (one, two)]
+    assert [bool(np.ptp(cell, axis=(0, 1)).any()) for cell in cells] == [False, True], "the second has a grasp or none"
     with pytest.raises(graspd.InputError, match="no grasp to draw"):
         known[[]].plot()
     with pytest.raises(graspd.NotFoundError, match="claw"):

@@ -1,8 +1,5 @@
 """Options are declared once; messages name them as the caller spells them."""
 
-import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +14,6 @@ from graspd.service.model.errors import InputError
 from graspd.service.model.local_options import LocalOptions
 from graspd.service.model.options import rows
 from tests.conftest import REPOSITORY
-from tests.one_more_option import FLAG, MEANING, NAME
 
 
 @pytest.mark.parametrize(
@@ -65,27 +61,6 @@ def test_an_option_of_the_planner_may_be_a_file_with_a_long_path(kind: type, tmp
         graspd.synthesize("barrett", "mug", scene="table", method="learned", options={"network": file})
     with pytest.raises(InputError, match=r"^options\.steps: must"):
         graspd.synthesize("barrett", "mug", method="graspit", options={"steps": "x" * 100})
-
-
-def test_one_more_option_is_found_in_all_places(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "tests.one_more_option", str(tmp_path / "data")]
-    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr
-    found = json.loads(done.stdout.splitlines()[-1])
-    assert all(FLAG in text and MEANING.removeprefix("largest ") in text for text in found["help"])
-    assert [text.strip() for text in found["out of bounds"][:2]] == [
-        f"graspd: {FLAG}: must be at most 20; see `root {name} --help`" for name in ("synth", "submit")
-    ]
-    assert NAME in found["out of bounds"][2]
-    for page, place in zip(found["forms"], ("", "cell-"), strict=True):
-        assert f'<label for="{place}{NAME}">Finger force [N]</label>' in page
-        assert f'name="{NAME}" type="number" min="1" max="20" step="any" value="5"' in page
-    shown = {"type": "number", "maximum": 20.0, "minimum": 1.0, "title": "Finger Force", "default": 5.0}
-    assert found["http"] == [shown | {"description": MEANING}] * 2
-    assert found["python"] == [f"{NAME}: 'float' = 5.0"] * 2
-    assert found["types"].count(f"    {NAME}: float\n") == 2
-    assert f"| `{NAME}` | `{FLAG}` | both | `5.0` | at least 1 and at most 20 | {MEANING} |" in found["docs"]
-    assert not found["warp"], "help, completion and what is refused need no engine"
 
 
 def test_the_types_of_keywords_are_up_to_date() -> None:

@@ -1,7 +1,6 @@
 """Files that a public project keeps beside its sources are valid; `import graspd` is light and complete."""
 
 import re
-import subprocess
 import sys
 import tomllib
 from pathlib import Path
@@ -14,9 +13,9 @@ from click.testing import CliRunner
 from packaging.specifiers import SpecifierSet
 
 import graspd
+from docs.commands import Line
 from graspd.service.model.version import PACKAGE_VERSION
 from tests.conftest import REPOSITORY
-from tests.docs_commands import Line
 from tests.shell import completed
 
 FORGE = REPOSITORY / ".github"
@@ -104,21 +103,49 @@ def test_a_commit_is_checked_by_the_tools_of_make_check() -> None:
     assert tools <= {f".venv/bin/{name}" for name in checked}
 
 
-HEAVY = ("numpy", "pydantic", "warp", "newton", "trimesh", "mujoco", "h5py", "httpx")
-#: All that it imports of its own: `libraries` imports the others without the garbage collector.
+ENGINE = {"warp", "newton", "trimesh", "mujoco", "scipy", "yourdfpy"}
+WORK = {*ENGINE, "graspd.worker"}
+SERVER = {"jinja2", "uvicorn", "fastapi", "starlette", "sqlalchemy", "redis"}
+CLIENT = "from graspd.client import client, commands, add_commands, dataset_commands, access_commands, tag_commands"
+OVERVIEW = """
+import contextlib, io, sys
+import graspd.cli
+sys.argv = ["graspd", "--help"]
+with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
+    graspd.cli.main()
+"""
+#: The readers' module for torch is for those who have it.
+SERVICE = [file for file in (REPOSITORY / "service").rglob("[a-z]*.py") if file.name != "torch_data.py"]
+MODULES = [".".join(("graspd", *file.relative_to(REPOSITORY).with_suffix("").parts)) for file in SERVICE]
+#: All that `import graspd` imports of its own: `libraries` imports the others without the garbage collector.
 OWN = {"graspd", "graspd.service", "graspd.service.model", "graspd.service.model.libraries"}
 
 
-def python(code: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    return completed([sys.executable, "-c", code], cwd=cwd)
+def modules_after(statement: str) -> set[str]:
+    done = completed([sys.executable, "-c", f"{statement}\nimport sys\nprint(*sys.modules)"], cwd=REPOSITORY)
+    assert done.returncode == 0, done.stderr
+    return set(done.stdout.split())
 
 
-def test_the_import_loads_nothing_that_takes_time() -> None:
-    done = python("import graspd, sys; print(*sys.modules)", REPOSITORY)
-    loaded = set(done.stdout.split())
-    assert "graspd" in loaded, done.stderr
-    assert {name for name in loaded if name.partition(".")[0] == "graspd"} == OWN
-    assert {name.partition(".")[0] for name in loaded}.isdisjoint(HEAVY)
+@pytest.mark.parametrize(
+    ("statement", "absent"),
+    [
+        ("import graspd", {*WORK, "numpy", "pydantic", "h5py", "httpx"}),
+        ("import graspd.api.app", WORK),
+        (CLIENT, WORK | SERVER),
+        (OVERVIEW, {*WORK, "fastapi", "sqlalchemy", "h5py", "numpy"}),
+        (f"import {', '.join(MODULES)}", {*WORK, "torch", "graspd.api"}),
+        # A worker says that it lives before the engine and the kernels are imported.
+        ("import graspd.commands.worker, graspd.worker.process.main", ENGINE),
+    ],
+    ids=["package", "server", "client", "overview", "service", "worker"],
+)
+def test_each_part_imports_no_more_than_it_needs(statement: str, absent: set[str]) -> None:
+    assert modules_after(statement).isdisjoint(absent)
+
+
+def test_the_package_imports_itself_where_it_is_used() -> None:
+    assert {name for name in modules_after("import graspd") if name.partition(".")[0] == "graspd"} == OWN
 
 
 def test_every_public_name_is_there_and_the_errors_are_one_tree() -> None:

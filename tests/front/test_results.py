@@ -12,19 +12,15 @@ from benchmarks.results.__main__ import main
 from benchmarks.results.manifest import DOCS, INDEX, digests, faults, load, staleness, there
 from benchmarks.results.running import Runner
 from benchmarks.results.studies import BY_NAME, STUDIES, Study, is_raw
+from docs.commands import Line
 from graspd.service.model.version import STAGE_REVISIONS
 from tests.conftest import REPOSITORY
-from tests.docs_commands import Line
 from tests.shell import completed
 
+ATLASES = sorted((DOCS / "results").glob("*stability/stability.md"))
 MOST_BYTES, MOST_LINES = 8_000_000, 6_000
-ADD = Study(
-    "add",
-    "a sum",
-    ("results/total.txt",),
-    ("python -c \"import sys; open(sys.argv[1], 'w').write(str(1 + 1)); print('done')\" OUT/results/total.txt",),
-    prints="results/sum.md",
-)
+_SUM = "python -c \"import sys; open(sys.argv[1], 'w').write(str(1 + 1)); print('done')\" OUT/results/total.txt"
+ADD = Study("add", "a sum", ("results/total.txt",), (_SUM,), prints="results/sum.md")
 
 
 def runner(folder: Path, **options: bool) -> Runner:
@@ -64,9 +60,7 @@ def test_what_a_page_cites_is_held_and_its_tables_are_current(path: Path) -> Non
     assert page.renewed(text, DOCS) == text, "run: make docs"
 
 
-@pytest.mark.parametrize(
-    "path", sorted((DOCS / "results").glob("*stability/stability.md")), ids=lambda path: path.parent.name
-)
+@pytest.mark.parametrize("path", ATLASES, ids=lambda path: path.parent.name)
 def test_what_the_atlas_finds_broken_is_among_the_limits(path: Path) -> None:
     still = path.read_text().partition("## What still breaks")[2].partition("\n## ")[0]
     _, _, *rows = [row.split(" | ") for row in still.splitlines() if row.startswith("| ")]

@@ -29,10 +29,7 @@ NOBODY = {"GRASPD_API_URL": "http://127.0.0.1:9"}
         ("submit", "missing option --hand; see `graspd submit --help`"),
         ("submit --hand", "option --hand requires an argument"),
         ("submit --hand allegro --object mug -n 0", "--grasps: must be at least 1"),
-        (
-            "submit --hand allegro --object mug --grasps many",
-            "--grasps: must be a whole number; see `graspd submit --help`",
-        ),
+        ("submit --hand x --object y --grasps many", "--grasps: must be a whole number; see `graspd submit --help`"),
         (
             "jobs --state runing",  # codespell:ignore runing
             "--state: must be one of queued, running, succeeded, failed, cancelled; did you mean running?",
@@ -55,17 +52,11 @@ def python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
     return completed([sys.executable, "-c", start], env=os.environ | environment)
 
 
-@pytest.mark.parametrize(
-    ("typed", "offered"),
-    [
-        ("", "synth"),
-        ("admin ker", "kernels"),
-        ("admin index re", "rebuild"),
-        ("datasets cr", "create"),
-        ("export --for", "--format"),
-        ("datasets card --li", "--licence"),
-    ],
-)
+OFFERED = {"": "synth", "admin ker": "kernels", "admin index re": "rebuild", "datasets cr": "create"}
+OFFERED |= {"export --for": "--format", "datasets card --li": "--licence"}
+
+
+@pytest.mark.parametrize(("typed", "offered"), OFFERED.items())
 def test_completion_knows_commands_without_the_engine(typed: str, offered: str) -> None:
     code = "try: main()\nfinally: print('warp' in sys.modules, file=sys.stderr)"
     words = f"graspd {typed}"

@@ -3,6 +3,7 @@
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -12,7 +13,7 @@ from graspd.service.queue.connection import connect, redis_url
 from graspd.service.queue.rq_queue import RqQueue
 from graspd.service.run.embedded import server_command
 from graspd.service.settings import Settings
-from graspd.service.store.store import open_store
+from graspd.service.store.store import Store, open_store
 from tests.fakes import add_assets
 from tests.indexes import EmptySchemas, open_services
 from tests.servers import PostgresServer
@@ -77,12 +78,16 @@ def index_url(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
         yield f"sqlite:///{tmp_path / 'index.sqlite'}"
 
 
-@pytest.fixture
-def services(tmp_path: Path) -> Iterator[Services]:
-    """A service without processes: memory store, SQLite index, memory queue, a hand `gripper` and an object `ball`;
-    each batch is a task."""
-    settings = Settings(data_dir=tmp_path, retry_backoff_s=0.0, task_s=0.0)
-    made = open_services(settings, open_store("memory://"))
+def service(folder: Path, store: Store | None = None, queue: RqQueue | None = None, **said: Any) -> Iterator[Services]:
+    """A service without processes, with a hand `gripper` and an object `ball`; each batch is a task."""
+    wanted = Settings(data_dir=folder, **{"retry_backoff_s": 0.0, "task_s": 0.0, **said})
+    made = open_services(wanted, store, queue)
     add_assets(made)
     yield made
     made.close()
+
+
+@pytest.fixture
+def services(tmp_path: Path) -> Iterator[Services]:
+    """A service with a store in memory and an index in SQLite."""
+    yield from service(tmp_path, open_store("memory://"))

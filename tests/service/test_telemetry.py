@@ -3,7 +3,6 @@
 import json
 import logging
 import os
-import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -20,6 +19,8 @@ from graspd.service.pipeline.controller import Controller
 from graspd.service.settings import Settings
 from graspd.service.telemetry import HeartbeatFile
 from tests.deploy.test_kubernetes import AGE_OF_THE_FILE
+from tests.fakes import with_settings
+from tests.shell import completed
 from tests.waiting import until
 
 log = logging.getLogger("graspd.test")
@@ -78,11 +79,8 @@ def test_on_a_terminal_a_message_is_one_line_of_text(written: Callable[[], str])
 
 
 def is_healthy(file: Path) -> bool:
-    command = ["sh", "-c", AGE_OF_THE_FILE]
-    done = subprocess.run(
-        command, env={**os.environ, "GRASPD_HEARTBEAT_FILE": str(file)}, capture_output=True, check=False
-    )
-    return done.returncode == 0
+    environment = {**os.environ, "GRASPD_HEARTBEAT_FILE": str(file)}
+    return completed(["sh", "-c", AGE_OF_THE_FILE], env=environment).returncode == 0
 
 
 def test_the_check_follows_the_age_of_the_file(tmp_path: Path) -> None:
@@ -97,12 +95,10 @@ def test_the_check_follows_the_age_of_the_file(tmp_path: Path) -> None:
 
 def test_a_controller_lives_without_redis(services: Services, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / "alive"
-    settings = services.settings.model_copy(update={"heartbeat_file": file, "integrity_scan_mb_per_s": 0.0})
+    watched = with_settings(services, heartbeat_file=file, integrity_scan_mb_per_s=0.0)
     monkeypatch.setattr(services.queue, "depths", Mock(side_effect=QueueUnavailable("Redis does not answer")))
     stop = threading.Event()
-    thread = threading.Thread(
-        target=Controller(Services(settings, services.store, services.index, services.queue)).run, args=(stop,)
-    )
+    thread = threading.Thread(target=Controller(watched).run, args=(stop,))
     thread.start()
     try:
         until(file.exists, "the file is touched")

@@ -65,19 +65,11 @@ def start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Started]:
     Everything is stopped at the end."""
     running: list[System] = []
 
-    def make(
-        *,
-        workers: int = 1,
-        fakes: bool = True,
-        api: bool = False,
-        environment: dict[str, str] | None = None,
-        **settings: Any,
-    ) -> System:
-        for name, value in {"FAKE_HOLD": str(tmp_path / "hold"), **(environment or {})}.items():
+    def make(workers: int = 1, *, fakes: bool = True, api: bool = False, environment: Any = (), **of: Any) -> System:
+        for name, value in {"FAKE_HOLD": str(tmp_path / "hold"), **dict(environment)}.items():
             monkeypatch.setenv(name, value)
-        wanted = Settings(
-            data_dir=tmp_path / "data", port=0, device="cpu", controller_interval_s=0.5, **{"task_s": 0.0, **settings}
-        )
+        quick = {"controller_interval_s": 0.5, "task_s": 0.0, **of}
+        wanted = Settings(data_dir=tmp_path / "data", port=0, device="cpu", **quick)
         command = ("-m", "tests.fakes") if fakes else ("-m", "graspd", "worker")
         supervisor = Supervisor(wanted, workers=workers, api=api, worker_command=(sys.executable, *command))
         empty_index(wanted.resolved_index_url).close()

@@ -3,8 +3,7 @@
 import json
 import os
 import sys
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -42,19 +41,8 @@ GRIPPER = """\
 """
 
 
-@dataclass(frozen=True)
-class Shell:
-    """Runs `graspd` as a user does, in a folder of the user's files."""
-
-    environment: dict[str, str]
-    folder: Path
-
-    def __call__(self, *arguments: str) -> tuple[int, dict[str, Any], str]:
-        """Exit code, the JSON object on the last line, standard error."""
-        command = [sys.executable, "-m", "graspd", *arguments, "--json"]
-        done = completed(command, env=self.environment, cwd=self.folder, timeout=280)
-        lines = done.stdout.strip().splitlines()
-        return done.returncode, json.loads(lines[-1]) if lines else {}, done.stderr
+#: Runs `graspd` as a user does; gives its exit code, the JSON object on the last line, and standard error.
+Shell = Callable[..., tuple[int, dict[str, Any], str]]
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +73,14 @@ def graspd(service: Supervisor, files: Path) -> Shell:
     kept = {name: value for name, value in os.environ.items() if not name.startswith("GRASPD_")}
     # The tests' own folder of modules, not what lies in the user's.
     path = os.pathsep.join(filter(None, (str(Path(__file__).parents[2]), kept.get("PYTHONPATH"))))
-    return Shell(kept | names | {"PYTHONPATH": path}, files)
+
+    def run(*arguments: str) -> tuple[int, dict[str, Any], str]:
+        command, own = [sys.executable, "-m", "graspd", *arguments, "--json"], kept | names | {"PYTHONPATH": path}
+        done = completed(command, env=own, cwd=files, timeout=280)
+        lines = done.stdout.strip().splitlines()
+        return done.returncode, json.loads(lines[-1]) if lines else {}, done.stderr
+
+    return run
 
 
 def test_a_refused_object_gets_in_with_the_named_fix(graspd: Shell) -> None:
@@ -109,10 +104,8 @@ def test_a_folder_of_objects_becomes_a_dataset_and_files(graspd: Shell, service:
     assert (made["dataset"]["state"], made["dataset"]["grasps"]) == ("succeeded", 8)
     assert made["refused"] == ["torn"]
     code, status, _ = graspd("datasets", "status", "play")
-    assert [(cell["object"], cell["state"]) for cell in status["matrix"]] == [
-        ("ball", "succeeded"),
-        ("rod", "succeeded"),
-    ]
+    states = {cell["object"]: cell["state"] for cell in status["matrix"]}
+    assert states == {"ball": "succeeded", "rod": "succeeded"}
     code, export, _ = graspd("datasets", "export", "play", "-o", str(tmp_path / "play"))
     assert code == 0 and export["complete"]
     assert len(list((tmp_path / "play").rglob("*.h5"))) == export["files"] == 2

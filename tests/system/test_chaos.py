@@ -17,7 +17,6 @@ import pytest
 from graspd.service.index.queries.grasps import GraspFilter
 from graspd.service.index.rebuild import differences
 from graspd.service.model import names
-from graspd.service.model.errors import QueueUnavailable
 from graspd.service.model.planning import plan
 from graspd.service.model.states import Priority, Stage, State
 from graspd.service.pipeline import job_actions
@@ -28,6 +27,7 @@ from graspd.service.store.manifests import ShardManifest, load_shard
 from graspd.service.store.records import read_record
 from tests.fakes import record_of
 from tests.fakes import request as wanted
+from tests.service.conftest import is_up
 from tests.service.pipeline.datasets.makers import add_asset, cells_of
 from tests.service.pipeline.datasets.makers import wanted as wanted_dataset
 from tests.system.conftest import System, alive
@@ -84,9 +84,7 @@ def test_a_worker_told_to_stop_hands_its_task_back_at_once(start: Start) -> None
     (done,) = system.finish(job)
     assert done.state is State.SUCCEEDED
     assert system.services.index.jobs.tasks(job=job).items[0].worker != first, "another worker ran it"
-    assert system.services.index.jobs.attempts(job=job) == [], (
-        "nobody waited for the lease to run out, it costs no attempt"
-    )
+    assert system.services.index.jobs.attempts(job=job) == [], "nobody waited for the lease to run out"
     for name in ("controller", "worker-0", "redis"):
         pid = system.kill(name)
         system.until(lambda n=name, p=pid: system.supervisor.pids.get(n, p) != p, f"{name} is started again")
@@ -99,7 +97,6 @@ _UP_IN_A_PROCESS = """
 import json, sys, time
 from pathlib import Path
 from graspd.service.settings import Settings
-from graspd.service.store.shards import read_shard
 from graspd.service.run.supervisor import Supervisor
 up = Supervisor(Settings(data_dir=Path(sys.argv[1]), port=0, device="cpu"), api=False,
                 worker_command=(sys.executable, "-m", "tests.fakes"))
@@ -142,15 +139,8 @@ def test_random_kills_lose_nothing_and_repeat_nothing(
     if remote:
         url = request.getfixturevalue("postgres_server").database()
         places = {"store_url": request.getfixturevalue("s3_url"), "index_url": url}
-    system = start(
-        workers=2,
-        api=True,
-        environment={"FAKE_SECONDS": "0.05"},
-        lease_s=2.0,
-        task_attempts=20,
-        retry_backoff_s=0.1,
-        **places,
-    )
+    quick = {"environment": {"FAKE_SECONDS": "0.05"}, "lease_s": 2.0, "retry_backoff_s": 0.1}
+    system = start(workers=2, api=True, task_attempts=20, **quick, **places)
     rng = random.Random(0)
     jobs = [system.submit(wanted(grasps=32 * batches // 10, seed=seed)) for seed in range(10)]
     everyone: set[int] = set()
@@ -201,10 +191,8 @@ def test_the_range_of_a_killed_worker_is_made_again_once(start: Start) -> None:
     assert differences(system.services.index, system.services.store) == []
     record = record_of(system.services, job)
     made = [load_shard(system.services.store, Stage.SYNTHESIZE, task.output) for task in plan(record)]
-    assert [(shard.attributes["batch"], shard.attributes["batch_rows"]) for shard in made] == [
-        (0, "[32, 32, 32]"),
-        (3, "[32, 32]"),
-    ]
+    parts = {shard.attributes["batch"]: shard.attributes["batch_rows"] for shard in made}
+    assert parts == {0: "[32, 32, 32]", 3: "[32, 32]"} and len(made) == 2
     rows = np.concatenate([shard["grasp/joint_positions"] for shard in made])
     assert len(np.unique(rows, axis=0)) == 160, "no batch is there twice"
 
@@ -236,20 +224,19 @@ def test_a_dataset_goes_on_after_everything_was_killed(start: Start) -> None:
         add_asset(system.services, "object", name)
     request = wanted_dataset("kitchen", hands=("gripper",), objects=OBJECTS, scenes=1)
     actions.create(system.services, request)
-    system.until(
-        lambda: system.services.index.datasets.get("kitchen").states[State.SUCCEEDED] >= 5, "a quarter is done"
-    )
+    kitchen = lambda: system.services.index.datasets.get("kitchen")  # noqa: E731
+    system.until(lambda: kitchen().states[State.SUCCEEDED] >= 5, "a quarter is done")
     system.hold.touch()
     for pid in system.supervisor.pids.values():
         with contextlib.suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
     before = made(system)
     assert len(before) < 2 * len(OBJECTS)
-    system.until(lambda: _redis_answers(system), "Redis is started again")
+    system.until(lambda: is_up(system.services.queue), "Redis is started again")
     again, new = actions.create(system.services, request)
     assert not new and not again.state.is_final
     system.hold.unlink()
-    system.until(lambda: system.services.index.datasets.get("kitchen").state.is_final, "the dataset is done")
+    system.until(lambda: kitchen().state.is_final, "the dataset is done")
     after = made(system)
     assert {key: after[key] for key in before} == before
     assert len(after) == 2 * len(OBJECTS)
@@ -257,11 +244,3 @@ def test_a_dataset_goes_on_after_everything_was_killed(start: Start) -> None:
     assert differences(system.services.index, system.services.store) == []
     taken, _ = actions.snapshot(system.services, "kitchen")
     assert taken.complete and len(taken.shards) == len(after)
-
-
-def _redis_answers(system: System) -> bool:
-    try:
-        system.services.queue.ping()
-    except QueueUnavailable:
-        return False
-    return True

@@ -19,7 +19,6 @@ from graspd.service.model.states import Priority, State
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
 from graspd.service.queue.connection import redis_url
-from graspd.service.queue.rq_queue import RqQueue
 from graspd.service.run.embedded import server_command
 from graspd.service.settings import Settings
 from tests.conftest import REPOSITORY
@@ -97,13 +96,9 @@ def test_steady_small_jobs_do_not_stop_a_dataset(start: Start) -> None:
     def keep_busy() -> None:
         seed = 0
         while not ended.is_set():
+            depths = system.services.queue.depths()
             # There are always more small tasks than the one worker gets done.
-            if (
-                sum(
-                    n for (priority, _), n in system.services.queue.depths().items() if priority is Priority.INTERACTIVE
-                )
-                < 8
-            ):
+            if sum(depth for (priority, _), depth in depths.items() if priority is Priority.INTERACTIVE) < 8:
                 seed += 1
                 system.submit(request(grasps=128, seed=seed))
             time.sleep(0.02)
@@ -111,9 +106,7 @@ def test_steady_small_jobs_do_not_stop_a_dataset(start: Start) -> None:
     thread = threading.Thread(target=keep_busy)
     thread.start()
     try:
-        system.until(
-            lambda: system.services.index.jobs.get(bulk).grasps >= 5 * 32, "five batches of the dataset are done"
-        )
+        system.until(lambda: system.services.index.jobs.get(bulk).grasps >= 5 * 32, "five batches are done")
     finally:
         ended.set()
         thread.join()
@@ -144,7 +137,6 @@ def test_a_worker_whose_engine_breaks_returns_when_it_is_fixed(start: Start, tmp
 
 @pytest.fixture
 def own_s3(s3_server: S3Server, monkeypatch: pytest.MonkeyPatch) -> Iterator[S3Server]:
-    """An S3 server that the test may kill."""
     with S3Server() as server:
         for name, value in server.environment.items():
             monkeypatch.setenv(name, value)
@@ -153,7 +145,6 @@ def own_s3(s3_server: S3Server, monkeypatch: pytest.MonkeyPatch) -> Iterator[S3S
 
 @pytest.fixture
 def own_postgres(postgres_server: PostgresServer) -> Iterator[PostgresServer]:
-    """A PostgreSQL that the test may kill."""
     with PostgresServer() as server:
         yield server
 
@@ -237,23 +228,14 @@ class House:
         self.start("redis", *server_command(self.settings))
         empty_index(self.settings.resolved_index_url).close()
         self.services = Services.open(self.settings)
-        assert isinstance(self.services.queue, RqQueue)
         wait_for_redis(self.services.queue)
         add_assets(self.services)
 
     def start(self, name: str, *command: str, **more: str) -> None:
-        environment = {
-            **os.environ,
-            "PYTHONPATH": str(REPOSITORY),
-            "GRASPD_DATA_DIR": str(self.settings.data_dir),
-            "GRASPD_REDIS_URL": redis_url(self.settings),
-            "GRASPD_LEASE_S": str(self.settings.lease_s),
-            "GRASPD_CONTROLLER_INTERVAL_S": "0.3",
-            "GRASPD_TASK_S": "0",
-            "GRASPD_LOG_FORMAT": "text",
-            "FAKE_HOLD": str(self.hold),
-            **more,
-        }
+        environment = os.environ | {"PYTHONPATH": str(REPOSITORY), "FAKE_HOLD": str(self.hold)}
+        environment |= {"GRASPD_DATA_DIR": str(self.settings.data_dir), "GRASPD_REDIS_URL": redis_url(self.settings)}
+        environment |= {"GRASPD_LEASE_S": str(LEASE_S), "GRASPD_CONTROLLER_INTERVAL_S": "0.3", "GRASPD_TASK_S": "0"}
+        environment |= {"GRASPD_LOG_FORMAT": "text", **more}
         with (self._logs / f"{name}.log").open("ab") as log:
             self.processes[name] = subprocess.Popen(command, env=environment, stdout=log, stderr=log)
 
@@ -265,7 +247,6 @@ class House:
         return len(re.findall(what, (self._logs / f"{name}.log").read_text()))
 
     def until(self, met: Callable[[], object], what: str) -> None:
-        """Until a condition is met; a failure shows the logs."""
         until(met, what, logs=self._said)
 
     def done(self, job: str) -> int:

@@ -22,7 +22,7 @@ from tests.conftest import REPOSITORY
 from tests.deploy.slurm import FakeSlurm
 from tests.fakes import add_assets, request
 from tests.system.conftest import System
-from tests.waiting import PATIENCE_S, until
+from tests.waiting import PATIENCE_S, answers, until
 
 SLURM = REPOSITORY / "docker" / "slurm"
 
@@ -51,13 +51,8 @@ def slurm(tmp_path: Path) -> Iterator[FakeSlurm]:
 @pytest.mark.chaos
 def test_preemption_a_lost_node_and_a_time_limit_lose_nothing(tmp_path: Path, slurm: FakeSlurm) -> None:
     shared = tmp_path / "shared"
-    settings = Settings(
-        data_dir=tmp_path / "data",
-        store_url=(shared / "store").as_uri(),
-        controller_interval_s=0.3,
-        lease_s=2.0,
-        task_s=0.0,
-    )
+    store, quick = (shared / "store").as_uri(), {"controller_interval_s": 0.3, "lease_s": 2.0, "task_s": 0.0}
+    settings = Settings(data_dir=tmp_path / "data", store_url=store, **quick)
     others = joining(settings, shared / "join.env", host="127.0.0.1")
     supervisor = Supervisor(settings, workers=0, api=False, joining=others)
     fakes = command(tmp_path / "bin" / "graspd", "tests.fakes")
@@ -69,9 +64,8 @@ def test_preemption_a_lost_node_and_a_time_limit_lose_nothing(tmp_path: Path, sl
         assert stat.S_IMODE((shared / "join.env").stat().st_mode) == 0o600
         job = job_actions.submit(system.services, request(grasps=32 * 16))[0].id
         hold.touch()
-        slow = environment(
-            shared, GRASPD=str(fakes), FAKE_SECONDS="0.2", FAKE_HOLD=str(hold), GRASPD_LEASE_S="2", IDLE_S="2"
-        )
+        slow = {"FAKE_SECONDS": "0.2", "FAKE_HOLD": str(hold), "GRASPD_LEASE_S": "2", "IDLE_S": "2"}
+        slow = environment(shared, GRASPD=str(fakes), **slow)
         first, second, third = slurm.sbatch(SLURM / "worker.sbatch", slow, array=3)
         busy = lambda: len(system.services.index.jobs.tasks(job=job, state=State.RUNNING).items)  # noqa: E731
         system.until(lambda: busy() == 3, f"three busy workers\n{slurm.logs()}")
@@ -101,16 +95,13 @@ def test_preemption_a_lost_node_and_a_time_limit_lose_nothing(tmp_path: Path, sl
 def test_the_service_of_a_lost_node_starts_anew_elsewhere(tmp_path: Path, slurm: FakeSlurm) -> None:
     """The node's disk is lost with it: index and queue are made again from the store."""
     shared = tmp_path / "shared"
-    add_assets_to(shared)
+    services = Services.open(Settings(data_dir=shared / "elsewhere", store_url=(shared / "store").as_uri()))
+    add_assets(services)
+    services.close()
     real = command(tmp_path / "bin" / "real" / "graspd", "graspd")
     fakes = command(tmp_path / "bin" / "fake" / "graspd", "tests.fakes")
-    quick = {
-        "GRASPD_LEASE_S": "2",
-        "GRASPD_CONTROLLER_INTERVAL_S": "0.3",
-        "GRASPD_PORT": "0",
-        "GRASPD_TASK_S": "0",
-        "JOIN_HOST": "127.0.0.1",
-    }
+    quick = {"GRASPD_LEASE_S": "2", "GRASPD_CONTROLLER_INTERVAL_S": "0.3", "GRASPD_PORT": "0", "GRASPD_TASK_S": "0"}
+    quick["JOIN_HOST"] = "127.0.0.1"
     nodes = [environment(shared, GRASPD=str(real), TMPDIR=str(tmp_path / node), **quick) for node in ("node1", "node2")]
     for node in ("node1", "node2"):
         (tmp_path / node).mkdir()
@@ -136,25 +127,12 @@ def joined(shared: Path) -> str | None:
         return None
 
 
-def add_assets_to(shared: Path) -> None:
-    services = Services.open(Settings(data_dir=shared / "elsewhere", store_url=(shared / "store").as_uri()))
-    add_assets(services)
-    services.close()
-
-
 def submitted(shared: Path, slurm: FakeSlurm) -> str:
     """A job of eight batches, submitted to the service that wrote the file; returns when a part is done."""
     until(lambda: joined(shared) is not None, f"a service\n{slurm.logs()}")
     said = dict(line.split("=", 1) for line in (joined(shared) or "").splitlines())
     url = said["GRASPD_API_URL"]
-
-    def ready() -> bool:
-        try:
-            return httpx.get(f"{url}/readyz", trust_env=False, timeout=60).status_code == 200
-        except httpx.HTTPError:
-            return False
-
-    until(ready, f"the API at {url}\n{slurm.logs()}")
+    until(lambda: answers(f"{url}/readyz"), f"the API at {url}\n{slurm.logs()}")
     wanted = request(grasps=32 * 8).model_dump(mode="json", exclude_none=True)
     answer = httpx.post(f"{url}/v1/jobs", json=wanted, trust_env=False, timeout=60)
     assert answer.status_code == 202, answer.text

@@ -154,9 +154,7 @@ def test_an_open_service_answers_its_own_machine_only(app: FastAPI, http: TestCl
 
 
 def test_only_who_may_read_is_told_what_is_wrong_with_a_part(closed: Closed, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        MemoryQueue, "ping", Mock(side_effect=QueueUnavailable("Redis does not answer at redis://inside:6379"))
-    )
+    monkeypatch.setattr(MemoryQueue, "ping", Mock(side_effect=QueueUnavailable("no answer at redis://inside:6379")))
     client, tokens = closed
     assert "inside" not in client.get("/readyz").text
     assert "inside" in client.get("/readyz", headers=bearer(tokens[Scope.READ])).text
@@ -228,7 +226,6 @@ def test_a_file_that_everybody_reads_or_nobody_can_is_bad(tmp_path: Path) -> Non
 SECRET = "correct horse battery staple"
 PROXY, STRANGER = ("10.1.2.3", 4000), ("203.0.113.9", 4000)
 GROUPS = {"ops": ":admin", "vision": "red:submit", "hands": "blue:submit", "*": ":read"}
-TASK = {"hand": "allegro", "object": "mug", "grasps": 32}
 
 
 def basic(user: str, secret: str = SECRET) -> str:
@@ -270,11 +267,11 @@ def test_keys_go_on_opening_beside_the_proxy(behind: Settings, services: Service
 
 def test_people_of_a_project_find_their_jobs_and_no_others(behind: Settings, services: Services) -> None:
     http = client(behind, services, PROXY)
-    job = http.post("/v1/jobs", json=TASK, headers=headers()).json()["id"]
+    job = http.post("/v1/jobs", json=JOB, headers=headers()).json()["id"]
     assert http.get(f"/v1/jobs/{job}", headers=headers("amy@lab.example")).json()["project"] == "red"
     assert http.get(f"/v1/jobs/{job}", headers=headers("bob@lab.example", "hands")).status_code == 404
     assert http.get("/", headers=headers()).status_code == 200
-    assert http.post("/v1/jobs", json=TASK, headers=headers("ray@lab.example", "")).status_code == 403
+    assert http.post("/v1/jobs", json=JOB, headers=headers("ray@lab.example", "")).status_code == 403
 
 
 def test_forged_headers_open_nothing(behind: Settings, services: Services) -> None:

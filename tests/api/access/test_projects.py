@@ -255,11 +255,8 @@ def test_one_request_of_two_projects_is_two_jobs_of_one_shard(world: World) -> N
 
 def test_the_same_file_of_two_projects_is_two_assets(world: World) -> None:
     digest = world.ask("bob", "GET", "/v1/hands/allegro").json()["digest"]
-    network = ("net.npz", to_bytes(random_network(hand="allegro", digest=digest)))
-    for kind, name, file in (
-        ("objects", "red-secret-ball", ("ball.stl", _BALL)),
-        ("networks", "red-secret-net", network),
-    ):
+    net = ("net.npz", to_bytes(random_network(hand="allegro", digest=digest)))
+    for kind, name, file in (("objects", "red-secret-ball", ("ball.stl", _BALL)), ("networks", "red-secret-net", net)):
         own = world.ask("bob", "POST", f"/v1/{kind}", data={"name": name}, files={"file": file}).json()
         assert own["digest"] != world.said[f"{kind}_digest"] and own["project"] == "blue"
         assert world.ask("bob", "GET", f"/v1/{kind}/{name}").json()["digest"] == own["digest"]

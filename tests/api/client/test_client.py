@@ -11,15 +11,7 @@ import pytest
 from graspd.api.models import Job
 from graspd.client import client as client_module
 from graspd.client.client import Client
-from graspd.service.model.errors import (
-    ConflictError,
-    GraspdError,
-    InputError,
-    NotFoundError,
-    QueueUnavailable,
-    QuotaError,
-    UnavailableError,
-)
+from graspd.service.model import errors
 from graspd.service.model.states import AssetKind, State
 
 Handler = Callable[[httpx.Request], httpx.Response]
@@ -42,22 +34,22 @@ def event(name: str, state: State) -> bytes:
 @pytest.mark.parametrize(
     ("slug", "status", "kind"),
     [
-        ("not-found", 404, NotFoundError),
-        ("conflict", 409, ConflictError),
-        ("queue-unavailable", 503, QueueUnavailable),
-        ("invalid-input", 422, InputError),
-        ("unauthorized", 401, InputError),
-        ("internal", 500, GraspdError),
-        ("something-newer", 503, UnavailableError),
+        ("not-found", 404, errors.NotFoundError),
+        ("conflict", 409, errors.ConflictError),
+        ("queue-unavailable", 503, errors.QueueUnavailable),
+        ("invalid-input", 422, errors.InputError),
+        ("unauthorized", 401, errors.InputError),
+        ("internal", 500, errors.GraspdError),
+        ("something-newer", 503, errors.UnavailableError),
     ],
 )
-def test_a_problem_document_becomes_its_exception(slug: str, status: int, kind: type[GraspdError]) -> None:
+def test_a_problem_document_becomes_its_exception(slug: str, status: int, kind: type[errors.GraspdError]) -> None:
     answer = httpx.Response(status, json={"type": f"/problems/{slug}", "detail": "what is wrong"})
     with client_of(lambda _: answer) as client, pytest.raises(kind, match="what is wrong") as caught:
         client.job("a")
     assert type(caught.value) is kind
-    with client_of(lambda _: httpx.Response(404, text="<html>nginx")) as client, pytest.raises(InputError, match="404"):
-        client.job("a")
+    with pytest.raises(errors.InputError, match="404"):
+        client_of(lambda _: httpx.Response(404, text="<html>nginx")).job("a")
 
 
 def test_lists_are_read_to_their_last_page_with_the_key() -> None:
@@ -87,14 +79,14 @@ def test_watching_goes_on_where_the_stream_broke() -> None:
 def test_a_download_that_breaks_leaves_no_file(tmp_path: Path) -> None:
     with (
         client_of(Mock(side_effect=httpx.ReadError("connection lost"))) as client,
-        pytest.raises(UnavailableError, match="connection lost"),
+        pytest.raises(errors.UnavailableError, match="connection lost"),
     ):
         client.save("/v1/shards/a/file", tmp_path / "a.h5")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_file_that_cannot_be_opened_is_the_callers_mistake(tmp_path: Path) -> None:
-    with client_of(lambda _: httpx.Response(500)) as client, pytest.raises(InputError, match="nowhere"):
+    with client_of(lambda _: httpx.Response(500)) as client, pytest.raises(errors.InputError, match="nowhere"):
         client.upload(AssetKind.OBJECT, tmp_path / "nowhere.stl")
 
 
@@ -104,7 +96,7 @@ def test_requests_that_come_too_fast_are_sent_again_but_a_used_up_quota_is_told(
     assert client_of(lambda _: next(answers)).jobs().items == []
     problem = {"type": "/problems/quota-exceeded", "detail": "no more jobs today"}
     used_up = httpx.Response(429, json=problem, headers={"Retry-After": "3600"})
-    with pytest.raises(QuotaError, match="no more jobs today"):
+    with pytest.raises(errors.QuotaError, match="no more jobs today"):
         client_of(lambda _: used_up).jobs()
 
 
@@ -116,21 +108,21 @@ def test_requests_that_come_too_fast_are_sent_again_but_a_used_up_quota_is_told(
     ],
 )
 def test_an_address_that_cannot_be_used_is_one_line_with_the_fix(url: str) -> None:
-    with pytest.raises(InputError, match=r"address of the API .* cannot be used; give http://HOST:PORT") as refused:
+    with pytest.raises(errors.InputError, match=r"address of the API .* cannot be used; give http://HOST") as refused:
         Client(url)
     assert "pass" not in str(refused.value)
 
 
 @pytest.mark.parametrize("key", ["gd_abc\u00a0def", "gd_größe", "gd_abc\r\ndef", "gd_abc def", "gd_abc\x00def"])
 def test_a_key_with_a_foreign_character_is_refused_and_not_told(key: str) -> None:
-    with pytest.raises(InputError, match="GRASPD_API_KEY") as refused:
+    with pytest.raises(errors.InputError, match="GRASPD_API_KEY") as refused:
         Client("http://127.0.0.1:1", key=key)
     assert "gd_" not in str(refused.value)
 
 
 def test_a_password_in_the_address_is_not_told_and_space_around_it_does_not_matter() -> None:
     assert Client(" http://127.0.0.1:1/\r", key="\u00a0gd_abc\n").url == "http://127.0.0.1:1"
-    with Client("http://me:secret@127.0.0.1:1") as client, pytest.raises(UnavailableError) as away:
+    with Client("http://me:secret@127.0.0.1:1") as client, pytest.raises(errors.UnavailableError) as away:
         client.jobs()
     assert "secret" not in f"{away.value} {client.url}"
 
@@ -144,7 +136,7 @@ def test_names_in_addresses_are_quoted() -> None:
 
     client = client_of(answer)
     for ask in (lambda: client.job("a b"), lambda: client.asset(AssetKind.OBJECT, "a/b?c#d")):
-        with pytest.raises(NotFoundError):
+        with pytest.raises(errors.NotFoundError):
             ask()
     assert asked == [b"/v1/jobs/a%20b", b"/v1/objects/a%2Fb%3Fc%23d"]
 

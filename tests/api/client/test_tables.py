@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from graspd.cli import build
 from graspd.client.reports import JobDisplay, print_cells, print_dataset, print_estimate
-from graspd.service.cli import plain_console, plain_table
+from graspd.service.cli import plain_console
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.states import State
 from graspd.service.pipeline.backends import Services
@@ -24,6 +24,7 @@ from graspd.service.pipeline.datasets.spec import DatasetRequest
 from tests.api.factories import add_job, finish_all
 from tests.fakes import plan_all
 
+#: Markup, were it not shown as it is.
 NAME = "[red]mug[/] :mug: " + "a-very-long-name-of-an-object-that-somebody-gave-to-it"[:46]
 ID = "0123456789ab"
 CREATED = "2026-11-26T03:14:11.123456Z"
@@ -92,15 +93,6 @@ def test_a_table_of_80_columns_cuts_nothing(shown: Any, command: str, whole: lis
     # Broken, in whichever column, but every letter of it is there.
     letters = "".join(sorted("".join("".join(lines).split())))
     assert all(letters.count(letter) >= NAME.count(letter) for letter in set(NAME) - {" "})
-
-
-def test_names_are_no_markup(capsys: pytest.CaptureFixture[str]) -> None:
-    text = "[red]mug[/] :mug: [/nothing]"
-    console, table = plain_console(), plain_table("name", text)
-    table.add_row("1", text)
-    console.print(text)
-    console.print(table)
-    assert capsys.readouterr().out.count(text) == 3
 
 
 def test_progress_shows_messages_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:

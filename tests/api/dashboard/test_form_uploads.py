@@ -25,15 +25,13 @@ def no_wait(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(form_uploads, "_CHECK_WAIT_S", 0.0)
 
 
-def check(services: Services, asset: AssetView, verdict: str, facts: dict[str, Any] | None = None) -> None:
+def check(services: Services, asset: AssetView, verdict: str, facts: Any = None) -> None:
     found = {"verdict": verdict, "message": "a thing of 60 m", "repairs": [], "facts": facts or {}}
     services.store.put(names.asset_check(AssetKind.OBJECT, asset.digest), json.dumps(found).encode())
     services.index.write.add_asset(load_asset(services.store, AssetKind.OBJECT, asset.digest), found)
 
 
-def uploaded(
-    http: TestClient, services: Services, verdict: str, facts: dict[str, Any] | None = None, **options: str
-) -> AssetView:
+def uploaded(http: TestClient, services: Services, verdict: str, facts: Any = None, **options: str) -> AssetView:
     data = {"options": json.dumps(options)} if options else {}
     asset = AssetView.model_validate(http.post("/v1/objects", files={"file": MESH}, data=data).json())
     check(services, asset, verdict, facts)
@@ -112,12 +110,8 @@ def test_a_form_that_names_no_known_object_gets_none(http: TestClient, services:
 
 
 #: What the check of a mesh in millimetres tells beside its message.
-TOO_LARGE = {
-    "problem": "the mesh is 60 m long",
-    "units_suggested": ["mm", "cm"],
-    "lengths_m": {"mm": 0.06, "cm": 0.6},
-    "options_suggested": [{"scale_to": None}],
-}
+TOO_LARGE = {"problem": "the mesh is 60 m long", "options_suggested": [{"scale_to": None}]}
+TOO_LARGE |= {"units_suggested": ["mm", "cm"], "lengths_m": {"mm": 0.06, "cm": 0.6}}
 
 
 def fixes_of(page: str) -> dict[str, str]:
@@ -143,7 +137,7 @@ def test_a_refusal_is_told_in_words_with_buttons(http: TestClient, services: Ser
         ("Scale to this size", {"object_scale_to": "120"}, {"scale_to": 0.12}),
     ],
 )
-def test_the_button_of_a_fix_checks_again_and_submits_nothing(
+def test_a_fix_checks_again_and_submits_nothing(
     http: TestClient, services: Services, words: str, field: dict[str, str], said: dict[str, Any]
 ) -> None:
     uploaded(http, services, "refuse", TOO_LARGE)

@@ -15,8 +15,8 @@ from graspd.api.middleware.limits import Allowance, BodyLimit, Rates
 from graspd.service.pipeline.backends import Services
 from graspd.service.queue.rq_queue import RqQueue
 from graspd.service.settings import Settings
-from tests.api.factories import bearer, finish_all
-from tests.fakes import plan_all, record_of
+from tests.api.factories import bearer
+from tests.fakes import plan_all
 from tests.waiting import PATIENCE_S
 
 JOB = {"hand": "allegro", "object": "mug", "grasps": 32}
@@ -110,15 +110,6 @@ def test_jobs_over_the_daily_quota_are_refused_until_midnight(make_twins: Twins,
     assert int(answers[-1].headers["retry-after"]) == 12 * 3600 + 1
     other = bearer(keys.add("you", Scope.SUBMIT, limits=KeyLimits(jobs_per_day=1)))
     assert clients[0].post("/v1/jobs", json=JOB | {"seed": 2}, headers=other).status_code == 202
-
-
-def test_grasps_in_flight_come_free_as_jobs_end(make_twins: Twins, keys: KeyFile, services: Services) -> None:
-    headers = bearer(keys.add("me", Scope.SUBMIT, limits=KeyLimits(grasps_in_flight=64)))
-    client, _ = make_twins()
-    first = client.post("/v1/jobs", json=JOB, headers=headers).json()["id"]
-    assert client.post("/v1/jobs", json=JOB | {"seed": 1, "grasps": 33}, headers=headers).status_code == 429
-    finish_all(services, record_of(services, first))
-    assert client.post("/v1/jobs", json=JOB | {"seed": 1, "grasps": 33}, headers=headers).status_code == 202
 
 
 def test_a_dataset_counts_with_all_cells_until_it_ends(make_twins: Twins, keys: KeyFile, services: Services) -> None:

@@ -19,8 +19,13 @@ from tests.damage import cut, flip, remove
 
 
 @pytest.fixture
-def file(http: TestClient, services: Services) -> str:
-    return f"/v1/shards/{finish_all(services, add_job(services))[0].shard_id}/file"
+def shard(services: Services) -> str:
+    return finish_all(services, add_job(services))[0].shard_id
+
+
+@pytest.fixture
+def file(shard: str) -> str:
+    return f"/v1/shards/{shard}/file"
 
 
 MODEL = "/v1/hands/allegro/model"
@@ -104,11 +109,6 @@ def test_an_estimate_names_the_one_method_that_works(http: TestClient) -> None:
     assert http.post("/v1/datasets", json=matrix).status_code == 422, "no dataset takes its name"
 
 
-@pytest.fixture
-def shard(http: TestClient, services: Services) -> str:
-    return finish_all(services, add_job(services))[0].shard_id
-
-
 def test_a_downloaded_shard_is_hdf5_with_its_sum_as_etag(http: TestClient, shard: str) -> None:
     answer = http.get(f"/v1/shards/{shard}/file")
     assert answer.headers["content-type"] == "application/x-hdf5"
@@ -117,24 +117,22 @@ def test_a_downloaded_shard_is_hdf5_with_its_sum_as_etag(http: TestClient, shard
         assert file["grasp/hand_pose"].shape == (32, 7)
 
 
-def test_a_range_gives_just_its_bytes_and_what_is_none_the_whole(http: TestClient, shard: str) -> None:
-    whole = http.get(f"/v1/shards/{shard}/file").content
+def test_a_range_gives_just_its_bytes_and_what_is_none_the_whole(http: TestClient, file: str) -> None:
+    whole = http.get(file).content
     for header, wanted in (("bytes=0-99", whole[:100]), ("bytes=100-", whole[100:]), ("bytes=-7", whole[-7:])):
-        part = http.get(f"/v1/shards/{shard}/file", headers={"Range": header})
+        part = http.get(file, headers={"Range": header})
         assert (part.status_code, part.content) == (206, wanted)
         assert part.headers["content-range"].endswith(f"/{len(whole)}")
-    answer = http.get(f"/v1/shards/{shard}/file", headers={"Range": "bytes=99999999-"})
+    answer = http.get(file, headers={"Range": "bytes=99999999-"})
     assert (answer.status_code, answer.headers["content-range"]) == (416, f"bytes */{len(whole)}")
     digits = "9" * 4400
     odd = ("bytes=-", "items=0-3", "bytes=0-1,4-5", f"bytes=-{digits}", f"bytes={digits}-", f"bytes=0-{digits}")
     assert {parse_range(header, 100) for header in (None, *odd)} == {None}
 
 
-def test_a_store_that_signs_hands_the_file_out_itself(
-    http: TestClient, services: Services, shard: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(type(services.store), "sign", lambda *_, **__: "https://bucket.example/signed")
-    answer = http.get(f"/v1/shards/{shard}/file", follow_redirects=False)
+def test_a_signed_file_is_handed_out_by_the_store(http: TestClient, file: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Store, "sign", lambda *_, **__: "https://bucket.example/signed")
+    answer = http.get(file, follow_redirects=False)
     assert (answer.status_code, answer.headers["location"]) == (307, "https://bucket.example/signed")
 
 

@@ -20,12 +20,12 @@ from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.controller import Controller
 from graspd.service.pipeline.lease_reaper import LOST_AFTER_S
 from graspd.service.run.commands import app
-from graspd.service.settings import Settings
 from graspd.service.store.records import add_job_event
 from tests.damage import overwrite
-from tests.fakes import add_assets, fail_task, make_shard, message_for, record_of, request
-from tests.indexes import empty_index, open_services
+from tests.fakes import fail_task, make_shard, message_for, record_of, request
+from tests.indexes import empty_index
 from tests.memory_queue import MemoryQueue
+from tests.service.conftest import service
 from tests.waiting import Clock
 
 GOOD = 3
@@ -35,12 +35,10 @@ DAMAGED = b'{"x": 1}'
 @pytest.fixture
 def services(tmp_path: Path) -> Iterator[Services]:
     """A service on files with some jobs."""
-    made = open_services(Settings(data_dir=tmp_path, retry_backoff_s=0.0))
-    add_assets(made)
-    for seed in range(GOOD):
-        job_actions.submit(made, request(seed=seed))
-    yield made
-    made.close()
+    for made in service(tmp_path):
+        for seed in range(GOOD):
+            job_actions.submit(made, request(seed=seed))
+        yield made
 
 
 def lost(services: Services) -> Services:
@@ -57,62 +55,51 @@ def a_job(services: Services) -> str:
     return services.index.jobs.page().items[0].id
 
 
-def of_job(services: Services) -> str:
-    return names.job_record(a_job(services))
-
-
-def of_manifest(services: Services) -> str:
+def manifest_of(services: Services) -> str:
     made = make_shard(services.store, message_for(seed=99))
     return names.shard_manifest(made.stage, made.shard_id)
 
 
-def of_attempt(services: Services) -> str:
+def attempt_of(services: Services) -> str:
     return fail_task(services, job := a_job(services), next(plan(record_of(services, job))), last=False)
 
 
-def of_event(services: Services) -> str:
+def event_of(services: Services) -> str:
     event = add_job_event(services.store, a_job(services), "cancelled")
     return names.event(names.job_events(a_job(services)), event.number, "cancelled")
 
 
-def of_asset(services: Services) -> str:
-    return names.asset_record(AssetKind.OBJECT, services.index.assets.get(AssetKind.OBJECT, "ball").digest)
+def ball(services: Services) -> tuple[AssetKind, str]:
+    return AssetKind.OBJECT, services.index.assets.get(AssetKind.OBJECT, "ball").digest
 
 
-def of_check(services: Services) -> str:
-    return names.asset_check(AssetKind.OBJECT, services.index.assets.get(AssetKind.OBJECT, "ball").digest)
-
-
-def of_dataset(services: Services) -> str:
-    return put(services, names.dataset_record("kitchen"))
-
-
-def of_snapshot(services: Services) -> str:
-    return put(services, names.dataset_snapshot("kitchen", "a" * 32))
-
-
-def put(services: Services, key: str) -> str:
-    services.store.put(key, b"{}")
-    return key
-
-
-RECORDS = [of_job, of_manifest, of_attempt, of_event, of_asset, of_check, of_dataset, of_snapshot]
+#: Keys of records, which are there but for those of a dataset.
+RECORDS: dict[str, Callable[[Services], str]] = {
+    "job": lambda services: names.job_record(a_job(services)),
+    "manifest": manifest_of,
+    "attempt": attempt_of,
+    "event": event_of,
+    "asset": lambda services: names.asset_record(*ball(services)),
+    "check": lambda services: names.asset_check(*ball(services)),
+    "dataset": lambda services: names.dataset_record("kitchen"),
+    "snapshot": lambda services: names.dataset_snapshot("kitchen", "a" * 32),
+}
 
 
 @pytest.mark.parametrize("record", RECORDS)
-def test_a_rebuild_leaves_out_damage_and_names_it(services: Services, record: Callable[[Services], str]) -> None:
-    key = record(services)
+def test_a_rebuild_leaves_out_damage_and_names_it(services: Services, record: str) -> None:
+    key = RECORDS[record](services)
     overwrite(services.store, key, DAMAGED)
     fresh = lost(services)
     Controller(fresh).round()
-    assert shown(fresh.index) == GOOD - (record is of_job)
+    assert shown(fresh.index) == GOOD - (record == "job")
     made = fresh.index.notes.completeness()
     assert made is not None and (made.left_out, made.names) == (1, (key,))
     fresh.index.close()
 
 
 def test_a_record_that_was_mended_is_there_again(services: Services) -> None:
-    key = of_job(services)
+    key = RECORDS["job"](services)
     whole = services.store.get(key)
     overwrite(services.store, key, DAMAGED)
     fresh = lost(services)
@@ -128,7 +115,7 @@ def test_a_record_that_was_mended_is_there_again(services: Services) -> None:
 def test_a_damaged_attempt_fails_its_task_and_stops_no_round(services: Services) -> None:
     clock, job = Clock(), a_job(services)
     controller = Controller(services, clock=clock)
-    overwrite(services.store, of_attempt(services), DAMAGED)
+    overwrite(services.store, attempt_of(services), DAMAGED)
     controller.round()
     taken = [services.queue.take("w") for _ in range(GOOD)]  # type: ignore[attr-defined]
     assert job in {delivery.message.job_id for delivery in taken}
@@ -140,22 +127,14 @@ def test_a_damaged_attempt_fails_its_task_and_stops_no_round(services: Services)
     assert failed == [job], "the attempts of the others can be counted, and they run again"
 
 
-def remove_file(folder: Path) -> None:
-    for path in folder.glob("index.sqlite*"):
-        path.unlink()
-
-
-def remove_only_the_file(folder: Path) -> None:
-    (folder / "index.sqlite").unlink()
-
-
-@pytest.mark.parametrize("remove", [remove_file, remove_only_the_file])
-def test_an_index_removed_under_its_readers_is_made_again(services: Services, remove: Callable[[Path], None]) -> None:
+@pytest.mark.parametrize("files", ["index.sqlite*", "index.sqlite"])
+def test_an_index_removed_under_its_readers_is_made_again(services: Services, files: str) -> None:
     controller = Controller(services)
     controller.round()
     other = Index(services.settings.resolved_index_url)
     assert shown(other) == GOOD
-    remove(services.settings.data_dir)
+    for path in services.settings.data_dir.glob(files):
+        path.unlink()
     controller.round()
     assert shown(other) == shown(services.index) == GOOD
     job_actions.submit(Services(services.settings, services.store, other, services.queue), request(seed=50))

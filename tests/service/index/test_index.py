@@ -19,34 +19,22 @@ from graspd.service.index.queries.grasps import GraspFilter, GraspSort
 from graspd.service.index.rebuild import differences, rebuild
 from graspd.service.index.views import GraspView
 from graspd.service.model.clock import timestamp
-from graspd.service.model.errors import ConflictError, IndexUnavailable, InputError, NotFoundError, StoreUnavailable
+from graspd.service.model.errors import ConflictError, IndexUnavailable, InputError, StoreUnavailable
 from graspd.service.model.planning import OUTCOMES, RoundRobin, message_of, plan
 from graspd.service.model.states import AssetKind, Priority, Stage, State
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
-from graspd.service.settings import Settings
 from graspd.service.store.store import Store, open_store
-from tests.fakes import add_assets, fail_task, finish, make_shard, make_task, record_of, request, with_settings
-from tests.indexes import empty_index
-from tests.memory_queue import MemoryQueue
+from tests.fakes import fail_task, finish, make_shard, make_task, record_of, request, with_settings
 from tests.servers import PostgresServer
+from tests.service.conftest import service
 from tests.service.index.test_projects import enter
 
 
 @pytest.fixture
-def index(index_url: str) -> Iterator[Index]:
-    made = empty_index(index_url)
-    yield made
-    made.close()
-
-
-@pytest.fixture
-def services(tmp_path: Path, index: Index, index_url: str) -> Services:
-    """A service without processes on an index of each kind: a hand `gripper` and an object `ball`."""
-    settings = Settings(data_dir=tmp_path, retry_backoff_s=0.0, task_s=0.0, index_url=SecretStr(index_url))
-    made = Services(settings, open_store("memory://"), index, MemoryQueue())
-    add_assets(made)
-    return made
+def services(tmp_path: Path, index_url: str) -> Iterator[Services]:
+    """A service on an index of each kind in turn."""
+    yield from service(tmp_path, open_store("memory://"), index_url=SecretStr(index_url))
 
 
 def fail(services: Services, job: str, batch: int, number: int, *, last: bool) -> None:
@@ -75,10 +63,8 @@ def test_a_job_shows_progress_by_stage(services: Services) -> None:
     services.index.live.set_progress({task.id: (1.0, 4.0, "descending")})
     shown = services.index.jobs.get(job.id)
     assert shown.state is State.RUNNING
-    assert [(s.stage, s.tasks, s.running, s.done) for s in shown.stages] == [
-        ("synthesize", 2, 1, 0.25),
-        ("scene", 2, 0, 0),
-    ]
+    told = [(stage.stage, stage.tasks, stage.running, stage.done) for stage in shown.stages]
+    assert told == [("synthesize", 2, 1, 0.25), ("scene", 2, 0, 0)]
     finish(services, job.id)
     done = services.index.jobs.get(job.id)
     assert (done.state, done.grasps) == (State.SUCCEEDED, 64)
@@ -131,22 +117,6 @@ def test_grasps_page_through_in_the_order_of_any_metric(services: Services) -> N
         known = [value for value in values if value is not None]
         assert known == sorted(known, reverse=descending), sort
         assert values[: len(known)] == known, f"{sort}: those without the metric come last"
-
-
-def test_a_cursor_of_another_list_is_refused(services: Services) -> None:
-    for cursor in ("rubbish", "eyJ4IjoxfQ", "", "W10"):
-        with pytest.raises(InputError, match="cursor"):
-            services.index.jobs.page(cursor=cursor)
-
-
-def test_unknown_ids_are_named(services: Services) -> None:
-    for call in (services.index.jobs.get, services.index.shards.get, services.index.jobs.task):
-        with pytest.raises(NotFoundError, match="nothing-here"):
-            call("nothing-here")
-    with pytest.raises(NotFoundError, match="there are: gripper"):
-        services.index.assets.get(AssetKind.HAND, "nothing-here")
-    with pytest.raises(NotFoundError, match=r"there are: gripper; did you mean gripper\?"):
-        services.index.assets.get(AssetKind.HAND, "griper")
 
 
 def test_failures_are_grouped_by_stage_and_error(services: Services) -> None:

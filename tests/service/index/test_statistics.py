@@ -15,6 +15,7 @@ from tests.indexes import empty_index
 
 COUNT = 500
 BINS = 12
+CREATED = "2026-01-01T00:00:00Z"
 
 
 @pytest.fixture
@@ -25,12 +26,7 @@ def values() -> np.ndarray:
 @pytest.fixture
 def index(tmp_path: Path, values: np.ndarray) -> Iterator[Index]:
     opened = empty_index(f"sqlite:///{tmp_path / 'index.sqlite'}")
-    plain = dict.fromkeys(METRICS) | {
-        "shard_id": "a" * 32,
-        "hand": "h",
-        "object": "o",
-        "created": "2026-01-01T00:00:00Z",
-    }
+    plain = dict.fromkeys(METRICS) | {"shard_id": "a" * 32, "hand": "h", "object": "o", "created": CREATED}
     rows = [plain | {"row": row, "epsilon": value, "valid": row % 2 == 0} for row, value in enumerate(values)]
     with opened.database.writing() as connection:
         connection.execute(insert(grasps), rows)
@@ -67,7 +63,7 @@ def test_distributions_of_many_grasps_come_from_a_fair_sample(index: Index) -> N
     with index.database.writing() as connection:
         for number in range(400):
             shard = hashlib.sha256(str(number).encode()).hexdigest()[:32]
-            made = {"shard_id": shard, "hand": "a", "object": "b", "created": "2026-01-01T00:00:00Z", "valid": True}
+            made = {"shard_id": shard, "hand": "a", "object": "b", "created": CREATED, "valid": True}
             rows = [made | {"row": row, "epsilon": number / 400} for row in range(8)]
             connection.execute(insert(grasps), rows)
             connection.execute(insert(shards), _shard(shard, hand="a", object="b", count=8))

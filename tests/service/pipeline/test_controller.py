@@ -33,7 +33,6 @@ class Bench:
     """A controller and one worker, both moved step by step."""
 
     def __init__(self, services: Services) -> None:
-        assert isinstance(services.queue, MemoryQueue)
         self.services, self.queue, self.clock = services, services.queue, Clock()
         self.controller = Controller(services, clock=self.clock)
 
@@ -52,9 +51,8 @@ class Bench:
 
     def do(self, delivery: Delivery, **stages: Any) -> Event | None:
         """What a worker does with a task."""
-        runner = Runner(
-            fake_stages() | {Stage(k): v for k, v in stages.items()}, worker="w", publish=self.queue.publish
-        )
+        table = fake_stages() | {Stage(name): stage for name, stage in stages.items()}
+        runner = Runner(table, worker="w", publish=self.queue.publish)
         raw = delivery.message.model_dump(mode="json", by_alias=True)
         outcome = runner.run(raw, TaskContext(self.services.store))
         self.queue.finish(delivery)
@@ -117,11 +115,8 @@ def test_while_redis_takes_no_writes_nobody_is_called_silent(bench: Bench, monke
     held = bench.take()
     bench.pass_time(2, beating=held)
     with monkeypatch.context() as patch:
-        patch.setattr(
-            bench.queue,
-            "announce",
-            Mock(side_effect=QueueUnavailable("Redis does not answer (MISCONF: the disk is full)")),
-        )
+        away = QueueUnavailable("Redis does not answer (MISCONF: the disk is full)")
+        patch.setattr(bench.queue, "announce", Mock(side_effect=away))
         for _ in range(10 * round(bench.services.settings.lease_s)):
             bench.clock.now += 1.0
             with pytest.raises(QueueUnavailable):
@@ -252,7 +247,6 @@ def test_a_lost_failure_event_is_made_good_from_the_store(bench: Bench) -> None:
 def test_a_damaged_manifest_fails_its_task_and_stops_no_other(bench: Bench) -> None:
     bad, _ = job_actions.submit(bench.services, request(seed=1))
     delivery = bench.take()
-    assert isinstance(delivery.message, TaskMessage)
     key = names.shard_manifest(delivery.message.stage, delivery.message.output)
     bench.services.store.put(key, b'{"version": 1, "shard_id": torn')
     bench.do(delivery)

@@ -160,23 +160,30 @@ def test_a_deleted_object_frees_its_name_and_its_files(services: Services) -> No
     assert publish_asset(services.store, AssetKind.OBJECT, "orb", OBJECT_FILES).name == "orb"
 
 
-@pytest.mark.parametrize("what", ["job", "dataset", "object"])
+def _jobs(services: Services) -> list[str]:
+    return [job.id for job in services.index.jobs.page().items]
+
+
+BALL = (AssetKind.OBJECT, "ball")
+#: What is there, how it is deleted, what of the index removes its rows, and where its objects lie.
+ACTS: dict[str, tuple[Callable[[Services], object], Callable[[Services], object], str, tuple[str, ...]]] = {
+    "job": (finished, lambda services: delete_job(services, _jobs(services)[0]), "remove_job", ("jobs",)),
+    "dataset": (dataset, lambda services: delete_dataset(services, "d"), "remove_dataset", ("datasets", "jobs")),
+    "object": (lambda _: None, lambda services: delete_asset(services, *BALL), "remove_asset", ("assets/object",)),
+}
+
+
+@pytest.mark.parametrize("what", ACTS)
 def test_the_next_controller_carries_out_a_broken_deletion(
     services: Services, what: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At each removal of an object in turn, and between the record and the rows."""
-    acts: dict[str, tuple[Callable[[], Any], Callable[[], Any]]] = {
-        "job": (lambda: finished(services, seed=3), lambda: delete_job(services, next(iter(_jobs(services))))),
-        "dataset": (lambda: dataset(services), lambda: delete_dataset(services, "d")),
-        "object": (lambda: None, lambda: delete_asset(services, AssetKind.OBJECT, "ball")),
-    }
-    make, act = acts[what]
-    make()
-    remove = {"job": "remove_job", "dataset": "remove_dataset", "object": "remove_asset"}[what]
+    make, act, remove, folders = ACTS[what]
+    make(services)
     with monkeypatch.context() as patch:
-        patch.setattr(Removals, remove, _break)
+        patch.setattr(Removals, remove, Mock(side_effect=KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
-            act()
+            act(services)
     assert pending(services.store)
     real, place = type(services.store).delete, 0
     while keys(services, "deletions"):
@@ -186,10 +193,7 @@ def test_the_next_controller_carries_out_a_broken_deletion(
                 raise StopIteration
         place += 1
     assert differences(services.index, services.store) == []
-    assert (
-        keys(services, *{"job": ("jobs",), "dataset": ("datasets", "jobs"), "object": ("assets/object",)}[what])
-        == set()
-    )
+    assert keys(services, *folders) == set()
 
 
 COLLECTED = pytest.mark.parametrize("collected", [False, True], ids=["at once", "after the controller"])
@@ -269,13 +273,6 @@ def test_a_deleted_tag_is_restored_with_its_grasps(services: Services) -> None:
     restore(services, "tag", "good", permit=lambda _: None)
     assert [(tag.name, tag.grasps) for tag in services.index.tags.all()] == [("good", 2)]
     assert not deletions(services.store)
-
-
-def _jobs(services: Services) -> list[str]:
-    return [job.id for job in services.index.jobs.page().items]
-
-
-_break = Mock(side_effect=KeyboardInterrupt)
 
 
 def _after(count: int, real: Any) -> Any:

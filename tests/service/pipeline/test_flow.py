@@ -21,13 +21,12 @@ from graspd.service.pipeline.controller import Controller, PeriodicDuty
 from graspd.service.pipeline.deletion import delete_job
 from graspd.service.queue.port import Event, EventKind
 from tests.fakes import beat_of, make_shard, request, with_settings
-from tests.memory_queue import Delivery, MemoryQueue
+from tests.memory_queue import Delivery
 from tests.waiting import Clock
 
 
 def taken(services: Services) -> list[Delivery]:
     """Every waiting task, in workers' hands."""
-    assert isinstance(services.queue, MemoryQueue)
     held = []
     while (delivery := services.queue.take(f"w{len(held)}")) is not None:
         services.queue.publish(_event(delivery, EventKind.STARTED))
@@ -36,7 +35,6 @@ def taken(services: Services) -> list[Delivery]:
 
 
 def finish(services: Services, delivery: Delivery) -> None:
-    assert isinstance(services.queue, MemoryQueue)
     make_shard(services.store, delivery.message)  # type: ignore[arg-type]
     services.queue.finish(delivery)
     services.queue.publish(_event(delivery, EventKind.FINISHED))
@@ -45,9 +43,8 @@ def finish(services: Services, delivery: Delivery) -> None:
 def _event(delivery: Delivery, kind: EventKind) -> Event:
     message = delivery.message
     output = "" if kind is EventKind.STARTED else message.output  # type: ignore[union-attr]
-    return Event(
-        kind=kind, at=timestamp(), task_id=message.task_id, stage=message.stage, worker=delivery.worker, output=output
-    )
+    of = {"task_id": message.task_id, "stage": message.stage, "worker": delivery.worker, "output": output}
+    return Event(kind=kind, at=timestamp(), **of)
 
 
 @pytest.fixture
@@ -82,7 +79,6 @@ def test_what_runs_is_not_queued_and_many_ends_are_one_round(services: Services,
 def test_progress_of_a_task_reaches_the_index_and_goes(services: Services, controller: Controller) -> None:
     job, _ = job_actions.submit(services, request())
     (held,) = taken(services)
-    assert isinstance(services.queue, MemoryQueue)
     busy = replace(beat_of("w0"), task_id=held.message.task_id)
     services.queue._workers["w0"] = replace(busy, done=3.0, total=4.0, message="descending")
     controller._clock.now += 1.0
@@ -100,7 +96,6 @@ def test_progress_of_a_task_reaches_the_index_and_goes(services: Services, contr
 
 def test_a_fleet_larger_than_the_window_finds_work(services: Services) -> None:
     small = with_settings(services, queue_window=1)
-    assert isinstance(services.queue, MemoryQueue)
     own = own_ability()
     can = {"stages": (Stage.SYNTHESIZE,), "schemas": own.schemas, "revisions": dict(own.revisions)}
     services.queue._workers.update({name: beat_of(name, **can) for name in map(str, range(20))})

@@ -19,31 +19,20 @@ from graspd.service.pipeline.integrity import BAD_MANIFEST, FOREIGN, MISSING, NO
 from graspd.service.pipeline.repair import repair
 from graspd.service.queue.port import EventKind
 from graspd.service.run import commands, store_commands
-from graspd.service.settings import Settings
 from graspd.service.store.manifests import ShardManifest, load_manifest, load_shard
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.process.runner import Runner
 from graspd.worker.stages.context import TaskContext
 from tests.damage import cut, flip, overwrite, remove
-from tests.fakes import add_assets, fake_stages, request
-from tests.indexes import open_services
+from tests.fakes import fake_stages, request
+from tests.service.conftest import service
 
 SHARDS = 6
 
 
-def service_on(folder: Path, url: str) -> Iterator[Services]:
-    """A service without processes: a store, an SQLite index, a hand and an object."""
-    settings = Settings(data_dir=folder, store_url=url, retry_backoff_s=0.0, task_s=0.0)
-    made = open_services(settings)
-    add_assets(made)
-    yield made
-    made.close()
-
-
 @pytest.fixture(params=["files", pytest.param("s3", marks=pytest.mark.s3)])
 def services(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Services]:
-    is_remote = request.param == "s3"
-    yield from service_on(tmp_path, request.getfixturevalue("s3_url") if is_remote else (tmp_path / "store").as_uri())
+    yield from service(tmp_path, store_url=request.getfixturevalue("s3_url") if request.param == "s3" else None)
 
 
 def findings(services: Services) -> list[Damage]:
@@ -56,9 +45,8 @@ def shards(services: Services) -> list[ShardManifest]:
     job, _ = job_actions.submit(services, request(grasps=32 * SHARDS))
     work_off(services)
     assert services.index.jobs.get(job.id).state is State.SUCCEEDED
-    found = [
-        load_manifest(services.store, s.stage, s.id) for s in services.index.shards.page(job=job.id, limit=99).items
-    ]
+    listed = services.index.shards.page(job=job.id, limit=99).items
+    found = [load_manifest(services.store, shard.stage, shard.id) for shard in listed]
     return sorted(found, key=lambda manifest: manifest.batch)
 
 
@@ -86,13 +74,8 @@ def harm(services: Services, shards: list[ShardManifest]) -> dict[str, str]:
     remove(services.store, shards[2].key)
     overwrite(services.store, names.shard_manifest(shards[3].stage, shards[3].shard_id), b'{"x": 1}')
     remove(services.store, names.shard_manifest(shards[4].stage, shards[4].shard_id))
-    return {
-        shards[0].shard_id: "SHA-256",
-        shards[1].shard_id: "bytes, expected",
-        shards[2].shard_id: MISSING,
-        shards[3].shard_id: BAD_MANIFEST,
-        shards[4].shard_id: NO_MANIFEST,
-    }
+    told = ("SHA-256", "bytes, expected", MISSING, BAD_MANIFEST, NO_MANIFEST)
+    return {shard.shard_id: what for shard, what in zip(shards, told, strict=False)}
 
 
 def test_five_kinds_of_damage_are_five_findings(services: Services, shards: list[ShardManifest]) -> None:
@@ -107,9 +90,8 @@ def test_what_is_made_again_has_the_checksum_it_had(services: Services, shards: 
     harm(services, shards)
     repaired, left = repair(services, findings(services))
     # The worker of a file without a manifest may be about to put it.
-    assert [one.what for one in left] == [
-        f"{NO_MANIFEST}; its manifest may follow soon; run the command again in a minute"
-    ]
+    (one,) = left
+    assert one.what == f"{NO_MANIFEST}; its manifest may follow soon; run the command again in a minute"
     assert len(repaired) == 4
     work_off(services)
     for manifest in (*shards[:4], shards[5]):

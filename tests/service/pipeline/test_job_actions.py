@@ -19,13 +19,7 @@ from graspd.service.pipeline.job_actions import check_scene
 from graspd.service.store.library import load_asset
 from graspd.service.store.records import job_events
 from tests.fakes import fail_task, finish, make_task, record_of, request, with_settings
-from tests.memory_queue import MemoryQueue
 from tests.service.index.test_index import fail
-
-
-def queue_of(services: Services) -> MemoryQueue:
-    assert isinstance(services.queue, MemoryQueue)
-    return services.queue
 
 
 def test_the_same_request_is_the_same_job(services: Services) -> None:
@@ -60,7 +54,7 @@ def test_a_large_job_fills_the_window_and_no_more(services: Services) -> None:
 
 def test_a_cancelled_job_leaves_the_queue(services: Services) -> None:
     job, _ = job_actions.submit(services, request(grasps=64))
-    queue_of(services).take("w")
+    services.queue.take("w")
     finish(services, job.id, batches=1)
     after = job_actions.cancel(services, job.id)
     assert after.state is State.CANCELLED and (after.stages[0].succeeded, after.stages[0].cancelled) == (1, 1)
@@ -91,7 +85,7 @@ def test_a_retried_job_gets_fresh_attempts(services: Services) -> None:
         fail(services, job.id, 1, number, last=number == 3)
     failed = services.index.jobs.get(job.id)
     assert (failed.state, failed.reason) == (State.FAILED, "attempt 3 went wrong")
-    queue = queue_of(services)
+    queue: Any = services.queue
     while queue.take("w") is not None:
         pass
     after = job_actions.retry(services, job.id)
@@ -184,9 +178,8 @@ def test_grasps_are_found_by_their_scene(services: Services) -> None:
     held = count(scene="table", lift_hard=True)
     assert held == count(scene="table", valid=True) > 0
     assert count(lift_hard=True, scene="free") == 0
-    far = services.index.grasps.page(
-        GraspFilter(at_least={"clearance_m": 0.5}), sort=GraspSort(by="clearance_m"), limit=200
-    ).items
+    half = GraspFilter(at_least={"clearance_m": 0.5})
+    far = services.index.grasps.page(half, sort=GraspSort(by="clearance_m"), limit=200).items
     assert far and {grasp.scene_kind for grasp in far} == {"table", "bin"}
     assert far[0].clearance_m == max(grasp.clearance_m for grasp in far)
 

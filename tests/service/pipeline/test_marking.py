@@ -30,7 +30,7 @@ from graspd.service.pipeline.datasets.spec import DatasetRequest
 from graspd.service.pipeline.deletion import delete_asset, delete_job
 from graspd.service.queue.port import Event, EventKind
 from graspd.service.settings import Settings
-from tests.fakes import add_assets, make_shard, make_task, record_of, request
+from tests.fakes import add_assets, finish, make_shard, record_of, request
 from tests.indexes import open_services
 
 
@@ -161,10 +161,8 @@ ALL = (names.JOBS, names.DATASETS, names.OBJECT_SETS, names.TAGS, names.DELETION
 
 
 def finished(services: Services, **changes: object) -> str:
-    """A job that succeeded."""
     job, _ = job_actions.submit(services, request(**changes))
-    for task in plan(record := record_of(services, job.id)):
-        make_task(services, record, task)
+    finish(services, job.id)
     return job.id
 
 
@@ -197,11 +195,8 @@ ACTS: dict[str, tuple[Callable[[Services], str | object], Callable[[Services, st
 def locked(services: Services, monkeypatch: pytest.MonkeyPatch) -> Iterator[Services]:
     """Another process holds the index."""
     monkeypatch.setattr(database, "_BUSY_TIMEOUT_S", 0.05)
-    index = Index(services.settings.resolved_index_url)
-    with (
-        closing(index),
-        closing(sqlite3.connect(str(make_url(services.settings.resolved_index_url).database))) as other,
-    ):
+    url = services.settings.resolved_index_url
+    with closing(Index(url)) as index, closing(sqlite3.connect(str(make_url(url).database))) as other:
         other.execute("BEGIN IMMEDIATE")
         yield Services(services.settings, services.store, index, services.queue)
 
@@ -209,12 +204,9 @@ def locked(services: Services, monkeypatch: pytest.MonkeyPatch) -> Iterator[Serv
 @contextmanager
 def full(services: Services, monkeypatch: pytest.MonkeyPatch) -> Iterator[Services]:
     """No room on the disk when rows are to be kept."""
+    error = OperationalError("COMMIT", {}, Exception("database or disk is full"))
     with monkeypatch.context() as patch:
-        patch.setattr(
-            Connection,
-            "commit",
-            Mock(side_effect=OperationalError("COMMIT", {}, Exception("database or disk is full"))),
-        )
+        patch.setattr(Connection, "commit", Mock(side_effect=error))
         yield services
 
 

@@ -26,7 +26,6 @@ from tests.indexes import empty_index
 
 
 def tasks(count: int) -> list[TaskMessage]:
-    """Messages of as many tasks."""
     return [message_for().model_copy(update={"task_id": f"{number:032x}"}) for number in range(count)]
 
 

@@ -32,8 +32,9 @@ from graspd.service.store.records import put_record
 from graspd.service.store.store import Store, open_store
 from tests.damage import flipped, overwrite
 from tests.fakes import job_record, make_shard, record_of, request, tasks_of
+from tests.service.conftest import service
 from tests.service.pipeline.test_controller import Bench
-from tests.service.pipeline.test_integrity import findings, service_on, work_off
+from tests.service.pipeline.test_integrity import findings, work_off
 
 
 def batches(count: int, **changes: object) -> list[TaskMessage]:
@@ -57,19 +58,12 @@ def pack(store: Store, messages: Sequence[TaskMessage], *, dead: Sequence[TaskMe
     manifests = [manifest.model_copy(update={"key": ""}).model_dump_json().encode() for manifest, _ in made]
     pieces = [*manifests, *(data for _, data in made)]
     starts = list(accumulate(map(len, pieces), initial=0))
-    rows = [
-        {
-            "id": manifest.shard_id,
-            "stage": manifest.stage,
-            "start": starts[len(made) + row],
-            "length": len(data),
-            "sha256": manifest.sha256,
-            "manifest_start": starts[row],
-            "manifest_length": len(manifests[row]),
-            "manifest_sha256": hashlib.sha256(manifests[row]).hexdigest(),
-        }
-        for row, (manifest, data) in enumerate(made)
-    ]
+    rows = []
+    for row, (manifest, data) in enumerate(made):
+        of_file = {"start": starts[len(made) + row], "length": len(data), "sha256": manifest.sha256}
+        of_manifest = {"manifest_start": starts[row], "manifest_length": len(manifests[row])}
+        of_manifest["manifest_sha256"] = hashlib.sha256(manifests[row]).hexdigest()
+        rows.append({"id": manifest.shard_id, "stage": manifest.stage, **of_file, **of_manifest})
     directory = json.dumps({"version": 1, "shards": rows}, separators=(",", ":")).encode()
     folder = digest_json([messages[0].hand_digest, messages[0].object_digest])
     key = f"packs/{folder}/{digest_bytes(directory)}.pack"
@@ -82,7 +76,7 @@ def pack(store: Store, messages: Sequence[TaskMessage], *, dead: Sequence[TaskMe
 
 @pytest.fixture
 def services(tmp_path: Path) -> Iterator[Services]:
-    yield from service_on(tmp_path, (tmp_path / "store").as_uri())
+    yield from service(tmp_path)
 
 
 def submit(services: Services, batches: int) -> tuple[str, list[Any]]:
@@ -158,9 +152,8 @@ def test_readers_name_the_command_and_read_places_in_packs(services: Services) -
 def test_an_index_that_is_made_anew_has_what_was_in_packs(services: Services) -> None:
     job, tasks = submit(services, 2)
     pack(services.store, tasks)
-    told = CliRunner().invoke(
-        commands.app, ["index", "rebuild", "--json", "--data-dir", str(services.settings.data_dir)]
-    )
+    command = ["index", "rebuild", "--json", "--data-dir", str(services.settings.data_dir)]
+    told = CliRunner().invoke(commands.app, command)
     assert told.exit_code == 0, told.output
     assert json.loads(told.stdout.splitlines()[-1])["shards"] == 2
     assert is_whole(services, job)

@@ -48,9 +48,9 @@ def add_cup(services: Services, version: int = 0, *, verdict: str | None = "acce
     return put(services, AssetKind.OBJECT, "cup", files, check)
 
 
-def add_network(services: Services, version: int = 0, *, hand: str = "gripper", verdict: str | None = "accept") -> str:
-    digest = services.index.assets.get(AssetKind.HAND, "gripper").digest if hand == "gripper" else "f" * 32
-    files = network_files(random_network(hand=hand, digest=digest, seed=version))
+def add_network(services: Services, version: int = 0, *, verdict: str | None = "accept") -> str:
+    digest = services.index.assets.get(AssetKind.HAND, "gripper").digest
+    files = network_files(random_network(hand="gripper", digest=digest, seed=version))
     check = check_network(files, "net") | {"verdict": verdict, "message": "it is none"} if verdict else None
     return put(services, AssetKind.NETWORK, "net", files, check)
 
@@ -253,16 +253,6 @@ def test_a_retried_job_sets_out_from_the_network_it_had(services: Services) -> N
     queue.finish(queue.take("w"))
     job_actions.retry(services, job.id)
     assert queue.take("w").message.request.network == net
-
-
-def test_a_network_of_another_hand_is_refused_in_a_line(services: Services) -> None:
-    add_network(services, hand="claw")
-    words = r"network 'net' proposes grasps of claw \(f{12}\), not of gripper \([0-9a-f]{12}\)"
-    with pytest.raises(InputError, match=words):
-        NETWORK.submit(services)
-    with pytest.raises(InputError, match=words):
-        actions.create(services, dataset_of(NETWORK))
-    assert services.index.jobs.page().items == [] and services.index.datasets.page().items == []
 
 
 def test_only_workers_that_know_networks_are_asked_for_one(services: Services) -> None:

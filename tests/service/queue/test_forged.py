@@ -4,7 +4,7 @@ import contextlib
 import json
 import os
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -25,9 +25,8 @@ from graspd.service.pipeline.leading import PART
 from graspd.service.queue.allowed import TASK_FUNCTION, allowed_job
 from graspd.service.queue.port import Event, EventKind
 from graspd.service.queue.rq_queue import EVENTS, METRICS, WORKERS, RqQueue, worker_key
-from graspd.service.settings import Settings
-from tests.fakes import add_assets, beat_of, request
-from tests.indexes import open_services
+from tests.fakes import beat_of, request
+from tests.service.conftest import service
 
 WIP = "rq:wip:interactive-synthesize"
 WAITING = "rq:queue:interactive-synthesize"
@@ -80,10 +79,8 @@ FORGERIES: dict[str, Callable[[Any], object]] = {
 
 
 @pytest.fixture
-def services(tmp_path: Path, rq_queue: RqQueue) -> Services:
-    made = open_services(Settings(data_dir=tmp_path, retry_backoff_s=0.0), queue=rq_queue)
-    add_assets(made)
-    return made
+def services(tmp_path: Path, rq_queue: RqQueue) -> Iterator[Services]:
+    yield from service(tmp_path, queue=rq_queue)
 
 
 @pytest.mark.parametrize("what", FORGERIES)

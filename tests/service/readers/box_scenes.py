@@ -15,12 +15,8 @@ JOINTS, GRASPS = 4, 6
 WIDTH, HEIGHT = 96, 72
 K = np.array([[100.0, 0, 48], [0, 100.0, 36], [0, 0, 1]])
 #: Two scenes: the box on its face, turned; and on its side.
-POSES = np.stack(
-    [
-        np.array([0.02, -0.01, 0.025, np.cos(0.3), 0, 0, np.sin(0.3)]),
-        np.array([-0.01, 0.03, 0.03, np.sqrt(0.5), np.sqrt(0.5), 0, 0]),
-    ]
-)
+TURNED, ON_ITS_SIDE = (np.cos(0.3), 0, 0, np.sin(0.3)), (np.sqrt(0.5), np.sqrt(0.5), 0, 0)
+POSES = np.array([[0.02, -0.01, 0.025, *TURNED], [-0.01, 0.03, 0.03, *ON_ITS_SIDE]])
 VALID = np.array([1, 1, 0, 1, 1, 1], np.uint8)
 SCENE_OF_GRASP = np.array([0, 0, 0, 1, 1, 0], np.int32)
 
@@ -98,7 +94,6 @@ def write(folder: Path) -> Path:
     names = [f"joint_{k}" for k in range(JOINTS)]
     folder.mkdir(exist_ok=True)
     (folder / "base.h5").write_bytes(write_shard("base", base, said | {"shard_id": "b" * 32, "joint_names": names}))
-    (folder / "views.h5").write_bytes(
-        write_shard("views", views, said | {"shard_id": "c" * 32, "base_shard": "b" * 32})
-    )
+    of_views = said | {"shard_id": "c" * 32, "base_shard": "b" * 32}
+    (folder / "views.h5").write_bytes(write_shard("views", views, of_views))
     return folder

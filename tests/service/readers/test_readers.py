@@ -171,18 +171,14 @@ def test_every_row_of_every_column_is_what_h5py_reads(box: Path) -> None:
 
 def test_what_is_packed_in_another_way_is_read_by_the_library(tmp_path: Path) -> None:
     values = np.arange(2 * 6 * 5, dtype=np.float32).reshape(2, 6, 5)
-    ways = {
-        "whole": {},
-        "two": {"chunks": (2, 6, 5), "compression": "gzip"},
-        "lzf": {"chunks": (1, 6, 5), "compression": "lzf"},
-        "bare": {"chunks": (1, 6, 5)},
-        "plain": {"chunks": (1, 6, 5), "compression": "gzip"},
-        "summed": {"chunks": (1, 6, 5), "compression": "gzip", "fletcher32": True},
-    }
+    bare = {"chunks": (1, 6, 5)}
+    plain = {**bare, "compression": "gzip"}
+    ways = {"whole": {}, "two": plain | {"chunks": (2, 6, 5)}, "lzf": bare | {"compression": "lzf"}}
+    ways |= {"bare": bare, "plain": plain, "summed": plain | {"fletcher32": True}}
     with h5py.File(tmp_path / "other.h5", "w") as file:
         for name, options in ways.items():
             file.create_dataset(name, data=values, **options)
-        half = file.create_dataset("half", shape=values.shape, dtype="f4", chunks=(1, 6, 5), compression="gzip")
+        half = file.create_dataset("half", shape=values.shape, dtype="f4", **plain)
         half[1] = values[1]
     with h5py.File(tmp_path / "other.h5") as file:
         table = RowTable.of(file, [*ways, "half"], "other")

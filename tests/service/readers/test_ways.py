@@ -40,10 +40,9 @@ def test_a_way_goes_from_standoff_or_pregrasp_to_lift_or_squeeze():
     assert point_at(way, 3.5).carried == pytest.approx([0, 0, 0.05]), "half way up"
 
 
-@pytest.mark.parametrize(
-    ("place", "x", "joint"), [(-1, 0.2, -0.3), (0.375, 0.15, -0.3), (1.5, 0.1, 0.05), (9, 0.1, 0.2)]
-)
-def test_between_two_postures_positions_and_joints_go_straight(place, x, joint):
+@pytest.mark.parametrize("at", [(-1, 0.2, -0.3), (0.375, 0.15, -0.3), (1.5, 0.1, 0.05), (9, 0.1, 0.2)])
+def test_between_two_postures_positions_and_joints_go_straight(at: tuple[float, float, float]):
+    place, x, joint = at
     point = point_at(way_of(shard(in_scene=True), 0), place)
     assert point.hand_pose[0] == pytest.approx(x) and point.joint_positions == pytest.approx([joint, joint])
 

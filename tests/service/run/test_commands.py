@@ -49,9 +49,7 @@ def _bad_model() -> ValidationError:
         (_bad_model(), 2, "graspd: grasps: must be at least 1\n"),
     ],
 )
-def test_an_error_is_one_line_and_an_exit_code(
-    error: BaseException, code: int, line: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_error_is_one_line_and_an_exit_code(error: BaseException, code: int, line: str, capsys: Any) -> None:
     with pytest.raises(typer.Exit) as ended:
         reporting_errors(Mock(side_effect=error))()
     assert ended.value.exit_code == code
@@ -114,10 +112,8 @@ def test_a_check_tells_differences_and_changes_nothing(services: Services) -> No
         shown = runner.invoke(app, damaged)
         assert shown.exit_code == 1 and "not in the index" in shown.output
     rebuild = [*damaged[:2], "--json", *damaged[3:]]
-    assert [json.loads(runner.invoke(app, rebuild).stdout.splitlines()[-1])["changed"] for _ in range(2)] == [
-        True,
-        False,
-    ]
+    told = [runner.invoke(app, rebuild).stdout.splitlines()[-1] for _ in range(2)]
+    assert [json.loads(line)["changed"] for line in told] == [True, False]
     assert runner.invoke(app, damaged).exit_code == 0
 
 
@@ -253,21 +249,22 @@ def test_a_setting_reaches_the_children(name: str, monkeypatch: pytest.MonkeyPat
 )
 def test_a_setting_taken_back_does_not_come_from_the_environment(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     value = value_of(name)
-    monkeypatch.setenv(
-        f"GRASPD_{name.upper()}", value.get_secret_value() if isinstance(value, SecretStr) else str(value)
-    )
+    text = value.get_secret_value() if isinstance(value, SecretStr) else str(value)
+    monkeypatch.setenv(f"GRASPD_{name.upper()}", text)
     for variable, text in _stated(Settings(**{name: None})).items():
         monkeypatch.setenv(variable, text)
     assert getattr(Settings(), name) is None
 
 
 @pytest.fixture
-def nothing_set(monkeypatch: pytest.MonkeyPatch) -> None:
+def bare(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
+    """An environment without settings."""
     for name in [name for name in os.environ if name.upper().startswith("GRASPD_")]:
         monkeypatch.delenv(name)
+    return monkeypatch
 
 
-def test_where_nothing_is_set_they_are_the_defaults_and_nothing_is_loaded(nothing_set: None) -> None:
+def test_where_nothing_is_set_defaults_count_and_nothing_is_loaded(bare: pytest.MonkeyPatch) -> None:
     whole = load_settings()
     assert engine_settings() == EngineSettings(whole.prefilter, whole.processes)
     code = "import sys; from graspd.service.cli import engine_settings; engine_settings(); print(*sys.modules)"
@@ -275,11 +272,9 @@ def test_where_nothing_is_set_they_are_the_defaults_and_nothing_is_loaded(nothin
     assert "pydantic_settings" not in done.stdout.split()
 
 
-def test_a_set_value_counts_and_a_bad_one_is_refused_by_name(
-    nothing_set: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("graspd_processes", "3")
+def test_a_set_value_counts_and_a_bad_one_is_refused_by_name(bare: pytest.MonkeyPatch) -> None:
+    bare.setenv("graspd_processes", "3")
     assert engine_settings() == EngineSettings("auto", 3)
-    monkeypatch.setenv("GRASPD_PREFILTER", "perhaps")
+    bare.setenv("GRASPD_PREFILTER", "perhaps")
     with pytest.raises(InputError, match="GRASPD_PREFILTER"):
         engine_settings()

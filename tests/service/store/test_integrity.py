@@ -120,21 +120,19 @@ def test_bytes_that_turned_in_secret_are_not_given(tmp_path: Path, store: Store,
 
 #: Columns valid, feasible and success of a grasp (None: absent), and whether it is valid, or feasible and unvalidated.
 STATUSES = [
-    (0, 1, None, False, True),
-    (1, None, None, False, True),  # graspd 0.1, not validated: not taken for valid
-    (1, 1, 1, True, False),
-    (1, 1, -1, False, True),
-    (0, 1, 0, False, False),
-    (0, 0, -1, False, False),
+    ((0, 1, None), False, True),
+    ((1, None, None), False, True),  # graspd 0.1, not validated: not taken for valid
+    ((1, 1, 1), True, False),
+    ((1, 1, -1), False, True),
+    ((0, 1, 0), False, False),
+    ((0, 0, -1), False, False),
 ]
 
 
-@pytest.mark.parametrize(("valid", "feasible", "success", "is_valid", "is_unvalidated"), STATUSES)
-def test_a_verdict_counts_only_where_there_is_one(
-    valid: int, feasible: int | None, success: int | None, is_valid: bool, is_unvalidated: bool
-) -> None:
-    said = {"quality/valid": valid, "quality/feasible": feasible, "quality/success": success}
-    columns = {name: np.array([value]) for name, value in said.items() if value is not None}
+@pytest.mark.parametrize(("said", "is_valid", "is_unvalidated"), STATUSES)
+def test_a_verdict_counts_only_where_there_is_one(said: Any, is_valid: bool, is_unvalidated: bool) -> None:
+    named = zip(("valid", "feasible", "success"), said, strict=True)
+    columns = {f"quality/{name}": np.array([value]) for name, value in named if value is not None}
     assert validity.chosen(columns).tolist() == [is_valid]
     assert validity.chosen(columns, unvalidated=True).tolist() == [is_unvalidated]
 

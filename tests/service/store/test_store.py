@@ -105,10 +105,9 @@ def test_a_url_that_names_no_store_is_refused(url: str) -> None:
 
 def test_a_full_disk_is_one_clear_line_and_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     store = open_store(tmp_path.as_uri())
+    full = Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
     with monkeypatch.context() as patch:
-        patch.setattr(
-            "graspd.service.store.store.os.fsync", Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
-        )
+        patch.setattr("graspd.service.store.store.os.fsync", full)
         with pytest.raises(StoreUnavailable, match=r"No space left on device$"):
             store.put("shards/base/a.h5", b"data")
     assert list((tmp_path / "shards" / "base").iterdir()) == []

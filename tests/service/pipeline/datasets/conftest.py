@@ -7,10 +7,8 @@ import pytest
 from pydantic import SecretStr
 
 from graspd.service.pipeline.backends import Services
-from graspd.service.settings import Settings
 from graspd.service.store.store import open_store
-from tests.fakes import add_assets
-from tests.indexes import open_services
+from tests.service.conftest import service
 from tests.service.pipeline.datasets.makers import add_asset
 
 
@@ -27,10 +25,7 @@ def services(tmp_path: Path) -> Iterator[Services]:
 
 
 def _service(folder: Path, url: str) -> Iterator[Services]:
-    settings = Settings(data_dir=folder, retry_backoff_s=0.0, task_s=0.0, index_url=SecretStr(url))
-    made = open_services(settings, open_store("memory://"))
-    add_assets(made)
-    for kind, name in (("hand", "claw"), ("object", "cube"), ("object", "cone")):
-        add_asset(made, kind, name)
-    yield made
-    made.close()
+    for made in service(folder, open_store("memory://"), index_url=SecretStr(url)):
+        for kind, name in (("hand", "claw"), ("object", "cube"), ("object", "cone")):
+            add_asset(made, kind, name)
+        yield made

@@ -11,16 +11,8 @@ import h5py
 import pytest
 
 from graspd.service.index.rebuild import differences, rebuild
-from graspd.service.model import digests, names
+from graspd.service.model import digests, errors, names
 from graspd.service.model.domain import JobRequest
-from graspd.service.model.errors import (
-    ConflictError,
-    DamagedShard,
-    InputError,
-    LimitError,
-    NotFoundError,
-    StoreUnavailable,
-)
 from graspd.service.model.planning import OUTCOMES
 from graspd.service.model.records import DatasetRecord, Snapshot, SnapshotShard, request_of
 from graspd.service.model.scene_spec import SceneSpec
@@ -75,7 +67,7 @@ def test_a_planner_that_was_stopped_is_continued(services: Services) -> None:
 
 def test_a_name_stands_for_one_dataset(services: Services) -> None:
     actions.create(services, wanted())
-    with pytest.raises(ConflictError, match="its objects are ball, cube; its grasps is 32\\); take another name"):
+    with pytest.raises(errors.ConflictError, match=r"objects are ball, cube; its grasps is 32\); take another name"):
         actions.create(services, wanted(objects=("ball",), grasps=64))
 
 
@@ -102,10 +94,10 @@ def test_what_cannot_be_used_is_refused_before_it_is_recorded(services: Services
     add_asset(services, "object", "torn", verdict="refuse")
     add_asset(services, "object", "fresh", verdict=None)
     for changes, error, words in (
-        ({"hands": ("foot",)}, NotFoundError, "there is no hand 'foot'; there are: claw, gripper"),
-        ({"objects": ("torn",)}, InputError, "was refused"),
-        ({"objects": ("fresh",)}, ConflictError, "still being checked"),
-        ({"sets": ("kitchen",)}, NotFoundError, "there is no set of objects 'kitchen'"),
+        ({"hands": ("foot",)}, errors.NotFoundError, "there is no hand 'foot'; there are: claw, gripper"),
+        ({"objects": ("torn",)}, errors.InputError, "was refused"),
+        ({"objects": ("fresh",)}, errors.ConflictError, "still being checked"),
+        ({"sets": ("kitchen",)}, errors.NotFoundError, "there is no set of objects 'kitchen'"),
     ):
         with pytest.raises(error, match=words):
             actions.create(services, wanted(**changes))
@@ -116,7 +108,7 @@ def test_what_cannot_be_used_is_refused_before_it_is_recorded(services: Services
 
 def test_a_matrix_over_the_limit_is_refused(services: Services) -> None:
     for refuse in (actions.create, lambda of, asked: estimate(of.index, asked)):
-        with pytest.raises(LimitError, match="over 100000 cells"):
+        with pytest.raises(errors.LimitError, match="over 100000 cells"):
             refuse(services, wanted(hands=("gripper", "claw"), objects=[f"o{i}" for i in range(60_000)]))
 
 
@@ -162,7 +154,7 @@ def test_cancel_stops_what_is_planned_and_what_is_not(services: Services) -> Non
     assert [cell.state for cell in cells_of(services)] == ["succeeded", "cancelled", "cancelled", "cancelled"]
     assert services.index.datasets.get("grasps").state == "cancelled"
     assert services.index.feed.believed_queued()[0] == set()
-    with pytest.raises(ConflictError, match="nothing to cancel"):
+    with pytest.raises(errors.ConflictError, match="nothing to cancel"):
         actions.cancel(services, "grasps")
 
 
@@ -182,7 +174,7 @@ def test_retry_starts_failed_and_cancelled_cells_again(services: Services) -> No
     finish(services, jobs[0])
     finish(services, jobs[1], batches=1)
     fail(services, jobs[2])
-    with pytest.raises(NotFoundError):
+    with pytest.raises(errors.NotFoundError):
         actions.retry(services, "other")
     actions.cancel(services, "grasps")
     plan_all(services)
@@ -193,7 +185,7 @@ def test_retry_starts_failed_and_cancelled_cells_again(services: Services) -> No
     for job in jobs:
         finish(services, job)
     assert services.index.datasets.get("grasps").state == "succeeded" and services.index.datasets.get("grasps").finished
-    with pytest.raises(ConflictError, match="nothing to retry"):
+    with pytest.raises(errors.ConflictError, match="nothing to retry"):
         actions.retry(services, "grasps")
 
 
@@ -232,15 +224,15 @@ def test_a_set_has_versions_and_the_newest_counts(either: Services) -> None:
         assert set(actions.add_object_set(either, "round", objects).objects) == set(objects)
     assert len(list(either.store.list(names.OBJECT_SETS))) == 3
     assert [view.objects for view in either.index.object_sets.newest()] == [["ball", "cone"]]
-    with pytest.raises(NotFoundError, match="there is no object 'moon'"):
+    with pytest.raises(errors.NotFoundError, match="there is no object 'moon'"):
         actions.add_object_set(either, "round", ["moon"])
-    with pytest.raises(InputError, match="holds no object"):
+    with pytest.raises(errors.InputError, match="holds no object"):
         actions.add_object_set(either, "none", [])
 
 
 def test_the_same_shards_are_the_same_snapshot(services: Services) -> None:
     actions.create(services, wanted())
-    with pytest.raises(ConflictError, match="no shard yet"):
+    with pytest.raises(errors.ConflictError, match="no shard yet"):
         actions.snapshot(services, "grasps")
     plan_all(services)
     jobs = jobs_of(services, "grasps")
@@ -280,10 +272,10 @@ def test_every_file_is_there_with_its_checksum(source: Fetch, snapshot: Snapshot
 def test_an_export_that_broke_off_is_gone_on_with(source: Fetch, snapshot: Snapshot, tmp_path: Path) -> None:
     def breaks_off(shard: SnapshotShard) -> Iterable[bytes]:
         if shard == snapshot.shards[5]:
-            raise StoreUnavailable("away")
+            raise errors.StoreUnavailable("away")
         return source(shard)
 
-    with pytest.raises(StoreUnavailable):
+    with pytest.raises(errors.StoreUnavailable):
         export_shards(snapshot, tmp_path / "out", breaks_off)
     assert not (tmp_path / "out" / "snapshot.json").exists() and not list(tmp_path.rglob("*.part"))
     assert export_shards(snapshot, tmp_path / "out", source) == 3
@@ -298,14 +290,14 @@ def test_a_file_that_was_changed_is_fetched_again(source: Fetch, snapshot: Snaps
 
 
 def test_a_wrong_checksum_leaves_no_file(snapshot: Snapshot, tmp_path: Path) -> None:
-    with pytest.raises(DamagedShard, match=snapshot.shards[0].id):
+    with pytest.raises(errors.DamagedShard, match=snapshot.shards[0].id):
         export_shards(snapshot, tmp_path / "out", lambda shard: [b"something else"])
     assert [path for path in (tmp_path / "out").rglob("*") if path.is_file()] == []
 
 
 def test_a_folder_that_cannot_be_made_is_the_callers_mistake(source: Fetch, snapshot: Snapshot, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="cannot be made"):
+    with pytest.raises(errors.InputError, match="cannot be made"):
         export_shards(snapshot, tmp_path / "file" / "out", source)
 
 
@@ -342,7 +334,7 @@ def test_a_cell_without_options_is_the_job_it_always_was(monkeypatch: pytest.Mon
 def test_options_of_the_method_are_those_of_each_cells_job(either: Services) -> None:
     actions.create(either, wanted(**ANNEALED))
     assert [(r.method, r.options) for r in requests_of(either)] == 4 * [("graspit", {"keep": 20, "steps": 40000})]
-    with pytest.raises(ConflictError, match="its options is"):
+    with pytest.raises(errors.ConflictError, match="its options is"):
         actions.create(either, wanted(**ANNEALED | {"options": {"keep": 5}}))
 
 
@@ -371,7 +363,7 @@ def test_a_later_chart_changes_nothing_of_a_dataset(services: Services) -> None:
 
 def test_a_target_out_of_reach_on_one_cell_makes_no_dataset(services: Services) -> None:
     publish(services.store, "charts", chart())
-    with pytest.raises(InputError, match=r"no fidelity of fast_graspd meets gsr>=0\.75"):
+    with pytest.raises(errors.InputError, match=r"no fidelity of fast_graspd meets gsr>=0\.75"):
         actions.create(services, wanted(**AUTO | {"target": "gsr>=0.75"}))
     assert not services.store.exists(names.dataset_record("grasps"))
 

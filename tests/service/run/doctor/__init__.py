@@ -1,1 +1,0 @@
-"""What graspd doctor finds, against real servers."""

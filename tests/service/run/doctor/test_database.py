@@ -4,6 +4,7 @@ import sqlite3
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -18,10 +19,10 @@ from graspd.service.run.doctor import backends
 from graspd.service.run.doctor.checks import Condition, Finding
 from graspd.service.settings import Settings
 from graspd.service.store.store import open_store
-from tests.fakes import add_assets, finish, request
-from tests.indexes import open_services
+from tests.fakes import finish, request
 from tests.memory_queue import MemoryQueue
 from tests.servers import PostgresServer, free_ports
+from tests.service.conftest import service
 from tests.service.index.test_index import fail
 
 Look = Callable[[], Finding]
@@ -29,12 +30,10 @@ Look = Callable[[], Finding]
 
 @pytest.fixture
 def kept(tmp_path: Path) -> Iterator[Services]:
-    services = open_services(Settings(data_dir=tmp_path))
-    add_assets(services)
-    finish(services, job_actions.submit(services, request(grasps=64))[0].id)
-    services.index.notes.set_complete()
-    yield services
-    services.close()
+    for services in service(tmp_path):
+        finish(services, job_actions.submit(services, request(grasps=64))[0].id)
+        services.index.notes.set_complete()
+        yield services
 
 
 @pytest.fixture(params=["rows", "names"])
@@ -68,9 +67,7 @@ def remove_row(services: Services) -> None:
     ("harm", "words"),
     [(lambda services: shard_of(services).unlink(), "not in the store"), (remove_row, "not in the index")],
 )
-def test_a_manifest_or_row_that_is_gone_is_bad(
-    kept: Services, look: Look, harm: Callable[[Services], None], words: str
-) -> None:
+def test_a_manifest_or_row_that_is_gone_is_bad(kept: Services, look: Look, harm: Any, words: str) -> None:
     shard = shard_of(kept).stem
     harm(kept)
     found = look()

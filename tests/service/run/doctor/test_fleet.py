@@ -139,9 +139,7 @@ def test_workers_that_fit_are_counted(settings: Settings, rq_queue: RqQueue) -> 
         ({"state": "quarantined", "reason": "no driver"}, "no driver", "on node1: graspd doctor"),
     ],
 )
-def test_workers_that_do_not_fit_are_bad(
-    settings: Settings, rq_queue: RqQueue, facts: dict[str, Any], told: str, fix: str
-) -> None:
+def test_unfit_workers_are_bad(settings: Settings, rq_queue: RqQueue, facts: Any, told: str, fix: str) -> None:
     present(rq_queue)
     present(rq_queue, "ill", **facts)
     found = workers(settings)

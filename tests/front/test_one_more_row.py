@@ -1,4 +1,4 @@
-"""One row more in the table of metrics is found everywhere: stored, indexed, filtered, shown and documented."""
+"""One row more in the table of options or of metrics is found in all places: declared, shown, stored, documented."""
 
 import json
 import sys
@@ -10,24 +10,47 @@ from benchmarks.large_index import fill
 from graspd.service.index.index import Index
 from graspd.service.store.store import open_store
 from tests.conftest import REPOSITORY
-from tests.one_more_metric import MEANING, NAME, TITLE
+from tests.one_more_row import FLAG, MEANING, NAME, OPTION, TITLE
 from tests.shell import completed
 
 Found = dict[str, Any]
 
 
 @pytest.fixture(scope="module")
-def found(tmp_path_factory: pytest.TempPathFactory) -> Found:
-    folder = tmp_path_factory.mktemp("metric")
+def both(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Found]:
+    folder = tmp_path_factory.mktemp("rows")
     older = f"sqlite:///{folder / 'older.sqlite'}"
     index = Index(older)
     fill(index, open_store("memory://"), grasps=64, jobs=2)
     index.close()
-    command = [sys.executable, "-m", "tests.one_more_metric", str(folder / "new"), older]
-    (folder / "new").mkdir()
-    done = completed(command, cwd=REPOSITORY)
+    for name in ("option", "metric"):
+        (folder / name).mkdir()
+    done = completed([sys.executable, "-m", "tests.one_more_row", folder, older], cwd=REPOSITORY)
     assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout.splitlines()[-1])
+    return dict(json.loads(done.stdout.splitlines()[-1]))
+
+
+@pytest.fixture
+def found(both: dict[str, Found]) -> Found:
+    return both["metric"]
+
+
+def test_one_more_option_is_found_in_all_places(both: dict[str, Found]) -> None:
+    found = both["option"]
+    assert all(FLAG in text and f"{MEANING} [N]".removeprefix("largest ") in text for text in found["help"])
+    assert [text.strip() for text in found["out of bounds"][:2]] == [
+        f"graspd: {FLAG}: must be at most 20; see `root {name} --help`" for name in ("synth", "submit")
+    ]
+    assert OPTION in found["out of bounds"][2]
+    for page, place in zip(found["forms"], ("", "cell-"), strict=True):
+        assert f'<label for="{place}{OPTION}">Finger force [N]</label>' in page
+        assert f'name="{OPTION}" type="number" min="1" max="20" step="any" value="5"' in page
+    shown = {"type": "number", "maximum": 20.0, "minimum": 1.0, "title": "Finger Force", "default": 5.0}
+    assert found["http"] == [shown | {"description": f"{MEANING} [N]"}] * 2
+    assert found["python"] == [f"{OPTION}: 'float' = 5.0"] * 2
+    assert found["types"].count(f"    {OPTION}: float\n") == 2
+    assert f"| `{OPTION}` | `{FLAG}` | both | `5.0` | at least 1 and at most 20 | {MEANING} [N] |" in found["docs"]
+    assert not found["warp"], "help, completion and what is refused need no engine"
 
 
 def test_shard_manifest_and_index_have_it_and_an_older_index_too(found: Found) -> None:

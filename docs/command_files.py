@@ -1,4 +1,4 @@
-"""What the pages call the reader's own, for `tests/docs_commands.py`: hands, meshes, shards, scenes, small datasets."""
+"""What the pages call the reader's own, for `docs/commands.py`: hands, meshes, shards, scenes, small datasets."""
 
 import os
 import re

@@ -1,8 +1,8 @@
 """The commands that README and docs print: found, checked against the command line, and run.
 
-usage: python -m tests.docs_commands [PAGE ...]    (make docs-commands; hours of two cores for all)
+usage: python -m docs.commands [PAGE ...]    (make docs-commands; hours of two cores for all)
 
-Each page gets a folder with the files that a reader would have (`tests/docs_files.py`), and a service where a line
+Each page gets a folder with the files that a reader would have (`docs/command_files.py`), and a service where a line
 needs one; its lines run in their order, as they are printed. Ends with 1 if a line failed.
 """
 
@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import graspd.cli
-from tests.docs_files import files_for
+from docs.command_files import files_for
 
 REPOSITORY: Final = Path(__file__).resolve().parent.parent
 DOCS: Final = REPOSITORY / "docs"
@@ -46,7 +46,7 @@ _INDENTED: Final = re.compile(r"(?:^\n)((?:^    .*\n)+)", re.MULTILINE)
 _TRIED: Final = re.compile(r"<!-- tried: [\w-]+ -->\s*$")
 #: The output that a page shows after a command that ends with an error.
 _REFUSAL: Final = re.compile(r"\s*```\ngraspd: ")
-_OURS: Final = {"graspd", "benchmarks", "examples", "tests"}
+_OURS: Final = {"graspd", "benchmarks", "docs", "examples", "tests"}
 #: What an indented block of commands begins with; any other is a file or a formula.
 _FIRST: Final = re.compile(r"(?:\w+=\S+ )*(?:\S*/)?(?:graspd|python|make|export|cp|curl|docker|kubectl) ")
 _OPERATORS: Final = {"|", "||", "&&", ";", "&", ">", ">>", "<", "2>", "(", ")"}
