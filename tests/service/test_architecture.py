@@ -72,7 +72,7 @@ def product() -> dict[str, str]:
     return {str(file): text for file in files if (text := file.read_text())}
 
 
-@pytest.mark.parametrize("what, budget", [("modules", 520), ("lines", 81_800), ("lines that the formatter skips", 40)])
+@pytest.mark.parametrize("what, budget", [("modules", 520), ("lines", 80_000), ("lines that the formatter skips", 40)])
 def test_the_product_stays_within_its_budget(what: str, budget: int, product: dict[str, str]) -> None:
     found = {
         "modules": len(product),
