@@ -32,7 +32,6 @@ gc.disable()
 
 
 def pytest_collection_finish() -> None:
-    """What was made so far, thousands of tests, stays until the end: Python's collector need not look at it again."""
     gc.enable()
     gc.collect()
     gc.freeze()

@@ -101,7 +101,6 @@ def fake_stages() -> dict[Stage, Any]:
 
 
 def make_shard(store: Store, message: TaskMessage, *, worker: str = "w") -> ShardManifest:
-    """Do a task on the spot: its shard and manifest are in the store afterwards."""
     context = TaskContext(store)
     made = fake_stages()[message.stage](message, context)
     manifest, data = shard_of(message, made, device="cpu", seconds=0.5, worker=worker)
@@ -133,7 +132,6 @@ def make_task(services: Services, job: JobRecord, task: PlannedTask, **info: Any
 
 
 def finish(services: Services, job: str, *, batches: float = math.inf, stage: Stage | None = None, **info: Any) -> None:
-    """The first tasks of a job, of one stage or all, done on the spot; see `make_task`."""
     for task in plan(record := record_of(services, job)):
         if task.batch < batches and stage in (None, task.stage):
             make_task(services, record, task, **info)
@@ -145,7 +143,6 @@ def plan_all(services: Services) -> None:
 
 
 def tasks_of(job: JobRecord) -> list[TaskMessage]:
-    """The first attempts at a job's tasks of synthesis."""
     tasks = [task for task in plan(job) if task.stage is Stage.SYNTHESIZE]
     return [message_of(job, task, attempt=1, max_attempt=3) for task in tasks]
 
@@ -182,7 +179,6 @@ def message_for(stage: Stage = Stage.SYNTHESIZE, *, attempt: int = 1, **changes:
 
 
 def hold_interpreter(seconds: float) -> None:
-    """Let no other Python of this process run for that long, as a compiler called without releasing the lock does."""
     if seconds > 0:
         ctypes.PyDLL(None).usleep(int(seconds * 1e6))
 
@@ -197,7 +193,6 @@ def _pretend_to_work(context: TaskContext) -> None:
 
 
 def _die_untold(once: Path) -> None:
-    """Let this worker be killed when it has put a shard, and before it says so, if no other one was."""
     from graspd.worker.process import runner
 
     def publish(*shard: Any) -> bool:

@@ -23,8 +23,6 @@ class Delivery:
 
 @dataclass
 class MemoryQueue(RqQueue):
-    """The queue without Redis. `take`, `beat` and `finish` are the worker's side."""
-
     clock: Callable[[], float] = time.monotonic
     _priorities: dict[Priority, list[Message]] = field(default_factory=lambda: {priority: [] for priority in Priority})
     _held: dict[str, Delivery] = field(default_factory=dict)
@@ -152,7 +150,6 @@ class MemoryQueue(RqQueue):
         """Nothing to give back."""
 
     def take(self, worker: str) -> Delivery | None:
-        """The next task, in the order of `priority_order`; it is leased to the worker."""
         for priority in priority_order(self._taken[worker]):
             if self._priorities[priority]:
                 self._taken[worker] += 1

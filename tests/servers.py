@@ -253,7 +253,6 @@ def _lock_port(port: int) -> bool:
 
 
 def _last_port() -> int:
-    """Where the ports begin that the system gives to who asks for any."""
     try:
         begin = int(Path("/proc/sys/net/ipv4/ip_local_port_range").read_text().split()[0])
     except OSError:

@@ -23,7 +23,6 @@ def until(met: Callable[[], Any], what: str, *, seconds: float = PATIENCE_S, log
 
 
 def answers(url: str, client: httpx.Client | None = None) -> bool:
-    """Whether a GET of it ends well."""
     try:
         got = client.get(url) if client else httpx.get(url, trust_env=False, timeout=60)
     except httpx.HTTPError:

@@ -44,7 +44,6 @@ class _Noon(datetime):
 
 @pytest.fixture
 def noon(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is noon (UTC) of `TODAY` to quotas: their day does not end while a test runs."""
     monkeypatch.setattr("graspd.api.access.quotas.datetime", _Noon)
 
 
@@ -81,7 +80,6 @@ def keys(settings: Settings) -> KeyFile:
 def make_twins(
     settings: Settings, services: Services, redis_server: str, rq_queue: RqQueue, noon: None
 ) -> Iterator[Callable[..., list[TestClient]]]:
-    """Makes two applications over the same services, keys and Redis, with these settings."""
     with ExitStack() as clients:
 
         def make(**changes: Any) -> list[TestClient]:

@@ -162,7 +162,6 @@ def _scene(random: np.random.Generator, count: int, request: JobRequest) -> Arra
 
 
 def scene_columns(random: np.random.Generator, count: int, scenes: int, clear: float = 0.5) -> Arrays:
-    """Every grasp in every scene, clear of the table or not by chance."""
     rows = count * scenes
     return {
         "scene/object_pose": poses(random, scenes),

@@ -72,7 +72,6 @@ def connect(settings: Settings) -> Iterator[Connect]:
 
 
 def rest(connection: socket.socket) -> bytes:
-    """What still comes until the server ends the connection."""
     found = b""
     while piece := connection.recv(65536):
         found += piece
@@ -166,7 +165,6 @@ def test_a_stream_of_events_ends_with_its_key(app: FastAPI, services: Services, 
 
 @pytest.fixture
 def closed(settings: Settings, services: Services, keys: KeyFile) -> Closed:
-    """The application of a service that has keys, and a key of each scope."""
     made = {scope: keys.add(scope.value, scope) for scope in Scope}
     return create_app(settings, services), made
 

@@ -41,7 +41,6 @@ _NASTY_KEYS = ([2**63], ["\ud800", "x"], ["x", "\ud800"], [2**70, "x"], [None, N
 
 @pytest.fixture(scope="module")
 def document(tmp_path_factory: pytest.TempPathFactory, redis_server: str) -> Iterator[Any]:
-    """The document of an application with jobs in every state, on a real Redis."""
     folder = tmp_path_factory.mktemp("contract")
     settings = Settings(data_dir=folder, redis_url=SecretStr(redis_server), max_upload_bytes=1 << 20)
     queue = RqQueue(connect(redis_server))
@@ -69,7 +68,6 @@ def document(tmp_path_factory: pytest.TempPathFactory, redis_server: str) -> Ite
 
     @schema.hook
     def map_query(context: Any, query: dict[str, Any]) -> dict[str, Any]:
-        """Every third parameter is made to break something."""
         for name, given in (query or {}).items():
             if (number := len(str(given))) % 3 == 0:
                 nasty = _NASTY_TEXT[number % len(_NASTY_TEXT)]
@@ -85,8 +83,6 @@ def _cursor(key: Any) -> str:
 
 
 def _addressed(app: Any) -> Any:
-    """The application, called by a name of this machine: an open service answers to no other."""
-
     async def call(scope: Any, receive: Any, send: Any) -> None:
         headers = [(name, value) for name, value in scope.get("headers", []) if name != b"host"]
         await app(scope | {"headers": [*headers, (b"host", b"127.0.0.1")]}, receive, send)
@@ -119,6 +115,5 @@ def _probe(operation: Any, examples: int) -> None:
 
 
 def _shown(error: BaseException) -> str:
-    """The failures in an exception, or in a group of them."""
     inner = getattr(error, "exceptions", None)
     return "\n".join(map(_shown, inner)) if inner else f"{type(error).__name__}: {error}"

@@ -1,7 +1,6 @@
-"""One word finds a job in the logs of all processes, metrics tell what they did, and a request is one trace."""
+"""One word finds a job in the logs of all processes; metrics count what they did."""
 
 import json
-import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -9,19 +8,11 @@ from typing import Any
 
 import httpx
 import pytest
-from opentelemetry.sdk.trace.export import SimpleSpanProcessor
-from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
-from starlette.testclient import TestClient
 
-from graspd.service import telemetry
-from graspd.service.model.planning import message_of, plan
-from graspd.service.model.states import Stage
 from graspd.service.pipeline.backends import Services
 from graspd.service.run.supervisor import Supervisor
 from graspd.service.settings import Settings
-from graspd.worker.process.runner import Runner
-from graspd.worker.stages.context import TaskContext
-from tests.fakes import add_assets, fake_stages, record_of
+from tests.fakes import add_assets
 from tests.waiting import PATIENCE_S, until
 
 
@@ -72,43 +63,3 @@ def test_metrics_tell_what_the_service_did(followed: Any) -> None:
         'graspd_part_up{part="store"} 1.0',
     ):
         assert line in told
-
-
-_PARENT = "00-" + "a" * 32 + "-" + "b" * 16 + "-01"
-
-
-@pytest.fixture
-def spans(monkeypatch: pytest.MonkeyPatch) -> InMemorySpanExporter:
-    exporter = InMemorySpanExporter()
-    monkeypatch.setenv("OTEL_EXPORTER_OTLP_ENDPOINT", "http://127.0.0.1:9")
-    monkeypatch.setattr("opentelemetry.sdk.trace.export.BatchSpanProcessor", lambda _: SimpleSpanProcessor(exporter))
-    monkeypatch.setattr(telemetry, "_tracer", None)
-    telemetry.set_up_tracing("test")
-    return exporter
-
-
-def test_a_task_is_in_its_requests_trace(spans: InMemorySpanExporter, http: TestClient, services: Services) -> None:
-    body = {"hand": "allegro", "object": "mug", "grasps": 32}
-    made = http.post("/v1/jobs", json=body, headers={"traceparent": _PARENT}).json()
-    record = record_of(services, made["id"])
-    task = next(task for task in plan(record) if task.stage is Stage.SYNTHESIZE)
-    message = message_of(record, task, attempt=1, max_attempt=3)
-    runner = Runner(fake_stages(), worker="w", publish=lambda event: None)
-    runner.run(message.model_dump(mode="json", by_alias=True), TaskContext(services.store))
-    found = {span.name: span for span in spans.get_finished_spans()}
-    request, work = found["HTTP POST"], found["task synthesize"]
-    assert f"{request.context.trace_id:032x}" == "a" * 32
-    assert work.context.trace_id == request.context.trace_id and work.parent is not None
-    assert work.parent.span_id == request.context.span_id
-    assert dict(work.attributes or {})["graspd.outcome"] == "finished"
-    assert dict(request.attributes or {})["http.route"] == "/v1/jobs"
-
-
-def test_without_an_endpoint_nothing_of_the_sdk_is_imported() -> None:
-    code = (
-        "import sys; from graspd.service import telemetry; telemetry.set_up_tracing('api')\n"
-        "with telemetry.span('x'): assert telemetry.traceparent() == ''\n"
-        "assert not [name for name in sys.modules if name.startswith('opentelemetry')]"
-    )
-    environment = {"PATH": "/usr/bin:/bin"}
-    subprocess.run([sys.executable, "-c", code], check=True, env=environment)

@@ -23,7 +23,6 @@ def descent(pivot: tuple[float, float, float] = (0.0, 0.0, -0.2), q: tuple[float
 
 
 def evaluated(found: Descent, pivot: tuple[float, float, float], q: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
-    """The five energies of a hand; its gradient is in `found.proposal.gradient`."""
     found.proposal.set_state(HandState(np.array([pivot]), np.array([[1.0, 0, 0, 0]]), np.array([q])))
     found.new_terms.zero_()
     for _, launch in found.launches.named()[1:-2]:

@@ -63,8 +63,6 @@ def chromium() -> Iterator[Any]:
 
 
 class Watch:
-    """What must not happen on any page: errors in the console, and requests to anywhere else."""
-
     def __init__(self, address: str) -> None:
         self.address = address
         self.trouble: list[str] = []

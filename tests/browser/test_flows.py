@@ -104,7 +104,6 @@ def touching(shard: Any, row: int) -> int:
 
 
 def colours(canvas: Any) -> int:
-    """Number of different colours on a canvas: one or two mean that nothing was drawn."""
     pixels = np.asarray(Image.open(io.BytesIO(canvas.screenshot())).convert("RGB").resize((200, 150)))
     return len(np.unique(pixels.reshape(-1, 3), axis=0))
 

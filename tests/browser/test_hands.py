@@ -46,7 +46,6 @@ CLAW = robot(
 
 
 def checked(services: Services, name: str) -> None:
-    """What a worker and the controller make of an upload."""
     asset = services.index.assets.get(AssetKind.HAND, name)
     message = IngestMessage(schema_=1, task_id="i", kind=AssetKind.HAND, name=asset.name, digest=asset.digest)
     ingest.run(message, TaskContext(services.store))
@@ -130,7 +129,6 @@ STOPS = ["standoff", "pregrasp", "grasp", "squeeze", "lift"]
 
 @pytest.fixture(scope="module")
 def bin_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two feasible grasps in a bin; the page shows them whether they lift or not."""
     path = tmp_path_factory.mktemp("scene") / "bin.h5"
     arguments = "--hand allegro --object mug --scene bin --scenes 1 -n 2 --want candidates --fidelity draft"
     result = CliRunner().invoke(synth, [*arguments.split(), "--device", "cpu", "-o", str(path), "--json"])

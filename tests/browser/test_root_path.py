@@ -25,7 +25,6 @@ def app(settings: Settings, services: Services) -> FastAPI:
 
 @pytest.fixture
 def address(app: FastAPI) -> Iterator[str]:
-    """As the browser sees it; a request to anywhere else fails the test that uses `page`."""
     with serving(app) as outer:
         yield f"{outer}{PREFIX}"
 

@@ -56,7 +56,6 @@ def test_each_grasp_is_in_each_scene_and_each_placement_a_stereo_pair(scene_shar
 
 @pytest.fixture(scope="module")
 def in_bin(base) -> Path:
-    """The same grasps as if they had been planned in a bin, in one scene, with their way."""
     shard = read_shard(base)
     pose = np.asarray(shard["grasp/hand_pose"])
     arrays = dict(shard.arrays) | {

@@ -63,8 +63,6 @@ def _why(done: subprocess.CompletedProcess[str]) -> str:
 
 @dataclass
 class Project:
-    """The compose file as a project of its own, with images, volumes and a network of its own."""
-
     folder: Path
     variables: Mapping[str, str]
 

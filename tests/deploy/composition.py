@@ -46,7 +46,6 @@ def names_asked_for(text: str) -> set[str]:
 
 
 def example() -> dict[str, str]:
-    """All variables of .env.example, those in comments too."""
     lines = re.findall(r"^(?:# )?([A-Z][A-Z0-9_]*)=(.*)$", ENV_EXAMPLE.read_text(), re.MULTILINE)
     return dict(lines)
 

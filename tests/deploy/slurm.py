@@ -40,8 +40,6 @@ def directives(script: Path) -> dict[str, str]:
 
 @dataclass
 class Element:
-    """One element of an array, or a job without one."""
-
     id: int
     """Its own; that of one element is the number of its array as well."""
     name: str
@@ -62,7 +60,6 @@ class Element:
             )
 
     def signal(self, number: int, *, everybody: bool) -> None:
-        """To all processes of the job, or to the batch shell alone (`B:`)."""
         assert self.process is not None
         (os.killpg if everybody else os.kill)(self.process.pid, number)
 
@@ -74,8 +71,6 @@ class Element:
 
 
 class FakeSlurm:
-    """The cluster. `folder` holds its commands and logs."""
-
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.elements: list[Element] = []

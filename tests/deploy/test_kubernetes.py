@@ -59,7 +59,6 @@ def containers() -> list[tuple[str, Document]]:
 
 
 def rendered(variant: str) -> list[Document]:
-    """What `kubectl apply -k` would send."""
     if shutil.which("kubectl") is None:
         pytest.skip("kubectl is not installed")
     done = completed(["kubectl", "kustomize", str(FOLDER / variant)])

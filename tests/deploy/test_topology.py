@@ -35,8 +35,6 @@ from tests.waiting import answers, until
 
 @dataclass
 class Topology:
-    """Two APIs, a controller and two workers without an engine."""
-
     folder: Path
     variables: dict[str, str]
     redis_port: int
@@ -153,7 +151,6 @@ NAME = "grasps.example.org"
 
 
 def served(folder: Path, api: int, plain: int, secure: int) -> Path:
-    """The configuration on loopback ports, with a certificate for one day, as a whole nginx.conf."""
     make = f"openssl req -x509 -newkey rsa:2048 -nodes -days 1 -subj /CN={NAME} -addext subjectAltName=DNS:{NAME}"
     files = ["-keyout", str(folder / "key.pem"), "-out", str(folder / "cert.pem")]
     subprocess.run([*make.split(), *files], check=True, capture_output=True)

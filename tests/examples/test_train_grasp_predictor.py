@@ -47,7 +47,6 @@ def grasps_of(count: int = 5, seed: int = 0) -> GraspSet:
 
 
 def block_of(size: tuple[float, float, float], *, turned: float = 0.0, at: tuple[float, float] = (0.0, 0.0)) -> Sight:
-    """All around seen: points on the sides of a box that stands on the table, turned about the vertical."""
     rng = np.random.default_rng(3)
     half = np.array(size) / 2
     points = rng.uniform(-1, 1, (600, 3))

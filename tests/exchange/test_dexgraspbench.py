@@ -58,8 +58,6 @@ _SHADOW_THUMB = [
 
 @dataclass
 class Loaded:
-    """One grasp as the evaluator holds it."""
-
     grasp: dict[str, Any]
     hand: dict[str, Any]
     model: Any

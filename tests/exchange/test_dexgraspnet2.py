@@ -52,8 +52,6 @@ K = np.array([[100.0, 0, 1], [0, 100, 0.5], [0, 0, 1]])
 
 @dataclass
 class Sample:
-    """Of one view of a scene, in the camera's frame: all of it, where the loader draws."""
-
     point_clouds: np.ndarray
     seg: np.ndarray
     rot: np.ndarray
@@ -124,7 +122,6 @@ def _points(depth: np.ndarray, intrinsics: np.ndarray, factor: np.ndarray) -> np
 
 
 def _workspace(cloud: np.ndarray, seg: np.ndarray, trans: np.ndarray) -> np.ndarray:
-    """The box around what is labelled, in the table's frame."""
     flat = np.concatenate([cloud.reshape(-1, 3), np.ones((seg.size, 1))], axis=-1)
     there = np.einsum("ab,nb->na", trans, flat)[:, :3].reshape(cloud.shape)
     low, high = there[seg > 0].min(axis=0) - OUTLIER, there[seg > 0].max(axis=0) + OUTLIER
@@ -160,7 +157,6 @@ def graspness_at(place: np.ndarray, surface: np.ndarray, points: np.ndarray) -> 
 
 @pytest.fixture(scope="module")
 def split(root: Path) -> range:
-    """Where the block's scenes are, for one of the two objects is held out."""
     return TRAIN if next((root / "data" / "dex_grasps_new" / "scene_0000").rglob("*.npz")).stem == "block" else VAL
 
 

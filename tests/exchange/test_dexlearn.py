@@ -38,8 +38,6 @@ POINT_M = 2e-5
 
 @dataclass
 class Sample:
-    """What a network gets of one file, for each of its K grasps and not for one that is drawn."""
-
     file: Path
     grasp_type_id: int
     hand_trans: np.ndarray
@@ -54,8 +52,6 @@ class Sample:
 
 
 class Data:
-    """The data set of a configuration, in a checkout at `root`, from where it is run."""
-
     def __init__(self, root: Path, name: str) -> None:
         said = yaml.safe_load((root / "dexlearn" / "config" / "data" / f"{name}.yaml").read_text())
         self.root, self.config = root, said
@@ -67,7 +63,6 @@ class Data:
         return list(json.loads((self.objects / self.config["split_path"] / f"{name}.json").read_text()))
 
     def samples(self, split: str) -> list[Sample]:
-        """Of `train` or `test`: what may be drawn. A type without any object in the split would break the draw."""
         found = []
         for kind in self.types:
             files = [f for name in self.split(split) for f in _glob(f"{self.grasps}/{kind}/{name}/**/**.npy")]

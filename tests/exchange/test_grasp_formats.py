@@ -29,8 +29,6 @@ DEEP = "[" * 100_000 + "]" * 100_000
 
 
 class Bomb:
-    """Runs a command when it is unpickled."""
-
     def __reduce__(self):
         return os.mkdir, ("bomb-went-off",)
 

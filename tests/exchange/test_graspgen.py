@@ -31,7 +31,6 @@ ROUNDING_M = 1e-12
 
 
 def record_of(data: Path, uuid: str) -> dict:
-    """As its reader finds it: the index names the shard, the shard is searched for the key."""
     folder = data / "grasps" / "barrett"
     number = json.loads((folder / "uuid_index.json").read_text())[uuid]
     found = []

@@ -33,7 +33,6 @@ def camera() -> np.ndarray:  # type: ignore[type-arg]
 
 @pytest.fixture
 def views() -> Shard:
-    """One picture of a box that stands askew in the world."""
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_euler("xyz", [0.3, -0.5, 1.0]).as_matrix()
     pose[:3, 3] = [0.05, 0.02, 0.04]

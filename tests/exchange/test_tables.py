@@ -30,7 +30,6 @@ ROUNDING_M = 1e-12
 
 
 def configs(folder: Path) -> dict[str, dict[str, list[Path]]]:
-    """What `load_dataset` finds: the card's configurations, their splits, and the files that the patterns match."""
     head = yaml.safe_load((folder / "README.md").read_text().split("---")[1])
     return {
         one["config_name"]: {part["split"]: sorted(folder.glob(part["path"])) for part in one["data_files"]}
@@ -44,7 +43,6 @@ def rows_of(folder: Path, table: str, name: str) -> list[dict]:
 
 
 def picture(cell: dict) -> np.ndarray:
-    """What its feature `Image` makes of a cell."""
     assert cell["path"] is None
     with Image.open(io.BytesIO(cell["bytes"])) as image:
         return np.array(image)
@@ -124,7 +122,6 @@ FLOAT32_M = 1e-6
 
 
 def frames(recorded: Path) -> list[dict]:
-    """All frames in the order of their files, as the reader joins them, cast to the features of `info.json`."""
     info = json.loads((recorded / "meta" / "info.json").read_text())
     rows = []
     for file in sorted((recorded / "data").glob("*/*.parquet")):

@@ -164,7 +164,6 @@ _LINK = re.compile(r"\]\(([^()\s]+)\)|(?:src|href)=\"([^\"]+)\"")
 
 
 def anchors(page: Path) -> set[str]:
-    """Names that GitHub gives the headings of a page."""
     text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
     found: dict[str, int] = {}
     names = set()
@@ -208,7 +207,6 @@ LOOKED_AT = 5
 
 @cache
 def pages() -> dict[str, Counter[str]]:
-    """Words of each page, those of its headings ten times, as searches weigh them."""
     found = {}
     for page in DOCS.rglob("*.md"):
         text = page.read_text().lower()

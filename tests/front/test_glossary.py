@@ -20,7 +20,6 @@ BANNED = {
 
 
 def words(name: str) -> set[str]:
-    """Words of a name in any spelling, in lower case, without numbers."""
     return {word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name)}
 
 
@@ -51,7 +50,6 @@ PLAIN = set((REFERENCE / "names.txt").read_text().split())
 
 
 def known(word: str, vocabulary: set[str]) -> bool:
-    """Whether a word or its singular or plural is there."""
     return bool({word, f"{word}s", f"{word}es", word.removesuffix("s"), word.removesuffix("es")} & vocabulary)
 
 

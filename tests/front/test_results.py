@@ -28,7 +28,6 @@ def runner(folder: Path, **options: bool) -> Runner:
 
 
 def test_the_manifest_holds_every_figure_and_picture_as_it_is() -> None:
-    """After a change by hand: python -m benchmarks.results --enter NAME."""
     assert faults(DOCS, load(DOCS)) == []
 
 

@@ -69,7 +69,6 @@ def empty_schemas(postgres_server: PostgresServer) -> Iterator[EmptySchemas]:
 
 @pytest.fixture(params=DATABASES)
 def index_url(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
-    """Where `empty_index` opens an index without rows: on a database of each kind in turn."""
     if request.param == "postgres":
         schemas: EmptySchemas = request.getfixturevalue("empty_schemas")
         with schemas.lent() as url:

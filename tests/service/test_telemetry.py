@@ -28,7 +28,6 @@ log = logging.getLogger("graspd.test")
 
 @pytest.fixture
 def written(capsys: pytest.CaptureFixture[str]) -> Iterator[Callable[[], str]]:
-    """What this process writes to stderr; logging is as it was afterwards."""
     root = logging.getLogger()
     before, level = list(root.handlers), root.level
     yield lambda: capsys.readouterr().err

@@ -14,7 +14,6 @@ from graspd.service import user_cache
 
 @pytest.fixture(autouse=True)
 def fresh(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Each test is a process that has not asked yet, on a machine with its own temporary files."""
     user_cache._root.cache_clear()
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
 

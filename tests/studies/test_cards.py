@@ -79,7 +79,6 @@ class Case:
 
 
 def case(folder: Path, *, drawn: bool = True, **options: Any) -> Case:
-    """The card of a dataset, with its plots or without; options as of `dataset`."""
     services = dataset(folder, **options)
     snapshot = actions.snapshot(services, NAME)[0]
     contents = contents_of_store(services.store, NAME, cache=folder / "cache")
@@ -106,7 +105,6 @@ def kitchen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Case]:
 
 @pytest.fixture(scope="module")
 def export(kitchen: Case, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The shards of that dataset as `graspd datasets export` writes them; tests only read it."""
     folder = tmp_path_factory.mktemp("export") / NAME
     export_shards(kitchen.snapshot, folder, lambda shard: kitchen.services.store.stream(shard.key))
     return folder
@@ -116,7 +114,6 @@ def unchanged(hand: str, obj: str, columns: dict[str, Array]) -> None: ...
 
 
 def dataset(folder: Path, change: Change = unchanged, fails: Any = None, grasps: int = 40, **options: Any) -> Services:
-    """Two hands x two objects, two batches each, with scenes and pictures; of the cell `fails` the first task fails."""
     services = open_services(Settings(data_dir=folder))
     factories.add_builtins(services)
     given = {"scenes": 2, "views": 1, "width": 24, "height": 16, "stereo": False, **options}

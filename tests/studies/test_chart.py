@@ -68,7 +68,6 @@ def test_runs_have_the_rates_that_their_counts_and_seconds_give(made: tuple[dict
 
 
 def assert_written(folder: Path, found: dict, column: str) -> None:
-    """All files of a chart, with the runs that the command printed."""
     assert json.loads((folder / "chart.json").read_text())["runs"] == found["runs"]
     rows = list(csv.DictReader((folder / "chart.csv").read_text().splitlines()))
     assert [row[column] for row in rows] == [str(run[column]) for run in found["runs"]]

@@ -27,7 +27,6 @@ HAND = pad_hand()
 
 
 def plates_case(**kwargs: object) -> Case:
-    """Two grasps that hold the box and one beside it."""
     rows = posture(((0, 0, 0), (0.0655, 0.0655)), ((0, 0, 0.004), (0.0655, 0.0655)), ((0, 0, -0.5), (0.065, 0.065)))
     grasps = GraspSet(rows, pregrasp(HAND, BOX, rows), squeeze(HAND, BOX, rows, total_normal_force=20.0), np.zeros(3))
     return Case("plates", HAND, BOX, grasps, **kwargs)  # type: ignore[arg-type]

@@ -39,7 +39,6 @@ class System:
         until(met, what, seconds=seconds, logs=self.logs)
 
     def finish(self, *jobs: str, seconds: float = PATIENCE_S) -> list[JobView]:
-        """The jobs once all are at their end."""
         is_done = lambda job: self.services.index.jobs.get(job).state.is_final  # noqa: E731
         self.until(lambda: all(map(is_done, jobs)), f"{len(jobs)} jobs done", seconds=seconds)
         return [self.services.index.jobs.get(job) for job in jobs]
@@ -51,7 +50,6 @@ class System:
         return pid
 
     def logs(self) -> str:
-        """The last lines of every log."""
         files = sorted((self.supervisor.settings.data_dir / "logs").glob("*.log"))
         return "\n".join(f"--- {file.name}\n{file.read_text(errors='replace')[-1500:]}" for file in files)
 
@@ -89,7 +87,6 @@ def start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Started]:
 
 
 def alive(pid: int) -> bool:
-    """Whether a process runs (a zombie does not)."""
     try:
         state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
     except (FileNotFoundError, ProcessLookupError):

@@ -212,7 +212,6 @@ OBJECTS = tuple(f"object-{i}" for i in range(20))
 
 
 def made(system: System) -> dict[str, str]:
-    """When each shard was made."""
     store = system.services.store
     keys = [entry.key for entry in store.list(names.SHARDS) if entry.key.endswith(".json")]
     return {key: read_record(ShardManifest, store, key).created for key in keys}

@@ -38,7 +38,6 @@ _BEFORE_IT = 150
 
 
 def makers(system: System) -> set[str]:
-    """Names of the workers that made a shard."""
     return {shard.worker for shard in system.services.index.shards.page(limit=200).items}
 
 
@@ -243,7 +242,6 @@ class House:
         self.start(name, sys.executable, "-m", "graspd", "controller", **more)
 
     def says(self, name: str, what: str) -> int:
-        """How often a process said something."""
         return len(re.findall(what, (self._logs / f"{name}.log").read_text()))
 
     def until(self, met: Callable[[], object], what: str) -> None:

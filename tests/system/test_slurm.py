@@ -120,7 +120,6 @@ def test_the_service_of_a_lost_node_starts_anew_elsewhere(tmp_path: Path, slurm:
 
 
 def joined(shared: Path) -> str | None:
-    """What the file says, if there is one."""
     try:
         return (shared / "join.env").read_text()
     except FileNotFoundError:

@@ -8,7 +8,6 @@ from graspd.cli import build
 
 
 def graspd(words: str, *more: object, code: int = 0) -> dict:
-    """What a command tells with --json; `words` are cut at spaces, `more` are whole arguments."""
     result = CliRunner().invoke(build(), [*words.split(), *(str(word) for word in more), "--json"])
     assert result.exit_code == code, result.output
     return dict(json.loads(result.stdout.splitlines()[-1]))

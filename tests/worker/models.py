@@ -99,7 +99,6 @@ def on_one_dof(hand: HandModel, rate: float = 1.0, offset: float = 0.0) -> HandM
 
 
 def on_tables(obj: ObjectModel, *, count: int = 2, seed: int = 1) -> Scenes:
-    """So many scenes of an object at rest on a table."""
     table = SceneSpec(kind="table")
     return Scenes(supports_of(table), rest_poses(table, obj, count=count, seed=seed)["scene/object_pose"])
 
@@ -116,7 +115,6 @@ def quality_columns(count: int) -> dict[str, np.ndarray]:
 
 
 def attributes_of(hand: HandModel, obj: ObjectModel, **more: object) -> dict[str, object]:
-    """What a base shard says of the grasps of a hand on an object."""
     said = {"hand": hand.name, "hand_digest": hand.digest, "object": obj.name, "object_digest": obj.digest}
     said |= {"method": "none", "fidelity": json_attribute({"face_error_m": 3e-4}), "seed": 5, "batch": 0}
     return {**said, "joint_names": list(hand.joint_names), **more}

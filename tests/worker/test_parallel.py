@@ -226,7 +226,6 @@ def test_a_run_in_this_process_makes_the_batches_of_a_job(pair) -> None:
 
 @pytest.fixture(scope="module")
 def own_scenes(pair):
-    """Of each of three batches its own."""
     whole = on_tables(pair[1], count=6)
     return [replace(whole, object_pose=whole.object_pose[first : first + 2]) for first in (0, 2, 4)]
 

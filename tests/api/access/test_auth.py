@@ -233,7 +233,6 @@ def basic(user: str, secret: str = SECRET) -> str:
 
 
 def headers(user: str = "ann@lab.example", groups: str = "vision", secret: str = SECRET) -> dict[str, str]:
-    """What the proxy sends of somebody who is signed in."""
     return {"Authorization": basic(user, secret), "X-Forwarded-Groups": groups}
 
 

@@ -84,7 +84,6 @@ class World:
 
     @property
     def secrets(self) -> list[str]:
-        """What none but the project and an admin may read."""
         named = [f"red-secret-{what}" for what in ("hand", "ball", "gone", "net", "data", "set", "tag")]
         return [*named, "red-secret broke", *self.said.values()]
 
@@ -144,7 +143,6 @@ def _addresses(world: World, template: str) -> Iterator[str]:
 
 
 def _bodies(world: World, method: str, address: str) -> list[dict[str, Any]]:
-    """What may be sent there: nothing; or documents and forms that name things of the project."""
     if method in ("GET", "HEAD", "DELETE"):
         is_list = address.endswith(("/grasps", "/shards", "/export"))
         return [{}, {"params": {"job": world.said["job_id"]}}] if is_list else [{}]
@@ -210,7 +208,6 @@ _NOT_THERE = (403, 404, 405, 422)
 
 
 def _state(world: World) -> Any:
-    """All that belongs to the project, as an admin sees it."""
     get = lambda path: world.ask("root", "GET", path).json()  # noqa: E731
     jobs = {job["id"]: job["state"] for job in get("/v1/jobs?limit=200")["items"] if job["project"] == "red"}
     data = get("/v1/datasets/red-secret-data")

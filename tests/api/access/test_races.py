@@ -150,7 +150,6 @@ def test_of_two_objects_of_one_name_at_once_one_gets_it(
 
 
 def at_once(twins: list[TestClient], ask: Callable[[TestClient, int], Response]) -> list[Response]:
-    """Two requests of a kind at the same time, each to an API of its own."""
     start = Barrier(2)
 
     def asked(number: int) -> Response:

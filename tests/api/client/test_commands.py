@@ -35,8 +35,6 @@ STL = b"solid box\nendsolid box\n"
 
 @dataclass(frozen=True)
 class Shell:
-    """Runs `graspd` as a user does: in a process of its own, or in this one, which has imported it already."""
-
     environment: dict[str, str]
     in_process: bool = True
 

@@ -141,7 +141,6 @@ def test_a_dataset_and_a_job_have_the_same_options(http: TestClient, services: S
 
 @pytest.fixture
 def jobs(http: TestClient, services: Services) -> dict[str, str]:
-    """One job that was validated, and a larger one on the same pair that was not."""
     validated = add_job(services, want="candidates")
     unvalidated = add_job(services, grasps=320, validation="none", want="candidates")
     for record in (validated, unvalidated):

@@ -43,7 +43,6 @@ def jobs(services: Services) -> list[str]:
 
 
 def fields_of(page: str) -> dict[str, str]:
-    """What a browser without scripts would send of the form: choices, and what it does not show."""
     picked = {
         name: (re.findall(r'<option value="([^"]*)" selected', body) or re.findall(r'<option value="([^"]*)"', body))[0]
         for name, body in re.findall(r'<select[^>]*name="(\w+)"[^>]*>(.*?)</select>', page, re.DOTALL)

@@ -12,7 +12,6 @@ from graspd.service.store.records import publish
 
 
 def a_map(name: str = "stiffness", **changes: object) -> StabilityMap:
-    """Two steps by three stiffnesses, the stiffest broken; the soft ones within reach of a job."""
     found: dict[int, tuple[float, Outcome]] = {2: (0.5, "good"), 3: (0.75, "weak"), 4: (math.inf, "broken")}
     cells = [
         MapCell("penalty", 10.0**k, dt, value, outcome, f"note {k}", reached=k < 4)

@@ -23,13 +23,11 @@ def parsed(name: str) -> nodes.Template:
 
 
 def unknown_calls(template: nodes.Template) -> set[str]:
-    """Names that a template calls and neither defines nor imports."""
     called = {call.node.name for call in template.find_all(nodes.Call) if isinstance(call.node, nodes.Name)}
     return called - macros(template) - GIVEN - set(ENVIRONMENT.globals)
 
 
 def macros(template: nodes.Template) -> set[str]:
-    """Names of the macros that a template defines or imports for itself and the parts that it includes."""
     return imports(template) | {macro.name for macro in template.find_all(nodes.Macro)}
 
 

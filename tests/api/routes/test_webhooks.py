@@ -39,8 +39,6 @@ def settings(settings: Settings) -> Settings:
 
 
 class Ear:
-    """Stands for the address: notes what is sent there, and answers as it is told."""
-
     def __init__(self, services: Services) -> None:
         self.services = services
         self.heard: list[tuple[str, bytes, dict[str, str]]] = []

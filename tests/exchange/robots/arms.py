@@ -14,7 +14,6 @@ JOINTS = [
 
 
 def write_arm(folder: Path, *, velocities: bool = True, scale: float = 1.0) -> Path:
-    """The arm's URDF with a base, links `pan_link` ... `turn_link`, a `flange`, and a gripper behind it."""
     lines = ['<robot name="six">', _link("base", 0.07, 0.08, -0.04)]
     parent = "base"
     for name, offset, axis, limit, velocity, radius, length in JOINTS:

@@ -39,7 +39,6 @@ def export(shard: Path, format_: str, folder: Path, *more: str) -> dict:
 
 
 def limp(shard: Path, out: Path) -> Path:
-    """The shard with two grasps that press no more than the open hand does: nothing is held by them."""
     made = read_shard(shard, kind="base")
     squeeze = np.array(made["squeeze/joint_positions"])
     squeeze[:2] = made["pregrasp/joint_positions"][:2]

@@ -42,7 +42,6 @@ def services(tmp_path: Path) -> Iterator[Services]:
 
 
 def lost(services: Services) -> Services:
-    """The same service with an index that knows nothing."""
     index = empty_index(f"sqlite:///{services.settings.data_dir / 'fresh.sqlite'}")
     return Services(services.settings, services.store, index, MemoryQueue())
 
@@ -144,7 +143,6 @@ def test_an_index_removed_under_its_readers_is_made_again(services: Services, fi
 
 
 def scribble_over_the_log(folder: Path) -> None:
-    """Of writes, while others have it open."""
     log = folder / "index.sqlite-wal"
     with log.open("r+b") as file:
         file.write(os.urandom(log.stat().st_size))

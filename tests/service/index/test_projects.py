@@ -27,7 +27,6 @@ def enter(services: Services, project: str, seed: int, *, key: str = "", batches
 
 
 def make(services: Services, record: JobRecord, *, day: str = DAY, device: str = "cuda:0", seconds: float = 10) -> int:
-    """All tasks of a job, each so long on such a device; returns how many of its grasps are valid."""
     made = [make_shard(services.store, message_of(record, task, attempt=1, max_attempt=3)) for task in plan(record)]
     told = {"created": f"{day}T12:00:00.000000Z", "device": device, "seconds": seconds}
     services.index.write.add_manifests([manifest.model_copy(update=told) for manifest in made])

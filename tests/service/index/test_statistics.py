@@ -35,7 +35,6 @@ def index(tmp_path: Path, values: np.ndarray) -> Iterator[Index]:
 
 
 def test_a_summary_is_of_what_passes_the_filter(index: Index, values: np.ndarray) -> None:
-    """Of a metric that no grasp has, and where no grasp passes, there is none."""
     summaries = index.statistics.summaries(GraspFilter(valid=True), ("epsilon", "contact_area_cm2"))
     found, passed = summaries.pop("epsilon"), values[::2]
     assert found.count == len(passed) and summaries == {}

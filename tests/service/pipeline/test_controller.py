@@ -50,7 +50,6 @@ class Bench:
         return delivery
 
     def do(self, delivery: Delivery, **stages: Any) -> Event | None:
-        """What a worker does with a task."""
         table = fake_stages() | {Stage(name): stage for name, stage in stages.items()}
         runner = Runner(table, worker="w", publish=self.queue.publish)
         raw = delivery.message.model_dump(mode="json", by_alias=True)

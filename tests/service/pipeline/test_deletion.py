@@ -177,7 +177,6 @@ ACTS: dict[str, tuple[Callable[[Services], object], Callable[[Services], object]
 def test_the_next_controller_carries_out_a_broken_deletion(
     services: Services, what: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """At each removal of an object in turn, and between the record and the rows."""
     make, act, remove, folders = ACTS[what]
     make(services)
     with monkeypatch.context() as patch:
@@ -207,7 +206,6 @@ def collect_garbage(services: Services) -> None:
 
 @COLLECTED
 def test_a_deleted_job_is_restored_as_it_was(services: Services, collected: bool) -> None:
-    """One that had failed, with its attempts: it is not run again."""
     job, _ = job_actions.submit(services, request())
     fail(services, job.id)
     before = services.index.jobs.get(job.id), services.index.jobs.attempts(job=job.id)

@@ -26,7 +26,6 @@ from tests.waiting import Clock
 
 
 def taken(services: Services) -> list[Delivery]:
-    """Every waiting task, in workers' hands."""
     held = []
     while (delivery := services.queue.take(f"w{len(held)}")) is not None:
         services.queue.publish(_event(delivery, EventKind.STARTED))
@@ -49,7 +48,6 @@ def _event(delivery: Delivery, kind: EventKind) -> Event:
 
 @pytest.fixture
 def controller(services: Services) -> Controller:
-    """One that leads, to whom time passes by its clock alone."""
     made = Controller(services, clock=Clock())
     made.round()
     return made

@@ -97,7 +97,6 @@ def full(services: Services) -> Services:
 
 
 def keys_of_each_kind(services: Services) -> list[str]:
-    """The longest-named of each kind of object, by key; every kind of hand's or object's file is there."""
     kinds = {_ID.sub("*", entry.key): entry.key for folder in FOLDERS for entry in services.store.list(folder)}
     return sorted(kinds.values())
 

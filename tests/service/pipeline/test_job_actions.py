@@ -104,7 +104,6 @@ def make(services: Services, job: JobRecord, stage: Stage, batch: int = 0) -> No
 
 
 def fail_batch(services: Services, job: JobRecord, batch: int, kind: str, number: int = 1) -> None:
-    """The last attempt at a batch's grasps."""
     task = next(task for task in plan(job) if task.stage is Stage.SYNTHESIZE and task.batch == batch)
     fail_task(services, job.id, task, number, kind=kind, reason="none of 128 candidates is valid in its scene")
 

@@ -66,7 +66,6 @@ def submit(seed: int) -> Callable[[Services], object]:
 
 
 def make_first_shard(services: Services) -> None:
-    """What a worker does for the first task of the only job."""
     record = record_of(services, services.index.jobs.page().items[0].id)
     task = next(plan(record))
     make_shard(services.store, message_of(record, task, attempt=1, max_attempt=3))
@@ -75,7 +74,6 @@ def make_first_shard(services: Services) -> None:
 
 
 def copy_index(folder: Path, target: Path) -> None:
-    """As a backup of the stopped service: the file with what belongs to it."""
     target.mkdir(exist_ok=True)
     for old in target.glob("index.sqlite*"):
         old.unlink()

@@ -57,8 +57,6 @@ def add_network(services: Services, version: int = 0, *, verdict: str | None = "
 
 @dataclass(frozen=True)
 class Reference:
-    """What a job names besides its hand and its object."""
-
     kind: AssetKind
     name: str
     add: Callable[..., str]

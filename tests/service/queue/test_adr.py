@@ -110,7 +110,6 @@ LOADED: list[int] = []
 
 
 def _load() -> int:
-    """As a stage loads its engine: once for all tasks of a process."""
     LOADED.append(os.getpid())
     return len(LOADED)
 

@@ -21,7 +21,6 @@ def plane(distance: float, tilt_deg: float = 0.0) -> np.ndarray:
 
 
 def still(noise: DepthNoise) -> DepthNoise:
-    """The camera with nothing that moves pixels sideways: on a plane that is noise too."""
     return replace(noise, lateral_px=0.0, lateral_angle_px=0.0, mixed=False)
 
 

@@ -31,7 +31,6 @@ from tests.service.readers.conftest import GRASPS, job_in
 
 @pytest.fixture
 def folder(services: Services, shards: Shards, tmp_path: Path) -> Path:
-    """The job's files as a user has them who downloaded them."""
     out = tmp_path / "files"
     out.mkdir()
     for number, shard in enumerate(shards):

@@ -13,7 +13,6 @@ WAYPOINTS = 4
 
 
 def shard(*, in_scene: bool) -> Shard:
-    """One grasp whose hand comes along x, closes two joints, and rises along z."""
     arrays: dict[str, np.ndarray] = {}
     for k, name in enumerate(("pregrasp", "grasp", "squeeze")):
         arrays[f"{name}/hand_pose"] = np.array([[0.1, 0, 0, 1, 0, 0, 0]], float)

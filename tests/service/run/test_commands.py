@@ -85,7 +85,6 @@ def test_a_setting_of_0_2_is_refused_with_its_new_name(monkeypatch: pytest.Monke
 
 
 def on_disk(services: Services) -> Services:
-    """The same service with its store in the data folder, as the commands find it."""
     store = open_store(services.settings.resolved_store_url)
     for entry in list(services.store.list("assets")):
         store.put(entry.key, services.store.get(entry.key))

@@ -199,7 +199,6 @@ def _balanced(
 
 
 def rigid_plates() -> HandModel:
-    """The plates with a drive that presses within its stroke."""
     return dataclasses.replace(PLATES, stiffness=np.full(2, 1000.0))
 
 
@@ -332,7 +331,6 @@ def test_a_finger_stands_off_that_is_near_and_does_not_touch() -> None:
 
 
 def around(hand: HandModel, count: int) -> Posture:
-    """Half closed hands around the object: clear ones, touching ones, deep ones."""
     rng = np.random.default_rng(5)
     rotation = rng.normal(size=(count, 4))
     rotation /= np.linalg.norm(rotation, axis=1, keepdims=True)

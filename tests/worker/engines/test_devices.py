@@ -64,7 +64,6 @@ def work(room: int) -> tuple[list[range], object]:
 
 @pytest.fixture
 def few_objects() -> None:
-    """Each halving looks for garbage: among those objects alone that the test makes."""
     gc.collect()
     gc.freeze()
 

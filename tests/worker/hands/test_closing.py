@@ -45,7 +45,6 @@ def urdf(*thumb: str, bends: str = limit(-0.2, 1.5)) -> bytes:
 
 
 def opposing_thumb(bends: str) -> list[str]:
-    """Before the palm, along z: it bends back to the fingers, about +x, behind an axial joint along itself."""
     return [
         link("thumb0", _PHALANX),
         link("thumb1", _PHALANX),
@@ -167,7 +166,6 @@ def test_a_tie_is_told_and_one_that_is_settled_is_not() -> None:
 
 
 def test_two_fingers_that_oppose_one_take_hold_between_them() -> None:
-    """What the tips do as such a hand closes points half to the side."""
     parts = [link("palm", f'<collision><origin xyz="0.03 0 -0.02"/>{_PLATE_SHAPE}</collision>')]
     for k, (x, y, yaw) in enumerate(((0.05, 0.0, 0.0), (-0.05, 0.03, np.pi), (-0.05, -0.03, np.pi))):
         bend = {"axis": "0 -1 0", "limit": '<limit lower="0" upper="1.4" effort="10"/>'}

@@ -87,7 +87,6 @@ def facts(report: dict) -> tuple[str, list[float], list[str], list[float]]:
 
 
 def added(path: Path) -> dict:
-    """The report of the files that the service gets from `hands add`."""
     with upload_of(path) as (upload, main):
         said = json.dumps({"file": main}) if main else ""
         files = files_of_upload(AssetKind.HAND, upload.name, upload.read_bytes(), limit_bytes=10**7, options=said)
@@ -176,7 +175,6 @@ def test_nothing_out_of_package_or_above_a_plain_folder_is_read(tmp_path: Path) 
 
 
 def claw(mesh: str = "") -> str:
-    """Two fingers that bend towards each other; the left one touches with a mesh as well."""
     box = '<collision><geometry><box size="0.08 0.04 0.02"/></geometry></collision>'
     more = f'<collision><geometry><mesh filename="{mesh}"/></geometry></collision>' if mesh else ""
     finger = '<collision><origin xyz="0 0 0.03"/><geometry><box size="0.02 0.02 0.06"/></geometry></collision>'
@@ -190,7 +188,6 @@ def claw(mesh: str = "") -> str:
 
 
 def verdicts(files: Mapping[str, bytes], main: str, folder: Path) -> list[str]:
-    """What becomes of a description, of its folder, and of a ZIP of that: `accept`, or the refusal."""
     for name, data in files.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_bytes(data)
@@ -305,7 +302,6 @@ def test_a_pointer_among_the_files_of_a_hand_is_told(files: dict[str, bytes], po
 
 @pytest.fixture
 def checkout(tmp_path: Path) -> Path:
-    """The folder of a ROS package; its name is not the package's."""
     for name, data in FILES.items():
         (tmp_path / "checkout" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "checkout" / name).write_bytes(data)

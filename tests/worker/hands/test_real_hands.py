@@ -58,7 +58,6 @@ def hands(shared_data: Path):
 
 
 def bare_files(shared_data: Path, name: str) -> tuple[dict[str, bytes], dict]:
-    """The files of a hand without the notes beside them, and these."""
     _, files, _ = files_from_path(shared_data / "hands" / HANDS[name][0])
     return files, json.loads(files.pop("hand.json"))
 
@@ -181,7 +180,6 @@ def test_frames_of_built_in_hands_are_those_of_the_maker(name: str, shared_data:
 
 
 def other_base(hand: HandModel) -> HandModel:
-    """The same hand with another frame on its root: what hangs on it, and its shapes, are told in that frame."""
     moved = invert(BASE)
     origin = hand.origin.copy()
     hangs = np.flatnonzero(hand.parent == 0)

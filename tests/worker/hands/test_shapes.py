@@ -122,7 +122,6 @@ def fork(gap: float) -> trimesh.Trimesh:
 
 
 def measured(mesh: trimesh.Trimesh) -> tuple[int, float]:
-    """Number of parts, and their volume over that of the mesh."""
     parts = parts_of(np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int32))
     return len(parts), union_volume(parts) / mesh.volume
 

@@ -87,7 +87,6 @@ def test_samples_are_those_of_a_process_without_a_cache(own_cache: Path) -> None
 
 
 def load_balls(files: dict[str, bytes] = BALLS, error: float = 3e-4, **options) -> ObjectModel:
-    """As a process that begins."""
     prepare._prepared.cache_clear()
     prepare._repaired.cache_clear()
     return load_object(files, name="balls", digest="d", face_error_m=error, options=options)
@@ -95,7 +94,6 @@ def load_balls(files: dict[str, bytes] = BALLS, error: float = 3e-4, **options) 
 
 @pytest.fixture
 def built(own_cache: Path, monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """The bounds to which objects were prepared, not read."""
     bounds: list[float] = []
     build = prepare.build
     monkeypatch.setattr(prepare, "build", lambda mesh, error: bounds.append(error) or build(mesh, error))

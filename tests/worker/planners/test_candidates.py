@@ -135,7 +135,6 @@ def always(score: float):
 
 @pytest.fixture
 def attempts(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Grows by the number of each attempt that is made."""
     made: list[int] = []
     set_out = planner._set_out
 
@@ -203,7 +202,6 @@ def free(pair):
 
 
 def test_the_hand_around_more_of_an_object_is_tried_first(free, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where nearness outweighs the balance."""
     shares, orders = [], []
     near_share, tried = Data.near_share, planner.tried
 
@@ -287,7 +285,6 @@ def test_hands_are_drawn_to_an_object_at_their_first_start_alone(free, monkeypat
 
 def test_attempts_made_ahead_give_grasps_of_one_after_the_other(free, monkeypatch: pytest.MonkeyPatch) -> None:
     def picky(grasps: GraspSet, placed: PlacedGrasps | None, _: object = None) -> np.ndarray:
-        """Takes two fifths of the hands, by where they are."""
         assert placed is None
         chance = np.modf(np.abs(grasps.grasp.hand_pose[:, 0]) * 1e4)[0]
         # No two are equally good: of several good ones the first stays, be it the worst.

@@ -87,7 +87,6 @@ def made(name: str, fidelity: Fidelity) -> dict[str, str]:
 
 
 def all_made(wanted: list[str]) -> dict[str, dict[str, str]]:
-    """Those of `method:fidelity`, in that order."""
     found = {}
     for one in wanted:
         name, _, level = one.partition(":")
@@ -158,7 +157,6 @@ def test_entry_points_of_other_packages_are_methods_or_refused(monkeypatch, name
 
 
 def test_the_documented_package_runs_as_a_method(tmp_path) -> None:
-    """As installed: a module and its metadata beside each other on the path."""
     (tmp_path / "mine.py").write_text(PAGE.split("```python\n", 1)[1].split("```", 1)[0])
     metadata = tmp_path / "mine-0.1.dist-info"
     metadata.mkdir()

@@ -78,7 +78,6 @@ def test_the_other_contact_solvers_also_reach_the_object(solver: str) -> None:
 
 
 def parts(count: int) -> planner.LaunchPart:
-    """The grasps of a batch as one part."""
     hand, obj = hand_from_path("allegro"), object_from_path("block", face_error_m=1e-3)
     (found,) = planner.optimise_batch(hand, obj, PlanRequest(count, FIDELITY, seed=3), ExecutionContext(threads=1))
     return found
@@ -125,7 +124,6 @@ def pair():
 
 
 def made(pair, wanted: list[PlanRequest], *runs: ExecutionContext) -> list[GraspSet | Exception]:
-    """The batches of one launch; those beyond the given contexts have one thread."""
     return plan_joined(*pair, list(map(BatchRequest, wanted, [*runs, *[ONE] * (len(wanted) - len(runs))])))
 
 
@@ -147,8 +145,6 @@ def test_a_launch_without_memory_is_halved_across_batches(pair, monkeypatch: pyt
     alone = [synthesize(*pair, one, ONE) for one in wanted]
 
     class Small(planner.Data):
-        """Of a device with room for two grasps."""
-
         def __init__(self, model: object, capacity: int) -> None:
             if capacity > 2 * QUICK.starts:
                 raise RuntimeError("Failed to allocate 8589934592 bytes on device 'cuda:0'")

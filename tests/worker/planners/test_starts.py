@@ -138,7 +138,6 @@ def test_draws_are_those_of_each_generator_alone_and_look_at_the_object() -> Non
 
 @pytest.fixture(scope="module")
 def ring() -> HandModel:
-    """Its six fingers stand side by side."""
     return ring_hand(6)
 
 
@@ -171,12 +170,10 @@ def test_a_grasp_that_opened_does_not_depend_on_its_batch(ring: HandModel) -> No
 
 
 def lying(obj) -> Environment:
-    """The object on a table as its mesh stands."""
     return Environment((Obstacle.half_space(UP, float(obj.vertices[:, 2].min())),), UP)
 
 
 def on_its_table(obj) -> Scenes:
-    """The same as a scene; the object's frame is the table's."""
     return Scenes(lying(obj).obstacles, np.array([[0.0, 0, 0, 1, 0, 0, 0]]))
 
 

@@ -109,7 +109,6 @@ def test_a_word_that_is_none_is_refused_before_the_files_are_read(words: str, tm
 
 
 def elsewhere(file: Path, folder: Path) -> Shard:
-    """The shard in another folder, whose mesh is no longer where it was."""
     moved = folder / "shard" / "own.h5"
     moved.parent.mkdir()
     moved.write_bytes(file.read_bytes())

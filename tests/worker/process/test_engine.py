@@ -167,8 +167,6 @@ def test_a_worker_in_quarantine_leaves_when_it_or_its_engine_ends(start: Start, 
 
 
 class Deaf(Link):
-    """To an engine that hears and says nothing until it is killed."""
-
     def __init__(self) -> None:
         self.told = []
         self.killed = False

@@ -26,7 +26,6 @@ from tests.worker.process.test_runner import broken
 
 @pytest.fixture
 def work(rq_queue, redis_server: str, tmp_path):
-    """Runs a worker with a table of stages, until no task waits; whether it ended well."""
     settings = Settings(redis_url=redis_server, data_dir=tmp_path, device="cpu")
 
     def run(table, **options) -> bool:

@@ -73,7 +73,6 @@ def placed_data(scene: Scene, joints: np.ndarray, pose: np.ndarray = FAR) -> muj
 
 
 def choose_contacts(near: np.ndarray, place: np.ndarray, normal: np.ndarray, *, scale: float, limit: int) -> np.ndarray:
-    """What `spread_contacts` does, of one set."""
     index = np.flatnonzero(near)
     if len(index) <= limit:
         return index

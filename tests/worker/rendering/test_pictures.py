@@ -123,7 +123,6 @@ def test_depth_colours_darken_with_distance_and_grey_is_nothing():
 
 
 def at(name: str, height: float = 0.0) -> Waypoint:
-    """The hand over the block, both raised."""
     rise = np.array([0, 0, height])
     return Waypoint(name, DOWN + np.append(rise, np.zeros(4)), np.full(2, 0.1), rise)
 

@@ -46,7 +46,6 @@ def bracket() -> ObjectModel:
 
 
 def overhang(obj: ObjectModel, pose: np.ndarray) -> float:
-    """How far the centre of mass projects outside the polygon of the hull vertices on the table; negative: inside."""
     points = apply(pose, obj.hull_vertices)
     carrying = points[points[:, 2] < CONTACT_M][:, :2]
     centre = apply(pose, obj.centre_of_mass)[:2]

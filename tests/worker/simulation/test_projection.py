@@ -206,7 +206,6 @@ def replayed_graphs(monkeypatch: pytest.MonkeyPatch) -> list:
 
 
 def forbid_the_host(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Inside `Launches.run` nothing can be read, written, allocated or loaded."""
     plain = Launches.run
 
     def run(self: Launches, times: int = 1) -> None:
@@ -227,7 +226,6 @@ def opened() -> Posture:
 
 
 def test_replayed_graphs_give_the_hands_of_plain_launches(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing on the host is touched between two launches."""
     plain, plainly_opened = planned(), opened()
     replayed = replayed_graphs(monkeypatch)
     forbid_the_host(monkeypatch)

@@ -223,7 +223,6 @@ def own_cache(tmp_path, monkeypatch: pytest.MonkeyPatch):
 
 @pytest.fixture
 def computed(own_cache, monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, ...]]:
-    """The shapes of the grids that were computed, not read."""
     shapes: list[tuple[int, ...]] = []
     sampled = grids._sampled
 
@@ -236,7 +235,6 @@ def computed(own_cache, monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, ...]
 
 
 def kept_grid(cell: float = 0.005, alpha: float = 0.0) -> Grid:
-    """The grid of a ball, as a process that begins has it."""
     skin = device_object(BALL, alpha, cell).surface
     cells = skin.cells
     arrays = {"field": skin.field, "first": cells.first, "face": cells.face, "key": cells.key}

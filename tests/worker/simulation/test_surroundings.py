@@ -113,7 +113,6 @@ def test_many_hands_have_the_room_of_each_ones_scene(name: str) -> None:
 
 
 def parted(hand: HandModel) -> tuple[HandModel, HandModel]:
-    """The hand's fingertips alone, and the rest of it."""
     tip = [piece.body in hand.fingertips for piece in hand.pieces]
     return tuple(
         replace(hand, pieces=tuple(p for p, is_tip in zip(hand.pieces, tip, strict=True) if is_tip == wanted))

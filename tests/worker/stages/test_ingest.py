@@ -105,7 +105,6 @@ def test_a_hand_is_tried_if_its_record_says_so(context: TaskContext, monkeypatch
 
 
 def start_instead(monkeypatch: pytest.MonkeyPatch, other: Callable[[list[str]], list[str]]) -> None:
-    """The check starts what `other` makes of its command."""
     start = ingest.subprocess.Popen
     monkeypatch.setattr(ingest.subprocess, "Popen", lambda command, **options: start(other(command), **options))
 
@@ -193,7 +192,6 @@ def computed() -> float:
 
 
 def upload(store: Store, kind: AssetKind, filename: str, data: bytes, options: dict | None = None):
-    """What a user is told of an upload: refused at the door, or what the worker's check says."""
     try:
         files = files_of_upload(kind, filename, data, limit_bytes=UPLOAD_BYTES)
         asset = publish_asset(store, kind, "upload", files)
@@ -207,7 +205,6 @@ def upload(store: Store, kind: AssetKind, filename: str, data: bytes, options: d
 
 
 def bad_files(shared_data: Path) -> list[dict[str, str]]:
-    """What the list of bad inputs says of each: file, kind, verdict, and a word that names the defect."""
     return list(json.loads((shared_data / "bad" / "INDEX.json").read_text())["inputs"])
 
 
@@ -235,7 +232,6 @@ def test_a_bad_file_gets_its_verdict_from_the_checking_child(shared_data: Path, 
 
 @cache
 def zip_bomb() -> bytes:
-    """Little that unpacks to more than eight times the limit."""
     return zipped({f"{i}.stl": bytes(DOOR_BYTES) for i in range(9)})
 
 

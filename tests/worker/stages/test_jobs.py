@@ -68,7 +68,6 @@ def job_of(store: Store, span: int = 1, **request) -> JobRecord:
 
 
 def end_of(store: Store, job: JobRecord) -> Event:
-    """The end of the last of a job's tasks, or of the first one that fails."""
     runner = Runner(STAGES, worker="w", publish=lambda event: None)
     for task in plan(job):
         message = message_of(job, task, attempt=1, max_attempt=3).model_dump(mode="json", by_alias=True)
@@ -208,7 +207,6 @@ def small_batches(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def made(store: Store, span: int, **request) -> tuple[JobRecord, list[tuple]]:
-    """What a job makes whose tasks have so many batches: stage, shard and manifest of each task."""
     job = job_of(store, span, fidelity="draft", seed=3, **request)
     end = end_of(store, job)
     assert end.kind is EventKind.FINISHED, end
@@ -323,7 +321,6 @@ def store(tmp_path) -> Store:
 
 @pytest.fixture
 def network(store: Store, files: dict[str, bytes], monkeypatch: pytest.MonkeyPatch) -> Asset:
-    """It, in the store; this process, as a worker of another machine, knows no network."""
     monkeypatch.setattr(known, "_known", LRUCache(16))
     monkeypatch.setattr(assets, "_cache", LRUCache(16))
     return publish_asset(store, AssetKind.NETWORK, "net", files)

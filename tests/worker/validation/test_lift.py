@@ -130,7 +130,6 @@ def test_a_box_with_its_origin_elsewhere_is_lifted_alike() -> None:
 
 
 def beside(place: tuple[float, float], size: tuple[float, float, float], mass: float = 0.1) -> Lift:
-    """The test with a neighbour that stands on the table at `place`, as seen from the box's middle."""
     other = object_from_mesh(trimesh.creation.box(size)).weighing(mass=mass)
     neighbour = Neighbour(other, (other.hull_vertices,), (), 0.0)
     pose = np.array([[[*place, size[2] / 2, 1.0, 0, 0, 0]]])
@@ -319,7 +318,6 @@ THREE_PLACES = PlacedGrasps(PLACED.supports, PLACED.object_pose, np.zeros(3, int
 
 @pytest.fixture
 def lifts(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Grows by the row of each lift that is simulated."""
     done: list[int] = []
     lift = Lift.lift
     monkeypatch.setattr(Lift, "lift", lambda self, grasps, row: done.append(row) or lift(self, grasps, row))
@@ -365,7 +363,6 @@ def numbered(count: int) -> GraspSet:
 
 
 def lift_tests(monkeypatch: pytest.MonkeyPatch, outcomes: dict[bool, list[int]]) -> list[object]:
-    """Stands in for the lift test at half the friction (True) and at the whole of it; grows by what is tested."""
     done: list[object] = []
 
     def validated(hand, obj, some, placed, *, hard=False, **_):

@@ -328,7 +328,6 @@ def test_a_draw_stays_in_the_range_of_its_axis(axis: Axis) -> None:
 
 
 def tied(second: float = 1.0) -> HandModel:
-    """Two fingers on one tendon."""
     hand = two_finger_hand()
     limits = {"lower": np.array([-0.3, -0.2]), "upper": np.array([1.2, 1.1]), "stiffness": np.array([10.0, 6.0])}
     return dataclasses.replace(hand, digest="2" * 32, tendons=(Tendon("both", (0, 1), (1.0, second)),), **limits)

@@ -282,8 +282,6 @@ def test_shell_that_convex_pieces_fill_in_is_refused_with_reason(tmp_path) -> No
 
 
 class Exploding(Test):
-    """The first push makes a velocity infinite."""
-
     def _push(self, direction: int) -> None:
         super()._push(direction)
         self.data.qvel[0] = np.inf

@@ -38,8 +38,6 @@ GRASPS = 84
 
 
 class Stand:
-    """Stands in for the module `mujoco_warp`."""
-
     class OverflowType(enum.IntFlag):
         NEFC = 1
         NJMAX_NNZ = 2
@@ -256,7 +254,6 @@ def test_who_insists_on_it_is_told_what_to_install(monkeypatch: pytest.MonkeyPat
 
 
 def lies(found: PrefilterOutcomes) -> PrefilterOutcomes:
-    """Of every grasp that fails the prefilter says that it clearly holds."""
     return dataclasses.replace(found, outcome=np.ones_like(found.outcome), margin=np.zeros(len(found.margin)))
 
 

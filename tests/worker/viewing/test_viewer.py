@@ -36,7 +36,6 @@ SCENE = json_attribute(SceneSpec(kind="bin").model_dump(mode="json"))
 
 
 def arrays(joints: int) -> dict[str, np.ndarray]:
-    """Three grasps in a bin, of which the second is valid: the hand comes down along z and rises again."""
     turned = quat_from_axis_angle(np.array([1.0, 0, 0]), np.asarray(np.pi))
     pose = np.tile(np.concatenate([[0, 0, 0.06], turned]), (GRASPS, 1))
     pose[:, 0] = 0.01 * np.arange(GRASPS)
@@ -74,7 +73,6 @@ def viewer() -> Iterator:
 
 @pytest.fixture(autouse=True)
 def first(request) -> None:
-    """Each test begins at the grasp of the first file's first filter."""
     if "viewer" in request.fixturenames:
         request.getfixturevalue("viewer").choose("all")
 

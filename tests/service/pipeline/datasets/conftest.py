@@ -14,13 +14,11 @@ from tests.service.pipeline.datasets.makers import add_asset
 
 @pytest.fixture
 def either(index_url: str, tmp_path: Path) -> Iterator[Services]:
-    """The service on an empty index of each kind in turn."""
     yield from _service(tmp_path, index_url)
 
 
 @pytest.fixture
 def services(tmp_path: Path) -> Iterator[Services]:
-    """The service on SQLite."""
     yield from _service(tmp_path, f"sqlite:///{tmp_path / 'index.sqlite'}")
 
 

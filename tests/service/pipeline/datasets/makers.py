@@ -26,7 +26,6 @@ def add_asset(services: Services, kind: str, name: str, *, content: str = "", ve
 
 
 def wanted(name: str = "grasps", **changes: Any) -> DatasetRequest:
-    """Two hands x two objects, one batch each."""
     given = {"hands": ("gripper", "claw"), "objects": ("ball", "cube"), "grasps": 32, "validation": "standard"}
     return DatasetRequest.model_validate({"name": name, **given, **changes})
 
@@ -40,7 +39,6 @@ def done(services: Services, name: str = "grasps", **changes: Any) -> None:
 
 
 def fail(services: Services, job: str, reason: str = "it broke") -> None:
-    """The first task of each batch of a job, failed for the last time."""
     for task in plan(record_of(services, job)):
         if task.stage is Stage.SYNTHESIZE:
             fail_task(services, job, task, services.index.jobs.task(task.id).attempt, reason=reason)

@@ -307,7 +307,6 @@ _ON_BALL = (("draft", 40, 0.3), ("standard", 15, 0.8))
 
 
 def chart(created: str = "2026-11-21T10:00:00.000Z", *, claw: str = "fine") -> dict[str, Any]:
-    """The gripper needs standard on all but the cube, the claw a fidelity of one's choice on all."""
     runs = [run(name, speed, gsr, hand="gripper", object_="ball") for name, speed, gsr in _ON_BALL]
     runs.append(run("draft", 40, 0.9, hand="gripper", object_="cube"))
     runs.append(run(claw, 6, 0.7, hand="claw", object_="elsewhere"))

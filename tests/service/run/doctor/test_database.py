@@ -81,7 +81,6 @@ def test_a_row_that_differs_is_bad(kept: Services) -> None:
 
 
 def test_what_is_on_its_way_in_is_no_difference(kept: Services, look: Look, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Between the two looks a controller takes up what was written."""
     key = shard_of(kept)
     data = key.read_bytes()
     key.unlink()

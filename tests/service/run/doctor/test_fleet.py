@@ -33,7 +33,6 @@ from tests.service.queue.test_queue import task
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is slow is the machine that the tests run on."""
     monkeypatch.setattr("graspd.service.run.doctor.backends._SLOW_REDIS_S", 60.0)
 
 
@@ -171,7 +170,6 @@ def test_clocks_that_agree_are_good(settings: Settings, rq_queue: RqQueue) -> No
     [(-60.0, Condition.WARNING), (60.0, Condition.WARNING), (3600.0, Condition.BAD), (-3.0, Condition.GOOD)],
 )
 def test_a_wrong_clock_is_named(settings: Settings, rq_queue: RqQueue, ahead_s: float, condition: Condition) -> None:
-    """Three seconds ago is as old as a beat may be."""
     present(rq_queue, seen=timestamp(-ahead_s))
     found = clocks(settings)
     assert found.condition is condition, found
