@@ -89,7 +89,7 @@ def of_metric(folder: Path, older_index: str) -> dict[str, Any]:
     from graspd.service.store.manifests import load_manifest
     from graspd.studies.cards.page import quality_table
     from tests.api.conftest import BASE_URL
-    from tests.studies.cards.conftest import case
+    from tests.studies.test_cards import case
 
     def measured(hand: str, obj: str, columns: dict[str, Any]) -> None:
         columns[METRIC.path] = np.linspace(0, 20, len(columns["quality/valid"]))
