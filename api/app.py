@@ -132,7 +132,7 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
                 answers = operation.setdefault("responses", {})
                 if "application/json" in answers.get("422", {}).get("content", {}):
                     answers["422"] = problems.responses(422)[422]
-                for status, answer in problems.responses(*_of_everybody(path, method)).items():
+                for status, answer in problems.responses(*_middleware_statuses(path, method)).items():
                     answers.setdefault(str(status), answer)
         if app.state.settings.api_root_path:
             document["servers"] = [{"url": app.state.settings.api_root_path}]
@@ -140,7 +140,7 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
     return app.openapi_schema
 
 
-def _of_everybody(path: str, method: str) -> list[int]:
+def _middleware_statuses(path: str, method: str) -> list[int]:
     """Return the statuses that middleware may send before a route runs."""
     statuses = [421]
     if path.startswith(("/v1/", "/metrics")):

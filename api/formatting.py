@@ -92,7 +92,7 @@ def stamp(value: str) -> str:
 _PLACES: Final = {"table": "on a table", "bin": "in a bin", "shelf": "on a shelf", "file": "in a scene of their own"}
 
 
-def place(kind: str) -> str:
+def scene_kind(kind: str) -> str:
     """Describe the kind of scene of grasps; empty: a free object."""
     return _PLACES.get(kind, "")
 
@@ -102,7 +102,7 @@ FILTERS: Final[Mapping[str, Callable[..., str]]] = {
     "count": count,
     "percent": percent,
     "valid_yield": valid_yield,
-    "place": place,
+    "place": scene_kind,
     "duration": duration,
     "worker_time": worker_time,
     "bytes": size,

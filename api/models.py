@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from graspd.service.index.views import AttemptView, GraspView, ShardView, StageProgress, TagView, Validated, WorkerView
 from graspd.service.model.base import Digest, TagName
 from graspd.service.model.domain import JobRequest
-from graspd.service.model.metric_fields import OfferedName, filters, means, with_fields
+from graspd.service.model.metric_fields import OfferedName, filter_fields, insert_fields, mean_fields
 from graspd.service.model.metrics import AXIS_WORDS, DIRECTION_CELLS
 from graspd.service.model.records import Choice
 from graspd.service.model.scene_spec import Box, HalfSpace, SceneKind
@@ -50,7 +50,7 @@ class Job(Validated):
     stages: list[StageStatus]
 
 
-@with_fields(last=means())
+@insert_fields(last=mean_fields())
 class MeanMetrics(BaseModel):
     """Means over the valid grasps of a job; absent while there are none."""
 
@@ -102,7 +102,7 @@ class JobDetail(Job):
     shards: list[Shard]
 
 
-@with_fields(sort=filters())
+@insert_fields(sort=filter_fields())
 class GraspQuery(BaseModel):
     """Filters and order of a list of grasps. A range excludes grasps whose metric is unknown."""
 

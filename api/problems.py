@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from starlette.exceptions import HTTPException
 from starlette.routing import Match
 
-from graspd.service.model.base import words
+from graspd.service.model.base import problem_text
 from graspd.service.model.errors import GraspdError, InputError, RateError, StoreUnavailable
 
 MEDIA_TYPE: Final = "application/problem+json"
@@ -169,7 +169,7 @@ def validation_answer(request: Request, error: RequestValidationError) -> JSONRe
 def _field_error(entry: dict[str, Any]) -> FieldError:
     place, *path = entry["loc"]
     tokens = [str(token).replace("~", "~0").replace("/", "~1") for token in path]
-    message = words(entry)
+    message = problem_text(entry)
     if entry["type"] == "json_invalid":
         message = str(entry.get("ctx", {}).get("error", message))
         tokens = []

@@ -70,39 +70,39 @@ class TimedProtocol(H11Protocol):
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
-        self._begin()
+        self._start_timer()
 
     def data_received(self, data: bytes) -> None:
         super().data_received(data)
-        self._look()
+        self._update_timer()
 
     def on_response_complete(self) -> None:
         super().on_response_complete()
         if self.conn.their_state is h11.SEND_BODY:
             self.loop.call_later(self.rest_s, self._drop_rest, self.cycle)
         # uvicorn now reads pipelined data.
-        self._look()
+        self._update_timer()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self._end()
+        self._stop_timer()
         super().connection_lost(exc)
 
-    def _look(self) -> None:
+    def _update_timer(self) -> None:
         if self.conn.their_state is not h11.IDLE:
-            self._end()
+            self._stop_timer()
         elif self.conn.trailing_data[0]:
-            self._begin()
+            self._start_timer()
 
-    def _begin(self) -> None:
+    def _start_timer(self) -> None:
         if self._patience is None and not self.transport.is_closing():
-            self._patience = self.loop.call_later(self.headers_s, self._give_up)
+            self._patience = self.loop.call_later(self.headers_s, self._time_out)
 
-    def _end(self) -> None:
+    def _stop_timer(self) -> None:
         if self._patience is not None:
             self._patience.cancel()
             self._patience = None
 
-    def _give_up(self) -> None:
+    def _time_out(self) -> None:
         if self.conn.trailing_data[0] and not self.transport.is_closing():
             self.transport.write(_TOO_SLOW)
         self.transport.close()

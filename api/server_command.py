@@ -6,8 +6,8 @@ from typing import Annotated
 
 import typer
 
-from graspd.service.cli import CommandGroup, keep_private, load_settings, log_to_stderr
-from graspd.service.model.libraries import imports
+from graspd.service.cli import CommandGroup, load_settings, log_to_stderr, restrict_file_access
+from graspd.service.model.libraries import pause_garbage_collection
 
 app = CommandGroup(add_completion=False)
 
@@ -18,10 +18,10 @@ def api(
     port: Annotated[int | None, typer.Option(min=0, max=65535, help="Port; 0: any free port.")] = None,
 ) -> None:
     """Run the HTTP API and the dashboard."""
-    with imports():
+    with pause_garbage_collection():
         from graspd.api.server import serve
 
     settings = load_settings(host=host, port=port)
     log_to_stderr(settings, "api")
-    keep_private(settings)
+    restrict_file_access(settings)
     serve(settings)

@@ -10,7 +10,7 @@ from pathlib import PurePosixPath
 from typing import IO, Final
 
 from graspd.service.model.errors import InputError, LimitError
-from graspd.service.model.names import refuse_long
+from graspd.service.model.names import check_length
 from graspd.service.model.states import AssetKind
 from graspd.service.store.assets import UNPACK_FACTOR, ZipFiles, asset_json, check_path
 from graspd.service.store.descriptions import json_object
@@ -63,7 +63,7 @@ def name_of_upload(filename: str) -> str:
     """Derive a valid asset name: `My mug (2).stl` becomes `My-mug-2`; raise InputError if it is too long."""
     leaf = PurePosixPath(filename.replace("\\", "/")).name
     stem = hand_name(leaf) if leaf.lower().endswith(SUFFIXES) else PurePosixPath(leaf).stem
-    return refuse_long(_NAME.sub("-", stem).strip("-._") or "unnamed")
+    return check_length(_NAME.sub("-", stem).strip("-._") or "unnamed")
 
 
 def _main_file(kind: AssetKind, upload: str, files: Mapping[str, bytes]) -> str:

@@ -29,7 +29,7 @@ from graspd.service.model.clock import timestamp
 from graspd.service.model.messages import TaskMessage
 from graspd.service.model.states import Priority, Stage
 from graspd.service.model.version import PACKAGE_VERSION
-from graspd.service.model.workers import own_ability
+from graspd.service.model.workers import capabilities
 from graspd.service.queue.lists import execution_keys, held_key, job_key, list_key, queue_name, rq_worker_key
 from graspd.service.queue.port import Event, EventKind
 from graspd.service.queue.rq_queue import WORKERS, RqQueue, cancel_key, open_queue, put_event, worker_key
@@ -186,8 +186,8 @@ def _beat(name: str, held: Held | None) -> dict[str, Any]:
         "task_id": task,
         "started": now,
         "seen": now,
-        "schemas": own_ability().schemas,
-        "revisions": dict(own_ability().revisions),
+        "schemas": capabilities().schemas,
+        "revisions": dict(capabilities().revisions),
         "done": time.monotonic() - held.begun if held else 0.0,
         "message": "pretending" if held else "",
     }

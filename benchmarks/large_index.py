@@ -19,7 +19,7 @@ from typing import Any, Final
 import numpy as np
 from sqlalchemy import Connection, Table
 
-from graspd.service.index.changes.rows import fitted, job_row, settle, shard_row, task_rows
+from graspd.service.index.changes.rows import derive_states, job_row, row_from, shard_row, task_rows
 from graspd.service.index.database import upsert
 from graspd.service.index.index import Index
 from graspd.service.index.tables import attempts, grasps, jobs, metadata, shards, tasks
@@ -88,7 +88,7 @@ class _Maker:
         with _without_indexes(connection, grasps):
             self._insert(connection, grasps, (row for record, task in base for row in self._grasps(record, task)))
         for record, _ in records:
-            settle(connection, record.id)
+            derive_states(connection, record.id)
         if connection.dialect.name == "sqlite":
             connection.exec_driver_sql("ANALYZE")
 
@@ -143,7 +143,7 @@ class _Maker:
             ended=self._at(record.request.seed, 0.9),
             last=True,
         )
-        return fitted(attempts, attempt, stage=task.stage.value)
+        return row_from(attempts, attempt, stage=task.stage.value)
 
     def _shard(self, record: JobRecord, task: PlannedTask) -> dict[str, Any]:
         kind = names.SHARD_KINDS[task.stage]

@@ -29,7 +29,10 @@ import pin  # noqa: E402
 EXTRAS: Final = ("", "api", "worker", "all", "dev")
 LARGEST: Final = 6
 _COMMAND: Final = "import sys; sys.argv = ['graspd', {}]; import graspd.cli; graspd.cli.main()"
-_OURS: Final = "from graspd.service.model.libraries import imports, own_process; own_process()\nwith imports(): {}"
+_OURS: Final = (
+    "from graspd.service.model.libraries import mark_process, pause_garbage_collection as imports\n"
+    "mark_process()\nwith imports(): {}"
+)
 _ENGINE: Final = "import graspd.worker.generation, graspd.worker.planners.fast_graspd.planner"
 #: Starts that users wait for, with their code.
 STARTS: Final = {

@@ -53,7 +53,7 @@ from scipy.spatial.distance import cdist
 
 from graspd.exchange.imported import ImportedGrasps, completed, joints_by_name, scaled_object, verdicts
 from graspd.exchange.plan import ExportPart, ExportSummary, PictureReference, by_scene, plain_name
-from graspd.service.model.base import why
+from graspd.service.model.base import error_text
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import (
     IDENTITY_POSE,
@@ -418,4 +418,4 @@ def load_npz(path: Path) -> dict[str, NDArray[Any]]:
         with np.load(path, allow_pickle=False) as found:
             return {name: found[name] for name in found.files}
     except (OSError, ValueError, EOFError, KeyError, MemoryError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError(f"{path} is no .npz file that can be read safely: {why(error)}") from None
+        raise InputError(f"{path} is no .npz file that can be read safely: {error_text(error)}") from None

@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.service.model.base import why
+from graspd.service.model.base import error_text
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import Floats
 from graspd.worker.control.postures import pregrasp, squeeze
@@ -141,5 +141,5 @@ def load_npy(path: Path) -> Any:
     except pickle.UnpicklingError as error:
         raise InputError(f"{path} cannot be read safely: {error}") from None
     except Exception as error:  # an untrusted pickle may raise anything
-        raise InputError(f"{path} is no NumPy file: {why(error)}") from None
+        raise InputError(f"{path} is no NumPy file: {error_text(error)}") from None
     return found.item() if isinstance(found, np.ndarray) and found.shape == () else found

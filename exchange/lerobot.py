@@ -26,11 +26,11 @@ from graspd.exchange.huggingface import png
 from graspd.exchange.imported import ImportedGrasps, joints_by_name, scaled_object, verdicts
 from graspd.exchange.plan import ExportPart, ExportSummary, PictureReference, by_scene
 from graspd.service import parquet
-from graspd.service.model.base import why
+from graspd.service.model.base import error_text
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import POSE_PARTS, Floats, compose, invert
 from graspd.service.readers import Pictures
-from graspd.service.readers.trajectories import way_of
+from graspd.service.readers.trajectories import trajectory_of
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.load import hand_from_path
 
@@ -105,7 +105,7 @@ def postures_of(lot: ExportPart, row: int) -> Floats:
     """Return (W, 7 + J) root and joints along a grasp's trajectory, in the frame of its table."""
     assert lot.placed is not None
     rest = np.asarray(lot.placed.object_pose[lot.placed.index[row]], float)
-    way = way_of(lot.shard, row)
+    way = trajectory_of(lot.shard, row)
     return np.array([np.concatenate([compose(rest, at.hand_pose), at.joint_positions]) for at in way])
 
 
@@ -272,7 +272,7 @@ def _names(path: Path) -> list[str]:
         with file.open("rb") as stream:
             names = [str(name) for name in json.loads(stream.read(_LARGEST))["features"][STATE]["names"]]
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise InputError(f"{file} is no description of a LeRobot data set: {why(error)}") from None
+        raise InputError(f"{file} is no description of a LeRobot data set: {error_text(error)}") from None
     if tuple(names[:7]) != POSE_PARTS:
         raise InputError(f"{path} was not exported by graspd: its states do not begin with {', '.join(POSE_PARTS)}")
     return names[7:]

@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.service.model.names import fitted
+from graspd.service.model.names import shorten
 from graspd.service.model.transforms import Floats, compose, invert, pose_from_matrix
 from graspd.service.readers import Pictures
 from graspd.service.store.shards import Shard
@@ -107,7 +107,7 @@ class ExportSummary:
 
 def plain_name(name: str) -> str:
     """Return a name fit for files and addresses; long names are cut, with a log message."""
-    return fitted(re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip("-.") or "unnamed")
+    return shorten(re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip("-.") or "unnamed")
 
 
 def prim_name(name: str) -> str:

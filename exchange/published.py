@@ -29,7 +29,7 @@ import numpy as np
 from pydantic_core import from_json
 
 from graspd.exchange.imported import ImportedGrasps, completed, joints_by_name, load_npy, scaled_object, verdicts
-from graspd.service.model.base import why
+from graspd.service.model.base import error_text
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import (
     Floats,
@@ -211,7 +211,7 @@ def _stored(path: Path) -> dict[str, Any]:
     try:
         found = from_json(path.read_bytes())
     except (OSError, ValueError) as error:
-        raise InputError(f"{path} is no JSON file: {why(error)}") from None
+        raise InputError(f"{path} is no JSON file: {error_text(error)}") from None
     if not isinstance(found, dict):
         raise InputError(f"{path} is no file of reference grasps: it holds no object")
     return found

@@ -16,7 +16,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
-from graspd.service.model.libraries import imports
+from graspd.service.model.libraries import pause_garbage_collection
 
 if TYPE_CHECKING:
     from graspd.grasps import Grasp, Grasps, Postures, open
@@ -73,7 +73,7 @@ def __getattr__(name: str) -> Any:
         return import_module("graspd.service.model.version").PACKAGE_VERSION
     if name not in __all__:
         raise AttributeError(f"module 'graspd' has no attribute {name!r}")
-    with imports():
+    with pause_garbage_collection():
         found = getattr(import_module(_LIVES_IN.get(name, "graspd.service.model.errors")), name)
     globals()[name] = found
     return found

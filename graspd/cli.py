@@ -13,10 +13,10 @@ import typer
 from pydantic import ValidationError
 from typer.core import TyperCommand, TyperGroup
 
-from graspd.service.cli import at_the_door
-from graspd.service.model.base import words
+from graspd.service.cli import run_command_line
+from graspd.service.model.base import problem_text
 from graspd.service.model.errors import did_you_mean
-from graspd.service.model.libraries import imports, own_process
+from graspd.service.model.libraries import mark_process, pause_garbage_collection
 from graspd.service.model.version import PACKAGE_VERSION
 
 COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
@@ -127,7 +127,7 @@ def load(module: str, name: str, ctx: Any = None) -> Any:
         path = f"{ctx.command_path} {name}" if ctx else f"graspd {name}"
         typer.echo(f"graspd: `{path}` is not part of this install; run pip install 'graspd[{missing}]'", err=True)
         raise typer.Exit(1)
-    with imports():
+    with pause_garbage_collection():
         group: Any = typer.main.get_command(import_module(module).app)
     # typer turns an app with one command into that command, not into a group.
     command: Any = group.get_command(ctx, name) if isinstance(group, TyperGroup) else group
@@ -147,7 +147,7 @@ def usage_line(error: Any) -> str:
     if hasattr(error, "possibilities"):
         said = f"there is no option {error.option_name}{did_you_mean(error.option_name, error.possibilities or ())}"
     elif isinstance(error.__cause__, ValidationError):
-        said = f"{max(error.param.opts, key=len)}: {words(error.__cause__.errors()[0])}"
+        said = f"{max(error.param.opts, key=len)}: {problem_text(error.__cause__.errors()[0])}"
     else:
         said = said[:1].lower() + said[1:].replace("'", "")
     hint = f"; see `{error.ctx.command_path} --help`" if error.ctx and said and not said.endswith("?") else ""
@@ -200,10 +200,10 @@ def _entry() -> None:
 
 
 def main() -> None:
-    own_process()
+    mark_process()
     # Commands do not draw with MuJoCo, whose import would start a process to search for GLFW without this setting.
     os.environ.setdefault("MUJOCO_GL", "disable")
     # Without this setting pydantic searches all installed packages for plugins. To enable plugins, set the variable to
     # "".
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
-    at_the_door(build())
+    run_command_line(build())

@@ -13,7 +13,7 @@ from rich.console import Console
 from graspd.api.formatting import count, duration
 from graspd.api.models import JobDetail
 from graspd.client.client import Client
-from graspd.client.reports import JobDisplay, job_summary, means_of, yield_of
+from graspd.client.reports import JobDisplay, job_summary, mean_metrics, yield_of
 from graspd.service.cli import CommandGroup, JsonFlag, emit, load_settings, plain_console, write_output
 from graspd.service.command_options import parsed_options
 from graspd.service.model.domain import JobRequest
@@ -78,7 +78,7 @@ def run(client: Client, request: JobRequest, out: Path, console: Console) -> tup
 
 
 def print_results(console: Console, job: JobDetail, paths: dict[str, list[str] | str]) -> None:
-    console.print(f"{yield_of(job)}; {means_of(job)}")
+    console.print(f"{yield_of(job)}; {mean_metrics(job)}")
     for stage in job.stages:
         console.print(f"{stage.stage.value:<11} {count(stage.tasks)} × {duration(stage.seconds / stage.tasks)}")
     console.print()

@@ -42,7 +42,7 @@ def doctor(
     """
     settings = load_settings(data_dir=data_dir)
     logging.basicConfig(level=logging.ERROR)
-    checks = _chosen(all_checks(settings, full=full), only)
+    checks = _select(all_checks(settings, full=full), only)
     found = []
     for finding in run_checks(checks):
         found.append(finding)
@@ -55,10 +55,10 @@ def doctor(
         emit({"ok": is_well, "checks": told, **{condition.value: number for condition, number in counts.items()}})
     else:
         typer.echo(", ".join(f"{number} {condition.value}" for condition, number in counts.items() if number), err=True)
-    _end(0 if is_well else 1)
+    _exit(0 if is_well else 1)
 
 
-def _end(code: int) -> None:
+def _exit(code: int) -> None:
     """Exit with a code, even while the thread of a timed-out check still hangs."""
     sys.stdout.flush()
     sys.stderr.flush()
@@ -71,23 +71,23 @@ def all_checks(settings: Settings, *, full: bool = False) -> list[Check]:
     """Return the checks of all packages; those of a missing package report that it is not installed."""
     checks = checks_of(settings, full=full)
     if missing_extra("graspd.api"):
-        checks.append(_absent("keys", "api"))
+        checks.append(_missing_extra("keys", "api"))
     else:
         from graspd.api.access.doctor import keys
 
         checks.append(Check("keys", partial(keys, settings)))
     if missing_extra("graspd.commands"):
-        return [*checks, _absent("gpu", "worker"), _absent("kernels", "worker")]
+        return [*checks, _missing_extra("gpu", "worker"), _missing_extra("kernels", "worker")]
     from graspd.commands.doctor import checks_of as of_worker
 
     return checks + of_worker(settings)
 
 
-def _absent(name: str, extra: str) -> Check:
+def _missing_extra(name: str, extra: str) -> Check:
     return Check(name, lambda: skipped(f"graspd[{extra}] is not part of this install"))
 
 
-def _chosen(checks: list[Check], only: str | None) -> list[Check]:
+def _select(checks: list[Check], only: str | None) -> list[Check]:
     if only is None:
         return checks
     wanted = {name.strip() for name in only.split(",")}

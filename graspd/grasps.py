@@ -214,7 +214,7 @@ class Grasps:
         Raises:
             InputError: the file has no such metric.
         """
-        known = self._known(name)
+        known = self._metric(name)
         values = self._columns[known.path]
         if not known.swept:
             return values
@@ -255,7 +255,7 @@ class Grasps:
         if count < 0:
             raise InputError(f"top {metric} of {count}: the number of grasps must be at least 0")
         values = np.asarray(self.metric(metric), float)
-        order = np.argsort(values if self._known(metric).less_is_better else -values, kind="stable")
+        order = np.argsort(values if self._metric(metric).less_is_better else -values, kind="stable")
         return self[order[np.isfinite(values[order])][:count]]
 
     def to_pandas(self) -> Any:
@@ -332,7 +332,7 @@ class Grasps:
             raise InputError(f"{path} cannot be written: {error.strerror}") from None
         return Path(path)
 
-    def _known(self, name: str) -> GraspMetric:
+    def _metric(self, name: str) -> GraspMetric:
         metric = _METRICS.get(name)
         if metric is None or metric.path not in self._columns:
             raise InputError(f"these grasps have no metric {name!r}; they have {', '.join(self.metrics)}")
@@ -365,10 +365,10 @@ def open(
         DamagedError: a file does not match its checksum.
     """
     shards = open_shards(source, job=job, dataset=dataset)
-    return joined([read_shard(shards.path(file), kind="base") for file in _of_hand(shards, hand).of("base")])
+    return concatenate([read_shard(shards.path(file), kind="base") for file in _of_hand(shards, hand).of("base")])
 
 
-def joined(shards: Sequence[Shard]) -> Grasps:
+def concatenate(shards: Sequence[Shard]) -> Grasps:
     """Concatenate the grasps of base shards of one hand; columns missing from some shards are omitted."""
     if not shards:
         raise InputError("no file of grasps was found")

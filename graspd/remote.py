@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Self, Unpack
 
-from graspd.grasps import Grasps, joined
+from graspd.grasps import Grasps, concatenate
 from graspd.service.model.domain import JobOptions, JobRequest
 from graspd.service.model.errors import InputError, TaskError
-from graspd.service.model.options import accepted, with_keywords
+from graspd.service.model.options import validate, with_keywords
 from graspd.service.model.states import State
 from graspd.service.store.shards import read_shard
 
@@ -62,7 +62,7 @@ class Client:
             NotFoundError: unknown hand or object.
             UnavailableError: the service does not answer.
         """
-        request = accepted(JobRequest, {"hand": hand, "object": object, **options})
+        request = validate(JobRequest, {"hand": hand, "object": object, **options})
         return Job(self._http, self._http.submit(request))
 
     def job(self, job_id: str) -> Job:
@@ -80,7 +80,7 @@ class Client:
             NotFoundError: there is no such shard.
         """
         file = b"".join(self._http.fetch(path_of("shards", shard_id, "file")))
-        return joined([read_shard(file, kind="base", name=shard_id[:12])])
+        return concatenate([read_shard(file, kind="base", name=shard_id[:12])])
 
 
 class Job:
@@ -140,7 +140,7 @@ class Job:
         if not base:
             raise InputError(f"job {self.id[:12]} has made no grasps yet: it is {self.state}")
         ordered = sorted(base, key=lambda shard: shard.batch)
-        return joined([read_shard(b"".join(self._http.fetch(one.file)), name=one.id[:12]) for one in ordered])
+        return concatenate([read_shard(b"".join(self._http.fetch(one.file)), name=one.id[:12]) for one in ordered])
 
     def cancel(self) -> Self:
         """Cancel the job; finished shards remain."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final, Unpack
 from graspd.grasps import Grasps
 from graspd.service.model.errors import InputError
 from graspd.service.model.local_options import LocalOptions
-from graspd.service.model.options import accepted, rows, with_keywords
+from graspd.service.model.options import rows, validate, with_keywords
 
 if TYPE_CHECKING:
     from graspd.keywords import SynthesizeKeywords
@@ -55,7 +55,7 @@ def synthesize(
     except ModuleNotFoundError as error:
         raise ImportError(f"synthesize needs {error.name}; run pip install 'graspd[worker]'") from error
     # None means that the option was not given.
-    asked = accepted(LocalOptions, {name: value for name, value in options.items() if value is not None})
+    asked = validate(LocalOptions, {name: value for name, value in options.items() if value is not None})
     told = (lambda done, total, _message: progress(done / total)) if progress else None
     try:
         made = synthesized_as(str(hand), str(object), asked, progress=told)

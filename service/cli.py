@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, ParamSpec, 
 import typer
 from pydantic import BaseModel, ValidationError
 
-from graspd.service.model.base import refusal
+from graspd.service.model.base import first_error
 from graspd.service.model.errors import GraspdError, InputError, without_secrets
 
 if TYPE_CHECKING:
@@ -45,9 +45,9 @@ def reporting_errors(command: Callable[P, R]) -> Callable[P, R]:
         except GraspdError as error:
             fail(str(error), error.exit_code)
         except ValidationError as error:
-            fail(refusal(error), InputError.exit_code)
+            fail(first_error(error), InputError.exit_code)
         except BrokenPipeError:
-            _silence(sys.stdout)  # The reader (head, less) has closed the pipe.
+            _discard_output(sys.stdout)  # The reader (head, less) has closed the pipe.
             raise typer.Exit(0) from None
         except KeyboardInterrupt:
             fail("interrupted", 130)
@@ -61,7 +61,7 @@ class CommandGroup(typer.Typer):
         return lambda command: add(reporting_errors(command))
 
 
-def at_the_door(command: Callable[[], object]) -> None:
+def run_command_line(command: Callable[[], object]) -> None:
     """Run the command line; report system errors in one line. Other exceptions are bugs and show their trace."""
     for descriptor in range(3):
         try:
@@ -79,10 +79,10 @@ def at_the_door(command: Callable[[], object]) -> None:
             if sys.stdout is not None:
                 sys.stdout.flush()
     except BrokenPipeError:
-        _silence(sys.stdout)
+        _discard_output(sys.stdout)
         sys.exit(0)
     except (OSError, MemoryError) as error:
-        _silence(sys.stdout)
+        _discard_output(sys.stdout)
         with contextlib.suppress(OSError, typer.Exit):
             fail(_refusal(error), 1)
         sys.exit(1)
@@ -103,7 +103,7 @@ def _refusal(error: OSError | MemoryError) -> str:
     return without_secrets(f"{said}; {fixes[error.errno]}" if error.errno in fixes else said)
 
 
-def _silence(stream: TextIO | None) -> None:
+def _discard_output(stream: TextIO | None) -> None:
     with contextlib.suppress(OSError, ValueError):
         if stream is not None:
             os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
@@ -125,7 +125,7 @@ def write_output(path: Path, content: bytes) -> None:
 
 
 @contextlib.contextmanager
-def told_to_stop() -> Iterator[list[int]]:
+def catch_stop_signals() -> Iterator[list[int]]:
     """Yield a list that receives the first stop signal (Ctrl-C, SIGTERM); a second signal ends the process."""
     asked: list[int] = []
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
@@ -189,7 +189,7 @@ def load_settings(**overrides: Any) -> Settings:
     try:
         return Settings(**{name: value for name, value in overrides.items() if value is not None})
     except ValidationError as error:
-        place, said = error.errors()[0]["loc"], refusal(error)
+        place, said = error.errors()[0]["loc"], first_error(error)
         raise InputError(f"GRASPD_{place[0]}".upper() + said.removeprefix(str(place[0])) if place else said) from None
 
 
@@ -213,7 +213,7 @@ def log_to_stderr(settings: Settings, process: str = "graspd") -> None:
     telemetry.set_up_logs(settings, process)
 
 
-def keep_private(settings: Settings) -> None:
+def restrict_file_access(settings: Settings) -> None:
     """Make new files of this process and its children, and a readable data folder, private to the user."""
     os.umask(0o077)
     with contextlib.suppress(OSError):

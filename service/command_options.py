@@ -12,7 +12,7 @@ import typer
 from pydantic import BaseModel
 
 from graspd.service.model.errors import InputError
-from graspd.service.model.options import EVERYWHERE, ModelT, Place, Row, accepted, rows
+from graspd.service.model.options import EVERYWHERE, ModelT, Place, Row, rows, validate
 
 
 def with_options(model: type[BaseModel], place: Place) -> Callable[[Callable[..., None]], Callable[..., None]]:
@@ -52,7 +52,7 @@ def parsed_options(model: type[ModelT], values: dict[str, Any]) -> ModelT:
     options = {row.name: row.flags[0].partition("/")[0] for place in EVERYWHERE for row in rows(model, place)}
     names = {name: f"--{name.replace('_', '-')}" for name in model.model_fields}
     # The dataset's name is an argument, not an option.
-    return accepted(model, values, names={**names, "name": "NAME", **options})
+    return validate(model, values, names={**names, "name": "NAME", **options})
 
 
 def pairs(texts: Iterable[str]) -> dict[str, str | int | float]:

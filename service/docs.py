@@ -106,7 +106,7 @@ PAGES: Final = tuple(f"docs/reference/{name}.md" for name in ("settings", "datas
 STUB: Final = "graspd/keywords.pyi"
 
 
-def renewed(text: str) -> str:
+def update_tables(text: str) -> str:
     for name, make in PARTS.items():
         pattern = re.compile(rf"(<!-- {name} -->\n).*?(<!-- /{name} -->)", re.DOTALL)
         text = pattern.sub(lambda found, make=make: f"{found[1]}{make()}\n{found[2]}", text)  # type: ignore[misc]
@@ -116,7 +116,7 @@ def renewed(text: str) -> str:
 def main(root: Path) -> None:
     for page in PAGES:
         path = root / page
-        path.write_text(renewed(path.read_text()))
+        path.write_text(update_tables(path.read_text()))
     (root / STUB).write_text(keywords_stub())
 
 

@@ -41,14 +41,14 @@ def load(file: Path) -> bytes | None:
     return content if hashlib.sha256(content).digest() == digest else None
 
 
-def keep(file: Path, content: bytes, *, limit_bytes: int = _LIMIT_BYTES) -> None:
+def store(file: Path, content: bytes, *, limit_bytes: int = _LIMIT_BYTES) -> None:
     """Write an entry after its SHA-256; remove the least recently used entries of its folder above `limit_bytes`."""
     with suppress(OSError):
-        write_whole(file, [hashlib.sha256(content).digest(), content])
-        make_room(file.parent, file.suffix, limit_bytes, keep=file)
+        write_atomically(file, [hashlib.sha256(content).digest(), content])
+        evict(file.parent, file.suffix, limit_bytes, keep=file)
 
 
-def write_whole(file: Path, pieces: Iterable[bytes]) -> None:
+def write_atomically(file: Path, pieces: Iterable[bytes]) -> None:
     """Write a file atomically, readable by this user only, and create its folder; nothing if the iteration raises."""
     file.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(dir=file.parent, suffix=".part")
@@ -61,8 +61,8 @@ def write_whole(file: Path, pieces: Iterable[bytes]) -> None:
         partial.unlink(missing_ok=True)
 
 
-def make_room(folder: Path, suffix: str, limit_bytes: int, *, keep: Path) -> None:
-    """Remove the least recently used files of a folder except `keep`, down to `limit_bytes` for others."""
+def evict(folder: Path, suffix: str, limit_bytes: int, *, keep: Path) -> None:
+    """Remove the least recently used files of a folder except `store`, down to `limit_bytes` for others."""
     found = []
     for file in folder.glob(f"*{suffix}"):
         with suppress(FileNotFoundError):

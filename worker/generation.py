@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import TaskCancelled
-from graspd.service.model.planning import totals
+from graspd.service.model.planning import sum_outcomes
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext, parallel_map
 from graspd.worker.grasps import GraspSet, joined, joined_columns
 from graspd.worker.hands.model import HandModel
@@ -491,7 +491,7 @@ class Batch:
         absent |= set() if self.request.robust else {"not_robust"}
         absent |= set() if self.request.min_payload else {"weak"}
         reasons = [name for name in REJECTIONS if name not in absent]
-        outcomes = totals([Counter(fate for fate in fates[:candidates].tolist() if fate != "kept")])
+        outcomes = sum_outcomes([Counter(fate for fate in fates[:candidates].tolist() if fate != "kept")])
         rejected = dict.fromkeys(reasons, 0)
         for name, number in outcomes.items():
             rejected[_REJECTION_OF.get(name, name if name in reasons else "dropped")] += number

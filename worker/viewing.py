@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from graspd.service.model.errors import InputError
 from graspd.service.model.scene_spec import Box, SceneSpec, supports_in
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, quat_rotate
-from graspd.service.readers.trajectories import Waypoint, point_at, scene_spec_of, stop_places, way_of, wrists_of
+from graspd.service.readers.trajectories import Waypoint, point_at, scene_spec_of, slider_axis, trajectory_of, wrists_of
 from graspd.service.store.shards import Shard
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
@@ -160,7 +160,7 @@ class Viewer:
         self._supports: Supports = supports_in(spec)
         self.server = _served(host, port)
         self.models = Models(self.server.scene, shown.hand, shown.obj, mounted=self._wrist is not None)
-        self._way = way_of(shown.shard, self.row)
+        self._way = trajectory_of(shown.shard, self.row)
         self._controls()
         self._load()
         self._aim()
@@ -228,7 +228,7 @@ class Viewer:
         self._title = gui.add_markdown("")
         turn = gui.add_button_group("grasp", ("previous", "next"))
         choice = gui.add_dropdown("show", self.filters, initial_value=self.filters[0])
-        places = stop_places(self._way)
+        places = slider_axis(self._way)
         marks = tuple((float(place), point.name) for place, point in zip(places, self._way, strict=True) if point.name)
         start = next(place for place, name in marks if name == "grasp")
         self.slider = gui.add_slider("way", 0.0, float(places[-1]), 0.01, start, marks=marks)
@@ -243,7 +243,7 @@ class Viewer:
 
     def _load(self) -> None:
         shard, row = self._shown.shard, self.row
-        self._way = way_of(shard, row)
+        self._way = trajectory_of(shard, row)
         number = int(self._arrays["grasp/scene_index"][row]) if "grasp/scene_index" in self._arrays else 0
         pose = np.asarray(self._arrays["scene/object_pose"][number], float) if self._supports else IDENTITY_POSE
         self.models.surround(self._supports, pose, self._shown.neighbours, number)
@@ -320,7 +320,7 @@ def _figures(shard: Shard, row: int) -> str:
 
 
 def _doing(way: Any, place: float) -> str:
-    places = stop_places(way)
+    places = slider_axis(way)
     names = [(float(at), point.name) for at, point in zip(places, way, strict=True) if point.name]
     near = next((name for at, name in names if abs(at - place) < 0.02), "")
     if near:

@@ -67,7 +67,7 @@ def authorize(request: HTTPConnection, scope: Scope) -> Key | None:
     return key
 
 
-def may_still(request: HTTPConnection, scope: Scope) -> bool:
+def is_still_authorized(request: HTTPConnection, scope: Scope) -> bool:
     """Check whether a long response may continue, since its key may have been revoked or expired."""
     keys: KeyFile = request.app.state.keys
     if keys.is_open:
@@ -109,7 +109,7 @@ def _refuse_strangers(request: HTTPConnection) -> None:
     """Restrict an open service to this machine: refuse other machines, and proxies, which may serve anyone."""
     passed_on = next((name for name in _OF_PROXIES if name in request.headers), None)
     address = request.client.host if request.client else ""
-    if passed_on is None and not _is_elsewhere(address):
+    if passed_on is None and not _is_remote(address):
         return
     by = f"through a proxy (header {passed_on})" if passed_on else f"from {address}"
     raise ApiError(
@@ -129,7 +129,7 @@ def identify(scope: AsgiScope, keys: KeyFile, proxy: Proxy) -> Key | None:
     return keys.find_session(cookie) if cookie else None
 
 
-def _is_elsewhere(address: str) -> bool:
+def _is_remote(address: str) -> bool:
     try:
         return not ipaddress.ip_address(address).is_loopback
     except ValueError:

@@ -206,7 +206,7 @@ class Quotas:
             claim.counts = False
             raise
         finally:
-            with self._forgiving(holder):
+            with self._log_outage(holder):
                 if claim.counts or met == "known":
                     self._connection.eval(_SETTLE, 1, holder.held, job, grasps, number)
                 else:
@@ -219,24 +219,24 @@ class Quotas:
 
     def _claim(self, holder: _Holder, job: str, grasps: int, number: str, today: int) -> str:
         """Return how a job is counted: `shared` by another pending claim, `known`, `unknown` (no Redis), or empty."""
-        met, amount = self._ask(holder, job, grasps, number, today)
+        met, amount = self._try_claim(holder, job, grasps, number, today)
         if met == "grasps":
-            with self._forgiving(holder):
-                self._forget_ended(holder)
-            met, amount = self._ask(holder, job, grasps, number, today)
+            with self._log_outage(holder):
+                self._drop_ended(holder)
+            met, amount = self._try_claim(holder, job, grasps, number, today)
         if met in ("grasps", "today"):
             raise holder.refusal(met, amount)
         return met
 
-    def _ask(self, holder: _Holder, job: str, grasps: int, number: str, today: int) -> tuple[str, int]:
+    def _try_claim(self, holder: _Holder, job: str, grasps: int, number: str, today: int) -> tuple[str, int]:
         limits = (holder.grasps, holder.today if today else 0)
         about = (job, grasps, *limits, _KEPT_S, today, number, _PENDING_S)
         met, amount = b"unknown", b"0"
-        with self._forgiving(holder):
+        with self._log_outage(holder):
             met, amount = self._connection.eval(_CLAIM, 2, holder.held, holder.day, *about)
         return met.decode(), int(amount)
 
-    def _forget_ended(self, holder: _Holder) -> None:
+    def _drop_ended(self, holder: _Holder) -> None:
         """Drop ended jobs. Pending jobs, absent in the index, and jobs claimed again meanwhile stay."""
         found = [word.decode(errors="replace") for word in self._connection.eval(_ENTERED, 1, holder.held)]
         entries = dict(zip(found[::2], found[1::2], strict=True))
@@ -246,7 +246,7 @@ class Quotas:
             self._connection.eval(_DROP, 1, holder.held, *some)
 
     @contextmanager
-    def _forgiving(self, holder: _Holder) -> Iterator[None]:
+    def _log_outage(self, holder: _Holder) -> Iterator[None]:
         try:
             yield
         except RedisError as error:

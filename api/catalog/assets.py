@@ -14,8 +14,8 @@ from graspd.service.index.views import AssetView, Page
 from graspd.service.model import names
 from graspd.service.model.digests import digest_files
 from graspd.service.model.errors import ConflictError, DamagedError, LimitError, NotFoundError
-from graspd.service.model.names import MOST, fitted
-from graspd.service.model.projects import EVERYTHING, ProjectScope, marks_of
+from graspd.service.model.names import MOST, shorten
+from graspd.service.model.projects import EVERYTHING, ProjectScope, project_mark
 from graspd.service.model.states import AssetKind
 from graspd.service.pipeline import deletion
 from graspd.service.pipeline.backends import Services
@@ -79,7 +79,7 @@ class Assets:
             return known
         if rename and self._holder(kind, name):
             name = self._next_name(kind, name)
-        self._refuse_taken(kind, name, digest)
+        self._check_name(kind, name, digest)
         index, store = self._services.index, self._services.store
         said = {"owner": caller_id(), "project": project, "shared": shared, "self_test": self_test}
         asset = library.store_files(store, kind, name, files, said=said)
@@ -88,7 +88,7 @@ class Assets:
             put_document(store, names.asset_check(kind, asset.digest), found)
         # With two simultaneous uploads under one name, the later one must find the record of the earlier one.
         with recording(self._services) as (connection, put):
-            self._refuse_taken(kind, name, asset.digest)
+            self._check_name(kind, name, asset.digest)
             asset = library.record_asset(store, asset, put)
             index.write.add_asset(asset, library.load_check(store, kind, asset.digest), within=connection)
         return self.one(kind, asset.digest)
@@ -111,7 +111,7 @@ class Assets:
             raise LimitError(f"the corrected asset.json exceeds {MAX_BYTES} bytes; give fewer corrections")
         files["asset.json"] = text
         if not new_name:
-            for mark in ({}, marks_of(files, project_scope().project)):
+            for mark in ({}, project_mark(files, project_scope().project)):
                 files.update(mark)
                 if known := self._find(AssetKind.HAND, digest_files(AssetKind.HAND, files)):
                     return known
@@ -121,7 +121,7 @@ class Assets:
         stem, _, number = name.rpartition("-")
         stem, first = (stem, int(number) + 1) if stem and number.isdigit() and len(number) < 4 else (name, 2)
         for tried in range(first, first + _NAMES_TRIED):
-            named = f"{fitted(stem, MOST - 5)}-{tried}"
+            named = f"{shorten(stem, MOST - 5)}-{tried}"
             if not self._holder(kind, named):
                 return named
         raise ConflictError(f"there are many {kind.value}s named {stem}-...; choose a name")
@@ -135,7 +135,7 @@ class Assets:
 
     def _mark(self, kind: AssetKind, name: str, files: MutableMapping[str, bytes], project: str) -> str:
         """Add the project's mark to the files, which makes them private to the project; return their digest."""
-        files.update(marks_of(files, ""))
+        files.update(project_mark(files, ""))
         digest = digest_files(kind, files)
         if not project:
             return digest
@@ -143,7 +143,7 @@ class Assets:
         if known and known.name == name and (known.shared or known.builtin):
             # The identical files are shared already: do not create a second asset.
             return digest
-        files.update(marks_of(files, project))
+        files.update(project_mark(files, project))
         return digest_files(kind, files)
 
     def _find(self, kind: AssetKind, name: str, scope: ProjectScope | None = None) -> AssetView | None:
@@ -159,6 +159,6 @@ class Assets:
         # A refused upload does not occupy its name: a fixed file may use it.
         return known.digest if known and known.verdict != "refuse" else ""
 
-    def _refuse_taken(self, kind: AssetKind, name: str, digest: str) -> None:
+    def _check_name(self, kind: AssetKind, name: str, digest: str) -> None:
         if self._holder(kind, name) not in ("", digest):
             raise ConflictError(f"there is another {kind.value} named {name!r}; give this one another name")

@@ -13,7 +13,7 @@ from anyio.to_thread import run_sync
 from fastapi import Request
 from fastapi.sse import ServerSentEvent
 
-from graspd.api.access.auth import caller, caller_id, may_change, may_still, must_own, project_scope
+from graspd.api.access.auth import caller, caller_id, is_still_authorized, may_change, must_own, project_scope
 from graspd.api.access.keys import Scope
 from graspd.api.catalog.jobs import Jobs
 from graspd.api.catalog.overview import Overview
@@ -36,7 +36,7 @@ _ENDS_AT_ONCE: Final = 100
 async def job_events(jobs: Jobs, job_id: str, request: Request) -> AsyncIterator[ServerSentEvent]:
     """Send `progress` with the job at each change; `end` when its state is final."""
     last = ""
-    while not await request.is_disconnected() and may_still(request, Scope.READ):
+    while not await request.is_disconnected() and is_still_authorized(request, Scope.READ):
         try:
             job = await run_sync(jobs.moving, job_id)
         except UnavailableError as error:
@@ -55,7 +55,7 @@ async def job_events(jobs: Jobs, job_id: str, request: Request) -> AsyncIterator
 
 
 async def ends(webhooks: Webhooks, since: int, request: Request) -> AsyncIterator[ServerSentEvent]:
-    while not await request.is_disconnected() and may_still(request, Scope.READ):
+    while not await request.is_disconnected() and is_still_authorized(request, Scope.READ):
         try:
             found = await run_sync(partial(webhooks.ends, since, limit=_ENDS_AT_ONCE))
         except UnavailableError as error:
@@ -72,7 +72,7 @@ async def ends(webhooks: Webhooks, since: int, request: Request) -> AsyncIterato
 async def service_events(overview: Overview, request: Request) -> AsyncIterator[ServerSentEvent]:
     """Send `progress` without content when a job, task or worker changed: the home page then reloads."""
     last = ""
-    while not await request.is_disconnected() and may_still(request, Scope.READ):
+    while not await request.is_disconnected() and is_still_authorized(request, Scope.READ):
         try:
             digest = await run_sync(overview.fingerprint)
         except UnavailableError as error:

@@ -30,7 +30,7 @@ from graspd.service.model.metrics import (
 from graspd.service.model.records import MOST_TAGGED, Grasp
 from graspd.service.model.scene_spec import supports_in
 from graspd.service.pipeline.backends import Services
-from graspd.service.readers.trajectories import scene_spec_of, stop_places, way_of
+from graspd.service.readers.trajectories import scene_spec_of, slider_axis, trajectory_of
 from graspd.service.store.columns import SCHEMAS
 from graspd.service.store.integrity import read_checked
 from graspd.service.store.shards import Shard, read_shard
@@ -94,7 +94,7 @@ class Grasps:
                 for metric in GRASP_METRICS
                 if metric.swept and metric.path in file.arrays
             },
-            way=_way(file, row),
+            way=_trajectory(file, row),
             scene=_scene(file, row),
             pushes=_pushes(file, row),
             verdict_margin=_value(file, "quality/verdict_margin", row),
@@ -127,10 +127,10 @@ class Grasps:
             )
             for metric, summary in known.summaries(where, MEAN_METRICS).items()
         ]
-        return histograms, _told(known.kinds(where))
+        return histograms, _diversity(known.kinds(where))
 
 
-def _told(kinds: GraspKinds) -> models.Diversity | None:
+def _diversity(kinds: GraspKinds) -> models.Diversity | None:
     if not kinds.cells:
         return None
     return models.Diversity(
@@ -205,8 +205,8 @@ def _texts(value: Any) -> list[str]:
     return [str(name) for name in value] if isinstance(value, list) else []
 
 
-def _way(file: Shard, row: int) -> list[models.Waypoint]:
-    points = way_of(file, row)
+def _trajectory(file: Shard, row: int) -> list[models.Waypoint]:
+    points = trajectory_of(file, row)
     return [
         models.Waypoint(
             name=point.name,
@@ -215,7 +215,7 @@ def _way(file: Shard, row: int) -> list[models.Waypoint]:
             joint_positions=point.joint_positions.tolist(),
             carried=point.carried.tolist(),
         )
-        for point, place in zip(points, stop_places(points).tolist(), strict=True)
+        for point, place in zip(points, slider_axis(points).tolist(), strict=True)
     ]
 
 

@@ -63,7 +63,7 @@ class Overview:
         """Return workers, live ones first, each with its present stage and the age of its lease."""
         known = self._services.index.overview.workers()
         doing = self._services.index.feed.outputs([worker.task_id for worker in known if worker.task_id])
-        seen = self._seen(worker.task_id for worker in known if worker.task_id)
+        seen = self._tasks_in_scope(worker.task_id for worker in known if worker.task_id)
         try:
             pulses = self._queue_now().workers
         except UnavailableError:
@@ -139,7 +139,7 @@ class Overview:
         moving = [(job.id, job.state, round(job.progress, 3)) for job in jobs]
         return digest_json({"stats": self.stats().model_dump(mode="json"), "workers": workers, "jobs": moving})
 
-    def _seen(self, tasks: Iterable[str]) -> set[str]:
+    def _tasks_in_scope(self, tasks: Iterable[str]) -> set[str]:
         """Return the tasks that are in scope or belong to no job, such as checks of uploads."""
         wanted, scope = set(tasks), project_scope()
         return wanted if scope.everything else wanted - self._services.index.jobs.out_of_scope(wanted, scope)
@@ -170,25 +170,25 @@ class Probes:
         with self._lock:
             now = time.monotonic()
             if self._known is None or now - self._known[0] > KEPT_S:
-                self._known = (now, self._ask())
+                self._known = (now, self._probe_all())
             return self._known[1]
 
-    def _ask(self) -> Health:
+    def _probe_all(self) -> Health:
         questions: dict[str, Callable[[], Part]] = {
             "redis": self._redis,
             "index": self._index,
-            "store": lambda: _answering(self._services.store.probe()),
+            "store": lambda: _healthy_part(self._services.store.probe()),
         }
         probes = {name: self._hanging.get(name) or _Probe(name, question) for name, question in questions.items()}
         deadline = time.monotonic() + PATIENCE_S
         parts = {name: probe.part(deadline) for name, probe in probes.items()}
         self._hanging = {name: probe for name, probe in probes.items() if probe.thread.is_alive()}
-        controller, workers = self._others() if parts["redis"].ok else (False, 0)
+        controller, workers = self._controller_and_workers() if parts["redis"].ok else (False, 0)
         return Health(ok=all(part.ok for part in parts.values()), parts=parts, controller=controller, workers=workers)
 
     def _redis(self) -> Part:
         """Probe Redis; a Redis of another service is not ready, because that service ignores jobs of this one."""
-        part, service = _answering(self._services.queue.ping()), self._services.queue.service()
+        part, service = _healthy_part(self._services.queue.ping()), self._services.queue.service()
         if service != self._service:
             try:
                 check_service(self._services.store, service)
@@ -201,7 +201,7 @@ class Probes:
 
     def _index(self) -> Part:
         """Probe the index; an incomplete index is not ready, because jobs would appear to be missing."""
-        part, made = _answering(self._services.index.database.ping()), self._services.index.notes.completeness()
+        part, made = _healthy_part(self._services.index.database.ping()), self._services.index.notes.completeness()
         if made is None:
             return part.model_copy(update={"ok": False, "detail": _INCOMPLETE})
         if made.left_out:
@@ -213,7 +213,7 @@ class Probes:
             return part.model_copy(update={"detail": detail})
         return part
 
-    def _others(self) -> tuple[bool, int]:
+    def _controller_and_workers(self) -> tuple[bool, int]:
         try:
             fit = [beat for beat in self._services.queue.workers() if beat.state != "quarantined"]
             return self._services.queue.announced(PART), len(fit)
@@ -221,7 +221,7 @@ class Probes:
             return False, 0
 
 
-def _answering(seconds: float) -> Part:
+def _healthy_part(seconds: float) -> Part:
     return Part(ok=True, latency_ms=round(1000 * seconds, 3))
 
 
@@ -301,13 +301,13 @@ class Deletions:
         self._services = services
 
     def recent(self) -> list[DeletionView]:
-        return [self._view(one) for one in deletions(self._services.store) if _is_seen(one)]
+        return [self._view(one) for one in deletions(self._services.store) if _is_in_scope(one)]
 
     def restore(self, what: What, name: str) -> DeletionView:
         def permit(one: Deletion) -> None:
             must_own(one.submitter, f"{what} {name!r}", one.project)
 
-        found = deletion.restore(self._services, what, name, permit=permit, among=_is_seen)
+        found = deletion.restore(self._services, what, name, permit=permit, among=_is_in_scope)
         log.info("%s %s restored", what, found.name or found.id)
         return self._view(found)
 
@@ -318,5 +318,5 @@ class Deletions:
         return DeletionView(what=one.what, id=one.id, at=one.at, until=until, project=one.project, **said)
 
 
-def _is_seen(one: Deletion) -> bool:
+def _is_in_scope(one: Deletion) -> bool:
     return project_scope().sees(one.project)

@@ -66,24 +66,24 @@ class Tags:
 
         def permit(tag: Tag | None) -> None:
             _permit(tag)
-            if tag is None and self._mine(project) >= MOST_TAGS:
+            if tag is None and self._tag_count(project) >= MOST_TAGS:
                 raise LimitError(f"there are {MOST_TAGS} tags already, the maximum; delete one")
 
-        changed = tagging.give(self._services, name, grasps, project=project, owner=caller_id(), permit=permit)
+        changed = tagging.tag_grasps(self._services, name, grasps, project=project, owner=caller_id(), permit=permit)
         log.info("tag %s given to %d grasps", name, changed)
         return TagChange(tag=self.one(tag_id(name, project)), changed=changed)
 
     def take_off(self, name: str, selection: Selection) -> TagChange:
         tag = self._services.index.tags.named(name, scope=project_scope())
-        changed = tagging.take_off(self._services, tag, self.chosen(selection), permit=_permit)
+        changed = tagging.untag_grasps(self._services, tag, self.chosen(selection), permit=_permit)
         return TagChange(tag=self.one(tag), changed=changed)
 
     def remove(self, name: str) -> None:
         tag = self._services.index.tags.named(name, scope=project_scope())
-        tagging.remove(self._services, tag, permit=_permit, owner=caller_id())
+        tagging.delete_tag(self._services, tag, permit=_permit, owner=caller_id())
         log.info("tag %s removed", name)
 
-    def _mine(self, project: str) -> int:
+    def _tag_count(self, project: str) -> int:
         """Return the number of tags of the project; for the unnamed project, of the caller's key."""
         found = self._services.index.tags.all(scope=ProjectScope(project, everything=False))
         return sum(bool(project) or may_change(tag.owner, tag.project) for tag in found)
@@ -120,7 +120,7 @@ class GraspExports:
         except BaseException:
             file.close()
             raise
-        return size, _sent(file)
+        return size, _stream(file)
 
     def _rows(self, places: Sequence[Grasp]) -> Iterator[dict[str, Any]]:
         tags = self._tags.of(places)
@@ -168,7 +168,7 @@ class GraspExports:
             packed.writestr(zipfile.ZipInfo("subset.json"), json.dumps(told, indent=1) + "\n")
 
 
-def _sent(file: IO[bytes]) -> Iterator[bytes]:
+def _stream(file: IO[bytes]) -> Iterator[bytes]:
     with closing(file):
         while chunk := file.read(_CHUNK):
             yield chunk

@@ -16,9 +16,9 @@ from graspd.api.catalog.assets import Assets
 from graspd.api.catalog.datasets import Datasets
 from graspd.api.catalog.jobs import Jobs
 from graspd.api.dashboard import figures
-from graspd.api.dashboard.figures import twins
+from graspd.api.dashboard.figures import paired_bars
 from graspd.api.dashboard.form_uploads import asset_choices
-from graspd.api.dashboard.forms import fields_of, first_message, inputs_of, listed
+from graspd.api.dashboard.forms import fields_of, first_message, inputs_of, split_list
 from graspd.api.dashboard.grasp_pages import COLUMNS
 from graspd.api.dashboard.rendering import render
 from graspd.api.routes.dependencies import READ, SUBMIT, AssetsOf, DatasetsOf, JobsOf
@@ -56,7 +56,7 @@ def datasets_page(
 def create(request: Request, datasets: DatasetsOf, assets: AssetsOf, fields: Fields) -> HTMLResponse | RedirectResponse:
     form = {key: str(fields[key]) for key in _MAKE if fields.get(key)}
     wanted = form | {"hands": fields.getlist("hands"), "objects": fields.getlist("objects")}
-    beside = {"neighbours": listed(form.get("neighbours", ""))}
+    beside = {"neighbours": split_list(form.get("neighbours", ""))}
     try:
         dataset = datasets.create(DatasetRequest.model_validate(wanted | beside))
     except (ValidationError, InputError) as error:
@@ -74,9 +74,9 @@ def act_on_pairs(
         if action == "submit":
             options = {key: str(fields[key]) for key in ("grasps", "fidelity") if fields.get(key)}
             wanted = [JobRequest.model_validate(options | {"hand": hand, "object": obj}) for hand, obj in pairs]
-            done, left = _each(jobs.submit, wanted)
+            done, left = _apply_to_each(jobs.submit, wanted)
         else:
-            done, left = _each(_job_action(jobs, action), _jobs_of(jobs, pairs, action))
+            done, left = _apply_to_each(_job_action(jobs, action), _jobs_of(jobs, pairs, action))
     except (ValidationError, InputError) as error:
         return _overview(request, datasets, assets, problem=first_message(error), status=422)
     return _redirect("/datasets", action, done=done, left=left)
@@ -107,14 +107,14 @@ def dataset_page(
         chosen=chosen or "",
         next=page.next if page else None,
         snapshots=datasets.snapshots(name, limit=10).items,
-        did=_did(request),
+        did=_action_summary(request),
     )
 
 
 @router.post("/{name}/cells", dependencies=SUBMIT)
 def act_on_cells(name: str, jobs: JobsOf, fields: Fields) -> RedirectResponse:
     action = str(fields.get("action", ""))
-    done, left = _each(_job_action(jobs, action), [str(cell) for cell in fields.getlist("cell")])
+    done, left = _apply_to_each(_job_action(jobs, action), [str(cell) for cell in fields.getlist("cell")])
     return _redirect(f"/datasets/{name}", action, done=done, left=left)
 
 
@@ -148,7 +148,7 @@ def _jobs_of(jobs: Jobs, pairs: Iterable[tuple[str, str]], action: str) -> list[
     ]
 
 
-def _each(do: Callable[[Any], Any], wanted: Iterable[Any]) -> tuple[int, int]:
+def _apply_to_each(do: Callable[[Any], Any], wanted: Iterable[Any]) -> tuple[int, int]:
     """Apply an action; return the numbers of successes, and of refusals because of owner or state."""
     done = left = 0
     for one in wanted:
@@ -164,7 +164,7 @@ def _redirect(address: str, action: str, *, done: int, left: int = 0) -> Redirec
     return RedirectResponse(f"{address}?{urlencode({'did': action, 'done': done, 'left': left})}", status_code=303)
 
 
-def _did(request: Request) -> str:
+def _action_summary(request: Request) -> str:
     given = request.query_params
     done, left = given.get("done", ""), given.get("left", "0")
     if given.get("did") not in _DONE or not done.isdigit() or not left.isdigit():
@@ -204,7 +204,7 @@ def _overview(
         inputs=inputs_of(cells=True),
         form=_MAKE | {"hands": [], "objects": []} | (form or {}),
         problem=problem,
-        did=_did(request),
+        did=_action_summary(request),
     )
 
 
@@ -226,5 +226,5 @@ def compare_page(request: Request, datasets: DatasetsOf, one: Named = "", other:
         names=[dataset.name for dataset in datasets.page(limit=_OFFERED).items],
         chosen=(one, other),
         found=found,
-        metrics=[(*shown[metric], both, twins(both)) for metric, both in found.metrics.items()] if found else [],
+        metrics=[(*shown[metric], both, paired_bars(both)) for metric, both in found.metrics.items()] if found else [],
     )

@@ -69,7 +69,7 @@ def bars(histogram: Histogram, path: str, where: dict[str, str]) -> list[Bar]:
 
 
 @dataclass(frozen=True)
-class TwinBar:
+class PairedBar:
     x: float
     one: float
     other: float
@@ -78,14 +78,14 @@ class TwinBar:
     shares: tuple[float, float]
 
 
-def twins(both: Sequence[Distribution | None]) -> list[TwinBar]:
+def paired_bars(both: Sequence[Distribution | None]) -> list[PairedBar]:
     """Return the bins of two distributions over the same range, each as shares of its own grasps."""
     first = next(each for each in both if each is not None)
     bins = len(first.counts)
     shares = [[n / each.count for n in each.counts] if each is not None else [0.0] * bins for each in both]
     most, width = max(map(max, shares)) or 1.0, (first.high - first.low) / bins
     return [
-        TwinBar(10.0 * at, 60 * a / most, 60 * b / most, first.low + at * width, first.low + (at + 1) * width, (a, b))
+        PairedBar(10.0 * at, 60 * a / most, 60 * b / most, first.low + at * width, first.low + (at + 1) * width, (a, b))
         for at, (a, b) in enumerate(zip(*shares, strict=True))
     ]
 

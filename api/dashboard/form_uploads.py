@@ -74,7 +74,7 @@ class AssetChoice:
         return FILE_FIELDS[kind] if self.file else kind.value
 
 
-def chosen(request: Request, assets: Assets, fields: FormData, kind: AssetKind) -> AssetChoice:
+def choose_asset(request: Request, assets: Assets, fields: FormData, kind: AssetKind) -> AssetChoice:
     """Return the hand or object of a submitted form: a new file, a known asset, or the refused file."""
     file, known = fields.get(FILE_FIELDS[kind]), _text(fields, kind.value)
     if isinstance(file, UploadFile) and file.filename:
@@ -82,12 +82,12 @@ def chosen(request: Request, assets: Assets, fields: FormData, kind: AssetKind) 
             asset = _store(request, assets, kind, file, _units(fields))
         except InputError as error:
             return AssetChoice(refused=Refusal(str(error)), file=file.filename)
-        return _checked(assets, asset)
+        return _wait_for_check(assets, asset)
     if known:
         return AssetChoice(name=known)
     if held := _text(fields, f"{kind.value}_held"):
         try:
-            return _checked(assets, _again(assets, kind, held, fields))
+            return _wait_for_check(assets, _retry_upload(assets, kind, held, fields))
         except InputError as error:
             return AssetChoice(refused=Refusal(str(error)), file=held, held=held)
     return AssetChoice(refused=Refusal(f"select a known {kind.value}, or a file"))
@@ -141,9 +141,9 @@ def _store(request: Request, assets: Assets, kind: AssetKind, file: UploadFile, 
     return store_upload(assets, kind, file, None, limit_bytes=limit, options=options, rename=True)
 
 
-def _again(assets: Assets, kind: AssetKind, digest: str, fields: FormData) -> AssetView:
+def _retry_upload(assets: Assets, kind: AssetKind, digest: str, fields: FormData) -> AssetView:
     """Store the refused file again, with the form's units or with the options of the pressed button."""
-    before, said = assets.one(kind, digest), pressed(fields, kind)
+    before, said = assets.one(kind, digest), fix_options(fields, kind)
     if not said and kind is AssetKind.OBJECT and (units := _units(fields)) != _text(fields, "held_units"):
         said = {"units": units}
     if not said:
@@ -156,7 +156,7 @@ def _again(assets: Assets, kind: AssetKind, digest: str, fields: FormData) -> As
     return assets.add(kind, before.name, {**files, "asset.json": json.dumps(stated).encode()}, rename=True)
 
 
-def pressed(fields: FormData, kind: AssetKind) -> dict[str, Any]:
+def fix_options(fields: FormData, kind: AssetKind) -> dict[str, Any]:
     """Return the options of the pressed button; values of null come from its field."""
     said = json_object(text, "the option") if (text := _text(fields, f"{kind.value}_fix")) else {}
     for key in [key for key, value in said.items() if value is None and key in _ASKED]:
@@ -170,7 +170,7 @@ def pressed(fields: FormData, kind: AssetKind) -> dict[str, Any]:
     return said
 
 
-def _checked(assets: Assets, asset: AssetView) -> AssetChoice:
+def _wait_for_check(assets: Assets, asset: AssetView) -> AssetChoice:
     """Wait briefly for the check of an upload, so that one press of the button suffices."""
     deadline = time.monotonic() + _CHECK_WAIT_S
     while asset.verdict is None and time.monotonic() < deadline:

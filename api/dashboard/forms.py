@@ -17,12 +17,12 @@ from starlette.datastructures import FormData, UploadFile
 from graspd.api.access.auth import project_scope
 from graspd.api.catalog.assets import Assets
 from graspd.api.catalog.jobs import Jobs
-from graspd.api.dashboard.form_uploads import FILE_FIELDS, UNITS, AssetChoice, choices, chosen, refusal_of
+from graspd.api.dashboard.form_uploads import FILE_FIELDS, UNITS, AssetChoice, choices, choose_asset, refusal_of
 from graspd.api.dashboard.rendering import render
 from graspd.api.routes.dependencies import READ, SUBMIT, AssetsOf, JobsOf
 from graspd.service.index.index import Index
 from graspd.service.index.queries.overview import BatchCost
-from graspd.service.model.base import refusal, words
+from graspd.service.model.base import first_error, problem_text
 from graspd.service.model.domain import JobOptions, JobRequest
 from graspd.service.model.errors import GraspdError, InputError
 from graspd.service.model.fidelity import OFFERED
@@ -119,7 +119,7 @@ def retry(job_id: str, jobs: JobsOf) -> RedirectResponse:
 
 
 def first_message(error: Exception) -> str:
-    return refusal(error) if isinstance(error, ValidationError) else str(error)
+    return first_error(error) if isinstance(error, ValidationError) else str(error)
 
 
 def _submit(request: Request, jobs: Jobs, assets: Assets, fields: FormData) -> HTMLResponse | RedirectResponse:
@@ -129,7 +129,7 @@ def _submit(request: Request, jobs: Jobs, assets: Assets, fields: FormData) -> H
         if name not in ("hand", "object") and isinstance(fields.get(name), str) and fields[name] != ""
     }
     form |= {one.name: fields.get(one.name) == "true" for one in inputs_of() if one.kind == "checkbox"}
-    things = {kind: chosen(request, assets, fields, kind) for kind in FILE_FIELDS}
+    things = {kind: choose_asset(request, assets, fields, kind) for kind in FILE_FIELDS}
     form |= {kind.value: one.name for kind, one in things.items()}
     shown = DEFAULTS | form | {"units": fields.get("units") or "m"}
     refused = {one.place(kind): one.refused.problem for kind, one in things.items() if one.refused}
@@ -138,7 +138,7 @@ def _submit(request: Request, jobs: Jobs, assets: Assets, fields: FormData) -> H
         return _form(request, assets, shown, things=things, errors=refused, status=422 if refused else 200)
     try:
         named = {kind.value: one.name or "unnamed" for kind, one in things.items()}
-        body = JobRequest.model_validate(form | named | {"neighbours": listed(str(form.get("neighbours", "")))})
+        body = JobRequest.model_validate(form | named | {"neighbours": split_list(str(form.get("neighbours", "")))})
     except ValidationError as error:
         return _form(request, assets, shown, things=things, errors=refused | _by_field(error), status=422)
     if refused:
@@ -154,7 +154,7 @@ def _submit(request: Request, jobs: Jobs, assets: Assets, fields: FormData) -> H
 def _by_field(error: ValidationError) -> dict[str, str]:
     errors: dict[str, str] = {}
     for entry in error.errors():
-        said = words(entry)
+        said = problem_text(entry)
         # An error about several fields has no field; its message mostly starts with the name of one.
         word = said.partition(" ")[0]
         whole = next((name for name in DEFAULTS if word in (name, name.rpartition("_")[2])), "scenes")
@@ -201,7 +201,7 @@ WORDS: Final = {
 }
 
 
-def listed(text: str) -> list[str]:
+def split_list(text: str) -> list[str]:
     return text.replace(",", " ").split()
 
 
@@ -218,7 +218,7 @@ class Expectations:
         wanted = {
             key: value for key, value in form.items() if key not in ("hand", "object", "fidelity") and value != ""
         }
-        wanted["neighbours"] = listed(str(form.get("neighbours", "")))
+        wanted["neighbours"] = split_list(str(form.get("neighbours", "")))
         wanted |= {"hands": (str(form["hand"]),), "objects": (str(form["object"]),)}
         return [(name, WORDS[name], self._one(wanted | {"fidelity": name})) for name in OFFERED]
 

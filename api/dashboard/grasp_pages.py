@@ -47,7 +47,7 @@ def grasps_page(
     if len(given) < len(request.query_params):
         # Forms send every field; the visible URL should be short.
         return RedirectResponse(f"/grasps?{urlencode(given)}" if given else "/grasps", status_code=303)
-    said = did(given)
+    said = action_summary(given)
     cursor, view = given.pop("cursor", None), given.pop("view", "cards")
     view = view if view in PAGE_SIZES else "cards"
     problem, page, query = "", None, GraspQuery()
@@ -67,7 +67,7 @@ def grasps_page(
         filtered=bool(set(given) - {"sort", "order"}),
         problem=problem,
         did=said,
-        **choice_of(tags, rows, known, given),
+        **tag_choices(tags, rows, known, given),
         all_said="all that match the filters" if set(given) - {"sort", "order"} else "all grasps",
         here="/grasps",
         shown_tag=next((tag for tag in known if tag.name == query.tag), None),
@@ -101,7 +101,7 @@ def grasp_page(
         "grasp.html",
         page="/grasps",
         grasp=grasp,
-        did=did(dict(request.query_params)),
+        did=action_summary(dict(request.query_params)),
         tags=[tag.name for tag in tags.all()],
         tagged=tags.of([(shard_id, row)]),
         stops=[point.name for point in grasp.way if point.name],
@@ -119,7 +119,7 @@ def grasp_page(
     )
 
 
-def choice_of(
+def tag_choices(
     tags: Tags, rows: Sequence[GraspView], known: Sequence[TagView], where: Mapping[str, str]
 ) -> dict[str, Any]:
     return {
@@ -169,11 +169,11 @@ def untag(tags: TagsOf, fields: Fields) -> RedirectResponse:
 
 @router.post("/grasps/export", dependencies=READ)
 async def export(request: Request, tags: TagsOf, exports: ExportsOf, fields: Fields) -> StreamingResponse:
-    wanted = _checked(_FORMAT, fields.get("format") or "zip", "format")
+    wanted = _validate(_FORMAT, fields.get("format") or "zip", "format")
     return await exported(request, tags, exports, _selection(fields), wanted)
 
 
-def did(given: dict[str, str]) -> str:
+def action_summary(given: dict[str, str]) -> str:
     """Describe the result of the last action; remove the action's parameters from `given`."""
     what, done, name = (given.pop(key, "") for key in ("did", "done", "named"))
     if what not in _DONE or not (done.isascii() and done.isdigit()) or len(done) > 9:
@@ -186,7 +186,7 @@ def did(given: dict[str, str]) -> str:
 
 
 def _tag(tags: Tags, fields: FormData, *, on: bool) -> RedirectResponse:
-    name = _checked(_NAME, fields.get("tag"), "tag")
+    name = _validate(_NAME, fields.get("tag"), "tag")
     selection = _selection(fields)
     change = tags.give(name, selection) if on else tags.take_off(name, selection)
     said = {"did": "tagged" if on else "untagged", "done": change.changed, "named": name}
@@ -222,7 +222,7 @@ def _filter(fields: FormData) -> list[tuple[str, str]]:
         raise InputError("the filter of the list cannot be read") from None
 
 
-def _checked(what: TypeAdapter[T], value: object, name: str) -> T:
+def _validate(what: TypeAdapter[T], value: object, name: str) -> T:
     try:
         return what.validate_python(value)
     except ValidationError as error:

@@ -74,7 +74,7 @@ def _correct(request: Request, assets: Assets, name: str, fields: FormData) -> H
     shown = _form_of(facts) | {key: value for key, value in fields.multi_items() if isinstance(value, str)}
     shown["fingertips"] = [str(value) for value in fields.getlist("fingertip")]
     try:
-        said = CorrectionRequest.model_validate(dict(_said(facts, shown)))
+        said = CorrectionRequest.model_validate(dict(_changed_fields(facts, shown)))
         made = store_correction(assets, hand.digest, said, said.name)
     except (InputError, ConflictError, ValueError) as error:
         return _page(request, hand, facts, problem=first_message(error), form=shown, status=422)
@@ -125,7 +125,7 @@ def _form_of(facts: HandFacts) -> dict[str, Any]:
     return form
 
 
-def _said(facts: HandFacts, form: dict[str, Any]) -> Iterator[tuple[str, Any]]:
+def _changed_fields(facts: HandFacts, form: dict[str, Any]) -> Iterator[tuple[str, Any]]:
     """Yield differences between form and facts, as fields of a request."""
     before = _form_of(facts)
     if name := form["name"].strip():

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from graspd.api.dashboard import figures, rendering
-from graspd.api.dashboard.grasp_pages import COLUMNS, choice_of, did
+from graspd.api.dashboard.grasp_pages import COLUMNS, action_summary, tag_choices
 from graspd.api.dashboard.rendering import base_url, render
 from graspd.api.models import GraspQuery, JobDetail
 from graspd.api.routes.dependencies import READ, GraspsOf, JobsOf, ShardsOf, TagsOf
@@ -50,8 +50,8 @@ def job_page(request: Request, job_id: str, jobs: JobsOf, grasps: GraspsOf, tags
         pictures=pictures[:_SHOWN_PICTURES],
         picture_count=len(pictures),
         rows=rows,
-        did=did(dict(request.query_params)),
-        **choice_of(tags, rows, tags.all(), where),
+        did=action_summary(dict(request.query_params)),
+        **tag_choices(tags, rows, tags.all(), where),
         all_said=f"all {'valid ' if validated else ''}grasps of this job",
         here=f"/jobs/{job_id}",
         view="",

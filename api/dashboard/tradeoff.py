@@ -180,7 +180,7 @@ def draw(measured: Measured, *, axis: str, hand: str = "", object: str = "") -> 
     across, x_ticks = _logarithmic([point.speed for point in points])
     up, y_ticks = _linear([point.accuracy for point in points], top=100.0 if shown.unit == "%" else None)
     shown_at = (replace(p, on_front=n in front, x=across(p.speed), y=up(p.accuracy)) for n, p in enumerate(points))
-    placed = _labelled(list(shown_at))
+    placed = _place_labels(list(shown_at))
     line = " ".join(f"{point.x:.1f},{point.y:.1f}" for point in placed if point.on_front)
     nothing = [group[0].label for group in _groups(chosen) if not _speed(group)]
     return Drawing(placed, line, x_ticks, y_ticks, shown, nothing)
@@ -231,14 +231,14 @@ def _speed(runs: Sequence[Run]) -> float:
     return math.exp(sum(map(math.log, speeds)) / len(speeds)) if speeds else 0.0
 
 
-def _labelled(points: list[Point]) -> list[Point]:
+def _place_labels(points: list[Point]) -> list[Point]:
     """Place labels beside their points, left or right, up or down, where they overlap the least."""
     taken = [(p.x - _DOT, p.y - _DOT, p.x + _DOT, p.y + _DOT) for p in points]
     placed: list[Point] = []
     for point in sorted(points, key=lambda point: point.y):
         offers = [(move, is_left) for move in _MOVES for is_left in (False, True)]
         boxes = [point.label_box(move, is_left=is_left) for move, is_left in offers]
-        costs = [sum(_covered(box, other) for other in taken) + _outside(box) for box in boxes]
+        costs = [sum(_overlap_area(box, other) for other in taken) + _outside_cost(box) for box in boxes]
         # Of equal places the first one, nearest to the point, is used.
         best = costs.index(min(costs))
         move, is_left = offers[best]
@@ -247,12 +247,12 @@ def _labelled(points: list[Point]) -> list[Point]:
     return sorted(placed, key=lambda point: point.speed)
 
 
-def _covered(one: tuple[float, ...], other: tuple[float, ...]) -> float:
+def _overlap_area(one: tuple[float, ...], other: tuple[float, ...]) -> float:
     across, up = (max(0.0, min(one[i + 2], other[i + 2]) - max(one[i], other[i])) for i in (0, 1))
     return across * up
 
 
-def _outside(box: tuple[float, float, float, float]) -> float:
+def _outside_cost(box: tuple[float, float, float, float]) -> float:
     """Return a cost for a label outside the chart or on its ticks, larger than any overlap."""
     left, top, right, bottom = box
     over = (_LEFT - left, right - (WIDTH - 4), -top, bottom - (HEIGHT - _BOTTOM))

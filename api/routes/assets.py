@@ -24,7 +24,7 @@ from graspd.api.routes.dependencies import (
     Limit,
     Paging,
     RequestLimiter,
-    is_known,
+    is_unmodified,
 )
 from graspd.api.uploads import files_of_upload, name_of_upload
 from graspd.service.index.views import AssetView, Page
@@ -139,7 +139,7 @@ def _add_model_route(router: APIRouter, kind: AssetKind) -> None:
         lasting = "private, max-age=31536000, immutable" if name == asset.digest else "no-cache"
         data = assets.model(asset)
         headers = {"ETag": f'"{hashlib.sha256(data).hexdigest()}"', "Cache-Control": lasting}
-        if is_known(request.headers, headers["ETag"]):
+        if is_unmodified(request.headers, headers["ETag"]):
             return Response(status_code=304, headers=headers)
         return Response(data, media_type=_GLB, headers=headers)
 
@@ -160,19 +160,19 @@ def store_upload(
     bounds their memory.
     """
     filename = file.filename or ""
-    with _one_of_few():
+    with _upload_slot():
         files = files_of_upload(kind, filename, file.file, limit_bytes=limit_bytes, options=options)
         return assets.add(kind, name or name_of_upload(filename), files, **said)
 
 
 def store_correction(assets: Assets, name: str, corrections: HandCorrections, new_name: str | None) -> AssetView:
     """Store a corrected hand and its check task; it counts as an upload."""
-    with _one_of_few():
+    with _upload_slot():
         return assets.correct(name, corrections, new_name or "")
 
 
 @contextmanager
-def _one_of_few() -> Iterator[None]:
+def _upload_slot() -> Iterator[None]:
     if not _AT_ONCE.acquire(timeout=_TURN_S):
         raise RateError("too many uploads at once; try again in a moment")
     try:

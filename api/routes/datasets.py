@@ -44,7 +44,7 @@ def create_dataset(body: DatasetRequest, response: Response, datasets: DatasetsO
     dataset = datasets.create(body)
     if dataset.state.is_final:
         response.status_code = 200
-    return _placed(dataset, response)
+    return _with_location(dataset, response)
 
 
 @router.post("/estimate", dependencies=READ, responses=responses(400, 404))
@@ -85,13 +85,13 @@ def list_cells(name: DatasetName, datasets: DatasetsOf, paging: PagingOf, state:
 @router.post("/{name}/cancel", status_code=202, dependencies=SUBMIT, responses=responses(404, 409))
 def cancel_dataset(name: DatasetName, response: Response, datasets: DatasetsOf) -> DatasetView:
     """Cancel a dataset and its unfinished jobs; results remain, and jobs of other datasets continue."""
-    return _placed(datasets.cancel(name), response)
+    return _with_location(datasets.cancel(name), response)
 
 
 @router.post("/{name}/retry", status_code=202, dependencies=SUBMIT, responses=responses(404, 409))
 def retry_dataset(name: DatasetName, response: Response, datasets: DatasetsOf) -> DatasetView:
     """Restart failed and cancelled cells; existing results are not made again."""
-    return _placed(datasets.retry(name), response)
+    return _with_location(datasets.retry(name), response)
 
 
 @router.delete("/{name}", status_code=204, dependencies=SUBMIT, responses=responses(404, 409))
@@ -158,7 +158,7 @@ def get_object_set(name: DatasetName, datasets: DatasetsOf) -> ObjectSetView:
     return datasets.object_set(name)
 
 
-def _placed(dataset: DatasetView, response: Response) -> DatasetView:
+def _with_location(dataset: DatasetView, response: Response) -> DatasetView:
     response.headers["Location"] = f"/v1/datasets/{dataset.name}"
     if not dataset.state.is_final:
         response.headers["Retry-After"] = "1"

@@ -165,7 +165,7 @@ class RequestLimiter:
 _TAGS: Final = re.compile(r'\s*((?:W/)?"[^"]*")\s*(?:,|$)')
 
 
-def is_known(headers: Headers, etag: str) -> bool:
+def is_unmodified(headers: Headers, etag: str) -> bool:
     """Check whether If-None-Match has the strong tag of this file, so that the response is 304."""
     given = headers.getlist("if-none-match")
     return any(value.strip() == "*" for value in given) or etag in {

@@ -13,7 +13,7 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 from graspd.api.catalog import events
 from graspd.api.models import Job, JobDetail, Shard
 from graspd.api.problems import ApiError, responses
-from graspd.api.routes.dependencies import READ, SUBMIT, JobsOf, PagingOf, ShardsOf, is_known, range_applies
+from graspd.api.routes.dependencies import READ, SUBMIT, JobsOf, PagingOf, ShardsOf, is_unmodified, range_applies
 from graspd.service.index.views import Page
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.states import State
@@ -147,7 +147,7 @@ def get_file(shard_id: str, request: Request, shards: ShardsOf) -> Response:
     shard = shards.intact(shard_id)
     # The id depends on the content, so cached copies never become stale.
     headers = {"ETag": f'"{shard.sha256}"', "Cache-Control": "private, max-age=31536000, immutable"}
-    if is_known(request.headers, headers["ETag"]):
+    if is_unmodified(request.headers, headers["ETag"]):
         return Response(status_code=304, headers=headers)
     only_head = request.method == "HEAD"
     if not only_head and (address := shards.address(shard)) is not None:

@@ -11,7 +11,7 @@ import typer
 from graspd.api.access.keys import Key, KeyFile, KeyLimits, ProjectLimits, Scope
 from graspd.api.formatting import minute
 from graspd.client.client import path_of
-from graspd.client.reports import UrlOption, YesOption, confirm, open_client, print_rows, say_deleted
+from graspd.client.reports import UrlOption, YesOption, confirm, open_client, print_rows, report_deletion
 from graspd.service.cli import CommandGroup, JsonFlag, load_settings, report
 from graspd.service.model.errors import InputError
 
@@ -45,7 +45,7 @@ def add_key(
     json: JsonFlag = False,
 ) -> None:
     """Make a key and show it once. Limits default to those of the settings."""
-    given = _given(
+    given = _given_limits(
         requests_per_minute=requests_per_minute,
         concurrency=concurrency,
         grasps_in_flight=grasps_in_flight,
@@ -81,7 +81,7 @@ def limit_key(
     json: JsonFlag = False,
 ) -> None:
     """Change the limits of a key, from the next request on."""
-    given = _given(
+    given = _given_limits(
         requests_per_minute=requests_per_minute,
         concurrency=concurrency,
         grasps_in_flight=grasps_in_flight,
@@ -125,7 +125,7 @@ def duration(text: str) -> timedelta:
     return timedelta(**{_UNITS[match[2]]: int(match[1])})
 
 
-def _given(**limits: int | None) -> dict[str, int]:
+def _given_limits(**limits: int | None) -> dict[str, int]:
     return {name: value for name, value in limits.items() if value is not None}
 
 
@@ -186,7 +186,7 @@ def limit_project(
     json: JsonFlag = False,
 ) -> None:
     """Change the shared limits of a project's keys, from the next submission on."""
-    given = _given(
+    given = _given_limits(
         grasps_in_flight=grasps_in_flight, grasps_per_day=grasps_per_day, gpu_seconds_per_day=gpu_seconds_per_day
     )
     if not given:
@@ -256,4 +256,4 @@ def delete_webhook(webhook: IdArgument, yes: YesOption = False, url: UrlOption =
     with open_client(url) as client:
         confirm(f"Delete the webhook {webhook} and its secret for good?", f"the webhook {webhook}", yes=yes)
         client.delete(path_of("webhooks", webhook))
-    say_deleted("webhook", webhook, json=json)
+    report_deletion("webhook", webhook, json=json)

@@ -85,7 +85,7 @@ def add_object(
     sizes = sizes_of(options.pop("scale_to", None))
     options |= provenance(licence, source) | ({"scale_to": sizes[0]} if len(sizes) == 1 else {})
     if len(sizes) > 1:
-        swept = sweep(files_of_set(file) or one_of_set(file, name), sizes)
+        swept = sweep(files_of_set(file) or single_object(file, name), sizes)
         add = partial(add_set, swept, name=name or name_of_set(file), prefix=None)
     elif files := files_of_set(file):
         add = partial(add_set, files, name=name or name_of_set(file), prefix=name)
@@ -144,7 +144,7 @@ def upload_of(path: Path) -> Iterator[tuple[Path, str]]:
         yield archive, main
 
 
-def one_of_set(path: Path, name: str | None) -> Objects:
+def single_object(path: Path, name: str | None) -> Objects:
     """Return a mesh file as a set of one object; InputError for anything else."""
     if path.suffix.lower() not in MESHES or not path.is_file():
         raise InputError(f"several sizes need a mesh file or a folder of meshes, not {path}")

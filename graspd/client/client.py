@@ -126,7 +126,7 @@ class Client(AbstractContextManager["Client"]):
     ) -> Iterator[bytes]:
         """Yield chunks of a file from the API; each may take at most `patience_s` [s]."""
         timeout = httpx.Timeout(patience_s, connect=_CONNECT_S)
-        with _translated(self.url), self._http.stream("GET", path, params=params, timeout=timeout) as answer:
+        with _convert_errors(self.url), self._http.stream("GET", path, params=params, timeout=timeout) as answer:
             _raise_for(answer)
             yield from answer.iter_bytes()
 
@@ -154,7 +154,7 @@ class Client(AbstractContextManager["Client"]):
                     if event == "end":
                         return
             except UnavailableError:
-                if not self._comes_back():
+                if not self._is_reachable_again():
                     raise
             time.sleep(_POLL_S)
 
@@ -219,7 +219,7 @@ class Client(AbstractContextManager["Client"]):
     def _document(self, kind: type[View], method: str, path: str, **options: Any) -> View:
         return kind.model_validate_json(self.send(method, path, **options).content)
 
-    def _comes_back(self) -> bool:
+    def _is_reachable_again(self) -> bool:
         deadline = time.monotonic() + 30.0
         while time.monotonic() < deadline:
             try:
@@ -231,7 +231,7 @@ class Client(AbstractContextManager["Client"]):
         return False
 
     def _events(self, path: str) -> Iterator[tuple[str, Any]]:
-        with _translated(self.url), self._http.stream("GET", path, timeout=_STREAM_TIMEOUT) as answer:
+        with _convert_errors(self.url), self._http.stream("GET", path, timeout=_STREAM_TIMEOUT) as answer:
             _raise_for(answer)
             yield from events_of(answer)
 
@@ -239,7 +239,7 @@ class Client(AbstractContextManager["Client"]):
         """Send a request and return the response; raise the error of a problem document."""
         given = {name: value for name, value in (params or {}).items() if value is not None}
         for wait in (*_WAITS_S, None):
-            with _translated(self.url):
+            with _convert_errors(self.url):
                 answer = self._http.request(method, path, params=given or None, **options)
             # Only the rate of requests recovers within a retry, not the other quotas.
             if wait is None or answer.status_code != 429 or RateError.slug not in answer.text:
@@ -285,7 +285,7 @@ def events_of(answer: httpx.Response) -> Iterator[tuple[str, Any]]:
 
 
 @contextmanager
-def _translated(url: str) -> Iterator[None]:
+def _convert_errors(url: str) -> Iterator[None]:
     try:
         yield
     except (httpx.ConnectError, httpx.ConnectTimeout):

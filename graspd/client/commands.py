@@ -20,8 +20,8 @@ from graspd.client.reports import (
     confirm,
     open_client,
     print_rows,
+    report_deletion,
     restore,
-    say_deleted,
     show_asset,
     show_job,
     watch,
@@ -51,11 +51,11 @@ def submit(
 ) -> None:
     """Submit a job: one hand on one object."""
     with open_client(url) as client:
-        as_object = partial(_uploaded, client, AssetKind.OBJECT)
-        pair = {"hand": _uploaded(client, AssetKind.HAND, hand), "object": as_object(object)}
+        as_object = partial(_asset_name, client, AssetKind.OBJECT)
+        pair = {"hand": _asset_name(client, AssetKind.HAND, hand), "object": as_object(object)}
         own = pairs(options.get("options", ()))
         if options.get("method") in NETWORK_METHODS and "network" in own:
-            own["network"] = _uploaded(client, AssetKind.NETWORK, str(own["network"]))
+            own["network"] = _asset_name(client, AssetKind.NETWORK, str(own["network"]))
         place = {
             "scene": scene_option(options.get("scene", "free"), named=as_object),
             "neighbours": [as_object(one) for one in options.get("neighbours", ())],
@@ -111,7 +111,7 @@ def delete(job_id: JobArgument, yes: YesOption = False, url: UrlOption = None, j
         asked = f"Delete job {job.id[:12]}, {job.hand} on {job.object}, with its {count(job.grasps)} grasps?"
         confirm(asked, f"job {job.id[:12]}", yes=yes)
         client.delete(path_of("jobs", job.id))
-    say_deleted("job", job.id, json=json, undo=f"graspd restore {job.id[:12]}")
+    report_deletion("job", job.id, json=json, undo=f"graspd restore {job.id[:12]}")
 
 
 @app.command("restore", epilog="graspd restore 3f2a")
@@ -123,7 +123,7 @@ def restore_job(
     """Restore a deleted job, within the grace time."""
     with open_client(url) as client:
         gone = [one["id"] for one in client.send("GET", "/v1/deletions").json() if one["what"] == "job"]
-    restore(url, "job", _only_one(gone, job_id), json=json)
+    restore(url, "job", _unique_id(gone, job_id), json=json)
 
 
 @app.command(epilog="graspd retry 3f2a --wait")
@@ -208,7 +208,7 @@ def asset_commands(kind: AssetKind) -> typer.Typer:
             client.asset(kind, name)
             confirm(f"Delete the {kind.value} {name}?", f"the {kind.value} {name}", yes=yes)
             client.delete(path_of(f"{kind.value}s", name))
-        say_deleted(kind.value, name, json=json, undo=f"graspd {kind.value}s restore {name}")
+        report_deletion(kind.value, name, json=json, undo=f"graspd {kind.value}s restore {name}")
 
     @group.command(
         "restore",
@@ -254,7 +254,7 @@ app.add_typer(access_commands.webhooks_app, name="webhooks")
 app.add_typer(tag_commands.app, name="tags")
 
 
-def _uploaded(client: Client, kind: AssetKind, value: str) -> str:
+def _asset_name(client: Client, kind: AssetKind, value: str) -> str:
     """Return the name of a hand, object or network; an existing path is uploaded and checked first."""
     path = Path(value)
     is_file_name = "/" in value or path.suffix.lower() in (*MAIN_SUFFIXES[kind], ".zip")
@@ -271,10 +271,10 @@ def _uploaded(client: Client, kind: AssetKind, value: str) -> str:
 def _full_id(client: Client, prefix: str) -> str:
     if len(prefix) >= 32:
         return prefix
-    return _only_one([job.id for job in client.jobs(limit=200).items], prefix)
+    return _unique_id([job.id for job in client.jobs(limit=200).items], prefix)
 
 
-def _only_one(ids: Iterable[str], prefix: str) -> str:
+def _unique_id(ids: Iterable[str], prefix: str) -> str:
     found = {id for id in ids if id.startswith(prefix)}
     if len(found) > 1:
         raise InputError(f"{len(found)} job ids begin with {prefix!r}; give more characters")

@@ -27,17 +27,17 @@ from graspd.client.reports import (
     print_dataset,
     print_estimate,
     print_rows,
+    report_deletion,
     restore,
-    say_deleted,
     watch_dataset,
 )
 from graspd.service.cli import CommandGroup, JsonFlag, emit, plain_console, report
 from graspd.service.command_options import pairs, parsed_options, with_options
 from graspd.service.index.views import DatasetView
-from graspd.service.model.base import Name, why
+from graspd.service.model.base import Name, error_text
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import InputError, TaskError, did_you_mean
-from graspd.service.model.options import accepted
+from graspd.service.model.options import validate
 from graspd.service.model.scene_spec import known_name, scene_option
 from graspd.service.model.states import AssetKind, State
 from graspd.service.pipeline.datasets.estimate import Estimate
@@ -61,7 +61,7 @@ class Spec(JobOptions):
     )
 
     @model_validator(mode="after")
-    def _one_number(self) -> Spec:
+    def _check_grasps(self) -> Spec:
         if self.total_grasps is not None and "grasps" in self.model_fields_set:
             raise ValueError("total_grasps replaces grasps: give one of them")
         return self
@@ -82,7 +82,7 @@ class PlanRequest:
         return matrix | {"grasps": math.ceil(self.total / (len(matrix["hands"]) * objects))}
 
 
-def wanted(
+def plan_request(
     spec: Path | None, *, name: str | None, hands: str | None, objects: str | None, options: dict[str, Any]
 ) -> PlanRequest:
     """Combine spec and options, which take precedence; the name is empty if neither contains it."""
@@ -112,7 +112,7 @@ def read_spec(file: Path) -> dict[str, Any]:
     try:
         found = load(file.read_text())
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{file} cannot be read: {why(error)}") from None
+        raise InputError(f"{file} cannot be read: {error_text(error)}") from None
     except (ValueError, RecursionError) as error:
         raise InputError(f"{file} is no {kind}: {error}") from None
     if not isinstance(found, dict):
@@ -122,7 +122,7 @@ def read_spec(file: Path) -> dict[str, Any]:
             found["scene"] = scene_option(found["scene"], beside=file.parent)
         if isinstance(beside := found.get("neighbours"), list):
             found["neighbours"] = [known_name(one) if isinstance(one, str) else one for one in beside]
-        spec = accepted(Spec, found)
+        spec = validate(Spec, found)
     except InputError as error:
         raise InputError(f"{file}: {error}") from None
     return spec.model_dump(mode="json", exclude_unset=True)
@@ -167,7 +167,7 @@ def create(
 ) -> None:
     """Make a dataset with a job for each hand and object. The same command continues it later."""
     console = plain_console(stderr=json)
-    asked = wanted(spec, name=name, hands=hands, objects=objects, options=options)
+    asked = plan_request(spec, name=name, hands=hands, objects=objects, options=options)
     if not asked.name:
         raise InputError("give a name: graspd datasets create NAME, or name in the file of --spec")
     with open_client(url) as client:
@@ -178,7 +178,7 @@ def create(
         if dry_run:
             _emit(json, estimate=found)
             return
-        if not yes and not _confirmed():
+        if not yes and not _confirm():
             raise InputError("nothing was started")
         refused: list[str] = []
         if files is not None:
@@ -194,7 +194,7 @@ def create(
             console.print(f"excluded, because refused: {', '.join(refused)}", soft_wrap=True)
         print_dataset(dataset, console)
         console.print(f"`graspd datasets status {asked.name}` shows each cell", style="dim")
-    _must_succeed(dataset, asked=wait)
+    _check_success(dataset, asked=wait)
 
 
 @group.command(epilog="graspd datasets estimate --hands allegro --objects mug --grasps 1000000 --scenes 2 --views 3")
@@ -209,7 +209,7 @@ def estimate(
     options: dict[str, Any],
 ) -> None:
     """Estimate the cost of a dataset: time for 1, 8 and 64 workers, storage, network."""
-    asked = wanted(spec, name=None, hands=hands, objects=objects, options=options)
+    asked = plan_request(spec, name=None, hands=hands, objects=objects, options=options)
     with open_client(url) as client:
         files, matrix = _matrix(client, asked)
         found = _estimate(client, matrix, files)
@@ -280,7 +280,7 @@ def delete(
         goes += f" ({size(found.size_bytes)})" + ", its snapshots" * with_snapshots
         confirm(f"Delete dataset {name} with {goes}?", f"dataset {name}", yes=yes)
         client.delete(path_of("datasets", name), with_snapshots=with_snapshots)
-    say_deleted("dataset", name, json=json, undo=f"graspd datasets restore {name}")
+    report_deletion("dataset", name, json=json, undo=f"graspd datasets restore {name}")
 
 
 @group.command("restore", epilog="graspd datasets restore kitchen")
@@ -297,7 +297,7 @@ def retry(name: NameArgument, wait: WaitOption = False, url: UrlOption = None, j
         if wait:
             dataset = watch_dataset(client, name, plain_console(stderr=True))
     _show(dataset, json=json)
-    _must_succeed(dataset, asked=wait)
+    _check_success(dataset, asked=wait)
 
 
 @group.command(epilog="graspd datasets snapshot kitchen")
@@ -382,7 +382,7 @@ def _upload(client: Client, files: Objects, set_name: str, console: Console) -> 
     return refused
 
 
-def _confirmed() -> bool:
+def _confirm() -> bool:
     if not sys.stdin.isatty():
         raise InputError("give --yes to start it, or --dry-run for the cost alone")
     return typer.confirm("Start it?")
@@ -400,7 +400,7 @@ def _show(dataset: DatasetView, *, json: bool) -> None:
         print_dataset(dataset, plain_console())
 
 
-def _must_succeed(dataset: DatasetView, *, asked: bool) -> None:
+def _check_success(dataset: DatasetView, *, asked: bool) -> None:
     if asked and dataset.state in (State.FAILED, State.CANCELLED):
         raise TaskError(
             f"dataset {dataset.name} is {dataset.state.value}; `graspd datasets retry {dataset.name}` runs it again"

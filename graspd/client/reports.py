@@ -58,7 +58,7 @@ def confirm(question: str, what: str, *, yes: bool) -> None:
         raise InputError("nothing was deleted")
 
 
-def say_deleted(what: str, name: str, *, json: bool, undo: str = "") -> None:
+def report_deletion(what: str, name: str, *, json: bool, undo: str = "") -> None:
     report({"deleted": name, "kind": what}, f"{what} {name} is deleted", json=json)
     if undo and not json:
         typer.echo(f"`{undo}` restores it within the grace time (GRASPD_SHARD_GRACE_S)", err=True)
@@ -156,7 +156,7 @@ def yield_of(job: JobDetail) -> str:
     return f"{line}; {job.recheck_held} of {job.rechecked} rechecked hold under the DexGraspBench protocol"
 
 
-def means_of(job: JobDetail) -> str:
+def mean_metrics(job: JobDetail) -> str:
     mean = job.mean
     return (
         f"mean ε {metric(mean.epsilon)}, contact {metric(mean.contact_area_cm2)} cm², "
@@ -181,7 +181,7 @@ def _print_job(job: JobDetail, url: str) -> None:
         )
     console.print(table)
     if job.grasps:
-        console.print(f"{yield_of(job)}; {means_of(job)}")
+        console.print(f"{yield_of(job)}; {mean_metrics(job)}")
         if found := job.diversity:
             types = ", ".join(f"{count(number)} {name}" for name, number in found.types.items())
             directions = f"{found.directions_used} of {found.directions} directions"
@@ -233,7 +233,7 @@ class JobDisplay:
             if self._console.is_terminal:
                 self._draw(stage, job)
             else:
-                self._say(stage, job)
+                self._print_state(stage, job)
 
     def _draw(self, stage: StageStatus, job: Job) -> None:
         if stage.stage not in self._bars:
@@ -252,7 +252,7 @@ class JobDisplay:
         message = stage.message if stage.state is State.RUNNING else stage.state.value
         self._progress.update(bar, completed=stage.done, message=message)
 
-    def _say(self, stage: StageStatus, job: Job) -> None:
+    def _print_state(self, stage: StageStatus, job: Job) -> None:
         now = time.monotonic()
         at, state = self._said.get(stage.stage, (0.0, State.QUEUED))
         if stage.state is state and (state is not State.RUNNING or now - at < _LINE_EVERY_S):
@@ -338,7 +338,7 @@ def print_cells(dataset: DatasetView, cells: Sequence[CellView], console: Consol
     if len(dataset.hands) > _MOST_COLUMNS:
         table = plain_table("hand", "object", "job", "", whole=("job",))
         for cell in cells:
-            words = _words(cell, dataset.options)
+            words = _cell_text(cell, dataset.options)
             table.add_row(cell.hand, cell.object, cell.job_id[:12], words, style=_STYLES[cell.state])
     else:
         table = plain_table("", *dataset.hands)
@@ -346,7 +346,7 @@ def print_cells(dataset: DatasetView, cells: Sequence[CellView], console: Consol
         for obj in dataset.objects:
             found = [at.get((hand, obj)) for hand in dataset.hands]
             table.add_row(
-                obj, *(Text(_words(cell, dataset.options), _STYLES[cell.state]) if cell else "" for cell in found)
+                obj, *(Text(_cell_text(cell, dataset.options), _STYLES[cell.state]) if cell else "" for cell in found)
             )
     console.print(table)
     for cell in [cell for cell in cells if cell.reason][:5]:
@@ -380,7 +380,7 @@ def _yield(made: Validated) -> str:
     return f"at {valid_yield(made)}" if made.validated else "not validated"
 
 
-def _words(cell: CellView, options: JobOptions) -> str:
+def _cell_text(cell: CellView, options: JobOptions) -> str:
     words = [cell.state.value]
     if cell.state is State.RUNNING:
         words.append(percent(cell.progress))

@@ -10,7 +10,7 @@ import typer
 
 from graspd.api.formatting import count, minute
 from graspd.client.client import path_of
-from graspd.client.reports import UrlOption, YesOption, confirm, open_client, print_rows, restore, say_deleted
+from graspd.client.reports import UrlOption, YesOption, confirm, open_client, print_rows, report_deletion, restore
 from graspd.service.cli import CommandGroup, JsonFlag, report
 from graspd.service.model.errors import InputError
 
@@ -51,7 +51,7 @@ def add_tag(
     """Tag grasps; a new tag is created."""
     body = {"name": tag, **_selection(grasps, where=where, job=job, dataset=dataset)}
     with open_client(url) as client:
-        _tell(client.send("POST", "/v1/tags", json=body).json(), "tagged with", json=json)
+        _report_change(client.send("POST", "/v1/tags", json=body).json(), "tagged with", json=json)
 
 
 @app.command("remove", epilog='graspd tags remove good --where "penetration_depth_mm > 1"')
@@ -69,7 +69,7 @@ def remove_tag(
     if "filter" in body:
         body["filter"]["tag"] = tag
     with open_client(url) as client:
-        _tell(client.send("POST", path_of("tags", tag, "remove"), json=body).json(), "removed from", json=json)
+        _report_change(client.send("POST", path_of("tags", tag, "remove"), json=body).json(), "removed from", json=json)
 
 
 @app.command("delete", epilog="graspd tags delete good")
@@ -80,7 +80,7 @@ def delete_tag(tag: NameArgument, yes: YesOption = False, url: UrlOption = None,
         has = client.send("GET", path).json()["grasps"]
         confirm(f"Delete the tag {tag} of {count(has)} grasps?", f"the tag {tag}", yes=yes)
         client.delete(path)
-    say_deleted("tag", tag, json=json, undo=f"graspd tags restore {shlex.quote(tag)}")
+    report_deletion("tag", tag, json=json, undo=f"graspd tags restore {shlex.quote(tag)}")
 
 
 @app.command("restore", epilog="graspd tags restore good")
@@ -119,7 +119,7 @@ def _selection(grasps: list[str] | None, **filters: str | None) -> dict[str, Any
     return {"grasps": [{"shard_id": shard, "row": int(row)} for shard, _, row in places]}
 
 
-def _tell(change: dict[str, Any], words: str, *, json: bool) -> None:
+def _report_change(change: dict[str, Any], words: str, *, json: bool) -> None:
     tag = change["tag"]
     line = f"{count(change['changed'])} grasps {words} {tag['name']}; {count(tag['grasps'])} grasps have the tag"
     report(change, line, json=json)

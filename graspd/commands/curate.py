@@ -47,7 +47,7 @@ def where(
     found = write_subset(
         shards_of(source), lambda some: [test(shard.arrays, shard.attributes) for shard in some], out, said=said
     )
-    _tell(found, out, json=json)
+    _report(found, out, json=json)
 
 
 @app.command(epilog="graspd datasets balance kitchen --by type,direction -o even")
@@ -72,10 +72,10 @@ def balance(
     kinds = [one.strip() for one in by.split(",") if one.strip()]
     chooser = Balance(kinds, at_most, min_distance, seed, hand)
     said = {"balance": kinds, "from": source, "at_most": at_most, "min_distance": min_distance, "seed": seed}
-    _tell(write_subset(shards_of(source), chooser, out, said=said), out, json=json)
+    _report(write_subset(shards_of(source), chooser, out, said=said), out, json=json)
 
 
-def _tell(found: dict[str, int], out: Path, *, json: bool) -> None:
+def _report(found: dict[str, int], out: Path, *, json: bool) -> None:
     line = f"{out}: {found['kept']} of {found['looked_at']} grasps in {found['shards']} shards"
     report({"folder": str(out), **found}, line, json=json)
     if found["passed_over"] and not json:

@@ -46,13 +46,13 @@ def run_child(arguments: Sequence[str]) -> subprocess.CompletedProcess[str]:
 
 def gpu(settings: Settings, *, child: Child = run_child, has_driver: Callable[[], bool] | None = None) -> Finding:
     """Check which GPUs Warp finds, and whether their memory is free; `has_driver`: a driver seems to be installed."""
-    found, wrong = _answer(child, ["gpus"])
+    found, wrong = _run_check(child, ["gpus"])
     if wrong:
         return bad(
             f"the GPUs cannot be queried: {wrong}", "see nvidia-smi and dmesg; restart the driver or the machine"
         )
     gpus: list[dict[str, Any]] = found["gpus"]
-    needed = f"the driver has CUDA {_dotted(found['driver'])}, Warp is built for {_dotted(found['toolkit'])}"
+    needed = f"the driver has CUDA {_version(found['driver'])}, Warp is built for {_version(found['toolkit'])}"
     fix = "install driver R580 or newer; in containers the NVIDIA container toolkit, --gpus all; CUDA_VISIBLE_DEVICES"
     if not gpus:
         if settings.device.startswith("cuda"):
@@ -77,7 +77,7 @@ def gpu(settings: Settings, *, child: Child = run_child, has_driver: Callable[[]
 
 def kernels(settings: Settings, *, child: Child = run_child) -> Finding:
     """Check that the engine gives plausible results, as a worker does before its first task."""
-    found, wrong = _answer(child, ["kernels", settings.device])
+    found, wrong = _run_check(child, ["kernels", settings.device])
     if wrong:
         return bad(
             f"the engine does not run: {wrong}",
@@ -89,7 +89,7 @@ def kernels(settings: Settings, *, child: Child = run_child) -> Finding:
     return good(f"plausible grasps, scenes and pictures of a ball on {found['device']}; kernel cache {found['cache']}")
 
 
-def _answer(child: Child, arguments: Sequence[str]) -> tuple[dict[str, Any], str]:
+def _run_check(child: Child, arguments: Sequence[str]) -> tuple[dict[str, Any], str]:
     try:
         done = child(arguments)
     except subprocess.TimeoutExpired as error:
@@ -101,7 +101,7 @@ def _answer(child: Child, arguments: Sequence[str]) -> tuple[dict[str, Any], str
         return {}, f"ended by signal {-done.returncode}" if done.returncode < 0 else tail
 
 
-def _dotted(version: Sequence[int] | None) -> str:
+def _version(version: Sequence[int] | None) -> str:
     return ".".join(map(str, version)) if version else "nothing"
 
 
@@ -109,7 +109,7 @@ def _has_driver() -> bool:
     return any(trace.exists() for trace in _TRACES) or shutil.which("nvidia-smi") is not None
 
 
-def _tell_gpus() -> dict[str, Any]:
+def _report_gpus() -> dict[str, Any]:
     import warp as wp
 
     from graspd.worker.engines import backend
@@ -122,7 +122,7 @@ def _tell_gpus() -> dict[str, Any]:
     return {"driver": wp.get_cuda_driver_version(), "toolkit": wp.get_cuda_toolkit_version(), "gpus": found}
 
 
-def _tell_kernels(wanted: str) -> dict[str, Any]:
+def _report_kernels(wanted: str) -> dict[str, Any]:
     import warp as wp
 
     from graspd.worker.engines import backend
@@ -139,7 +139,7 @@ def _tell_kernels(wanted: str) -> dict[str, Any]:
 
 
 def main(arguments: Sequence[str]) -> None:
-    told = _tell_gpus() if arguments[0] == "gpus" else _tell_kernels(arguments[1])
+    told = _report_gpus() if arguments[0] == "gpus" else _report_kernels(arguments[1])
     sys.stdout.write(f"{json.dumps(told)}\n")
     sys.stdout.flush()
     # A regular exit of Warp takes seconds, and there is nothing to save.

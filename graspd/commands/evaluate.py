@@ -15,7 +15,7 @@ from graspd.exchange.inputs import expand, load_case
 from graspd.service.cli import CommandGroup, JsonFlag, emit, plain_console, write_output
 from graspd.service.model.errors import InputError, one_of
 from graspd.service.model.metrics import AXIS_MEANINGS, MOST_ROBUST_MODELS
-from graspd.service.store.shards import carried, json_attribute, read_shard, write_shard
+from graspd.service.store.shards import carried_attributes, json_attribute, read_shard, write_shard
 from graspd.studies.evaluation import Protocol, combine, evaluate
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.files.subsets import require_empty
@@ -89,7 +89,7 @@ def evaluate_command(
     json: JsonFlag = False,
 ) -> None:
     """Measure grasps and validate them in an independent engine. Metrics are medians, ε and areas at 5 mm."""
-    level = _checked_level(protocol, level)
+    level = _validate_level(protocol, level)
     if robust and protocol == "displacement":
         raise InputError(
             "--robust repeats pushes or lifts in perturbed models: choose --protocol dexgraspbench or lift"
@@ -125,13 +125,13 @@ def evaluate_command(
                 models=robust,
                 validation_hand=twin,
                 tell=partial(write_copy, file, copies[file]) if copies else lambda found: None,
-                run=ExecutionContext(threads=threads, progress=partial(_show, bar, task, case.name)),
+                run=ExecutionContext(threads=threads, progress=partial(_update_bar, bar, task, case.name)),
             )
             rows.append({"file": str(file), **row})
-    _tell(rows, other.name if other else "", json=json)
+    _report(rows, other.name if other else "", json=json)
 
 
-def _checked_level(protocol: str, level: str) -> str:
+def _validate_level(protocol: str, level: str) -> str:
     """Return the level, or the protocol's default if empty; InputError for an invalid one."""
     if protocol not in get_args(Protocol):
         raise InputError(f"unknown protocol {protocol!r}; choose {one_of(protocol, get_args(Protocol))}")
@@ -142,7 +142,7 @@ def _checked_level(protocol: str, level: str) -> str:
     return level
 
 
-def _tell(rows: list[dict[str, Any]], foreign: str, *, json: bool) -> None:
+def _report(rows: list[dict[str, Any]], foreign: str, *, json: bool) -> None:
     whole = combine([{key: value for key, value in row.items() if key != "file"} for row in rows])
     if json:
         verdicts = [{"file": row["file"], **one} for row in rows for one in row.pop("verdicts", [])]
@@ -150,7 +150,7 @@ def _tell(rows: list[dict[str, Any]], foreign: str, *, json: bool) -> None:
     else:
         plain_console().print(_table(rows, whole))
         if whole.get("robust_share") is not None:
-            typer.echo(_said_of_models(whole))
+            typer.echo(_format_robustness(whole))
         if "foreign_held" in whole:
             typer.echo(_foreign(whole, foreign))
         for row in rows:
@@ -173,7 +173,7 @@ def _copies(paths: list[Path], files: list[Path], out: Path | None, *, robust: i
     return {files[0]: out}
 
 
-def _said_of_models(whole: dict[str, Any]) -> str:
+def _format_robustness(whole: dict[str, Any]) -> str:
     words = {axis.word: name for axis, name in AXIS_MEANINGS.items()}
     axes = sorted(whole["robust_axes"].items(), key=lambda pair: pair[1]["share"])
     each = ", ".join(f"{words[axis]} {one['share']:.2f}" for axis, one in axes)
@@ -193,7 +193,7 @@ def _joint_map(text: str | None) -> dict[str, str]:
     return found
 
 
-def _show(bar: Progress, task: TaskID, name: str, done: float, total: float, what: str) -> None:
+def _update_bar(bar: Progress, task: TaskID, name: str, done: float, total: float, what: str) -> None:
     bar.update(task, completed=done, total=total, description=f"{name}: {what}")
 
 
@@ -239,7 +239,7 @@ def write_copy(source: Path, out: Path, found: Robustness) -> None:
     """Write a base shard with the robust shares of its grasps; all else, including its id, is unchanged."""
     shard = read_shard(source, kind="base")
     said = json_attribute({"models": found.held.shape[1], "wanted": found.wanted})
-    data = write_shard("base", {**shard.arrays, **found.columns}, {**carried(shard), "robust": said})
+    data = write_shard("base", {**shard.arrays, **found.columns}, {**carried_attributes(shard), "robust": said})
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         write_output(out, data)

@@ -22,7 +22,7 @@ from graspd.exchange.robots.execution import (
 )
 from graspd.service.model.scene_spec import SceneSpec, supports_in
 from graspd.service.model.transforms import compose, invert
-from graspd.service.readers.trajectories import Waypoint, scene_spec_of, way_of, wrists_of
+from graspd.service.readers.trajectories import Waypoint, scene_spec_of, trajectory_of, wrists_of
 from graspd.service.store.shards import Shard
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.files.provenance import neighbours_of_shard, placed_of_shard
@@ -74,37 +74,38 @@ class GraspSheet:
         title += f", {self.scene}" if self.scene else ""
         captions = figures(self.shard.arrays, self.rows)
         if self.kind == "way":
-            names, drawn = self._ways()
+            names, drawn = self._strip_pictures()
             below = [[f"{k + 1}   " + ",  ".join(" ".join(pair) for pair in one)] for k, one in enumerate(captions)]
             cells = [[Image.fromarray(picture) for picture in strip] for strip in drawn]
             return label_page(cells, names, below, title=title, subtitle=subtitle)
-        drawn = self._alone()
+        drawn = self._grasp_pictures()
         if self.kind == "three sides":
             return three_sides_sheet(drawn, captions, title=title, subtitle=subtitle)
         return contact_sheet(drawn[:, 0], captions, title=title, subtitle=subtitle)
 
-    def _ways(self) -> tuple[tuple[str, ...], NDArray[np.uint8]]:
+    def _strip_pictures(self) -> tuple[tuple[str, ...], NDArray[np.uint8]]:
         """Return the names of the postures, and their pictures (N, F, H, W, 3)."""
-        ways = [way_of(self.shard, int(row)) for row in self.rows]
+        ways = [trajectory_of(self.shard, int(row)) for row in self.rows]
         names = STRIP if any(point.name == "lift" for point in ways[0]) else FREE_STRIP
-        drawn = self._drawn([[_named(way, name) for name in names] for way in ways], 1)
+        drawn = self._render([[_waypoint(way, name) for name in names] for way in ways], 1)
         return names, drawn[:, 0]
 
-    def _alone(self) -> NDArray[np.uint8]:
+    def _grasp_pictures(self) -> NDArray[np.uint8]:
         """Return pictures at the grasp (N, A, H, W, 3)."""
         sides = 3 if self.kind == "three sides" else 1
         if self.scene:
-            return self._drawn([[_named(way_of(self.shard, int(row)), "grasp")] for row in self.rows], sides)[:, :, 0]
+            ways = [trajectory_of(self.shard, int(row)) for row in self.rows]
+            return self._render([[_waypoint(way, "grasp")] for way in ways], sides)[:, :, 0]
         shown, samples = Posture.from_columns(self.shard.arrays).take(self.rows), LOOKS[self.kind][1]
         at = (shown.hand_pose, shown.joint_positions, self.size, THREE_SIDES[:sides])
         return grasp_pictures(self.hand, self.obj, *at, run=self.run, samples=samples)
 
-    def _drawn(self, frames: list[list[Waypoint]], sides: int) -> NDArray[np.uint8]:
-        around, samples = around_of(self.shard, self.rows), LOOKS[self.kind][1]
+    def _render(self, frames: list[list[Waypoint]], sides: int) -> NDArray[np.uint8]:
+        around, samples = surroundings_of(self.shard, self.rows), LOOKS[self.kind][1]
         return way_pictures(self.hand, self.obj, frames, around, self.size, sides=sides, run=self.run, samples=samples)
 
 
-def around_of(shard: Shard, rows: NDArray[np.intp]) -> PictureScenes:
+def surroundings_of(shard: Shard, rows: NDArray[np.intp]) -> PictureScenes:
     """Return the surroundings of grasps of a base shard: the scenes in which they were planned, or none."""
     if (spec := _scene_of(shard)) is None:
         return PictureScenes()
@@ -118,7 +119,7 @@ def _scene_of(shard: Shard) -> SceneSpec | None:
     return None if spec is None or spec.kind == "free" or "grasp/scene_index" not in shard.arrays else spec
 
 
-def _named(way: list[Waypoint], name: str) -> Waypoint:
+def _waypoint(way: list[Waypoint], name: str) -> Waypoint:
     return next(point for point in way if point.name == name)
 
 
@@ -152,26 +153,26 @@ class GraspAnimation:
         pictures: list[NDArray[np.uint8]] = []
         seconds: list[float] = []
         for row in self.rows:
-            found = self._executed(row)
+            found = self._execute(row)
             limits, names = hand_limits(found.hand), found.hand.joint_names
             way = timed(straight_paths(found, 0), names, limits.velocity, speed=SPEED)
-            pictures.append(self._drawn(row, waypoints(found, way)))
+            pictures.append(self._render(row, waypoints(found, way)))
             shown = [STEP_S, *np.diff(way.time).tolist()]
             shown[0] += BEFORE_S
             shown[-1] += AFTER_S
             seconds += shown
         return animation(np.concatenate(pictures), seconds, suffix)
 
-    def _executed(self, row: np.intp) -> Executions:
+    def _execute(self, row: np.intp) -> Executions:
         one, placed = np.array([row]), placed_of_shard(self.shard)
         grasps = GraspSet.from_columns(self.shard.arrays).take(one)
         placed = None if placed is None else placed.take(one)
         tool = tool_frame(None, self.hand.root_link, {})
         return executions(self.hand, self.obj, grasps, rows=one, placed=placed, tool=tool, quality={})
 
-    def _drawn(self, row: np.intp, way: Sequence[Waypoint]) -> NDArray[np.uint8]:
+    def _render(self, row: np.intp, way: Sequence[Waypoint]) -> NDArray[np.uint8]:
         width = self.width or WIDTH
-        around = around_of(self.shard, np.array([row]))
+        around = surroundings_of(self.shard, np.array([row]))
         size = (width, round(HIGH * width))
         (sides,) = way_pictures(
             self.hand, self.obj, [way], around, size, whole=True, run=self.run, samples=FILM_SAMPLES

@@ -16,8 +16,8 @@ from graspd.service.command_options import with_options
 from graspd.service.model.errors import GraspdError, InputError
 from graspd.service.model.states import AssetKind
 from graspd.service.store.asset_options import HandWords, hand_options
-from graspd.service.store.asset_summary import say_check, self_test_lines
-from graspd.service.store.descriptions import described
+from graspd.service.store.asset_summary import print_check, self_test_lines
+from graspd.service.store.descriptions import description_of
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.hands.check import check_hand
 from graspd.worker.hands.load import files_from_path, hand_from_path, main_file
@@ -60,9 +60,9 @@ def check(
     if write and report["verdict"] != "refuse":
         _write(file, options, report, write)
     if not json:
-        say_check(AssetKind.HAND, report)
+        print_check(AssetKind.HAND, report)
     if self_test and report["verdict"] != "refuse":
-        report["self_test"] = _tried(file, options, quiet=json)
+        report["self_test"] = _self_test(file, options, quiet=json)
         if not json:
             for label, says in self_test_lines(report):
                 typer.echo(f"  {label:<18} {says}")
@@ -72,7 +72,7 @@ def check(
         raise typer.Exit(InputError.exit_code)
 
 
-def _tried(file: str, options: dict[str, Any], *, quiet: bool) -> dict[str, Any]:
+def _self_test(file: str, options: dict[str, Any], *, quiet: bool) -> dict[str, Any]:
     from graspd.worker.stages.hand_self_test import tried_softly
 
     with _bar("self-test   ", "starting; the first run on a machine compiles its kernels", quiet=quiet) as run:
@@ -107,7 +107,7 @@ def _write(file: str, options: dict[str, Any], report: dict[str, Any], target: P
     settings = parse_options(files, {**stated, **options})
     said = settings.model_dump(mode="json", exclude_unset=True)
     said["file"] = PurePosixPath(main_file(files, settings)).name
-    text = dumps({**said, **described(report["facts"])}, indent=2)
+    text = dumps({**said, **description_of(report["facts"])}, indent=2)
     try:
         target.write_text(text + "\n")
     except OSError as error:

@@ -12,7 +12,7 @@ from graspd.service.command_options import with_options
 from graspd.service.model.errors import GraspdError, InputError
 from graspd.service.model.object_options import ObjectOptions
 from graspd.service.model.states import AssetKind
-from graspd.service.store.asset_summary import say_check, verdict_line
+from graspd.service.store.asset_summary import print_check, verdict_line
 from graspd.service.store.assets import builtin_names
 from graspd.service.store.object_sets import Objects, files_of_set
 from graspd.worker.objects.check import check_object
@@ -32,7 +32,7 @@ def check(
     json: JsonFlag = False,
 ) -> None:
     """Check whether a mesh can be used; report its repairs and its size. Needs no server."""
-    if several := _several(file):
+    if several := _object_set(file):
         if picture:
             raise InputError(f"--picture draws one object; {file} holds {len(several)}")
         _check_set(several, options, json=json)
@@ -45,12 +45,12 @@ def check(
     if json:
         emit(report)
     else:
-        say_check(AssetKind.OBJECT, report)
+        print_check(AssetKind.OBJECT, report)
     if report["verdict"] == "refuse":
         raise typer.Exit(InputError.exit_code)
 
 
-def _several(file: str) -> Objects | None:
+def _object_set(file: str) -> Objects | None:
     """Return the objects of a folder, or of a ZIP of several; None for one object."""
     if file in builtin_names(AssetKind.OBJECT) and not Path(file).is_file():
         return None

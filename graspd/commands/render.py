@@ -94,7 +94,7 @@ def render(
         channels=parse_channels(channels.split(",")),
         cameras=given,
         neighbours=neighbours_of_shard(scene, with_ or []),
-        drawn=_drawn_in(scene, hand) if scene.kind == "base" else _drawn(scene, with_hand, hand),
+        drawn=_best_grasps(scene, hand) if scene.kind == "base" else _hand_in_pictures(scene, with_hand, hand),
         supports=TABLE if spec is None else supports_in(spec),
     )
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
@@ -110,7 +110,7 @@ def render(
             seed=number,
             baseline_m=baseline,
             extras=extras,
-            run=ExecutionContext(used, progress=partial(_show, bar, task)),
+            run=ExecutionContext(used, progress=partial(_update_bar, bar, task)),
         )
     seconds = perf_counter() - started
     inherited = (*INHERITED, "neighbours", "neighbour_digests", "neighbour_sources")
@@ -203,10 +203,10 @@ def _scenes(path: Path) -> Shard:
     return shard
 
 
-def _drawn_in(base: Shard, hand: str | None) -> DrawnHand | None:
+def _best_grasps(base: Shard, hand: str | None) -> DrawnHand | None:
     """Return the best valid grasp of each scene of a base shard; if not validated, the best feasible."""
     validated = validity.valid(base.arrays).any()
-    rows = best_in_scenes(base.arrays, validity.chosen(base.arrays, unvalidated=not validated))
+    rows = best_in_scenes(base.arrays, validity.selection(base.arrays, unvalidated=not validated))
     if not len(base["grasp/hand_pose"]):
         return None
     poses, joints = (np.asarray(base[f"grasp/{name}"], float)[rows] for name in ("hand_pose", "joint_positions"))
@@ -214,7 +214,7 @@ def _drawn_in(base: Shard, hand: str | None) -> DrawnHand | None:
     return DrawnHand(hand_of_shard(base, hand), rows, placed, joints, wrists_of(base, rows))
 
 
-def _drawn(scene: Shard, base_file: Path | None, hand: str | None) -> DrawnHand | None:
+def _hand_in_pictures(scene: Shard, base_file: Path | None, hand: str | None) -> DrawnHand | None:
     """Return the best clear grasp of each scene by epsilon, for `--with-hand`."""
     if base_file is None:
         return None
@@ -231,7 +231,7 @@ def _drawn(scene: Shard, base_file: Path | None, hand: str | None) -> DrawnHand 
     return DrawnHand(model, rows, poses, joints, wrists_of(scene, rows))
 
 
-def _show(bar: Progress, task: TaskID, done: float, total: float, message: str) -> None:
+def _update_bar(bar: Progress, task: TaskID, done: float, total: float, message: str) -> None:
     bar.update(task, completed=done, total=total, description=message)
 
 

@@ -19,7 +19,7 @@ from graspd.service.model.cores import available_cores
 from graspd.service.model.errors import InputError, one_of
 from graspd.service.model.fidelity import FIDELITIES, OFFERED, Fidelity
 from graspd.service.model.metrics import ROBUST_MODELS
-from graspd.service.model.renamed import renamed_chart
+from graspd.service.model.renamed import convert_chart
 from graspd.service.model.scene_spec import SceneSpec, parse_scene
 from graspd.service.model.studies import Stability, from_json
 from graspd.service.model.version import PACKAGE_VERSION
@@ -65,7 +65,7 @@ def bench(
         device=resolved,
         repeats=repeats,
         joins=join or [1],
-        say=_say,
+        say=_echo,
     )
     if out is not None:
         write(result, out)
@@ -74,14 +74,14 @@ def bench(
 
 def _fidelities(names: list[str] | None, points: list[int] | None, errors: list[float] | None) -> list[Fidelity]:
     """Return the named fidelities, then variants of the first one with one setting changed at a time."""
-    chosen = _known(names or OFFERED)
+    chosen = _check_fidelities(names or OFFERED)
     found = [FIDELITIES[name] for name in chosen]
     changes: list[dict[str, Any]] = [{"fine_points": n, "name": f"{chosen[0]}/points={n}"} for n in points or []]
     changes += [{"face_error_m": e, "name": f"{chosen[0]}/error={dumps(e)}"} for e in errors or []]
     return found + [Fidelity(**(found[0].model_dump() | change)) for change in changes]
 
 
-def _known(fidelities: Sequence[str]) -> list[str]:
+def _check_fidelities(fidelities: Sequence[str]) -> list[str]:
     for name in fidelities:
         if name not in FIDELITIES:
             raise InputError(f"unknown fidelity {name!r}; choose one of {one_of(name, FIDELITIES)}")
@@ -117,10 +117,10 @@ def stability(
     if unknown := [name for name in only or [] if name not in STUDIES]:
         raise InputError(f"there is no study {unknown[0]!r}; choose one of {one_of(unknown[0], STUDIES)}")
     if source:
-        found = _joined([_read_maps(path) for path in source])
+        found = _merge([_read_maps(path) for path in source])
         found = replace(found, maps=[one for one in found.maps if not only or one.name in only])
     else:
-        found = _measured(tuple(only or STUDIES), hand, object_, quick=quick, long=long, threads=threads)
+        found = _measure(tuple(only or STUDIES), hand, object_, quick=quick, long=long, threads=threads)
     if out is not None:
         write(found, out)
     key = _publish(STABILITY, found.as_json(), data_dir) if publish else None
@@ -130,7 +130,7 @@ def stability(
     report(told, markdown(found), json=json)
 
 
-def _measured(names: tuple[str, ...], hand: str, obj: str, *, quick: bool, long: bool, threads: int) -> Stability:
+def _measure(names: tuple[str, ...], hand: str, obj: str, *, quick: bool, long: bool, threads: int) -> Stability:
     from graspd.worker.engines import backend
 
     backend.start()
@@ -138,7 +138,7 @@ def _measured(names: tuple[str, ...], hand: str, obj: str, *, quick: bool, long:
 
     from graspd.studies.stability.studies import run
 
-    maps = run(names, hand, obj, quick=quick, long=long, work=ExecutionContext(threads=threads), say=_say)
+    maps = run(names, hand, obj, quick=quick, long=long, work=ExecutionContext(threads=threads), say=_echo)
     command = shlex.join(["graspd", *(Path(word).name if "/" in word else word for word in sys.argv[1:])])
     return Stability(timestamp(), command, {"graspd": PACKAGE_VERSION, "warp": wp.__version__}, maps)
 
@@ -158,7 +158,7 @@ def _read_maps(path: Path) -> Stability:
     return found
 
 
-def _joined(parts: list[Stability]) -> Stability:
+def _merge(parts: list[Stability]) -> Stability:
     """Merge several runs; of maps with the same name, the later one counts."""
     maps = {one.name: one for part in parts for one in part.maps}
     commands = "; ".join(dict.fromkeys(part.command for part in parts))
@@ -167,11 +167,11 @@ def _joined(parts: list[Stability]) -> Stability:
 
 def _publish(kind: str, document: dict[str, Any], data_dir: Path | None) -> str:
     key = publish_record(open_store(load_settings(data_dir=data_dir).resolved_store_url), kind, document)
-    _say(f"published as {key}")
+    _echo(f"published as {key}")
     return key
 
 
-def _say(line: str) -> None:
+def _echo(line: str) -> None:
     typer.echo(line, err=True)
 
 
@@ -244,7 +244,7 @@ def chart(
     if quick:
         hands, objects, fidelities = (_parts(text)[0] for text in (hands, objects, fidelities))
         batches, baseline_batch, repeats, models_around = [4], 2, 1, 2
-    levels = _known(_parts(fidelities))
+    levels = _check_fidelities(_parts(fidelities))
     chosen = settings_of(
         _parts(methods),
         levels,
@@ -254,8 +254,8 @@ def chart(
         quick=quick,
         run=on,
     )
-    models, things = [hand_from_path(part) for part in _parts(hands)], _things(_parts(objects))
-    said = {"command": shlex.join(["graspd", *(_short(word) for word in sys.argv[1:])]), "remark": remark}
+    models, things = [hand_from_path(part) for part in _parts(hands)], _chart_objects(_parts(objects))
+    said = {"command": shlex.join(["graspd", *(_without_folders(word) for word in sys.argv[1:])]), "remark": remark}
 
     def keep(so_far: dict[str, Any]) -> None:
         if out is not None:
@@ -264,15 +264,15 @@ def chart(
     if place is None:
         from graspd.studies.chart.chart import chart as run
 
-        result = run(models, things, chosen, repeats=repeats, models=models_around, say=_say, keep=keep)
+        result = run(models, things, chosen, repeats=repeats, models=models_around, say=_echo, keep=keep)
     else:
         from graspd.studies.chart.scenes import scene_chart
 
-        result = scene_chart(models, things, chosen, place, models=models_around, work=work, say=_say, keep=keep)
+        result = scene_chart(models, things, chosen, place, models=models_around, work=work, say=_echo, keep=keep)
     result |= said
     if sweep:
         result["sweeps"] = turn(
-            models[0], things[0], batch=batches[0], repeats=repeats, quick=quick, run=on, knobs=knob or (), say=_say
+            models[0], things[0], batch=batches[0], repeats=repeats, quick=quick, run=on, knobs=knob or (), say=_echo
         )
     _finish(result, out, data_dir, publish=publish, json=json)
 
@@ -289,7 +289,7 @@ def _finish(result: dict[str, Any], out: Path | None, data_dir: Path | None, *, 
 
 def _read_chart(path: Path) -> dict[str, Any]:
     def parse(document: Any) -> dict[str, Any]:
-        found = renamed_chart(document)
+        found = convert_chart(document)
         if not isinstance(found, dict) or not {"created", "runs"} <= found.keys():
             raise ValueError("no chart")
         return found
@@ -310,7 +310,7 @@ def _place(scene: str) -> SceneSpec | None:
     return spec if spec.target is not None else parse_scene(scene, faces="all")
 
 
-def _short(word: str) -> str:
+def _without_folders(word: str) -> str:
     """Remove local folders from a word of the command line, because they differ between machines."""
 
     def one(part: str) -> str:
@@ -334,7 +334,7 @@ def _number(text: str) -> int:
     return int(text)
 
 
-def _things(objects: Sequence[str]) -> list[Any]:
+def _chart_objects(objects: Sequence[str]) -> list[Any]:
     from graspd.studies.chart.chart import ChartObject
     from graspd.worker.objects.prepare import name_of, object_from_path
 

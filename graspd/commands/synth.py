@@ -14,11 +14,11 @@ import typer
 from graspd.service.cli import (
     CommandGroup,
     JsonFlag,
+    catch_stop_signals,
     engine_settings,
     fail,
     plain_console,
     report,
-    told_to_stop,
     write_output,
 )
 from graspd.service.command_options import pairs, parsed_options, with_options
@@ -60,7 +60,7 @@ def synth(
     if "payload" not in options and asked.place.kind != "free" and asked.validation != "none":
         asked = asked.model_copy(update={"payload": asked.mass is not None or asked.density is not None})
     settings = engine_settings()
-    with told_to_stop() as stop, _bar(quiet=json) as progress:
+    with catch_stop_signals() as stop, _bar(quiet=json) as progress:
         try:
             made = synthesized_as(
                 hand,
@@ -77,7 +77,7 @@ def synth(
         shard = write_shard("base", made.arrays, {**made.attributes, "shard_id": id_of_columns(made.arrays)})
         write_output(out, shard)
     found = {"file": str(out), **made.summary()}
-    report(found, _said(found | ({"reason": None} if made.interrupted else {})), json=json)
+    report(found, _format_summary(found | ({"reason": None} if made.interrupted else {})), json=json)
     if made.interrupted:
         fail(f"interrupted: {out} contains {found['grasps']} of {asked.grasps} grasps", 128 + stop[0])
     if made.reason is not None:
@@ -106,7 +106,7 @@ def _bar(*, quiet: bool) -> Iterator[Report]:
         yield tell
 
 
-def _said_of_models(found: dict[str, Any]) -> str:
+def _format_robustness(found: dict[str, Any]) -> str:
     share, not_robust = found["robust_share"], found["not_robust"]
     if share is None:
         return (
@@ -119,7 +119,7 @@ def _said_of_models(found: dict[str, Any]) -> str:
     return f"each grasp holds in at least {wanted:.0%} {models}; {not_robust} held grasps are not robust"
 
 
-def _said(found: dict[str, Any]) -> str:
+def _format_summary(found: dict[str, Any]) -> str:
     validated, mean = found["validation"] != "none", found["mean"]
     word = "valid" if validated else "feasible"
     lines = [
@@ -129,7 +129,7 @@ def _said(found: dict[str, Any]) -> str:
         f"{found['grasps_per_second']:.1f} grasps/s"
     ]
     if "robust_share" in found:
-        lines.append(_said_of_models(found))
+        lines.append(_format_robustness(found))
     if found["grasps"]:
         lines[0] += (
             f"; mean epsilon {mean['epsilon']:.3f}, contact {mean['contact_area_cm2']:.1f} cm^2, "

@@ -12,9 +12,9 @@ from typing import Annotated
 
 import typer
 
-from graspd.service.cli import CommandGroup, JsonFlag, keep_private, load_settings, log_to_stderr, report
+from graspd.service.cli import CommandGroup, JsonFlag, load_settings, log_to_stderr, report, restrict_file_access
 from graspd.service.model.errors import InputError, UnavailableError
-from graspd.service.model.libraries import imports
+from graspd.service.model.libraries import pause_garbage_collection
 from graspd.service.model.states import Stage
 from graspd.service.settings import Settings
 
@@ -50,7 +50,7 @@ def worker(
     """Run one or several workers, each on one device, until stopped."""
     settings = load_settings(device=device, threads=threads, join=join, processes=processes, data_dir=data_dir)
     log_to_stderr(settings, "worker")
-    keep_private(settings)
+    restrict_file_access(settings)
     if check:
         check_worker(settings)
         return
@@ -65,7 +65,7 @@ def worker(
         arguments += ["--data-dir", str(settings.data_dir), *(("--stages", stages) if stages else ())]
         run_workers(workers, arguments, settings, stop_on_signals())
         return
-    with imports():
+    with pause_garbage_collection():
         from graspd.worker.process.main import run_worker
 
     ended_well = run_worker(

@@ -15,9 +15,9 @@ from graspd.service.index.database import (
     REVISION_TABLE,
     UNUSABLE,
     connect_postgres,
-    mapped,
+    convert_errors,
     revision_of,
-    unusable,
+    url_error,
 )
 from graspd.service.model.errors import IndexDamaged, IndexUnavailable
 
@@ -42,18 +42,18 @@ class IndexCondition:
         return bool(self.revision) and self.revision == self.newest
 
 
-def look(url: str | URL) -> IndexCondition | None:
+def read_condition(url: str | URL) -> IndexCondition | None:
     """Return the condition of an index; None without a file. Errors as in `Database`, and IndexDamaged."""
     try:
         parsed = make_url(url)
         if parsed.get_backend_name() == "sqlite":
-            return _look_at_file(Path(str(parsed.database)))
-        return _look_at_postgres(url)
+            return _file_condition(Path(str(parsed.database)))
+        return _postgres_condition(url)
     except UNUSABLE as error:
-        raise unusable(error) from None
+        raise url_error(error) from None
 
 
-def _look_at_file(path: Path) -> IndexCondition | None:
+def _file_condition(path: Path) -> IndexCondition | None:
     if not path.exists():
         return None
     try:
@@ -71,10 +71,10 @@ def _look_at_file(path: Path) -> IndexCondition | None:
     return IndexCondition(f"SQLite {sqlite3.sqlite_version}", rows[0][0] if rows else "", REVISION)
 
 
-def _look_at_postgres(url: str | URL) -> IndexCondition:
+def _postgres_condition(url: str | URL) -> IndexCondition:
     engine = connect_postgres(url)
     try:
-        with mapped(), engine.connect() as connection:
+        with convert_errors(), engine.connect() as connection:
 
             def ask(question: str) -> str:
                 return str(connection.scalar(text(question)))

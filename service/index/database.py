@@ -79,7 +79,7 @@ class Database:
         try:
             self._engine = self._open()
         except IndexDamaged:
-            self._put_aside()
+            self._move_damaged_file()
             self._engine = self._open()
 
     @contextmanager
@@ -88,7 +88,7 @@ class Database:
         if within is not None:
             yield within
             return
-        with self._fixed(), self._present().connect() as connection:
+        with self._handle_errors(), self._current_engine().connect() as connection:
             if connection.dialect.name == "sqlite":
                 connection.exec_driver_sql("BEGIN")
             else:
@@ -105,7 +105,7 @@ class Database:
         if within is not None:
             yield within
             return
-        with self._fixed(), self._write_lock, self._present().connect() as connection:
+        with self._handle_errors(), self._write_lock, self._current_engine().connect() as connection:
             if connection.dialect.name == "sqlite":
                 # A transaction that reads before it writes fails at once if another one writes in between.
                 connection.exec_driver_sql("BEGIN IMMEDIATE")
@@ -132,7 +132,7 @@ class Database:
     def among(self, query: Select[Any], column: ColumnElement[Any], wanted: Iterable[Any]) -> list[Any]:
         """Return the rows whose column has one of the wanted values; the number of values is unlimited."""
         with self.reading() as connection:
-            return list(rows_among(connection, query, column, wanted))
+            return list(rows_in(connection, query, column, wanted))
 
     def value(self, query: Select[Any], within: Connection | None = None) -> Any:
         """Return the first column of the first row; None without rows."""
@@ -151,19 +151,19 @@ class Database:
     def _open(self) -> Engine:
         engine = _engine(self._url)
         try:
-            with mapped(), self._file.opening() if self._file is not None else nullcontext():
-                self._note_identity()
+            with convert_errors(), self._file.opening() if self._file is not None else nullcontext():
+                self._store_identity()
                 self.was = _make_tables(engine, anew=self._anew) or self.was
-                self._note_identity()
+                self._store_identity()
         except BaseException:
             engine.dispose()
             raise
         return engine
 
-    def _note_identity(self) -> None:
+    def _store_identity(self) -> None:
         self._identity = self._file.identity() if self._file is not None else None
 
-    def _present(self) -> Engine:
+    def _current_engine(self) -> Engine:
         """Return the engine; a new one if the file was removed or replaced meanwhile."""
         if self._file is not None and self._file.identity() != self._identity:
             with self._opening:
@@ -174,18 +174,18 @@ class Database:
         return self._engine
 
     @contextmanager
-    def _fixed(self) -> Iterator[None]:
+    def _handle_errors(self) -> Iterator[None]:
         """Convert errors; move a damaged file away, so that the next call makes a new file."""
         try:
-            with mapped():
+            with convert_errors():
                 yield
         except IndexDamaged:
-            self._put_aside()
+            self._move_damaged_file()
             raise
 
-    def _put_aside(self) -> None:
+    def _move_damaged_file(self) -> None:
         if self._file is not None:
-            with mapped(), self._file.opening():
+            with convert_errors(), self._file.opening():
                 self._file.set_aside(self._identity)
 
 
@@ -199,7 +199,7 @@ def chunks(ids: Sequence[T], size: int = 1000) -> Iterable[Sequence[T]]:
     return (ids[start : start + size] for start in range(0, len(ids), size))
 
 
-def rows_among(
+def rows_in(
     connection: Connection, query: Select[Any], column: ColumnElement[Any], wanted: Iterable[Any]
 ) -> Iterator[Any]:
     for some in chunks(list(wanted)):
@@ -212,7 +212,7 @@ def _file_of(url: str | URL) -> SqliteFile | None:
         parsed = make_url(url)
         is_file = parsed.get_backend_name() == "sqlite" and parsed.database and parsed.database != ":memory:"
     except UNUSABLE as error:
-        raise unusable(error) from None
+        raise url_error(error) from None
     return SqliteFile(Path(str(parsed.database))) if is_file else None
 
 
@@ -220,12 +220,12 @@ def _engine(url: str | URL) -> Engine:
     try:
         return _sqlite_engine(url) if make_url(url).get_backend_name() == "sqlite" else connect_postgres(url)
     except UNUSABLE as error:
-        raise unusable(error) from None
+        raise url_error(error) from None
 
 
-def unusable(error: Exception) -> InputError:
+def url_error(error: Exception) -> InputError:
     """Return the error for an unusable index URL, without SQLAlchemy's text, which may contain a password."""
-    why = f" ({_line(error)})" if isinstance(error, NoSuchModuleError | ModuleNotFoundError) else ""
+    why = f" ({_error_line(error)})" if isinstance(error, NoSuchModuleError | ModuleNotFoundError) else ""
     return InputError(
         f"the index URL (GRASPD_INDEX_URL) cannot be used{why}; give sqlite:///PATH or "
         "postgresql+psycopg://HOST/NAME, and in a password %2F for / and %40 for @"
@@ -264,11 +264,11 @@ def _sqlite_engine(url: str | URL) -> Engine:
 def _make_tables(engine: Engine, *, anew: bool) -> str:
     """Make missing tables; return the revision of dropped ones, else ""."""
     dropped = ""
-    with _making(engine) as connection:
+    with _schema_transaction(engine) as connection:
         found = revision_of(connection)
         if found and found != REVISION:
             if not anew:
-                raise IndexUnavailable(_of_another_revision(found))
+                raise IndexUnavailable(_revision_mismatch(found))
             there = MetaData()
             there.reflect(connection)
             there.drop_all(connection)
@@ -289,7 +289,7 @@ def revision_of(connection: Connection) -> str:
     return str(connection.scalar(text(f"SELECT version_num FROM {REVISION_TABLE}")) or "")
 
 
-def _of_another_revision(found: str) -> str:
+def _revision_mismatch(found: str) -> str:
     if found > REVISION:
         return (
             f"the index was made by a newer graspd (revision {found}, here {REVISION}); use that, or delete the index"
@@ -298,7 +298,7 @@ def _of_another_revision(found: str) -> str:
 
 
 @contextmanager
-def _making(engine: Engine) -> Iterator[Connection]:
+def _schema_transaction(engine: Engine) -> Iterator[Connection]:
     """Yield a transaction while no other process makes tables; all of it is committed, or nothing."""
     with engine.connect() as connection:
         if connection.dialect.name == "postgresql":
@@ -316,24 +316,24 @@ def _making(engine: Engine) -> Iterator[Connection]:
 
 
 @contextmanager
-def mapped() -> Iterator[None]:
+def convert_errors() -> Iterator[None]:
     """Convert errors of the database to InputError, IndexDamaged or IndexUnavailable."""
     try:
         yield
     except DataError as error:
         # The value is invalid, not the database: retries would never end.
-        raise InputError(f"the index cannot store this value: {_line(error)}") from error
+        raise InputError(f"the index cannot store this value: {_error_line(error)}") from error
     except (OverflowError, UnicodeEncodeError):
         raise InputError("the index stores only whole numbers below 2^63 and Unicode text; give such values") from None
     except SQLAlchemyError as error:
         if getattr(getattr(error, "orig", None), "sqlite_errorcode", 0) & 0xFF in _DAMAGED:
             raise IndexDamaged(
-                f"the index is damaged ({_line(error)}); a new one replaces it and is filled from the store"
+                f"the index is damaged ({_error_line(error)}); a new one replaces it and is filled from the store"
             ) from error
-        raise IndexUnavailable(f"the index does not answer or cannot be written: {_line(error)}") from error
+        raise IndexUnavailable(f"the index does not answer or cannot be written: {_error_line(error)}") from error
 
 
-def _line(error: Exception) -> str:
+def _error_line(error: Exception) -> str:
     original = getattr(error, "orig", None) or error
     return (str(original).strip().splitlines() or [type(original).__name__])[0]
 
@@ -377,14 +377,14 @@ class SqliteFile:
         """Hold the lock among processes, and remove files that belonged to a missing database."""
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            lock = self._beside(".lock").open("w")
+            lock = self._sidecar(".lock").open("w")
         except OSError as error:
             raise IndexUnavailable(f"the index {self.path} cannot be opened: {error.strerror}") from None
         with lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             if self.identity() is None:
                 for name in _COMPANIONS:
-                    self._beside(name).unlink(missing_ok=True)
+                    self._sidecar(name).unlink(missing_ok=True)
             yield
 
     def set_aside(self, damaged: Identity) -> None:
@@ -394,10 +394,10 @@ class SqliteFile:
         suffix = f".damaged-{datetime.now(UTC):%Y%m%dT%H%M%S}"
         log.error("the index %s is damaged and moved to %s%s; a new one replaces it", self.path, self.path, suffix)
         for name in ("", *_COMPANIONS):
-            if (found := self._beside(name)).exists():
+            if (found := self._sidecar(name)).exists():
                 found.rename(found.with_name(f"{self.path.name}{suffix}{name}"))
 
-    def _beside(self, name: str) -> Path:
+    def _sidecar(self, name: str) -> Path:
         return self.path.with_name(f"{self.path.name}{name}")
 
 

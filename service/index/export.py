@@ -28,7 +28,7 @@ def export(database: Database, folder: Path) -> dict[str, int]:
     pyarrow.
     """
     # The import precedes the query, so that a missing package is reported at once.
-    schemas = {name: schema_of({c.name: _word(c) for c in table.columns}) for name, table in TABLES.items()}
+    schemas = {name: schema_of({c.name: _type_name(c) for c in table.columns}) for name, table in TABLES.items()}
     with database.reading() as connection:
         return {
             name: write(folder / f"{name}.parquet", schemas[name], _groups(connection, table))
@@ -46,6 +46,6 @@ def _groups(connection: Connection, table: Table) -> Iterator[list[dict[str, Any
         yield rows
 
 
-def _word(column: Column[Any]) -> str:
+def _type_name(column: Column[Any]) -> str:
     kinds = {BigInteger: "int64", Integer: "int64", Float: "float64", Boolean: "bool_"}
     return next((word for kind, word in kinds.items() if isinstance(column.type, kind)), "text")

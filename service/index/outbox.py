@@ -10,7 +10,7 @@ from typing import Any, Final
 from sqlalchemy import Connection, delete, func, select, update
 
 from graspd.service.index.database import IndexPart, upsert
-from graspd.service.index.project_scope import seen
+from graspd.service.index.project_scope import in_scope
 from graspd.service.index.tables import datasets, deliveries, ends, webhooks
 from graspd.service.index.views import DeliveryView, EndView, WebhookView
 from graspd.service.model.clock import timestamp
@@ -29,7 +29,7 @@ class DueDelivery:
     attempts: int
 
 
-def note_ends(connection: Connection, rows: Sequence[dict[str, Any]]) -> None:
+def append_ends(connection: Connection, rows: Sequence[dict[str, Any]]) -> None:
     """Append ends to the feed within a transaction.
 
     The number of an end is the time in milliseconds, or the last number plus 1: a rebuilt index thus continues after
@@ -47,7 +47,7 @@ def last_end(connection: Connection) -> int:
 
 class Outbox(IndexPart):
     def ends(self, since: int, *, limit: int, scope: ProjectScope = EVERYTHING) -> list[EndView]:
-        query = select(ends).where(ends.c.seq > since, *seen(scope, ends)).order_by(ends.c.seq).limit(limit)
+        query = select(ends).where(ends.c.seq > since, *in_scope(scope, ends)).order_by(ends.c.seq).limit(limit)
         return [EndView(**row) for row in self.database.rows(query)]
 
     def untold_datasets(self, *, limit: int = 200) -> list[tuple[str, int]]:
@@ -61,7 +61,7 @@ class Outbox(IndexPart):
         with self.database.writing() as connection:
             untold = (datasets.c.name == name, datasets.c.told < events)
             if connection.execute(update(datasets).where(*untold).values(told=events)).rowcount:
-                note_ends(connection, [row])
+                append_ends(connection, [row])
 
     def add(self, hook: Webhook, *, seen: int | None = None, within: Connection | None = None) -> None:
         """Add a webhook; it receives ends after `seen`, by default all future ends."""
@@ -72,11 +72,11 @@ class Outbox(IndexPart):
             upsert(connection, webhooks, [row], keep=("seen",))
 
     def hooks(self, *, scope: ProjectScope = EVERYTHING) -> list[WebhookView]:
-        query = select(webhooks).where(*seen(scope, webhooks)).order_by(webhooks.c.created, webhooks.c.id)
+        query = select(webhooks).where(*in_scope(scope, webhooks)).order_by(webhooks.c.created, webhooks.c.id)
         return [WebhookView(**row) for row in self.database.rows(query)]
 
     def hook(self, webhook: str, *, scope: ProjectScope = EVERYTHING) -> WebhookView:
-        query = select(webhooks).where(webhooks.c.id == webhook, *seen(scope, webhooks))
+        query = select(webhooks).where(webhooks.c.id == webhook, *in_scope(scope, webhooks))
         return WebhookView(**self.database.one(query, f"webhook {webhook!r}"))
 
     def remove(self, webhook: str) -> None:

@@ -17,18 +17,18 @@ from graspd.service.model.projects import ProjectScope
 Tests = tuple[ColumnElement[bool], ...]
 
 
-def seen(scope: ProjectScope, table: Table) -> Tests:
+def in_scope(scope: ProjectScope, table: Table) -> Tests:
     """Return the scope's conditions on a table with projects, or on tables joined to it."""
     return () if scope.everything else (table.c.project == scope.project,)
 
 
-def seen_with_job(scope: ProjectScope, table: Table) -> Tests:
+def in_scope_by_job(scope: ProjectScope, table: Table) -> Tests:
     """Return the scope's conditions on a table of parts of jobs."""
     of_project = select(jobs.c.id).where(jobs.c.project == scope.project)
     return () if scope.everything else (table.c.job_id.in_(of_project),)
 
 
-def seen_assets(scope: ProjectScope) -> Tests:
+def assets_in_scope(scope: ProjectScope) -> Tests:
     """Return the scope's conditions on hands and objects: own, built-in and shared ones."""
     if scope.everything:
         return ()
@@ -41,7 +41,7 @@ def nearest_asset(scope: ProjectScope) -> ColumnElement[int]:
     return case((assets.c.project == scope.project, 0), (shared, 1), else_=2)
 
 
-def seen_shards(scope: ProjectScope, shard: ColumnElement[Any]) -> Tests:
+def shards_in_scope(scope: ProjectScope, shard: ColumnElement[Any]) -> Tests:
     """Return the conditions on ids of shards that a job of the project makes or reuses."""
     wanted = (tasks.c.shard_id == shard, tasks.c.job_id == jobs.c.id, jobs.c.project == scope.project)
     return () if scope.everything else (exists().where(*wanted),)

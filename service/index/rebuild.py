@@ -87,65 +87,65 @@ class _Rebuild:
 
     def assets(self) -> None:
         for kind, digest in stored_assets(self._store):
-            with self._each(names.asset_check(kind, digest)):
+            with self._skip_invalid(names.asset_check(kind, digest)):
                 check = load_check(self._store, kind, digest)
-                with self._each(names.asset_record(kind, digest), "assets"):
+                with self._skip_invalid(names.asset_record(kind, digest), "assets"):
                     self._index.write.add_asset(load_asset(self._store, kind, digest), check, within=self._connection)
 
     def jobs(self) -> None:
         """Read jobs, then failed attempts in order, then users' actions."""
         known = []
         for key, data in self._read(names.JOBS, lambda key: key.endswith("/job.json") and key.count("/") == 2):
-            with self._each(key, "jobs"):
+            with self._skip_invalid(key, "jobs"):
                 record = parse_record(JobRecord, data, key)
                 self._index.write.add_job(record, within=self._connection)
                 known.append(record.id)
-        attempts = self._parsed(AttemptRecord, names.TASKS)
+        attempts = self._parse_records(AttemptRecord, names.TASKS)
         for attempt in sorted(attempts, key=lambda attempt: attempt.number):
-            with self._each(names.attempt(attempt.task_id, attempt.number), "attempts"):
+            with self._skip_invalid(names.attempt(attempt.task_id, attempt.number), "attempts"):
                 self._index.write.add_attempt(attempt, within=self._connection)
         for job in known:
-            if events := self._parsed(JobEvent, names.job_events(job)):
+            if events := self._parse_records(JobEvent, names.job_events(job)):
                 self._index.write.set_job_events(job, events, within=self._connection)
 
     def shards(self) -> None:
         for key, data in self._read(names.SHARDS):
-            with self._each(key, "shards"):
+            with self._skip_invalid(key, "shards"):
                 self._index.write.add_manifests([parse_record(ShardManifest, data, key)], within=self._connection)
 
     def datasets(self) -> None:
         for key, data in self._read(names.DATASETS, lambda key: key.endswith("/dataset.json")):
-            with self._each(key, "datasets"):
+            with self._skip_invalid(key, "datasets"):
                 record = parse_record(DatasetRecord, data, key)
                 self._index.write_dataset.add(record, within=self._connection)
-                if events := self._parsed(DatasetEvent, names.dataset_events(record.name)):
+                if events := self._parse_records(DatasetEvent, names.dataset_events(record.name)):
                     self._index.write_dataset.set_events(record.name, events, within=self._connection)
         told = self._index.datasets.ended(within=self._connection) | self._told
         for name, events in told.items():
             self._connection.execute(update(datasets).where(datasets.c.name == name).values(told=events))
         for key, data in self._read(names.DATASETS, lambda key: "/snapshots/" in key):
-            with self._each(key, "snapshots"):
+            with self._skip_invalid(key, "snapshots"):
                 self._index.write_dataset.add_snapshot(parse_record(Snapshot, data, key), within=self._connection)
         for key, data in self._read(names.OBJECT_SETS):
-            with self._each(key, "object_sets"):
+            with self._skip_invalid(key, "object_sets"):
                 self._index.write_dataset.add_object_set(parse_record(ObjectSet, data, key), within=self._connection)
 
     def webhooks(self) -> None:
-        for hook in self._parsed(Webhook, names.WEBHOOKS):
-            with self._each(names.webhook(hook.id)):
+        for hook in self._parse_records(Webhook, names.WEBHOOKS):
+            with self._skip_invalid(names.webhook(hook.id)):
                 self._index.outbox.add(hook, seen=self._seen.get(hook.id, self._last), within=self._connection)
 
     def tags(self) -> None:
         """Read the last version of each tag; earlier versions remain after interrupted changes."""
         last = {key.rpartition("/")[0]: (key, data) for key, data in sorted(self._read(names.TAGS))}
         for key, data in last.values():
-            with self._each(key):
+            with self._skip_invalid(key):
                 self._index.tags.put(parse_record(Tag, data, key), within=self._connection)
 
-    def _parsed(self, model: type[RecordT], prefix: str) -> list[RecordT]:
+    def _parse_records(self, model: type[RecordT], prefix: str) -> list[RecordT]:
         found = []
         for key, data in sorted(self._read(prefix)):
-            with self._each(key):
+            with self._skip_invalid(key):
                 found.append(parse_record(model, data, key))
         return found
 
@@ -153,13 +153,13 @@ class _Rebuild:
         self, prefix: str, wanted: Callable[[str], bool] = lambda key: key.endswith(".json")
     ) -> Iterator[tuple[str, bytes]]:
         """Yield keys and bytes of records; records removed since the listing are skipped."""
-        keys = [entry.key for entry in self._store.list(prefix) if wanted(entry.key) and not self._is_gone(entry.key)]
+        keys = [entry.key for entry in self._store.list(prefix) if wanted(entry.key) and not self._deleted(entry.key)]
         with ThreadPoolExecutor(_READERS) as pool:
             for key, data in zip(keys, pool.map(self._bytes, keys), strict=True):
                 if data is not None:
                     yield key, data
 
-    def _is_gone(self, key: str) -> bool:
+    def _deleted(self, key: str) -> bool:
         folder, _, rest = key.partition("/")
         what = {names.JOBS: "job", names.DATASETS: "dataset"}.get(folder, "")
         return (what, rest.partition("/")[0]) in self._gone
@@ -171,7 +171,7 @@ class _Rebuild:
             return None
 
     @contextmanager
-    def _each(self, key: str, what: str | None = None) -> Iterator[None]:
+    def _skip_invalid(self, key: str, what: str | None = None) -> Iterator[None]:
         try:
             with self._connection.begin_nested():
                 yield
@@ -240,11 +240,11 @@ def _rows(table: Table, connection: Connection) -> dict[tuple[Any, ...], dict[st
     columns = [column for column in table.columns if column.name not in LIVE_COLUMNS]
     rows = {}
     for row in connection.execute(select(*columns)).mappings():
-        rows[tuple(row[key] for key in keys)] = _lasting(dict(row))
+        rows[tuple(row[key] for key in keys)] = _without_run_state(dict(row))
     return rows
 
 
-def _lasting(row: dict[str, Any]) -> dict[str, Any]:
+def _without_run_state(row: dict[str, Any]) -> dict[str, Any]:
     """Return a row without present state: whether a task runs, and its progress."""
     if row.get("state") == State.RUNNING.value:
         row["state"] = State.QUEUED.value

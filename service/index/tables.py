@@ -16,11 +16,11 @@ from graspd.service.model.metrics import IndexLevel, indexed
 metadata: Final = MetaData()
 
 
-def required(kind: TypeEngine[Any] | type[TypeEngine[Any]], *names: str) -> list[Column[Any]]:
+def required_columns(kind: TypeEngine[Any] | type[TypeEngine[Any]], *names: str) -> list[Column[Any]]:
     return [Column(name, kind, nullable=False) for name in names]
 
 
-def ownership() -> list[Column[Any]]:
+def owner_columns() -> list[Column[Any]]:
     widths = {"owner": 64, "project": 32}
     return [Column(name, String(width), nullable=False, server_default="") for name, width in widths.items()]
 
@@ -31,12 +31,12 @@ jobs: Final = Table(
     Column("id", String(32), primary_key=True),
     Column("state", String(10), nullable=False),
     Column("priority", String(12), nullable=False),
-    *required(String(64), "hand", "object"),
-    *required(String(32), "hand_digest", "object_digest"),
+    *required_columns(String(64), "hand", "object"),
+    *required_columns(String(32), "hand_digest", "object_digest"),
     Column("request", JSON, nullable=False),
     Column("revisions", JSON, nullable=False, server_default='{"synthesize": 1, "scene": 1, "render": 1}'),
     Column("origin", JSON(none_as_null=True)),
-    *ownership(),
+    *owner_columns(),
     Column("cancelled", Boolean, nullable=False),
     # Number of batches per task.
     Column("span", Integer, nullable=False),
@@ -59,12 +59,12 @@ tasks: Final = Table(
     Column("id", String(32), primary_key=True),
     Column("job_id", String(32), nullable=False),
     Column("stage", String(12), nullable=False),
-    *required(Integer, "batch", "position", "count"),
+    *required_columns(Integer, "batch", "position", "count"),
     Column("priority", String(12), nullable=False),
     Column("inputs", JSON, nullable=False),
     Column("shard_id", String(32), nullable=False),
     Column("state", String(10), nullable=False),
-    *required(Boolean, "ready", "done"),
+    *required_columns(Boolean, "ready", "done"),
     Column("last_attempt", Integer, nullable=False),
     Column("exhausted", Boolean, nullable=False),
     Column("retried_upto", Integer, nullable=False),
@@ -112,13 +112,13 @@ shards: Final = Table(
     Column("key", String(128), nullable=False),
     Column("sha256", String(64), nullable=False),
     Column("size_bytes", BigInteger, nullable=False),
-    *required(Integer, "count", "valid"),
+    *required_columns(Integer, "count", "valid"),
     Column("candidates", Integer, nullable=False, server_default="0"),
     Column("rechecked", Integer, nullable=False, server_default="0"),
     Column("recheck_held", Integer, nullable=False, server_default="0"),
     Column("validated", Integer, nullable=False, server_default="0"),
-    *required(String(64), "hand", "object"),
-    *required(String(32), "hand_digest", "object_digest"),
+    *required_columns(String(64), "hand", "object"),
+    *required_columns(String(32), "hand_digest", "object_digest"),
     Column("batch", Integer, nullable=False),
     Column("batches", Integer, nullable=False, server_default="1"),
     Column("seed", Integer, nullable=False),
@@ -144,7 +144,7 @@ grasps: Final = Table(
     metadata,
     Column("shard_id", String(32), primary_key=True),
     Column("row", Integer, primary_key=True),
-    *required(String(64), "hand", "object"),
+    *required_columns(String(64), "hand", "object"),
     *(Column(metric.name, Integer if metric.whole else Float) for metric in indexed()),
     Column("valid", Boolean, nullable=False),
     Column("success", Boolean),
@@ -171,11 +171,11 @@ assets: Final = Table(
     Column("size_bytes", Integer, nullable=False),
     Column("created", String(32), nullable=False),
     Column("builtin", Boolean, nullable=False),
-    *ownership(),
+    *owner_columns(),
     Column("shared", Boolean, nullable=False, server_default=false()),
     Column("verdict", String(8)),
     Column("message", Text),
-    *required(JSON, "repairs", "facts"),
+    *required_columns(JSON, "repairs", "facts"),
     Column("last_attempt", Integer, nullable=False),
     Column("queued", Boolean, nullable=False, default=False),
     Column("not_before", Float, nullable=False, default=0.0),
@@ -193,7 +193,7 @@ workers: Final = Table(
     Column("version", String(32), nullable=False),
     Column("state", String(16), nullable=False),
     Column("task_id", String(32)),
-    *required(String(32), "started", "seen"),
+    *required_columns(String(32), "started", "seen"),
     Column("reason", String(300), nullable=False, server_default=""),
 )
 #: Costs of deleted shards by project, day and device, because deleted results count as usage.
@@ -203,7 +203,7 @@ spent: Final = Table(
     Column("project", String(32), primary_key=True),
     Column("day", String(10), primary_key=True),
     Column("device", String(64), primary_key=True),
-    *required(BigInteger, "grasps", "valid", "tasks"),
+    *required_columns(BigInteger, "grasps", "valid", "tasks"),
     Column("seconds", Float, nullable=False),
 )
 notes: Final = Table(
@@ -226,10 +226,10 @@ datasets: Final = Table(
     metadata,
     Column("name", String(64), primary_key=True),
     Column("digest", String(32), nullable=False),
-    *required(JSON, "hands", "objects", "options", "revisions"),
+    *required_columns(JSON, "hands", "objects", "options", "revisions"),
     Column("cells", Integer, nullable=False),
     Column("created", String(32), nullable=False),
-    *ownership(),
+    *owner_columns(),
     Column("cancelled", Boolean, nullable=False),
     Column("events", Integer, nullable=False),
     Column("applied", Integer, nullable=False, default=0),
@@ -245,8 +245,8 @@ dataset_cells: Final = Table(
     metadata,
     Column("dataset", String(64), primary_key=True),
     Column("position", Integer, primary_key=True),
-    *required(String(64), "hand", "object"),
-    *required(String(32), "hand_digest", "object_digest", "job_id"),
+    *required_columns(String(64), "hand", "object"),
+    *required_columns(String(32), "hand_digest", "object_digest", "job_id"),
     Column("fidelity", String(64), nullable=True),
     Column("choice", JSON(none_as_null=True)),
     Index("dataset_cells_by_job", "job_id"),
@@ -258,7 +258,7 @@ dataset_snapshots: Final = Table(
     Column("digest", String(32), primary_key=True),
     Column("created", String(32), nullable=False),
     Column("complete", Boolean, nullable=False),
-    *required(Integer, "shards", "grasps", "valid"),
+    *required_columns(Integer, "shards", "grasps", "valid"),
     Column("size_bytes", BigInteger, nullable=False),
 )
 object_sets: Final = Table(
@@ -275,8 +275,8 @@ tags: Final = Table(
     metadata,
     Column("id", String(32), primary_key=True),
     Column("name", String(64), nullable=False),
-    *required(String(32), "created", "changed"),
-    *ownership(),
+    *required_columns(String(32), "created", "changed"),
+    *owner_columns(),
     Index("tags_by_name", "name", "project"),
 )
 #: Grasps of a tag. Some may be missing, because their shards were deleted with the last job that needed them.
@@ -308,7 +308,7 @@ webhooks: Final = Table(
     Column("url", Text, nullable=False),
     Column("states", JSON, nullable=False),
     Column("created", String(32), nullable=False),
-    *ownership(),
+    *owner_columns(),
     # Present state: ends up to this number have deliveries.
     Column("seen", BigInteger, nullable=False, server_default="0"),
 )

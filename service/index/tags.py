@@ -7,7 +7,7 @@ from collections.abc import Collection, Sequence
 from sqlalchemy import Connection, case, delete, func, select, tuple_
 
 from graspd.service.index.database import IndexPart, upsert
-from graspd.service.index.project_scope import seen, seen_shards
+from graspd.service.index.project_scope import in_scope, shards_in_scope
 from graspd.service.index.tables import grasps, tagged, tags
 from graspd.service.index.views import TagView
 from graspd.service.model.errors import NotFoundError
@@ -19,13 +19,13 @@ class Tags(IndexPart):
     def all(self, *, scope: ProjectScope = EVERYTHING) -> list[TagView]:
         there = (grasps.c.shard_id == tagged.c.shard_id) & (grasps.c.row == tagged.c.row)
         number = select(func.count()).select_from(tagged.join(grasps, there)).where(tagged.c.tag == tags.c.id)
-        query = select(tags, number.scalar_subquery().label("grasps")).where(*seen(scope, tags))
+        query = select(tags, number.scalar_subquery().label("grasps")).where(*in_scope(scope, tags))
         return [TagView(**row) for row in self.database.rows(query.order_by(tags.c.name, tags.c.project))]
 
     def named(self, name: str, *, scope: ProjectScope = EVERYTHING) -> str:
         """Return the id of a tag by name or id, own tags first; NotFoundError if none is in scope."""
         own_first = case((tags.c.id == name, 0), (tags.c.project == scope.project, 1), else_=2)
-        query = select(tags.c.id).where((tags.c.name == name) | (tags.c.id == name), *seen(scope, tags))
+        query = select(tags.c.id).where((tags.c.name == name) | (tags.c.id == name), *in_scope(scope, tags))
         found = self.database.value(query.order_by(own_first, tags.c.project).limit(1))
         if found is None:
             raise NotFoundError(f"there is no tag {name!r}")
@@ -35,14 +35,14 @@ class Tags(IndexPart):
         """Return the names of the tags of each given grasp that has any."""
         found: dict[Grasp, list[str]] = {}
         query = select(tagged.c.shard_id, tagged.c.row, tags.c.name).order_by(tags.c.name)
-        query = query.where(tags.c.id == tagged.c.tag, *seen(scope, tags))
+        query = query.where(tags.c.id == tagged.c.tag, *in_scope(scope, tags))
         key = tuple_(tagged.c.shard_id, tagged.c.row)
         for shard, row, name in self.database.among(query, key, sorted(wanted)):
             found.setdefault((shard, row), []).append(name)
         return found
 
     def there(self, wanted: Sequence[Grasp], *, scope: ProjectScope = EVERYTHING) -> set[Grasp]:
-        query = select(grasps.c.shard_id, grasps.c.row).where(*seen_shards(scope, grasps.c.shard_id))
+        query = select(grasps.c.shard_id, grasps.c.row).where(*shards_in_scope(scope, grasps.c.shard_id))
         key = tuple_(grasps.c.shard_id, grasps.c.row)
         return {(shard, row) for shard, row in self.database.among(query, key, wanted)}
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, computed_field
 
 from graspd.service.model.domain import JobOptions, JobRequest
-from graspd.service.model.metric_fields import values, with_fields
+from graspd.service.model.metric_fields import insert_fields, value_fields
 from graspd.service.model.planning import shortfall
 from graspd.service.model.records import Choice
 from graspd.service.model.states import AssetKind, Priority, Stage, State
@@ -143,7 +143,7 @@ class ShardView(View):
     manifest: dict[str, Any] = Field(default_factory=dict, description="complete manifest, only in `get_shard`")
 
 
-@with_fields(valid=values(optional=False), created=values(optional=True))
+@insert_fields(valid=value_fields(optional=False), created=value_fields(optional=True))
 class GraspView(View):
     """One grasp with its quality in the index; contact metrics at the threshold of the manifest (5 mm)."""
 

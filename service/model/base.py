@@ -53,7 +53,7 @@ _CLASS: Final = re.compile(r"_[A-Z]\w*$|constrained-\w+$")
 _CHOICES: Final = re.compile(r"'(?P<word>.*?)' is not one of (?P<expected>'.*')")
 
 
-def refusal(
+def first_error(
     error: ValidationError, model: type[BaseModel] | None = None, names: Mapping[str, str] | None = None
 ) -> str:
     """Return the first error after its location: `scene.touch: must be at least -1`; with `model`, the whole range."""
@@ -65,7 +65,7 @@ def refusal(
         place = [named] if named.startswith("-") else [named, *place[1:]]
     field = model.model_fields.get(str(first["loc"][0])) if model and len(first["loc"]) == 1 else None
     bounded = field is not None and first["type"] in _BOUNDS
-    said = f"{range_words(bounds_of(field))}; got {first['input']!r}" if field and bounded else words(first)
+    said = f"{range_text(bounds_of(field))}; got {first['input']!r}" if field and bounded else problem_text(first)
     return f"{'.'.join(place)}: {said}" if place else said
 
 
@@ -82,12 +82,12 @@ def _metadata(annotation: object) -> list[object]:
     return [part for one in inner for part in (one.metadata if isinstance(one, FieldInfo) else (one,))]
 
 
-def range_words(bounds: Mapping[str, float]) -> str:
+def range_text(bounds: Mapping[str, float]) -> str:
     said = [_WORDS[name].format(**{key: f"{bounds[key]:.12g}"}) for name, key in _BOUNDS.items() if key in bounds]
     return " and ".join([*said[:1], *(words.removeprefix("must be ") for words in said[1:])])
 
 
-def words(entry: Mapping[str, Any]) -> str:
+def problem_text(entry: Mapping[str, Any]) -> str:
     facts = entry.get("ctx", {})
     message = _SUBJECT.sub(lambda found: "" if found[1] else "must ", entry["msg"])
     if facts.get("pattern") == NAME:
@@ -108,6 +108,6 @@ def first_line(error: BaseException) -> str:
     return (str(error).strip().splitlines() or [type(error).__name__])[0]
 
 
-def why(error: Exception) -> str:
+def error_text(error: Exception) -> str:
     """Return a library's message about a file; for a system error, its text without number and path."""
     return getattr(error, "strerror", None) or str(error)

@@ -17,11 +17,11 @@ _LATELY_S: Final = 2.0
 def available_cores(root: Path = ROOT) -> int:
     """Return the number of cores of this process: its affinity, or its control group's quota, rounded up, if less."""
     given = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, min([given, *(math.ceil(quota) for quota in _lately(root, int(time.monotonic() / _LATELY_S)))]))
+    return max(1, min([given, *(math.ceil(quota) for quota in _quota_cache(root, int(time.monotonic() / _LATELY_S)))]))
 
 
 @lru_cache(maxsize=1)
-def _lately(root: Path, moment: int) -> list[float]:
+def _quota_cache(root: Path, moment: int) -> list[float]:
     """Return the quotas, cached per time slot, because reading the files takes milliseconds."""
     return list(_quotas(root))
 

@@ -9,7 +9,7 @@ from typing import Final
 
 from graspd.service.model.domain import JobRequest, batches_of
 from graspd.service.model.metrics import MIN_DISTANCE_M
-from graspd.service.model.renamed import original
+from graspd.service.model.renamed import original_request
 from graspd.service.model.states import AssetKind, Stage
 from graspd.service.model.version import STAGE_REVISIONS
 
@@ -98,11 +98,11 @@ def _verdict_text(request: JobRequest, batches: range) -> dict[str, object]:
         found |= {"payload": [_PAYLOAD_REVISION, request.min_payload]}
     if request.shake:
         found |= {"shake": True}
-    return original(found)
+    return original_request(found)
 
 
 def job_id(request: JobRequest, hand_digest: str, object_digest: str, project: str = "") -> str:
     """Return the id of a job: equal requests on equal hand and object in one project are one job."""
-    wanted = original(request.model_dump(mode="json"))
+    wanted = original_request(request.model_dump(mode="json"))
     said = {"request": wanted, "hand": hand_digest, "object": object_digest, "revisions": STAGE_REVISIONS}
     return digest_json(said | ({"project": project} if project else {}))

@@ -261,26 +261,26 @@ class JobOptions(Model):
 
     @field_validator("fidelity")
     @classmethod
-    def _known(cls, value: str | Fidelity) -> str | Fidelity:
+    def _check_fidelity(cls, value: str | Fidelity) -> str | Fidelity:
         if value != AUTO:
             resolve_fidelity(value)
         return value
 
     @field_validator("channels")
     @classmethod
-    def _in_order(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+    def _sort_channels(cls, value: tuple[str, ...]) -> tuple[str, ...]:
         # Sorted, because another order of channels must give the same job.
         return tuple(name for name in EXTRA_CHANNELS if name in value)
 
     @model_validator(mode="before")
     @classmethod
-    def _some_scenes(cls, data: Any) -> Any:
+    def _set_scenes(cls, data: Any) -> Any:
         if isinstance(data, dict) and data.get("scene", "free") != "free" and data.get("scenes", 0) in (0, "0", ""):
             return {**data, "scenes": SCENES}
         return data
 
     @model_validator(mode="after")
-    def _consistent(self) -> Self:
+    def _check_consistency(self) -> Self:
         if self.fidelity == AUTO and not self.target:
             example = "lift>=0.9" if self.in_scene else "gsr>=0.6"
             raise ValueError(f"fidelity auto needs a target, such as {example}")
@@ -340,10 +340,10 @@ class JobOptions(Model):
 
     @property
     def place(self) -> SceneSpec:
-        return scene_of(self.scene, faces=self.faces, touch=self.touch, beside=self._dropped)
+        return scene_of(self.scene, faces=self.faces, touch=self.touch, beside=self._named_neighbours)
 
     @property
-    def _dropped(self) -> tuple[NamedNeighbour, ...]:
+    def _named_neighbours(self) -> tuple[NamedNeighbour, ...]:
         # Plain names became `NamedNeighbour` when the field was parsed.
         return tuple(one for one in self.neighbours if isinstance(one, NamedNeighbour))
 
@@ -351,7 +351,7 @@ class JobOptions(Model):
     def beside(self) -> tuple[NamedNeighbour, ...]:
         """Neighbours: of the scene document, then dropped ones."""
         placed = self.scene.neighbours if isinstance(self.scene, SceneDocument) else ()
-        return (*placed, *self._dropped)
+        return (*placed, *self._named_neighbours)
 
     def with_beside(self, found: Sequence[NamedNeighbour]) -> Self:
         if not found:
@@ -413,7 +413,7 @@ def batches_of(grasps: int) -> int:
     return -(-grasps // BATCH_SIZE)
 
 
-def check_known(options: JobOptions) -> None:
+def check_digests(options: JobOptions) -> None:
     """Raise ValueError if a neighbour or the network has no digest: its name may later refer to other files."""
     if any(one.digest is None for one in options.beside):
         raise ValueError("each neighbour of a stored job has the digest of its files")

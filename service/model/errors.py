@@ -176,13 +176,13 @@ class TaskRefused(TaskError):
     slug, title = "task-refused", "The task was refused"
 
 
-def _below(kind: type[GraspdError]) -> Iterator[type[GraspdError]]:
+def _subclasses(kind: type[GraspdError]) -> Iterator[type[GraspdError]]:
     for one in kind.__subclasses__():
         yield one
-        yield from _below(one)
+        yield from _subclasses(one)
 
 
-ERRORS: Final = {error.slug: error for error in _below(GraspdError) if error is not AssetError}
+ERRORS: Final = {error.slug: error for error in _subclasses(GraspdError) if error is not AssetError}
 ERRORS[GraspdError.slug] = GraspdError
 
 #: User and password of a URL, up to the last @, because an unquoted password may contain an @ or a slash.
@@ -205,7 +205,7 @@ SEARCHED: Final = 1000
 _LISTED: Final = 20
 
 
-def known_names(word: str, names: Sequence[str]) -> str:
+def available_names(word: str, names: Sequence[str]) -> str:
     """Return `; there are: A, B` with the first names, and the most similar of at most `SEARCHED` names."""
     listed = ", ".join(names[:_LISTED]) + (", ..." if len(names) > _LISTED else "")
     return f"; there are: {listed or 'none yet'}{did_you_mean(word, names)}"

@@ -17,14 +17,14 @@ version_of = lru_cache(maxsize=64)(version)
 _ours = False
 
 
-def own_process() -> None:
+def mark_process() -> None:
     """Mark this process as graspd's own: imported objects stay until exit, without garbage collection."""
     global _ours
     _ours = True
 
 
 @contextmanager
-def imports() -> Iterator[None]:
+def pause_garbage_collection() -> Iterator[None]:
     collects = gc.isenabled()
     gc.disable()
     try:

@@ -12,7 +12,7 @@ from graspd.service.model.domain import SCENES, JobOptions
 from graspd.service.model.errors import one_of
 from graspd.service.model.fidelity import FIDELITIES, Fidelity
 from graspd.service.model.object_options import MeshOptions
-from graspd.service.model.options import Option, Place, accepted
+from graspd.service.model.options import Option, Place, validate
 from graspd.service.model.scene_spec import MOST_NEIGHBOURS, MOST_SCENES, SceneSpec, Touch, parse_scene
 
 _LOCAL: Final[tuple[Place, ...]] = ("synth", "python")
@@ -61,7 +61,7 @@ class LocalOptions(MeshOptions, JobOptions):
 
     @field_validator("fidelity")
     @classmethod
-    def _known(cls, value: str | Fidelity) -> str | Fidelity:
+    def _check_fidelity(cls, value: str | Fidelity) -> str | Fidelity:
         if not isinstance(value, str) or value not in FIDELITIES:
             raise ValueError(f"unknown fidelity {value!r}; choose one of {one_of(str(value), FIDELITIES)}")
         return value
@@ -75,7 +75,7 @@ class LocalOptions(MeshOptions, JobOptions):
 
     @model_validator(mode="before")
     @classmethod
-    def _some_scenes(cls, data: Any) -> Any:
+    def _set_scenes(cls, data: Any) -> Any:
         return data
 
     @property
@@ -100,4 +100,4 @@ class LocalOptions(MeshOptions, JobOptions):
         """Return the job without scene and rechecks. `options` has digests instead of files; InputError if invalid."""
         shared = {name: getattr(self, name) for name in JobOptions.model_fields.keys() - _OF_PLACE}
         # Rechecks are a sample over many jobs; a single file can be validated completely at level `dexgraspbench`.
-        return accepted(JobOptions, shared | {"fidelity": self.knobs, "options": options, "rechecks": 0})
+        return validate(JobOptions, shared | {"fidelity": self.knobs, "options": options, "rechecks": 0})

@@ -8,7 +8,7 @@ from typing import Any, Literal, Self
 from pydantic import ConfigDict, Field, model_validator
 
 from graspd.service.model.base import Digest, Model, Name, Word
-from graspd.service.model.domain import JobRequest, check_known
+from graspd.service.model.domain import JobRequest, check_digests
 from graspd.service.model.states import AssetKind, Stage
 
 
@@ -45,8 +45,8 @@ class TaskMessage(Model):
     model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
 
     @model_validator(mode="after")
-    def _knows_its_files(self) -> Self:
-        check_known(self.request)
+    def _check_digests(self) -> Self:
+        check_digests(self.request)
         return self
 
 

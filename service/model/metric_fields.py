@@ -19,7 +19,7 @@ else:
     OfferedName = Literal[tuple(metric.name for metric in indexed(IndexLevel.OFFERED))]
 
 
-def values(*, optional: bool, default: Any = ...) -> dict[str, Any]:
+def value_fields(*, optional: bool, default: Any = ...) -> dict[str, Any]:
     # Manifests list the sorted metrics first.
     chosen = sorted(indexed(), key=lambda metric: metric.indexed < IndexLevel.SORTED)
     return {
@@ -29,11 +29,11 @@ def values(*, optional: bool, default: Any = ...) -> dict[str, Any]:
     }
 
 
-def means() -> dict[str, Any]:
+def mean_fields() -> dict[str, Any]:
     return {metric.name: (float | None, None) for metric in indexed(IndexLevel.OFFERED)}
 
 
-def filters() -> dict[str, Any]:
+def filter_fields() -> dict[str, Any]:
     fields: dict[str, Any] = {}
     for metric in indexed(IndexLevel.OFFERED):
         low, high = metric.limits
@@ -42,7 +42,7 @@ def filters() -> dict[str, Any]:
     return fields
 
 
-def with_fields(**parts: Mapping[str, Any]) -> Callable[[type[M]], type[M]]:
+def insert_fields(**parts: Mapping[str, Any]) -> Callable[[type[M]], type[M]]:
     """Decorate a model: insert each part of fields before the field with the part's name, `last` at the end."""
 
     def made(model: type[M]) -> type[M]:

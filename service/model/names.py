@@ -132,7 +132,7 @@ MOST: Final = 64
 log = logging.getLogger(__name__)
 
 
-def refuse_long(name: str) -> str:
+def check_length(name: str) -> str:
     """Return the name; InputError if a name that users choose is too long."""
     if len(name) > MOST:
         raise InputError(
@@ -142,7 +142,7 @@ def refuse_long(name: str) -> str:
 
 
 @lru_cache(maxsize=4096)
-def fitted(name: str, most: int = MOST) -> str:
+def shorten(name: str, most: int = MOST) -> str:
     """Return the name; a long one becomes its beginning and a digest, so that it is unique, and is logged once."""
     if len(name) <= most:
         return name

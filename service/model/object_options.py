@@ -42,7 +42,7 @@ class ObjectOptions(MeshOptions):
     )
 
     @model_validator(mode="after")
-    def _one_of_mass_and_density(self) -> Self:
+    def _check_mass_and_density(self) -> Self:
         if self.mass is not None and self.density is not None:
             raise ValueError("mass and density exclude each other: give one")
         return self

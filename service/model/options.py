@@ -16,7 +16,7 @@ from typing import Annotated, Any, Final, Literal, TypeVar, Union, get_args, get
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
-from graspd.service.model.base import bounds_of, range_words, refusal
+from graspd.service.model.base import bounds_of, first_error, range_text
 from graspd.service.model.errors import InputError
 
 ModelT = TypeVar("ModelT", bound=BaseModel)
@@ -86,7 +86,7 @@ class Row:
     @property
     def range(self) -> str:
         """Bounds as a phrase, such as `at least 0 and at most 3`; empty: none."""
-        return range_words(self.bounds).removeprefix("must be ")
+        return range_text(self.bounds).removeprefix("must be ")
 
     @property
     def kind(self) -> Any:
@@ -104,12 +104,12 @@ def rows(model: type[BaseModel], place: Place) -> list[Row]:
     return sorted(found, key=lambda row: row.option.group != "basic")
 
 
-def accepted(model: type[ModelT], values: Mapping[str, Any], *, names: Mapping[str, str] | None = None) -> ModelT:
+def validate(model: type[ModelT], values: Mapping[str, Any], *, names: Mapping[str, str] | None = None) -> ModelT:
     """Validate values; InputError states the first invalid one, by its name in `names` if given."""
     try:
         return model.model_validate(values)
     except ValidationError as error:
-        raise InputError(refusal(error, model, names)) from None
+        raise InputError(first_error(error, model, names)) from None
 
 
 def with_keywords(model: type[BaseModel], place: Place) -> Callable[[FunctionT], FunctionT]:

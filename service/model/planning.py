@@ -258,7 +258,7 @@ OUTCOMES: Final = {
 }
 
 
-def totals(parts: Iterable[Mapping[str, int]]) -> dict[str, int]:
+def sum_outcomes(parts: Iterable[Mapping[str, int]]) -> dict[str, int]:
     found: dict[str, int] = dict.fromkeys(OUTCOMES, 0)
     for part in parts:
         for name, count in part.items():
@@ -266,7 +266,7 @@ def totals(parts: Iterable[Mapping[str, int]]) -> dict[str, int]:
     return {name: count for name, count in found.items() if count}
 
 
-def told(outcomes: Mapping[str, int]) -> str:
+def format_outcomes(outcomes: Mapping[str, int]) -> str:
     order = sorted(outcomes.items(), key=lambda pair: -pair[1])
     return ", ".join(f"{count:,} {OUTCOMES.get(name, name.replace('_', ' '))}" for name, count in order if count)
 
@@ -277,14 +277,14 @@ def shortfall(
     """Explain why fewer grasps were found than wanted; None if all were found. `limit`: the hand's payload limit."""
     if found >= wanted:
         return None
-    lost, tries = told(outcomes), candidates + outcomes.get("repeated", 0)
+    lost, tries = format_outcomes(outcomes), candidates + outcomes.get("repeated", 0)
     ended = limit or f"the budget of {budget:g} candidates per grasp is exhausted"
     return (
         f"found {found:,} of {wanted:,} {counted} grasps in {tries:,} candidates{': ' if lost else ''}{lost}; {ended}"
     )
 
 
-def limit_told(hand: str, friction: float, grasps: int, lifts: float, bound: float, wanted: float | None = None) -> str:
+def limit_text(hand: str, friction: float, grasps: int, lifts: float, bound: float, wanted: float | None = None) -> str:
     """Describe a hand's payload limit in a sentence; `bound` [kg] follows from actuators and friction, inf: none."""
     most = f", and at most {bound:.2g} kg by actuator effort" if math.isfinite(bound) else ""
     less = "" if wanted is None else f"; {wanted:.3g} kg are wanted"

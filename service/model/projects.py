@@ -32,6 +32,6 @@ class ProjectScope:
 EVERYTHING: Final = ProjectScope()
 
 
-def marks_of(files: Mapping[str, bytes], project: str) -> dict[str, bytes]:
+def project_mark(files: Mapping[str, bytes], project: str) -> dict[str, bytes]:
     """Return the mark of a private upload; for a shared one, an empty file that replaces an existing mark."""
     return {MARK: project.encode()} if project or MARK in files else {}

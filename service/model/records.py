@@ -17,7 +17,7 @@ from graspd.service.model import names
 from graspd.service.model.base import Digest, Name, TagName
 from graspd.service.model.clock import timestamp
 from graspd.service.model.digests import digest_json
-from graspd.service.model.domain import JobOptions, JobRequest, check_known
+from graspd.service.model.domain import JobOptions, JobRequest, check_digests
 from graspd.service.model.fidelity import AUTO
 from graspd.service.model.messages import IngestMessage, Origin, TaskMessage
 from graspd.service.model.projects import Project
@@ -69,7 +69,7 @@ class JobRecord(Record):
 
     @model_validator(mode="before")
     @classmethod
-    def _as_it_was_meant(cls, data: Any) -> Any:
+    def _convert_version_1(cls, data: Any) -> Any:
         # Records of version 1 have neither validator nor revisions.
         if isinstance(data, dict) and data.get("version") == 1:
             request = {"want": "candidates", "validation": "none", **data.get("request", {})}
@@ -77,8 +77,8 @@ class JobRecord(Record):
         return data
 
     @model_validator(mode="after")
-    def _knows_its_files(self) -> Self:
-        check_known(self.request)
+    def _check_digests(self) -> Self:
+        check_digests(self.request)
         if self.span > 1 and self.request.views:
             raise ValueError("a task of a job with pictures has one batch")
         return self
@@ -167,7 +167,7 @@ class DatasetRecord(Record):
     project: Project = Field("", description="project of that key; empty: the unnamed project")
 
     @model_validator(mode="after")
-    def _a_job_a_cell(self) -> DatasetRecord:
+    def _check_job_count(self) -> DatasetRecord:
         if len(self.jobs) != len(self.hands) * len(self.objects):
             raise ValueError("a dataset has a job for each hand and object")
         if len(self.fidelities) != (len(self.jobs) if self.options.fidelity == AUTO else 0):
@@ -206,7 +206,7 @@ class SnapshotShard(Record):
 
     @field_validator("key")
     @classmethod
-    def _taken_apart(cls, key: str, info: ValidationInfo) -> str:
+    def _convert_pack_key(cls, key: str, info: ValidationInfo) -> str:
         # A snapshot of 0.2 may refer to a part of a pack; now each shard is a file.
         stages = {kind: stage for stage, kind in names.SHARD_KINDS.items()}
         return names.shard_file(stages[info.data["kind"]], info.data["id"]) if "@" in key else key

@@ -41,11 +41,11 @@ def has_old_names(document: bytes) -> bool:
     return _OLD.search(document) is not None
 
 
-def renamed(value: Any) -> Any:
+def convert_names(value: Any) -> Any:
     if isinstance(value, dict):
         # Options next to a method are the planner's own and are not renamed.
         own = {"options"} if "method" in value else set()
-        found = {KEYS.get(key, key): inner if key in own else renamed(inner) for key, inner in value.items()}
+        found = {KEYS.get(key, key): inner if key in own else convert_names(inner) for key, inner in value.items()}
         for key, names in VALUES.items():
             if isinstance(old := found.get(key), str):
                 found[key] = names.get(old, old)
@@ -53,28 +53,28 @@ def renamed(value: Any) -> Any:
             found.pop(_REMOVED, None)
         return found
     if isinstance(value, list):
-        return [renamed(inner) for inner in value]
+        return [convert_names(inner) for inner in value]
     return value
 
 
-def renamed_chart(chart: Any) -> Any:
+def convert_chart(chart: Any) -> Any:
     """Convert a chart of `graspd chart` to present names."""
-    return _measures(renamed(chart))
+    return _measures(convert_names(chart))
 
 
 def _measures(value: Any) -> Any:
     if isinstance(value, dict):
-        return {_of_chart(key): _measures(inner) for key, inner in value.items()}
+        return {_chart_name(key): _measures(inner) for key, inner in value.items()}
     if isinstance(value, list):
-        return [_of_chart(inner) if isinstance(inner, str) else _measures(inner) for inner in value]
+        return [_chart_name(inner) if isinstance(inner, str) else _measures(inner) for inner in value]
     return value
 
 
-def _of_chart(name: str) -> str:
+def _chart_name(name: str) -> str:
     return _CHART.sub(lambda found: f"{found[1] or ''}{'dexgraspbench' if found[2] else 'candidates'}", name)
 
 
-def original(request: dict[str, Any]) -> dict[str, Any]:
+def original_request(request: dict[str, Any]) -> dict[str, Any]:
     """Return a job's request with the names of graspd 0.2, whose digests are the ids of jobs and shards."""
     found = {
         _OLD_KEYS.get(key, key): _OLD_VALUES[key].get(value, value) if key in _OLD_VALUES else value
@@ -83,9 +83,9 @@ def original(request: dict[str, Any]) -> dict[str, Any]:
     return found | {_REMOVED: 0} if "rechecks" in request else found
 
 
-def for_worker_of(revision: int, stage: str, message: dict[str, Any]) -> dict[str, Any]:
+def message_for_revision(revision: int, stage: str, message: dict[str, Any]) -> dict[str, Any]:
     """Convert a task message to the names of its revision: workers of 0.2 may run during an upgrade."""
     request = message.get("request")
     if not isinstance(request, dict) or not 0 < revision <= _REVISIONS.get(stage, 0):
         return message
-    return message | {"request": original(request)}
+    return message | {"request": original_request(request)}

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import AfterValidator, Discriminator, Field, Tag, ValidationError, model_validator
 
-from graspd.service.model.base import Digest, Model, Name, refusal, why
+from graspd.service.model.base import Digest, Model, Name, error_text, first_error
 from graspd.service.model.errors import InputError, did_you_mean
 
 #: Kinds of scenes; `free`: a floating object, `file`: supports from a file.
@@ -37,13 +37,13 @@ Touch = Annotated[float, Field(ge=LEAST_TOUCH, le=MOST_TOUCH, allow_inf_nan=Fals
 Vector = tuple[_Metres, _Metres, _Metres]
 
 
-def _turned(pose: tuple[float, ...]) -> tuple[float, ...]:
+def _check_rotation(pose: tuple[float, ...]) -> tuple[float, ...]:
     if abs(math.hypot(*pose[3:]) - 1.0) > 1e-3:
         raise ValueError("the quaternion w x y z of a pose must have unit length")
     return pose
 
 
-Pose = Annotated[tuple[_Metres, _Metres, _Metres, _Number, _Number, _Number, _Number], AfterValidator(_turned)]
+Pose = Annotated[tuple[_Metres, _Metres, _Metres, _Number, _Number, _Number, _Number], AfterValidator(_check_rotation)]
 
 
 class HalfSpace(Model):
@@ -56,7 +56,7 @@ class HalfSpace(Model):
     """n.x on the plane [m]."""
 
     @model_validator(mode="after")
-    def _directed(self) -> Self:
+    def _check_normal(self) -> Self:
         if math.hypot(*self.normal) < 1e-6:
             raise ValueError("a half-space needs a normal that is not zero")
         return self
@@ -98,7 +98,7 @@ class SceneSpec(Model):
     neighbours: tuple[NeighbourSpec, ...] = Field((), max_length=MOST_NEIGHBOURS)
 
     @model_validator(mode="after")
-    def _whole(self) -> Self:
+    def _check_scene(self) -> Self:
         self._check_neighbours()
         if self.kind == "file" and not self.supports:
             raise ValueError("a scene file needs supports: at least one half_space or box")
@@ -151,7 +151,7 @@ def parse_scene(
     try:
         return SceneSpec(**said, faces=faces, touch=touch, neighbours=others)
     except ValidationError as error:
-        raise InputError(f"scene {text}: {refusal(error)}") from None
+        raise InputError(f"scene {text}: {first_error(error)}") from None
 
 
 def read_scene(path: Path) -> SceneSpec:
@@ -160,14 +160,14 @@ def read_scene(path: Path) -> SceneSpec:
             raise InputError(f"the scene file {path} is larger than {MAX_FILE_BYTES // 1024} KiB")
         text = path.read_text("utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"the scene file {path} cannot be read: {why(error)}") from None
-    found = _loaded(text, path)
+        raise InputError(f"the scene file {path} cannot be read: {error_text(error)}") from None
+    found = _parse_document(text, path)
     if not isinstance(found, dict):
         raise InputError(f"the scene file {path} must hold one object with supports and a target")
     try:
         spec = SceneSpec(**{"kind": "file", **found})
     except (ValidationError, TypeError) as error:
-        said = refusal(error) if isinstance(error, ValidationError) else str(error)
+        said = first_error(error) if isinstance(error, ValidationError) else str(error)
         raise InputError(f"the scene file {path} is wrong: {said}") from None
     files = [path.parent / one.object for one in spec.neighbours]
     beside = tuple(
@@ -177,7 +177,7 @@ def read_scene(path: Path) -> SceneSpec:
     return spec.model_copy(update={"neighbours": beside})
 
 
-def _loaded(text: str, path: Path) -> object:
+def _parse_document(text: str, path: Path) -> object:
     try:
         if path.suffix.lower() == ".json":
             return json.loads(text)
@@ -243,7 +243,7 @@ class NamedNeighbour(NeighbourSpec):
     object: Name = Field(description="name of an object known to the service")
 
 
-def _whole(value: str | NamedNeighbour) -> NamedNeighbour:
+def _as_neighbour(value: str | NamedNeighbour) -> NamedNeighbour:
     return NamedNeighbour(object=value) if isinstance(value, str) else value
 
 
@@ -251,7 +251,7 @@ def _whole(value: str | NamedNeighbour) -> NamedNeighbour:
 BesideOption = Annotated[
     Annotated[Name, Tag("name")] | Annotated[NamedNeighbour, Tag("neighbour")],
     Discriminator(lambda value: "name" if isinstance(value, str) else "neighbour"),
-    AfterValidator(_whole),
+    AfterValidator(_as_neighbour),
 ]
 
 
@@ -304,7 +304,7 @@ def scene_of(
         spec = {"kind": "file", "supports": option.supports, "target": option.target, "neighbours": others}
         return SceneSpec(**spec, faces=faces, touch=touch)
     except ValidationError as error:
-        raise ValueError(refusal(error)) from None
+        raise ValueError(first_error(error)) from None
 
 
 def known_name(text: str) -> str:

@@ -31,7 +31,7 @@ class MapCell:
 
     @property
     def text(self) -> str:
-        return self.label or short(self.value)
+        return self.label or format_short(self.value)
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ def counts(cells: Iterable[MapCell]) -> dict[Outcome, int]:
     return {outcome: outcomes.count(outcome) for outcome in OUTCOMES}
 
 
-def graded(value: float, weak: float, broken: float) -> Outcome:
+def grade(value: float, weak: float, broken: float) -> Outcome:
     if not value < broken:  # True for nan too.
         return "broken"
     return "good" if value < weak else "weak"
@@ -118,7 +118,7 @@ def reachable(cells: Iterable[MapCell], where: Callable[[MapCell], bool]) -> lis
     return [replace(cell, reached=where(cell)) for cell in cells]
 
 
-def short(value: float) -> str:
+def format_short(value: float) -> str:
     """Format a number in at most five characters, for a small cell."""
     size = abs(value)
     if not math.isfinite(value):

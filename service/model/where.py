@@ -77,7 +77,7 @@ class Connective:
 Node = Flag | MetricComparison | WordComparison | TypeComparison | Negation | Connective
 
 
-def parsed(text: str) -> Node:
+def parse_where(text: str) -> Node:
     """Parse an expression to its tree; InputError states the position of a mistake, or the known names."""
     if len(text) > LONGEST:
         raise InputError(f"the expression is {len(text)} characters long; at most {LONGEST} are allowed")
@@ -118,18 +118,18 @@ class _Parser:
 
     def _chain(self, word: str, part: Callable[[], Node]) -> Node:
         parts = [part()]
-        while self._takes("word", word):
+        while self._accept("word", word):
             parts.append(part())
         return parts[0] if len(parts) == 1 else Connective(word, tuple(parts))
 
     def _factor(self, depth: int) -> Node:
         if depth > _DEEPEST:
             raise InputError(f"the expression is nested more than {_DEEPEST} deep")
-        if self._takes("word", "not"):
+        if self._accept("word", "not"):
             return Negation(self._factor(depth + 1))
-        if self._takes("op", "("):
+        if self._accept("op", "("):
             inner = self.expression(depth + 1)
-            if not self._takes("op", ")"):
+            if not self._accept("op", ")"):
                 raise InputError("a parenthesis is not closed")
             return inner
         return self._condition(self._next("a name"))
@@ -152,12 +152,12 @@ class _Parser:
         self.at += 1
         op, value = _COMPARISONS[following.text], self._next("a value")
         if name in _WORDS:
-            return _of_word(name, op, value)
+            return _word_comparison(name, op, value)
         if value.kind != "number":
             raise InputError(f"{name} is compared with a number, not with {value.text!r}")
         return MetricComparison(name, op, float(value.text))
 
-    def _takes(self, kind: str, text: str) -> bool:
+    def _accept(self, kind: str, text: str) -> bool:
         if self.at < len(self.tokens) and self.tokens[self.at] == _Token(kind, text):
             self.at += 1
             return True
@@ -170,7 +170,7 @@ class _Parser:
         return self.tokens[self.at - 1]
 
 
-def _of_word(name: str, op: str, value: _Token) -> Node:
+def _word_comparison(name: str, op: str, value: _Token) -> Node:
     if op not in ("=", "!="):
         raise InputError(f"{name} is compared with a word by = or !=, not by {op}")
     if value.kind not in ("word", "quoted"):

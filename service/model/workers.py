@@ -53,7 +53,7 @@ class WorkerBeat:
 
     @classmethod
     def of_this_process(cls, name: str, device: str, stages: Iterable[Stage]) -> Self:
-        host, now, own = socket.gethostname(), timestamp(), own_ability()
+        host, now, own = socket.gethostname(), timestamp(), capabilities()
         facts = (host, os.getpid(), device, "", tuple(stages), PACKAGE_VERSION, "checking", "", now, now)
         return cls(name, *facts, schemas=own.schemas, revisions=dict(own.revisions))
 
@@ -92,10 +92,10 @@ class Capabilities:
         return ""
 
 
-def own_ability() -> Capabilities:
+def capabilities() -> Capabilities:
     return Capabilities((OLDEST_TASK_SCHEMA, TASK_SCHEMA), STAGE_REVISIONS)
 
 
-def need_of(message: TaskMessage | IngestMessage) -> Requirements:
+def requirements_of(message: TaskMessage | IngestMessage) -> Requirements:
     revision = message.revision if isinstance(message, TaskMessage) else 0
     return Requirements(message.stage, message.schema_, message.newest_schema or message.schema_, revision)

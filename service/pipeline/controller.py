@@ -22,7 +22,7 @@ from graspd.service.model.errors import BusyError, DamagedError, NotFoundError, 
 from graspd.service.model.planning import RoundRobin, ingest_id, ingest_message
 from graspd.service.model.records import JobRecord
 from graspd.service.model.states import Priority
-from graspd.service.model.workers import WorkerBeat, need_of
+from graspd.service.model.workers import WorkerBeat, requirements_of
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.datasets.rounds import DatasetRounds
 from graspd.service.pipeline.garbage_collector import GarbageCollector
@@ -35,7 +35,7 @@ from graspd.service.pipeline.lease_reaper import LeaseReaper
 from graspd.service.pipeline.webhook_dispatcher import WebhookDispatcher
 from graspd.service.queue.port import Event, EventKind
 from graspd.service.store.library import publish_builtins, stored_assets
-from graspd.service.store.packs import take_apart
+from graspd.service.store.packs import unpack_all
 from graspd.service.store.records import newest_mark, next_mark, read_record, set_mark
 from graspd.service.telemetry import HeartbeatFile
 
@@ -93,11 +93,11 @@ class Controller:
             PeriodicDuty(clock, services.queue.tidy, _WORKERS_EVERY_S),
             PeriodicDuty(clock, self._mark, _WORKERS_EVERY_S),
             PeriodicDuty(clock, self._indexer.flush, _WORKERS_EVERY_S),
-            PeriodicDuty(clock, self._look_after_workers, _WORKERS_EVERY_S, share=0.1),
+            PeriodicDuty(clock, self._check_workers, _WORKERS_EVERY_S, share=0.1),
             # A lease is checked three times before it counts as lost.
-            PeriodicDuty(clock, self._look_after_queue, interval_s, longest_s=services.settings.lease_s / 3),
+            PeriodicDuty(clock, self._reconcile_queue, interval_s, longest_s=services.settings.lease_s / 3),
             PeriodicDuty(clock, self._feed_new, 0.0),
-            PeriodicDuty(clock, self._pass_on_progress, min(_PROGRESS_EVERY_S, interval_s), share=0.1),
+            PeriodicDuty(clock, self._publish_progress, min(_PROGRESS_EVERY_S, interval_s), share=0.1),
             # The index is free for at least as long as it was locked.
             PeriodicDuty(clock, self._enter_large_job, _ENTERING_GAP_S, share=0.5),
             PeriodicDuty(clock, self._plan, interval_s),
@@ -106,11 +106,11 @@ class Controller:
 
     def run(self, stop: threading.Event) -> None:
         """Run rounds until `stop` is set; wait with growing pauses for an unavailable backend."""
-        with self._beside(stop):
+        with self._background_duties(stop):
             self._run(stop)
 
     @contextmanager
-    def _beside(self, stop: threading.Event) -> Iterator[None]:
+    def _background_duties(self, stop: threading.Event) -> Iterator[None]:
         """Run webhooks, and the integrity scan if enabled, in parallel with the rounds."""
         duties = {"webhooks": WebhookDispatcher(self._services, stop).run}
         if self._services.settings.integrity_scan_mb_per_s:
@@ -144,7 +144,7 @@ class Controller:
                 log.exception("a round failed; the controller continues in %.2g s", pause)
                 stop.wait(pause)
         if self._started:
-            with _noted([]):
+            with _log_failures([]):
                 self._mark()
 
     def round(self, *, wait_s: float = 0.0) -> None:
@@ -152,12 +152,12 @@ class Controller:
         store.
         """
         self._identify()
-        self._see_to_the_index()
+        self._ensure_index()
         away: list[UnavailableError] = []
-        with _noted(away):
+        with _log_failures(away):
             self._index_events(0.0 if self._has_plans else min(wait_s, _PROGRESS_EVERY_S))
         for duty in self._duties:
-            with _noted(away):
+            with _log_failures(away):
                 duty()
         if away:
             raise away[0]
@@ -173,7 +173,7 @@ class Controller:
             notes.set_marked(StoreMark(fresh, fresh, changes))
             self._known, self._made = fresh, False
 
-    def _pass_on_progress(self) -> None:
+    def _publish_progress(self) -> None:
         """Publish changed progress of tasks from the reports of workers."""
         busy = (beat for beat in self._services.queue.workers() if beat.task_id)
         found = {beat.task_id: (beat.done, beat.total, beat.message) for beat in busy}
@@ -200,7 +200,7 @@ class Controller:
             log.error("the remaining tasks of job %s are not entered: %s", self._entered, error)
         self._services.index.write.enter_more(self._entered, record)
 
-    def _look_after_workers(self) -> None:
+    def _check_workers(self) -> None:
         self._announce()
         # A worker reports its regular end, but its registration disappears a moment earlier.
         present = self._services.queue.workers()
@@ -218,23 +218,23 @@ class Controller:
             forget_before=timestamp(_FORGET_WORKERS_AFTER_S),
         )
 
-    def _see_to_the_index(self) -> None:
+    def _ensure_index(self) -> None:
         """Ensure that the index is complete before events are applied, because it may be lost at any time."""
         if not self._started:
             self._start()
         elif self._services.index.notes.completeness() is None or self._is_stale():
-            self._make_whole()
+            self._rebuild_index()
 
     def _start(self) -> None:
         publish_builtins(self._services.store)
-        for manifest in take_apart(self._services.store):
+        for manifest in unpack_all(self._services.store):
             self._alive.touch()
             self._indexer.made(manifest)
         complete_if_new(self._services.index, self._services.store)
         made = self._services.index.notes.completeness()
         # Omitted records may be repaired by now.
         if made is None or made.left_out or self._is_stale():
-            self._make_whole()
+            self._rebuild_index()
         else:
             self._index_assets()
         self._started = True
@@ -250,7 +250,7 @@ class Controller:
         self._services.index.notes.set_incomplete()
         return True
 
-    def _make_whole(self) -> None:
+    def _rebuild_index(self) -> None:
         log.warning("the index may lack records of the store: it is rebuilt from the store")
         rebuild(self._services.index, self._services.store, progress=lambda *_: self._alive.touch())
 
@@ -280,7 +280,7 @@ class Controller:
     def _announce(self) -> None:
         self._services.queue.announce(PART, 5 * self._services.settings.controller_interval_s + 5)
 
-    def _look_after_queue(self) -> None:
+    def _reconcile_queue(self) -> None:
         # If Redis is readable but not writable, as on a full disk, no worker can send a heartbeat. This call then fails
         # first, and no worker counts as lost.
         self._announce()
@@ -331,12 +331,12 @@ class Controller:
         for check in self._services.index.feed.ready_checks(now=now, limit=self._services.settings.queue_window):
             self._services.index.live.set_asset_waiting([check.digest], queued=True)
             if self._services.store.exists(names.asset_check(check.kind, check.digest)):
-                with _noted([]):
+                with _log_failures([]):
                     self._indexer.checked(check.kind, check.digest)
             elif ingest_id(check.kind, check.digest) not in (present or ()):
                 numbers = {"attempt": check.last_attempt + 1, "max_attempt": self._services.settings.task_attempts}
                 message = ingest_message(check.kind, check.name, check.digest, **numbers)
-                place = self._routes.place(need_of(message))
+                place = self._routes.place(requirements_of(message))
                 if place.held:
                     self._services.index.live.set_asset_waiting([check.digest], queued=False, not_before=now + HELD_S)
                 else:
@@ -345,7 +345,7 @@ class Controller:
 
 
 @contextmanager
-def _noted(away: list[UnavailableError]) -> Iterator[None]:
+def _log_failures(away: list[UnavailableError]) -> Iterator[None]:
     """Log an unavailable backend or a damaged record, so that independent work continues."""
     try:
         yield

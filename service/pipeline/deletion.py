@@ -94,7 +94,7 @@ def delete_dataset(services: Services, name: str, *, owner: str = "", with_snaps
         services.index.removals.remove_dataset(name, within=connection)
 
 
-def put_away(services: Services, deletion: Deletion) -> None:
+def move_to_removed(services: Services, deletion: Deletion) -> None:
     """Move the deleted objects below `removed/`, the deletion's record last; nothing if the resource was restored."""
     record = _record_of(deletion)
     with services.index.database.writing():
@@ -105,7 +105,7 @@ def put_away(services: Services, deletion: Deletion) -> None:
         if deletion.job is not None:
             put_record(services.store, released_key(deletion), DeletedJob(at=deletion.at, job=deletion.job))
         attempts = [names.attempt(task, number) for task, number in deletion.attempts]
-        for key in [*attempts, *_last(_below(services.store, record.rpartition("/")[0]), record)]:
+        for key in [*attempts, *_record_last(_keys_below(services.store, record.rpartition("/")[0]), record)]:
             services.store.move(key, f"{folder}/{key}")
         services.store.delete(names.deletion(deletion.what, deletion.id))
 
@@ -144,13 +144,13 @@ def _restore(services: Services, deletion: Deletion, connection: Connection) -> 
     if not store.exists(waiting) and store.exists(record):
         called = deletion.id if deletion.what in ("job", "dataset") else deletion.name
         raise ConflictError(f"there is a {deletion.what} {called!r} again; delete that first")
-    moved = [key.removeprefix(f"{folder}/") for key in _below(store, folder)]
-    for key in _last([key for key in moved if key != "deletion.json"], record):
+    moved = [key.removeprefix(f"{folder}/") for key in _keys_below(store, folder)]
+    for key in _record_last([key for key in moved if key != "deletion.json"], record):
         store.move(f"{folder}/{key}", key)
     try:
         if deletion.what == "dataset":
             _restore_jobs(services, deletion, connection)
-        _enter(services, deletion, connection)
+        _restore_rows(services, deletion, connection)
     except ConflictError:
         if not store.exists(waiting):
             put_record(store, waiting, deletion)  # The controller will remove it again.
@@ -159,7 +159,7 @@ def _restore(services: Services, deletion: Deletion, connection: Connection) -> 
     store.delete(f"{folder}/deletion.json")
 
 
-def _enter(services: Services, deletion: Deletion, connection: Connection) -> None:
+def _restore_rows(services: Services, deletion: Deletion, connection: Connection) -> None:
     """Write the rows that follow from the records of a job, dataset, hand, object or network."""
     store, index = services.store, services.index
     if deletion.what == "job":
@@ -177,7 +177,7 @@ def _enter(services: Services, deletion: Deletion, connection: Connection) -> No
         _require(services, [*members, *((AssetKind.OBJECT, one.digest) for one in dataset.objects)], connection)
         index.write_dataset.add(dataset, within=connection)
         index.write_dataset.set_events(dataset.name, dataset_events(store, dataset.name), within=connection)
-        for key in _below(store, names.dataset_snapshots(dataset.name)):
+        for key in _keys_below(store, names.dataset_snapshots(dataset.name)):
             index.write_dataset.add_snapshot(read_record(Snapshot, store, key), within=connection)
     else:
         kind = AssetKind(deletion.what)
@@ -203,8 +203,8 @@ def _restore_jobs(services: Services, deletion: Deletion, connection: Connection
 
 def _restore_tag(services: Services, deletion: Deletion) -> None:
     folder = removed_folder(deletion)
-    key = next(key for key in _below(services.store, folder) if not key.endswith("/deletion.json"))
-    tagging.bring_back(services, read_record(Tag, services.store, key))
+    key = next(key for key in _keys_below(services.store, folder) if not key.endswith("/deletion.json"))
+    tagging.restore_tag(services, read_record(Tag, services.store, key))
     for done in (key, f"{folder}/deletion.json"):
         services.store.delete(done)
 
@@ -224,11 +224,11 @@ def _record_of(deletion: Deletion) -> str:
     return names.asset_record(AssetKind(deletion.what), deletion.id)
 
 
-def _below(store: Store, folder: str) -> list[str]:
+def _keys_below(store: Store, folder: str) -> list[str]:
     return sorted(entry.key for entry in store.list(folder))
 
 
-def _last(keys: Iterable[str], record: str) -> list[str]:
+def _record_last(keys: Iterable[str], record: str) -> list[str]:
     return sorted(keys, key=lambda key: (key == record, key))
 
 

@@ -12,7 +12,7 @@ from graspd.service.model.domain import JobRequest
 from graspd.service.model.errors import InputError
 from graspd.service.model.fidelity import AUTO, OFFERED
 from graspd.service.model.records import Choice
-from graspd.service.model.renamed import renamed_chart
+from graspd.service.model.renamed import convert_chart
 from graspd.service.model.studies import FREE, IN_SCENE, IN_SCENES, SPEEDS
 from graspd.service.store.integrity import get_document
 from graspd.service.store.records import charts_of, latest_key
@@ -91,7 +91,7 @@ class Resolver:
             key = latest_key(self._store, charts_of(request.place))
             if not key:
                 raise InputError(_no_chart(request))
-            self._charts[request.scene] = _Chart(key, renamed_chart(get_document(self._store, key)))
+            self._charts[request.scene] = _Chart(key, convert_chart(get_document(self._store, key)))
         return self._charts[request.scene]
 
 

@@ -20,7 +20,7 @@ from graspd.service.model.records import Record
 from graspd.service.model.states import AssetKind, Stage
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
-from graspd.service.pipeline.deletion import delete_job, put_away
+from graspd.service.pipeline.deletion import delete_job, move_to_removed
 from graspd.service.store.records import DeletedJob, Deletion, load_dataset, read_record, removed_before
 
 log = logging.getLogger(__name__)
@@ -38,7 +38,7 @@ class GarbageCollector:
         """Work for at most `budget_s`; return whether work is left."""
         deadline = self._clock() + budget_s
         for _, deletion in self._records(Deletion, names.DELETIONS):
-            if self._clock() > deadline or not self._carry_out(deletion, deadline):
+            if self._clock() > deadline or not self._execute(deletion, deadline):
                 return True
             log.info("the objects of %s %s are removed", deletion.what, deletion.id)
         return False
@@ -75,7 +75,7 @@ class GarbageCollector:
             except DamagedError as error:
                 log.warning("%s", error)
 
-    def _carry_out(self, deletion: Deletion, deadline: float) -> bool:
+    def _execute(self, deletion: Deletion, deadline: float) -> bool:
         """Remove rows that a killed process left, then objects; return whether all is done."""
         with self._services.index.database.writing() as connection:
             if not self._services.store.exists(names.deletion(deletion.what, deletion.id)):
@@ -89,7 +89,7 @@ class GarbageCollector:
                 removals.remove_asset(AssetKind(deletion.what), deletion.id, within=connection)
         if deletion.what == "dataset" and not self._remove_jobs_of(deletion.id, deadline):
             return False
-        put_away(self._services, deletion)
+        move_to_removed(self._services, deletion)
         return True
 
     def _remove_jobs_of(self, dataset: str, deadline: float) -> bool:

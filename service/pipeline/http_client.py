@@ -83,7 +83,7 @@ def is_public(address: Address) -> bool:
 
 def reachable(host: str, port: int, allowed: Networks) -> list[str]:
     """Return a host's addresses; RefusedAddress unless all are public or in `allowed`, OSError without any."""
-    found = list(dict.fromkeys(str(info[4][0]) for info in _looked_up(host, port)))
+    found = list(dict.fromkeys(str(info[4][0]) for info in _resolve_host(host, port)))
     for one in found:
         address = ipaddress.ip_address(one.partition("%")[0])
         if not is_public(address) and not any(address in network for network in allowed):
@@ -91,7 +91,7 @@ def reachable(host: str, port: int, allowed: Networks) -> list[str]:
     return found
 
 
-def _looked_up(host: str, port: int) -> list[Any]:
+def _resolve_host(host: str, port: int) -> list[Any]:
     """Return the addresses of a host; OSError if it has none, or after `LOOK_UP_S`."""
     found: list[Any] = []
 

@@ -62,7 +62,7 @@ class Identity:
         if not self.chain or self.is_same or take_over:
             return ""
         if self.index is not None and self.index not in self.chain:
-            return _others_index(store)
+            return _foreign_index_error(store)
         known = {self.index, self.redis, self.folder} & set(self.chain)
         what = "was taken over by" if known else "belongs to"
         return (
@@ -97,7 +97,7 @@ def identify(
     if not chain:
         # An empty index remains from a start that was killed here.
         if index is not None and not take_over and services.index.notes.completeness() is not None:
-            raise BusyError(_others_index(services.store.url))
+            raise BusyError(_foreign_index_error(services.store.url))
         index = services.index.notes.name_service(index or secrets.token_hex(_BYTES))
         if redis not in (None, index) and not holds_redis:
             raise BusyError(_REDIS)
@@ -147,7 +147,7 @@ def recorded(folder: Path | None) -> str | None:
     return None
 
 
-def _others_index(store: str) -> str:
+def _foreign_index_error(store: str) -> str:
     return (
         f"the index belongs to another graspd service than the store {store}; name the index of that store, or run "
         "`graspd admin index rebuild` to make this one from it"

@@ -77,14 +77,14 @@ class Indexer:
     def _start(self, started: dict[str, str]) -> None:
         """Mark tasks as started by workers; remove them from the argument."""
         if started:
-            with _left_out(f"the start of {len(started)} tasks"):
+            with _skip_invalid(f"the start of {len(started)} tasks"):
                 self.tell(self._services.index.live.set_running(started))
             started.clear()
 
     def _finish(self, events: Sequence[Event], places: Sequence[int]) -> list[int]:
         """Index finished shards; return the positions of events whose manifests cannot be read."""
         made, waiting = list[ShardManifest](), []
-        for place, found in self._loaded(events, places):
+        for place, found in self._load_manifests(events, places):
             if isinstance(found, ShardManifest):
                 self._deferrals.pop(events[place].task_id, None)
                 made.append(found)
@@ -100,7 +100,7 @@ class Indexer:
         self._index(made)
         return waiting
 
-    def _loaded(
+    def _load_manifests(
         self, events: Sequence[Event], places: Sequence[int]
     ) -> Iterator[tuple[int, ShardManifest | Exception]]:
         for some in chunks(places, _MANIFESTS_AT_ONCE):
@@ -170,14 +170,14 @@ class Indexer:
     def _apply(self, event: Event) -> bool:
         """Apply one event by itself; return False if it must wait for the store."""
         try:
-            with _left_out(f"event {event.kind} of task {event.task_id}"):
-                self._take_up(event)
+            with _skip_invalid(f"event {event.kind} of task {event.task_id}"):
+                self._handle_event(event)
         except StoreUnavailable as error:
             log.warning("%s; events wait for it", error)
             return False
         return True
 
-    def _take_up(self, event: Event) -> None:
+    def _handle_event(self, event: Event) -> None:
         if event.kind is EventKind.FINISHED:
             kind, _, digest = event.output.partition("/")
             self.checked(AssetKind(kind), digest)
@@ -191,16 +191,16 @@ class Indexer:
             if event.kind is EventKind.DEFERRED:
                 self._defer(event)
             else:
-                self._wait_again(event, 0.0, None)
+                self._set_waiting(event, 0.0, None)
 
     def _defer(self, event: Event) -> None:
         if len(self._deferrals) >= _REMEMBERED_TASKS:
             self._deferrals.clear()
         count = self._deferrals[event.task_id] = self._deferrals.get(event.task_id, 0) + 1
         wait = backoff(self._services.settings.retry_backoff_s, count)
-        self._wait_again(event, time.time() + wait, f"waits: {event.message}")
+        self._set_waiting(event, time.time() + wait, f"waits: {event.message}")
 
-    def _wait_again(self, event: Event, not_before: float, message: str | None) -> None:
+    def _set_waiting(self, event: Event, not_before: float, message: str | None) -> None:
         if event.stage is Stage.INGEST:
             digest = event.output.partition("/")[2]
             self._services.index.live.set_asset_waiting([digest], queued=False, not_before=not_before, message=message)
@@ -209,7 +209,7 @@ class Indexer:
 
 
 @contextmanager
-def _left_out(what: str) -> Iterator[None]:
+def _skip_invalid(what: str) -> Iterator[None]:
     """Skip an invalid event: any client of Redis can write one, and it must not block others."""
     try:
         yield

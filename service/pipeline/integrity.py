@@ -111,7 +111,7 @@ def examine(
     """Return the damage of one object or None; the file of a shard is checked with its manifest."""
     try:
         if not key.startswith(f"{names.SHARDS}/"):
-            return _sealed(store, key, read, unsealed)
+            return _check_sealed(store, key, read, unsealed)
         if (match := _SHARD.fullmatch(key)) is None:
             return Damage(key, FOREIGN) if store.exists(key) else None
         kind, shard, ending = match.groups()
@@ -125,12 +125,12 @@ def examine(
         return None  # The object was removed after the listing.
 
 
-def _sealed(store: Store, key: str, read: Read, unsealed: Unsealed) -> Damage | None:
+def _check_sealed(store: Store, key: str, read: Read, unsealed: Unsealed) -> Damage | None:
     """Check an object by its own checksum; without one, check its content as far as possible."""
     match = _UPLOAD.fullmatch(key)
     model = next((model for pattern, model in _RECORDS if re.fullmatch(pattern, key)), None)
     try:
-        if not is_sealed(key, _counted(store.stream(key), read), store.size(key)):
+        if not is_sealed(key, _count_bytes(store.stream(key), read), store.size(key)):
             unsealed(key)
             if match is not None and match[3] == "files.zip":
                 _check_upload(store, key, AssetKind(match[1]), match[2])
@@ -143,7 +143,7 @@ def _sealed(store: Store, key: str, read: Read, unsealed: Unsealed) -> Damage | 
     return None
 
 
-def _counted(chunks: Iterator[bytes], read: Read) -> Iterator[bytes]:
+def _count_bytes(chunks: Iterator[bytes], read: Read) -> Iterator[bytes]:
     for chunk in chunks:
         read(len(chunk))
         yield chunk

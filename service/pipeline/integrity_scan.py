@@ -73,7 +73,7 @@ class IntegrityScan:
 
     def advance(self) -> bool:
         """Read some more objects; return whether more can be read now. Interrupted: `store verify` reads now."""
-        self._look_again_in_time(None)
+        self._recheck_if_due(None)
         note = self._services.index.notes.scan_note()
         if note.folder >= len(FOLDERS):
             if (age_of(note.started) or 0.0) < ROUND_S:
@@ -83,8 +83,8 @@ class IntegrityScan:
         keys = self._keys(FOLDERS[note.folder], note.after)
         for key in keys:
             if is_checked(key):
-                self._look(key)
-            self._look_again_in_time(replace(note, after=key))
+                self._check(key)
+            self._recheck_if_due(replace(note, after=key))
         over = len(keys) < _KEYS
         note = replace(note, folder=note.folder + over, after="" if over else keys[-1])
         if note.folder == len(FOLDERS):
@@ -92,7 +92,7 @@ class IntegrityScan:
         self._services.index.notes.set_scan_note(note)
         return True
 
-    def _look_again_in_time(self, reached: ScanNote | None) -> None:
+    def _recheck_if_due(self, reached: ScanNote | None) -> None:
         if self._clock() - self._looked > _AGAIN_S:
             if reached is not None:
                 self._services.index.notes.set_scan_note(reached)
@@ -102,15 +102,15 @@ class IntegrityScan:
         """Check known damage again; remove repaired and deleted objects from the list."""
         self._looked = self._clock()
         _, known = self._services.index.damage.known(limit=_KNOWN)
-        if well := [one.key for one in known if self._is_well(one)]:
+        if well := [one.key for one in known if self._is_repaired(one)]:
             self._services.index.damage.mark([], intact=well)
 
-    def _is_well(self, one: Damage) -> bool:
+    def _is_repaired(self, one: Damage) -> bool:
         stem, dot, _ = one.key.rpartition(".")
         keys = [f"{stem}.json", f"{stem}.h5"] if one.shard and dot else [one.key]
         return all(examine(self._services.store, key, read=self._pace) is None for key in keys)
 
-    def _look(self, key: str) -> None:
+    def _check(self, key: str) -> None:
         self._pace(_LEAST)
         wrong = examine(self._services.store, key, read=self._pace)
         if wrong is not None and not may_await_manifest(self._services.store, wrong):

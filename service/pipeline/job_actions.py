@@ -26,12 +26,12 @@ from graspd.service.model.records import JobRecord
 from graspd.service.model.scene_spec import HalfSpace, Pose, Supports
 from graspd.service.model.states import AssetKind, Priority, Stage, State
 from graspd.service.model.transforms import quat_conjugate, quat_rotate
-from graspd.service.model.workers import Capabilities, Requirements, WorkerBeat, need_of, own_ability
+from graspd.service.model.workers import Capabilities, Requirements, WorkerBeat, capabilities, requirements_of
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.fidelity_choice import Resolver
 from graspd.service.pipeline.ranges import TaskRanges
 from graspd.service.pipeline.recording import recording
-from graspd.service.pipeline.usable import refuse_deleted, usable, with_neighbours, with_network
+from graspd.service.pipeline.usable import refuse_deleted, usable_asset, with_neighbours, with_network
 from graspd.service.queue.port import Event, EventKind
 from graspd.service.store.records import add_job_event, job_events, put_record, read_record, refuse_pending
 from graspd.service.telemetry import bound
@@ -59,12 +59,12 @@ def prepare(
     """Return the job of a request whose hand, object and network are in scope; a small job is interactive.
 
     Raises:
-        NotFoundError, ConflictError: as in `usable`, also of neighbours and network.
+        NotFoundError, ConflictError: as in `usable_asset`, also of neighbours and network.
         InputError: a failed check; a network of another hand; no chart meets the target; the object or a neighbour
             penetrates a support of its scene (SceneError).
     """
-    hand = usable(services, AssetKind.HAND, request.hand, scope)
-    obj = usable(services, AssetKind.OBJECT, request.object, scope)
+    hand = usable_asset(services, AssetKind.HAND, request.hand, scope)
+    obj = usable_asset(services, AssetKind.OBJECT, request.object, scope)
     request, beside = with_neighbours(services, request, scope)
     request = with_network(services, request, [hand], scope)
     check_scene(request, obj, beside)
@@ -115,22 +115,22 @@ def cancel(services: Services, job_id: str, *, cause: str = "") -> JobView:
 
     The job's event names the causing event of a dataset, if any. ConflictError for a job that has ended.
     """
-    with _changing(services, job_id, _refuse_ended) as add:
+    with _transaction(services, job_id, _refuse_ended) as add:
         in_queue = services.index.feed.unfinished_tasks(job_id)
         add("cancelled", cause=cause)
     try:
         services.queue.discard(in_queue)
     except UnavailableError as error:
         log.warning("job %s is cancelled; its queued tasks are removed once the queue answers: %s", job_id, error)
-    return _told(services, job_id)
+    return _publish_state(services, job_id)
 
 
 def retry(services: Services, job_id: str, *, cause: str = "") -> JobView:
     """Queue the failed and cancelled tasks of a job again, with fresh attempts; ConflictError without any."""
-    with _changing(services, job_id, _refuse_unfailed) as add:
+    with _transaction(services, job_id, _refuse_unfailed) as add:
         add("retried", services.index.feed.failed_tasks(job_id), cause=cause)
     _start(services, job_id)
-    return _told(services, job_id)
+    return _publish_state(services, job_id)
 
 
 @dataclass(frozen=True)
@@ -155,7 +155,7 @@ class Routes:
         none is,
         the task is held back. Without workers, this version's capabilities are assumed.
         """
-        here = self._here.get(need.stage) or [own_ability()]
+        here = self._here.get(need.stage) or [capabilities()]
         lacking = {one.lacks(need) for one in here} - {""}
         if all(one.lacks(need) for one in here):
             return Route(held=f"held back, because no present worker is capable: {'; '.join(sorted(lacking))}")
@@ -172,7 +172,7 @@ def queue_tasks(services: Services, ready: Sequence[ReadyTask], *, routes: Route
     for task in ready:
         most = task.retried_upto + services.settings.task_attempts
         message = message_of(task.job, task.task, attempt=task.last_attempt + 1, max_attempt=most)
-        place = routes.place(need_of(message))
+        place = routes.place(requirements_of(message))
         if place.held:
             held[place.held].append(task.task.id)
         else:
@@ -193,13 +193,13 @@ def _start(services: Services, job_id: str) -> None:
         if room > 0:
             routes = Routes(services.queue.workers())
             queue_tasks(services, services.index.feed.ready_of_job(job_id, limit=room), routes=routes)
-        _told(services, job_id)
+        _publish_state(services, job_id)
     except UnavailableError as error:
         log.warning("job %s is recorded; its tasks are queued when the queue answers: %s", job_id, error)
 
 
 @contextmanager
-def _changing(services: Services, job_id: str, refuse: Callable[[JobView], None]) -> Iterator[Callable[..., None]]:
+def _transaction(services: Services, job_id: str, refuse: Callable[[JobView], None]) -> Iterator[Callable[..., None]]:
     """Lock a job to append an event unless `refuse` raises; of two concurrent changes the later one sees both.
 
     Earlier events are read before the lock, because the store may be slow.
@@ -231,7 +231,7 @@ def _refuse_unfailed(job: JobView) -> None:
         raise ConflictError(f"job {job.id} is {job.state}; only a failed or cancelled job can be retried")
 
 
-def _told(services: Services, job_id: str) -> JobView:
+def _publish_state(services: Services, job_id: str) -> JobView:
     job = services.index.jobs.get(job_id)
     try:
         services.queue.publish(Event(kind=EventKind.JOB, at=timestamp(), job_id=job_id, message=job.state.value))

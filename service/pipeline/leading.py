@@ -41,7 +41,7 @@ class Leadership:
         told = False
         while not stop.is_set():
             self._alive.touch()
-            if (leads := self._leads()) is True:
+            if (leads := self._renew_lease()) is True:
                 log.info("this controller leads")
                 return True
             if leads is False and not told:
@@ -74,14 +74,14 @@ class Leadership:
         while not done.wait(_LOOK_S) and not stop.is_set():
             if time.monotonic() < due:
                 continue
-            if self._leads() is False and not over.is_set():
+            if self._renew_lease() is False and not over.is_set():
                 log.warning("this controller was silent for too long, and another leads now")
                 over.set()
             due = time.monotonic() + self._lease_s / _RENEWALS
         if stop.is_set():
             over.set()
 
-    def _leads(self) -> bool | None:
+    def _renew_lease(self) -> bool | None:
         """Return whether this process leads for the next lease; None if Redis is unavailable."""
         try:
             return self._queue.lead(self.holder, self._lease_s)

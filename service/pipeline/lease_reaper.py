@@ -19,7 +19,7 @@ from graspd.service.pipeline.indexer import Indexer
 from graspd.service.queue.port import Lease
 from graspd.service.store.integrity import put_document
 from graspd.service.store.manifests import load_manifest
-from graspd.service.store.packs import take_apart
+from graspd.service.store.packs import unpack_all
 from graspd.service.store.records import put_record, read_record, task_attempts
 
 log = logging.getLogger(__name__)
@@ -52,7 +52,7 @@ class LeaseReaper:
             if silence <= lease_s:
                 heartbeats[lease.key] = (lease.beat, silence)
             else:
-                self._lose(lease)
+                self._handle_lost_lease(lease)
                 lost.append(lease)
         self._heartbeats = heartbeats
         return lost
@@ -74,7 +74,7 @@ class LeaseReaper:
         """Recover lost events from the store; queue tasks again whose result the store lacks."""
         again = []
         for made in (
-            take_apart(self._services.store) if missing else ()
+            unpack_all(self._services.store) if missing else ()
         ):  # Written by a worker of 0.2, in a rolling upgrade.
             self._indexer.made(made)
         for task, (stage, shard) in self._services.index.feed.outputs(missing).items():
@@ -121,14 +121,14 @@ class LeaseReaper:
         else:
             self._services.index.live.set_asset_waiting([digest], queued=False)
 
-    def _lose(self, lease: Lease) -> None:
+    def _handle_lost_lease(self, lease: Lease) -> None:
         worker, message = self._services.queue.holder(lease)
         log.warning("worker %s was lost with task %s (attempt %d)", worker, lease.task_id, lease.attempt)
         try:
             if isinstance(message, TaskMessage):
-                self._lose_task(worker, message)
+                self._fail_lost_task(worker, message)
             elif isinstance(message, IngestMessage):
-                self._lose_check(message)
+                self._fail_lost_check(message)
         except UnavailableError:
             raise
         except Exception:  # Any client of Redis can forge a lease, which must not block others.
@@ -136,7 +136,7 @@ class LeaseReaper:
         # The lease is removed last: if the store was unavailable, the next round finds the lease again.
         self._services.queue.release(lease)
 
-    def _lose_task(self, worker: str, message: TaskMessage) -> None:
+    def _fail_lost_task(self, worker: str, message: TaskMessage) -> None:
         if self._find(message.task_id, message.stage, message.output):
             return
         attempt = AttemptRecord.of(
@@ -156,7 +156,7 @@ class LeaseReaper:
         # No wait: the machine causes a first loss more often than the task does.
         self._indexer.failed(attempt, at_once=attempt.number == 1)
 
-    def _lose_check(self, message: IngestMessage) -> None:
+    def _fail_lost_check(self, message: IngestMessage) -> None:
         if message.attempt >= message.max_attempt:
             ended = f"the check of this {message.kind.value} crashed its worker {message.attempt} times"
             reason = f"{ended}; delete it to try again"

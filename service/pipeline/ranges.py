@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Final
 
 from graspd.service.index.queries.overview import BatchCost
-from graspd.service.index.queries.rates import Rates, tries
+from graspd.service.index.queries.rates import Rates, candidates
 from graspd.service.model.domain import batches_of
 from graspd.service.model.projects import EVERYTHING, ProjectScope
 from graspd.service.model.records import MOST_BATCHES, JobRecord
@@ -52,7 +52,7 @@ class TaskRanges:
         if job.priority is Priority.INTERACTIVE and not (able and all(one.device.startswith("cuda") for one in able)):
             return job
         rate = Rates(self._costs, job.request, {one.device for one in able}).of(job.request.hand, job.request.object)
-        batch_s = rate.seconds_per_try * tries(rate, job.request) / batches
+        batch_s = rate.seconds_per_try * candidates(rate, job.request) / batches
         by_time = int(wanted_s / max(1e-3, batch_s or wanted_s))
         workers = -(-(len(able) or _EXPECTED) // among)
         return job.model_copy(update={"span": span_of(batches, by_time, workers)})

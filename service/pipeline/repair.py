@@ -50,7 +50,7 @@ def _fix(services: Services, one: Damage, harmed: set[str]) -> str:
     stage = STAGES[one.key.split("/")[1]]
     if may_await_manifest(services.store, one):
         return "its manifest may follow soon; run the command again in a minute"
-    planned = _planned(services, stage, one.shard)
+    planned = _task_of_shard(services, stage, one.shard)
     if isinstance(planned, str):
         if one.what == NO_MANIFEST:
             services.store.set_aside(one.key)
@@ -94,18 +94,18 @@ def _clear(services: Services, one: Damage, stage: Stage) -> None:
     file, manifest = names.shard_file(stage, one.shard), names.shard_manifest(stage, one.shard)
     if one.what == BAD_MANIFEST:
         services.store.set_aside(manifest)
-    if one.what not in (BAD_MANIFEST, NO_MANIFEST) or not _known_to_index(services, one.shard, file):
+    if one.what not in (BAD_MANIFEST, NO_MANIFEST) or not _matches_index(services, one.shard, file):
         services.store.set_aside(file)
 
 
-def _known_to_index(services: Services, shard: str, file: str) -> bool:
+def _matches_index(services: Services, shard: str, file: str) -> bool:
     try:
         return services.index.shards.get(shard).sha256 == hashlib.sha256(services.store.get(file)).hexdigest()
     except NotFoundError:
         return False
 
 
-def _planned(services: Services, stage: Stage, shard: str) -> tuple[JobRecord, PlannedTask] | str:
+def _task_of_shard(services: Services, stage: Stage, shard: str) -> tuple[JobRecord, PlannedTask] | str:
     """Return the task that makes a shard, or the reason why there is none."""
     job = services.index.shards.job_of(shard)
     if job is None:

@@ -16,7 +16,9 @@ from graspd.service.store.records import Deletion, drop_older, newest_version, p
 Permit = Callable[[Tag | None], None]
 
 
-def give(services: Services, name: str, grasps: Collection[Grasp], *, project: str, owner: str, permit: Permit) -> int:
+def tag_grasps(
+    services: Services, name: str, grasps: Collection[Grasp], *, project: str, owner: str, permit: Permit
+) -> int:
     """Give a tag to grasps; return how many did not have it. LimitError: more than `MOST_TAGGED`."""
 
     def added(tag: Tag) -> Tag:
@@ -31,7 +33,7 @@ def give(services: Services, name: str, grasps: Collection[Grasp], *, project: s
     return len(after.members) - len(before.members)
 
 
-def take_off(services: Services, tag: str, grasps: Collection[Grasp], *, permit: Permit) -> int:
+def untag_grasps(services: Services, tag: str, grasps: Collection[Grasp], *, permit: Permit) -> int:
     """Remove a tag, by its id, from grasps; return how many had it."""
     before, after = _change(
         services, tag, lambda one: one.model_copy(update={"grasps": by_shard(one.members - set(grasps))}), permit
@@ -39,7 +41,7 @@ def take_off(services: Services, tag: str, grasps: Collection[Grasp], *, permit:
     return len(before.members) - len(after.members)
 
 
-def remove(services: Services, tag: str, *, permit: Permit, owner: str = "") -> None:
+def delete_tag(services: Services, tag: str, *, permit: Permit, owner: str = "") -> None:
     """Delete a tag by its id; its list of grasps is stored for the grace time."""
 
     def gone(one: Tag) -> Tag:
@@ -53,7 +55,7 @@ def remove(services: Services, tag: str, *, permit: Permit, owner: str = "") -> 
     _change(services, tag, gone, permit)
 
 
-def bring_back(services: Services, tag: Tag) -> None:
+def restore_tag(services: Services, tag: Tag) -> None:
     """Restore a deleted tag with its grasps; ConflictError if the name is in use again."""
 
     def permit(known: Tag | None) -> None:

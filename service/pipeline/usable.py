@@ -18,7 +18,7 @@ from graspd.service.pipeline.backends import Services
 Options = TypeVar("Options", bound=JobOptions)
 
 
-def usable(services: Services, kind: AssetKind, name: str, scope: ProjectScope = EVERYTHING) -> AssetView:
+def usable_asset(services: Services, kind: AssetKind, name: str, scope: ProjectScope = EVERYTHING) -> AssetView:
     """Return a hand, object or network, by name or digest, that jobs may use.
 
     NotFoundError: none is in scope. InputError: it failed its check. ConflictError: its check is still running.
@@ -42,10 +42,10 @@ def with_neighbours(
 ) -> tuple[Options, Sequence[AssetView]]:
     """Return options with the present digests of the neighbours' names, and these neighbours.
 
-    A digest in the request itself, for example one copied from a job, stays. Errors as in `usable`; InputError if a
-    name and a digest belong to two objects.
+    A digest in the request itself, for example one copied from a job, stays. Errors as in `usable_asset`; InputError if
+    a name and a digest belong to two objects.
     """
-    beside = [usable(services, AssetKind.OBJECT, one.digest or one.object, scope) for one in options.beside]
+    beside = [usable_asset(services, AssetKind.OBJECT, one.digest or one.object, scope) for one in options.beside]
     found = []
     for one, asset in zip(options.beside, beside, strict=True):
         if one.object not in (asset.name, asset.digest):
@@ -59,11 +59,11 @@ def with_network(
 ) -> Options:
     """Return options with the digest of their network; unchanged if their method uses none.
 
-    Errors as in `usable`; InputError if the network proposes grasps of another hand.
+    Errors as in `usable_asset`; InputError if the network proposes grasps of another hand.
     """
     if not options.network:
         return options
-    network = usable(services, AssetKind.NETWORK, options.network, scope)
+    network = usable_asset(services, AssetKind.NETWORK, options.network, scope)
     own = str(network.facts.get("hand_digest", ""))
     if other := next((hand for hand in hands if hand.digest != own), None):
         raise InputError(

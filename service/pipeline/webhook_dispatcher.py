@@ -79,24 +79,24 @@ class WebhookDispatcher:
             return []
         out.plan()
         started = []
-        for due in self._in_turn(out.due(time.time() if now is None else now)):
+        for due in self._fair_order(out.due(time.time() if now is None else now)):
             with self._lock:
-                slow = sum(map(self._failed_last, self._under_way.values()))
-                full = len(self._under_way) >= AT_ONCE or (self._failed_last(due) and slow >= SLOW_AT_ONCE)
+                slow = sum(map(self._has_failed, self._under_way.values()))
+                full = len(self._under_way) >= AT_ONCE or (self._has_failed(due) and slow >= SLOW_AT_ONCE)
                 if full or due.hook.id in self._under_way:
                     continue
                 self._under_way[due.hook.id] = due
-            started.append(self._pool.submit(self._try, due))
+            started.append(self._pool.submit(self._attempt, due))
         return started
 
-    def _in_turn(self, found: list[DueDelivery]) -> list[DueDelivery]:
+    def _fair_order(self, found: list[DueDelivery]) -> list[DueDelivery]:
         """Sort by turns of projects, or of keys without a project; within each, the least recently used first."""
         of_project: dict[str, list[DueDelivery]] = {}
         for due in sorted(found, key=lambda one: self._last.get(one.hook.id, (0.0, False))):
             of_project.setdefault(due.hook.project or f"key {due.hook.owner}", []).append(due)
         return interleave(list(of_project.values()))
 
-    def _failed_last(self, due: DueDelivery) -> bool:
+    def _has_failed(self, due: DueDelivery) -> bool:
         return due.attempts > 0 or self._last.get(due.hook.id, (0.0, False))[1]
 
     def tell_datasets(self) -> None:
@@ -107,7 +107,7 @@ class WebhookDispatcher:
             row |= {"project": dataset.project, "owner": dataset.owner}
             self._services.index.outbox.tell_dataset(name, untold[name], row)
 
-    def _try(self, due: DueDelivery) -> None:
+    def _attempt(self, due: DueDelivery) -> None:
         is_settled = False
         try:
             self._deliver(due)

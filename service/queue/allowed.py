@@ -16,7 +16,7 @@ from rq.job import Job
 from rq.serializers import JSONSerializer
 
 from graspd.service.model.errors import TaskRefused
-from graspd.service.queue.entries import is_wrong_type
+from graspd.service.queue.entries import is_type_error
 
 TASK_FUNCTION: Final = "graspd.task"
 #: Lifetime of the data of a broken job in Redis [s]. Results are not stored: events report them.
@@ -40,8 +40,8 @@ def allowed_job(job: Job, queue: Queue) -> Job:
     return new_job(message, id=job.id, origin=queue.name, connection=job.connection, description=job.description)
 
 
-def is_of_an_entry(error: Exception) -> bool:
+def is_entry_error(error: Exception) -> bool:
     """Check whether RQ failed to read an entry rather than to take it: unreadable entries are discarded."""
     if not hasattr(error, "job_id"):  # RQ sets job_id on errors of reading an entry's job.
         return isinstance(error, UnicodeDecodeError)
-    return not isinstance(error, RedisError) or is_wrong_type(error)
+    return not isinstance(error, RedisError) or is_type_error(error)

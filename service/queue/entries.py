@@ -14,7 +14,7 @@ from typing import Any, Final, TypeVar
 from pydantic import TypeAdapter, ValidationError
 
 from graspd.service.model.messages import message_type
-from graspd.service.model.renamed import renamed
+from graspd.service.model.renamed import convert_names
 from graspd.service.model.workers import WorkerBeat
 from graspd.service.queue.port import Event, Message
 
@@ -38,7 +38,7 @@ def task_of(job: str) -> tuple[str, int]:
     return (match[1], int(match[2])) if match else (job, 0)
 
 
-def is_wrong_type(error: Exception) -> bool:
+def is_type_error(error: Exception) -> bool:
     return str(error).startswith("WRONGTYPE")
 
 
@@ -46,7 +46,7 @@ def message(data: bytes | None) -> Message | None:
     if data is None:
         return None
     try:
-        raw = renamed(json.loads(zlib.decompressobj().decompress(data, _MESSAGE_BYTES))[2][0])
+        raw = convert_names(json.loads(zlib.decompressobj().decompress(data, _MESSAGE_BYTES))[2][0])
         return message_type(raw).model_validate(raw)
     except Exception:  # Forged data may raise any error.
         return None

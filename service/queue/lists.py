@@ -57,30 +57,30 @@ def queue_names(stages: Collection[Stage], taken: int = 0, *, ability: Capabilit
     ]
 
 
-def known_lists(connection: Any) -> list[str]:
+def list_names(connection: Any) -> list[str]:
     """Return the names of lists that may contain tasks: the common ones, and all separate ones ever used."""
     try:
         found = connection.smembers(LISTS)
     except ResponseError as error:
-        if not entries.is_wrong_type(error):
+        if not entries.is_type_error(error):
             raise
         found = set()
     named = (entries.text(raw).removeprefix(Queue.redis_queue_namespace_prefix) for raw in found)
-    return [*_COMMON, *sorted(name for name in named if is_apart(name))[:_MOST_APART]]
+    return [*_COMMON, *sorted(name for name in named if is_separate(name))[:_MOST_APART]]
 
 
 def place_of(name: str) -> tuple[Priority, Stage]:
     return _PLACES[_common(name)]
 
 
-def is_apart(name: str) -> bool:
+def is_separate(name: str) -> bool:
     return name not in _PLACES and _common(name) in _PLACES
 
 
-def without_takers(names: Iterable[str], abilities: Collection[tuple[Stage, Capabilities]]) -> list[str]:
+def unserved_lists(names: Iterable[str], abilities: Collection[tuple[Stage, Capabilities]]) -> list[str]:
     """Return the separate lists that no capable worker of their stage reads."""
     served = {name for stage, ability in abilities for name in queue_names([stage], ability=ability)}
-    return [name for name in names if is_apart(name) and name not in served]
+    return [name for name in names if is_separate(name) and name not in served]
 
 
 def _common(name: str) -> str:

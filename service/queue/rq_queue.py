@@ -25,9 +25,9 @@ from rq.serializers import JSONSerializer
 from graspd.service.model.base import first_line
 from graspd.service.model.clock import age_of
 from graspd.service.model.errors import QueueUnavailable
-from graspd.service.model.renamed import for_worker_of
+from graspd.service.model.renamed import message_for_revision
 from graspd.service.model.states import Priority, Stage
-from graspd.service.model.workers import WorkerBeat, need_of
+from graspd.service.model.workers import WorkerBeat, requirements_of
 from graspd.service.queue import entries
 from graspd.service.queue.allowed import new_job
 from graspd.service.queue.connection import connect, redis_url
@@ -38,12 +38,12 @@ from graspd.service.queue.lists import (
     held_key,
     job_key,
     kinds,
-    known_lists,
     list_key,
+    list_names,
     place_of,
     queue_name,
     rq_worker_key,
-    without_takers,
+    unserved_lists,
     workers_key,
 )
 from graspd.service.queue.port import Event, Lease, Message, Place, QueueStatus
@@ -81,7 +81,7 @@ class RqQueue:
     def ping(self) -> float:
         """Return the round-trip time [s]."""
         start = time.perf_counter()
-        with _mapped():
+        with _convert_errors():
             self.connection.ping()
         return time.perf_counter() - start
 
@@ -96,11 +96,11 @@ class RqQueue:
         if again:
             stale += [job_key(rq_id(message.task_id, message.attempt)) for message in messages]
         added = 0
-        with _mapped():
+        with _convert_errors():
             if stale:
                 self.connection.delete(*stale)
             for message in messages:
-                name = queue_name(priority, message.stage, need_of(message) if apart else None)
+                name = queue_name(priority, message.stage, requirements_of(message) if apart else None)
                 if name not in self._queues:
                     self._queues[name] = Queue(name, self.connection, serializer=JSONSerializer)
                 with suppress(DuplicateJobError):
@@ -111,7 +111,7 @@ class RqQueue:
     def discard(self, task_ids: Collection[str]) -> None:
         """Remove waiting tasks; ask workers that run one of them to stop at the next launch."""
         wanted = set(task_ids)
-        with _mapped(), self.connection.pipeline(transaction=False) as pipe:
+        with _convert_errors(), self.connection.pipeline(transaction=False) as pipe:
             for task in wanted:
                 pipe.set(cancel_key(task), "1", ex=_CANCEL_TTL_S)
             pipe.execute()
@@ -123,14 +123,14 @@ class RqQueue:
             pipe.execute()
 
     def waiting(self) -> set[str]:
-        with _mapped(), self.connection.pipeline(transaction=True) as pipe:
+        with _convert_errors(), self.connection.pipeline(transaction=True) as pipe:
             for key in self._list_keys():
                 pipe.lrange(key, 0, -1)
             return {entries.task_of(entries.text(job))[0] for jobs in pipe.execute() for job in jobs}
 
     def depths(self) -> dict[tuple[Priority, Stage], int]:
-        with _mapped(), self.connection.pipeline(transaction=False) as pipe:
-            lists = known_lists(self.connection)
+        with _convert_errors(), self.connection.pipeline(transaction=False) as pipe:
+            lists = list_names(self.connection)
             for name in lists:
                 pipe.llen(list_key(name))
             depths: Counter[tuple[Priority, Stage]] = Counter()
@@ -141,8 +141,8 @@ class RqQueue:
     def clear_untaken(self, present: Collection[WorkerBeat]) -> None:
         """Remove separate lists without capable workers; the controller then finds their tasks missing."""
         abilities = [(stage, beat.ability) for beat in present for stage in beat.stages]
-        with _mapped(), self.connection.pipeline(transaction=False) as pipe:
-            for name in without_takers(known_lists(self.connection), abilities):
+        with _convert_errors(), self.connection.pipeline(transaction=False) as pipe:
+            for name in unserved_lists(list_names(self.connection), abilities):
                 key = list_key(name)
                 for job in self.connection.lrange(key, 0, -1):
                     pipe.delete(job_key(entries.text(job)))
@@ -155,8 +155,8 @@ class RqQueue:
     def leases(self) -> list[Lease]:
         """Return the leases of all workers, living or dead; reading changes nothing."""
         # RQ's own readers also move lost tasks and run callbacks, so the keys are read directly.
-        with _mapped(), self.connection.pipeline(transaction=False) as pipe:
-            keys = [held_key(name) for name in known_lists(self.connection)]
+        with _convert_errors(), self.connection.pipeline(transaction=False) as pipe:
+            keys = [held_key(name) for name in list_names(self.connection)]
             for key in keys:
                 pipe.zrange(key, 0, -1, withscores=True)
             found = pipe.execute()
@@ -169,7 +169,7 @@ class RqQueue:
 
     def holder(self, lease: Lease) -> tuple[str, Message | None]:
         """Return worker and message of a lost lease, one round trip each; None for data that Redis has lost."""
-        with _mapped(), self.connection.pipeline(transaction=False) as pipe:
+        with _convert_errors(), self.connection.pipeline(transaction=False) as pipe:
             pipe.hmget(job_key(entries.text(lease.key[1].partition(b":")[0])), "worker_name", "data")
             (found,) = pipe.execute(raise_on_error=False)  # The name may have a value of another type.
         worker, data = (None, None) if isinstance(found, Exception) else found
@@ -179,68 +179,68 @@ class RqQueue:
         """Remove the lease of a lost worker; a worker that still lives detects the loss and stops."""
         key, entry = lease.key
         name = entries.text(entry)
-        with _mapped(), self.connection.pipeline(transaction=True) as pipe:
+        with _convert_errors(), self.connection.pipeline(transaction=True) as pipe:
             pipe.zrem(key, entry)
             pipe.delete(*execution_keys(name), job_key(name.partition(":")[0]))
             pipe.execute()
 
     def workers(self) -> list[WorkerBeat]:
         """Return the workers with a heartbeat within the last lease time."""
-        with _mapped():
+        with _convert_errors():
             names = sorted(self.connection.smembers(WORKERS))
             found = self.connection.mget([_WORKER + name for name in names]) if names else []
         return [beat for data in found if (beat := entries.read(WorkerBeat, data)) is not None]
 
     def publish(self, *events: Event) -> None:
-        with _mapped(), self.connection.pipeline(transaction=False) as pipe:
+        with _convert_errors(), self.connection.pipeline(transaction=False) as pipe:
             for event in events:
                 put_event(pipe, event)
             pipe.execute()
 
     def consume(self, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
         """Return the next events for the controller, oldest first; unacknowledged ones are delivered again."""
-        with _mapped():
+        with _convert_errors():
             while self._unread != ">":
                 pending = self._of_group(self._unread, limit, 0.0)
                 self._unread = pending[-1][0] if pending else ">"
-                if known := self._known(pending):
+                if known := self._readable_events(pending):
                     return known
-            return self._known(self._of_group(">", limit, wait_s))
+            return self._readable_events(self._of_group(">", limit, wait_s))
 
     def acknowledge(self, event_ids: Sequence[str]) -> None:
         if event_ids:
-            with _mapped():
+            with _convert_errors():
                 self.connection.xack(EVENTS, _GROUP, *event_ids)
 
     def tail(self, after: str, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
         """Return events after an id, for any number of readers; `"$"`: only future ones, `"0"`: all stored."""
-        with _mapped():
+        with _convert_errors():
             found = self.connection.xread({EVENTS: after}, count=limit, block=int(wait_s * 1000) or None)
         return [(event_id, event) for event_id, event in entries.events(found) if event is not None]
 
     def announce(self, part: str, seconds: float) -> None:
         """Announce that a part of the service (the controller) lives, for some seconds."""
-        with _mapped():
+        with _convert_errors():
             self.connection.set(_part_key(part), "1", px=int(seconds * 1000))
 
     def announced(self, part: str) -> bool:
-        with _mapped():
+        with _convert_errors():
             return bool(self.connection.exists(_part_key(part)))
 
     def service(self) -> str | None:
         """Return the identity of the service that owns this queue; None if unset, or lost by Redis."""
-        with _mapped():
+        with _convert_errors():
             found = self.connection.get(_SERVICE)
         return None if found is None else entries.text(found)
 
     def set_service(self, identity: str, *, instead: bool = False) -> None:
         """Set the identity of the owning service, if it is unset or `instead` is given."""
-        with _mapped():
+        with _convert_errors():
             self.connection.set(_SERVICE, identity, nx=not instead)
 
     def lead(self, holder: str, seconds: float) -> bool:
         """Acquire or renew the leadership of the controllers for some seconds; False if another one leads."""
-        with _mapped():
+        with _convert_errors():
             new = self.connection.lock(LEAD, timeout=seconds, thread_local=False)
             lease = self._leases.setdefault(holder, new)
             lease.timeout = seconds
@@ -255,20 +255,20 @@ class RqQueue:
             except LockError:
                 pass
             except ResponseError as error:
-                if not entries.is_wrong_type(error):
+                if not entries.is_type_error(error):
                     raise
                 self.connection.delete(LEAD)
             return False
 
     def resign(self, holder: str) -> None:
-        with _mapped(), suppress(LockError):
+        with _convert_errors(), suppress(LockError):
             self.connection.lock(LEAD).do_release(holder)
 
     def now(self, *, lease_s: float) -> QueueStatus:
         """Return queue lengths, ages and workers for the metrics, at a cost independent of the queue's length."""
         beats = self.workers()
-        with _mapped(), self.connection.pipeline(transaction=False) as pipe:
-            lists = known_lists(self.connection)
+        with _convert_errors(), self.connection.pipeline(transaction=False) as pipe:
+            lists = list_names(self.connection)
             for name in lists:
                 pipe.llen(list_key(name))
                 pipe.lindex(list_key(name), 0)
@@ -293,13 +293,13 @@ class RqQueue:
         return QueueStatus(depth, oldest, running, workers)
 
     def count(self, amounts: Mapping[str, float]) -> None:
-        with _mapped(), self.connection.pipeline(transaction=False) as pipe:
+        with _convert_errors(), self.connection.pipeline(transaction=False) as pipe:
             for name, amount in amounts.items():
                 pipe.hincrbyfloat(METRICS, name, amount)
             pipe.execute()
 
     def counted(self) -> dict[str, float]:
-        with _mapped():
+        with _convert_errors():
             found = self.connection.hgetall(METRICS)
         sums: dict[str, float] = {}
         for name, raw in found.items():
@@ -309,8 +309,8 @@ class RqQueue:
 
     def tidy(self) -> None:
         # RQ cleans its registries of workers in its own maintenance, which is off.
-        with _mapped(), self.connection.pipeline(transaction=False) as pipe:
-            lists = known_lists(self.connection)
+        with _convert_errors(), self.connection.pipeline(transaction=False) as pipe:
+            lists = list_names(self.connection)
             entries.sweep(self.connection, {**_KINDS, **kinds(lists)}, EVENTS)
             known = list(self.connection.smembers(WORKERS))
             for name in known:
@@ -340,7 +340,7 @@ class RqQueue:
             self.connection.xgroup_create(EVENTS, _GROUP, id="0", mkstream=True)
         return entries.events(read())
 
-    def _known(self, found: Sequence[tuple[str, Event | None]]) -> list[tuple[str, Event]]:
+    def _readable_events(self, found: Sequence[tuple[str, Event | None]]) -> list[tuple[str, Event]]:
         """Return the readable events; acknowledge and discard the unreadable ones."""
         self.acknowledge([event_id for event_id, event in found if event is None])
         return [(event_id, event) for event_id, event in found if event is not None]
@@ -348,14 +348,14 @@ class RqQueue:
     def _job(self, message: Message) -> Job:
         data = message.model_dump(mode="json", by_alias=True)
         return new_job(
-            for_worker_of(getattr(message, "revision", 0), message.stage, data),
+            message_for_revision(getattr(message, "revision", 0), message.stage, data),
             id=rq_id(message.task_id, message.attempt),
             connection=self.connection,
             description=f"{message.stage} {message.task_id}",
         )
 
     def _list_keys(self) -> list[str]:
-        return [list_key(name) for name in known_lists(self.connection)]
+        return [list_key(name) for name in list_names(self.connection)]
 
 
 def open_queue(settings: Settings, *, patience: int = 3) -> RqQueue:
@@ -425,7 +425,7 @@ _KINDS: Final = {
 
 
 @contextmanager
-def _mapped() -> Iterator[None]:
+def _convert_errors() -> Iterator[None]:
     try:
         yield
     except (RedisError, OSError) as error:

@@ -104,10 +104,10 @@ class Clouds(Sequence[dict[str, Any]]):
             return [self[i] for i in range(*index.indices(len(self)))]
         places = self._places[index]
         first, scenes = places[0], self.pictures.scenes_of(places[0].scene_shard)
-        draw = np.random.default_rng([self._seed, self.epoch, *_words(first)])
+        draw = np.random.default_rng([self._seed, self.epoch, *_seed_words(first)])
         views = [CloudView(self.pictures.columns_of(place, COLUMNS), self._noise, draw) for place in places]
         object_pose = scenes.object_pose(first.scene)
-        into = self._into(views[0].extrinsics, object_pose)
+        into = self._frame_transform(views[0].extrinsics, object_pose)
         sample = self._cloud(views, draw, into)
         if self._surface is not None:
             touched = self._graspness(views, sample["cloud/pixel"], scenes, first.scene)
@@ -124,17 +124,17 @@ class Clouds(Sequence[dict[str, Any]]):
         found = [view.pixels(whole=self._whole) for view in views]
         pixel = np.concatenate([np.stack([np.full(len(row), v), row, col], 1) for v, (row, col) in enumerate(found)])
         if self._voxel:
-            pixel = pixel[_voxels(_of(views, pixel, CloudView.points), self._voxel, draw)]
+            pixel = pixel[_voxels(_gather(views, pixel, CloudView.points), self._voxel, draw)]
         seen = len(pixel)
         if seen >= self.points:
             pixel = pixel[draw.choice(seen, self.points, replace=False)]
         elif seen:
             pixel = np.concatenate([pixel, pixel[draw.integers(seen, size=self.points - seen)]])
-        normals = transforms.quat_rotate(into[3:], _of(views, pixel, CloudView.normals))
+        normals = transforms.quat_rotate(into[3:], _gather(views, pixel, CloudView.normals))
         cloud: dict[str, Any] = {
-            "cloud/points": transforms.apply(into, _of(views, pixel, CloudView.points)).astype(np.float32),
+            "cloud/points": transforms.apply(into, _gather(views, pixel, CloudView.points)).astype(np.float32),
             "cloud/normals": normals.astype(np.float32),
-            "cloud/object": _of(views, pixel, CloudView.is_object).astype(np.uint8),
+            "cloud/object": _gather(views, pixel, CloudView.is_object).astype(np.uint8),
             "cloud/pixel": pixel.astype(np.int32),
         }
         if not seen:
@@ -144,7 +144,7 @@ class Clouds(Sequence[dict[str, Any]]):
     def _graspness(self, views: Sequence[CloudView], pixel: Ints, scenes: Scenes, scene: int) -> Floats:
         """Compute graspness at the points without noise: noise changes measured points, not contacts."""
         assert self._surface is not None
-        points = _of(views, pixel, CloudView.true_points)
+        points = _gather(views, pixel, CloudView.true_points)
         on_object = transforms.apply(transforms.invert(scenes.object_pose(scene)), points)
         rows = scenes.base_rows(scene)
         hands = self._surface(scenes.base, rows) if len(rows) else np.zeros((0, 1, 3))
@@ -165,7 +165,7 @@ class Clouds(Sequence[dict[str, Any]]):
             labels[f"{posture}/joint_positions"] = np.asarray(scenes.base[f"{posture}/joint_positions"])[rows]
         return labels
 
-    def _into(self, extrinsics: Floats, object_pose: Floats) -> Floats:
+    def _frame_transform(self, extrinsics: Floats, object_pose: Floats) -> Floats:
         """Return the transform (7,) from the table's frame to the sample's frame."""
         if self.frame == "camera":
             return transforms.pose_from_matrix(extrinsics)
@@ -181,7 +181,7 @@ def _by_scene(places: Sequence[PictureAddress]) -> list[list[PictureAddress]]:
     return list(found.values())
 
 
-def _of(views: Sequence[CloudView], pixel: Ints, what: Callable[[CloudView, Ints, Ints], Array]) -> Array:
+def _gather(views: Sequence[CloudView], pixel: Ints, what: Callable[[CloudView, Ints, Ints], Array]) -> Array:
     parts = [what(view, *pixel[pixel[:, 0] == number, 1:].T) for number, view in enumerate(views)]
     found = np.empty((len(pixel), *parts[0].shape[1:]), parts[0].dtype)
     for number, part in enumerate(parts):
@@ -195,7 +195,7 @@ def _voxels(points: Floats, edge: float, draw: np.random.Generator) -> Ints:
     return order[np.unique(cubes, axis=0, return_index=True)[1]]
 
 
-def _words(place: PictureAddress) -> tuple[int, int]:
+def _seed_words(place: PictureAddress) -> tuple[int, int]:
     """Return seed words that depend on the content of a picture, not on its file name."""
     name = f"{place.file.hand}/{place.file.object}/{place.file.batch}"
     return int.from_bytes(hashlib.sha256(name.encode()).digest()[:8]), place.row

@@ -103,17 +103,17 @@ class DepthNoise:
         angle = incidence(true, k) if angle is None else angle
         scale = float(k[0, 0]) / self.focal_px
         with np.errstate(invalid="ignore", divide="ignore"):
-            seen = _beside(true, scale * (self.lateral_px + self.lateral_angle_px * _steepness(angle)), draw)
+            seen = _shift_pixels(true, scale * (self.lateral_px + self.lateral_angle_px * _steepness(angle)), draw)
             if self.mixed:
-                seen = _mixed(seen, draw)
+                seen = _mix_edges(seen, draw)
             seen = seen + self.axial(seen, angle) * draw.standard_normal(true.shape)
             if self.baseline_m:
-                seen = self._triangulated(seen, draw)
+                seen = self._quantize_disparity(seen, draw)
             if self.depth_step_m:
                 seen = np.round(seen / self.depth_step_m) * self.depth_step_m
             return np.where(self._holes(true, angle, k, draw), np.nan, seen)
 
-    def _triangulated(self, depth: Floats, draw: np.random.Generator) -> Floats:
+    def _quantize_disparity(self, depth: Floats, draw: np.random.Generator) -> Floats:
         product = self.focal_px * self.baseline_m
         disparity = product / depth + self.disparity_px * draw.standard_normal(depth.shape)
         if self.disparity_step_px:
@@ -163,7 +163,7 @@ def _steepness(angle: Floats) -> Floats:
     return np.asarray(bounded / (np.pi / 2 - bounded))
 
 
-def _beside(depth: Floats, sigma_px: Floats, draw: np.random.Generator) -> Floats:
+def _shift_pixels(depth: Floats, sigma_px: Floats, draw: np.random.Generator) -> Floats:
     height, width = depth.shape
     aside, down = (np.round(sigma_px * draw.standard_normal(depth.shape)).astype(int) for _ in range(2))
     rows = np.clip(np.arange(height)[:, None] + down, 0, height - 1)
@@ -171,7 +171,7 @@ def _beside(depth: Floats, sigma_px: Floats, draw: np.random.Generator) -> Float
     return depth[rows, columns]
 
 
-def _mixed(depth: Floats, draw: np.random.Generator) -> Floats:
+def _mix_edges(depth: Floats, draw: np.random.Generator) -> Floats:
     found = depth
     for axis in (1, 0):
         last = depth.shape[axis] - 1

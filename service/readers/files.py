@@ -16,13 +16,13 @@ from graspd.service.model.errors import DamagedShard, InputError, NotFoundError
 from graspd.service.model.planning import plan
 from graspd.service.model.records import JobRecord
 from graspd.service.store.columns import ShardKind
-from graspd.service.store.integrity import check_content, check_digest, check_file, gone
+from graspd.service.store.integrity import check_content, check_digest, check_file, missing_error
 from graspd.service.store.manifests import load_manifest
 from graspd.service.store.packs import PACKED, has_packs
 from graspd.service.store.records import newest_snapshot, read_record
 from graspd.service.store.shards import kind_of, open_shard
 from graspd.service.store.store import Store, open_store
-from graspd.service.user_cache import folder, make_room, write_whole
+from graspd.service.user_cache import evict, folder, write_atomically
 
 DEFAULT_BYTES: Final = 20 << 30
 _STAGES: Final = {kind: stage for stage, kind in names.SHARD_KINDS.items()}
@@ -59,8 +59,8 @@ class ShardCache:
         """Return the local path of a file of the store, downloaded if necessary; DamagedShard if missing or damaged."""
         path = self.folder / f"{sha256}.h5"
         if not self._is_intact(path, sha256):
-            write_whole(path, self._checked(store, key, sha256))
-            make_room(self.folder, path.suffix, self.limit_bytes, keep=path)
+            write_atomically(path, self._checked(store, key, sha256))
+            evict(self.folder, path.suffix, self.limit_bytes, keep=path)
         return path
 
     @staticmethod
@@ -88,7 +88,7 @@ class ShardCache:
                 digest.update(chunk)
                 yield chunk
         except NotFoundError:
-            raise gone(f"{store.url}/{key}") from None
+            raise missing_error(f"{store.url}/{key}") from None
         check_digest(f"{store.url}/{key}", digest.hexdigest(), sha256)
 
 
@@ -165,11 +165,11 @@ def open_shards(
     """
     if isinstance(source, Store) or (isinstance(source, str) and "://" in source):
         store = source if isinstance(source, Store) else open_store(source, make=False)
-        found = _of_store(store, job, dataset, snapshot)
+        found = _shards_of_store(store, job, dataset, snapshot)
         kept = ShardCache(cache or folder("shards"), limit_bytes=cache_bytes)
         return Shards(_ordered(found), store, kept)
     given = [source] if isinstance(source, str | Path) else list(source)
-    return Shards(_ordered(_local(path) for entry in given for path in _paths(Path(entry))))
+    return Shards(_ordered(_shard_file(path) for entry in given for path in _paths(Path(entry))))
 
 
 def _paths(entry: Path) -> list[Path]:
@@ -185,7 +185,7 @@ def _paths(entry: Path) -> list[Path]:
     return [entry]
 
 
-def _local(path: Path) -> ShardFile:
+def _shard_file(path: Path) -> ShardFile:
     with open_shard(path) as file:
         kind, said = kind_of(file, str(path)), dict(file.attrs)
     name = str(said.get("shard_id", path.resolve()))
@@ -194,18 +194,18 @@ def _local(path: Path) -> ShardFile:
     )
 
 
-def _of_store(store: Store, job: str | None, dataset: str | None, snapshot: str | None) -> Iterator[ShardFile]:
+def _shards_of_store(store: Store, job: str | None, dataset: str | None, snapshot: str | None) -> Iterator[ShardFile]:
     if (job is None) == (dataset is None):
         raise InputError(f"name the data to read from {store.url}: a job or a dataset")
     if has_packs(store):
         raise InputError(f"{store.url} has shards in {PACKED}")
     if job is not None:
-        return _of_job(store, job)
+        return _shards_of_job(store, job)
     assert dataset is not None
-    return _of_snapshot(store, dataset, snapshot)
+    return _shards_of_snapshot(store, dataset, snapshot)
 
 
-def _of_job(store: Store, job: str) -> Iterator[ShardFile]:
+def _shards_of_job(store: Store, job: str) -> Iterator[ShardFile]:
     record = read_record(JobRecord, store, names.job_record(job))
     for task in plan(record):
         try:
@@ -215,7 +215,7 @@ def _of_job(store: Store, job: str) -> Iterator[ShardFile]:
         yield ShardFile(made.shard_id, made.kind, made.hand, made.object, made.batch, key=made.key, sha256=made.sha256)
 
 
-def _of_snapshot(store: Store, dataset: str, digest: str | None) -> Iterator[ShardFile]:
+def _shards_of_snapshot(store: Store, dataset: str, digest: str | None) -> Iterator[ShardFile]:
     taken = newest_snapshot(store, dataset, digest)
     for shard in taken.shards:
         yield ShardFile(shard.id, shard.kind, shard.hand, shard.object, shard.batch, key=shard.key, sha256=shard.sha256)

@@ -66,7 +66,7 @@ class Grasps(Sequence[dict[str, Any]]):
         self._valid, self._unvalidated, self._where = valid, unvalidated, where
         self._files = shards.of("base")
         self._memory: OrderedDict[str, dict[str, Array]] = OrderedDict()
-        self._rows = [self._kept(file) for file in self._files]
+        self._rows = [self._selected_rows(file) for file in self._files]
         #: (shards,) end index of each base shard's grasps.
         self.ends = np.cumsum([len(rows) for rows in self._rows], dtype=np.int64)
 
@@ -111,10 +111,10 @@ class Grasps(Sequence[dict[str, Any]]):
                 f"the shards do not fit into one array ({error}); read one hand: shards.only(...)"
             ) from None
 
-    def _kept(self, file: ShardFile) -> NDArray[np.intp]:
+    def _selected_rows(self, file: ShardFile) -> NDArray[np.intp]:
         held = self._load(file, tuple(SCHEMAS["base"]) if self._where else validity.COLUMNS, keep=False)
         if self._valid or self._unvalidated:
-            mask = validity.chosen(held, unvalidated=self._unvalidated)
+            mask = validity.selection(held, unvalidated=self._unvalidated)
         else:
             mask = np.ones(len(held["quality/valid"]), bool)
         if self._where is not None:

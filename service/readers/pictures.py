@@ -175,7 +175,7 @@ class Scenes:
         free = np.asarray(base["quality/success"]) >= 0 if planned else np.asarray(scenes["grasp/valid"]) == 1
         mask = free if clear else np.ones(len(scene), bool)
         if valid or unvalidated:
-            mask = mask & validity.chosen(base.arrays, unvalidated=unvalidated)[row]
+            mask = mask & validity.selection(base.arrays, unvalidated=unvalidated)[row]
         kept = np.flatnonzero(mask)
         self._scene, self._row = scene[kept], row[kept]
         pose = np.asarray(scenes["grasp/hand_pose"], float)[kept]
@@ -190,14 +190,14 @@ class Scenes:
         return self._object[scene]
 
     def base_rows(self, scene: int) -> NDArray[np.intp]:
-        return self._row[self._of(scene)]
+        return self._row[self._rows_of_scene(scene)]
 
-    def _of(self, scene: int) -> NDArray[np.intp]:
+    def _rows_of_scene(self, scene: int) -> NDArray[np.intp]:
         return np.flatnonzero(self._scene == scene)
 
     def grasps(self, scene: int, extrinsics: NDArray[np.float64]) -> dict[str, Any]:
         """Return the grasps of one scene in the frame of the camera with these extrinsics (4, 4)."""
-        rows, camera = self._of(scene), transforms.pose_from_matrix(extrinsics)
+        rows, camera = self._rows_of_scene(scene), transforms.pose_from_matrix(extrinsics)
         pose = transforms.compose(camera, self._pose[rows])
         found: dict[str, Any] = {"grasp/hand_pose": pose, "grasp/base_row": self._row[rows], "base_id": self.base_id}
         found["object/pose"] = transforms.compose(camera, self._object[scene])

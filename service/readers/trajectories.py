@@ -33,7 +33,7 @@ class Waypoint:
     """(3,) displacement of the lifted object from its rest position [m]."""
 
 
-def way_of(shard: Shard, row: int) -> list[Waypoint]:
+def trajectory_of(shard: Shard, row: int) -> list[Waypoint]:
     """Return the trajectory of a grasp: pregrasp, grasp, squeeze; approach and lift if present.
 
     The last waypoint of an approach and the pregrasp have the same hand pose; in between the open fingers close.
@@ -55,7 +55,7 @@ def way_of(shard: Shard, row: int) -> list[Waypoint]:
     return way
 
 
-def stop_places(way: Sequence[Waypoint]) -> Floats:
+def slider_axis(way: Sequence[Waypoint]) -> Floats:
     """Return the slider position (W,) of each waypoint: 0, 1, 2, ... for stops, evenly spaced between them."""
     stops = [k for k, point in enumerate(way) if point.name]
     return np.interp(np.arange(len(way)), stops, np.arange(len(stops)))
@@ -63,7 +63,7 @@ def stop_places(way: Sequence[Waypoint]) -> Floats:
 
 def point_at(way: Sequence[Waypoint], place: float) -> Waypoint:
     """Interpolate a posture at a slider position: linear for positions and joints, slerp for rotation."""
-    places = stop_places(way)
+    places = slider_axis(way)
     place = float(np.clip(place, places[0], places[-1]))
     k = min(int(np.searchsorted(places, place, side="right")) - 1, len(way) - 2)
     a, b = way[k], way[k + 1]

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspd.service.model.metrics import GRASP_METRICS, GraspMetric
-from graspd.service.model.where import Connective, Flag, MetricComparison, Negation, Node, TypeComparison, parsed
+from graspd.service.model.where import Connective, Flag, MetricComparison, Negation, Node, TypeComparison, parse_where
 from graspd.service.store import validity
 from graspd.service.store.manifests import INDEX_THRESHOLD_M
 
@@ -29,7 +29,7 @@ _FLAGS: Final = {"held": "quality/success", "lift": "quality/lift_outcome", "lif
 
 def parse(text: str) -> Test:
     """Compile an expression to a test, or raise InputError; comparisons with a missing metric or nan are false."""
-    tree = parsed(text)
+    tree = parse_where(text)
     return lambda columns, said: _mask(tree, columns, said)
 
 

@@ -19,17 +19,17 @@ from pathlib import Path
 from typing import Final
 
 from graspd.service.model.errors import BusyError, InputError, UnavailableError
-from graspd.service.run.children import start_of
+from graspd.service.run.children import start_time
 from graspd.service.settings import Settings
-from graspd.service.user_cache import write_whole
+from graspd.service.user_cache import write_atomically
 
 _FILE: Final = "api.json"
 
 
 def record_address(folder: Path, url: str) -> None:
     """Record that this process's service has the address `url`."""
-    record = {"api_url": url, "pid": os.getpid(), "started": start_of(os.getpid())}
-    write_whole(folder / _FILE, [json.dumps(record).encode()])
+    record = {"api_url": url, "pid": os.getpid(), "started": start_time(os.getpid())}
+    write_atomically(folder / _FILE, [json.dumps(record).encode()])
 
 
 def local_url(host: str, port: int) -> str:
@@ -70,7 +70,7 @@ def forget_address(folder: Path) -> None:
 def recorded_address(folder: Path) -> str | None:
     """Return the URL of a data folder's service; None if not recorded, or the recording process is gone."""
     record = _read(folder)
-    return record[0] if record is not None and start_of(record[1]) == record[2] else None
+    return record[0] if record is not None and start_time(record[1]) == record[2] else None
 
 
 def _read(folder: Path) -> tuple[str, int, str] | None:
@@ -111,7 +111,7 @@ class ListenAddress:
         }
         text = "".join(f"{name}={shlex.quote(value)}\n" for name, value in said.items())
         try:
-            write_whole(self.file, [text.encode()])
+            write_atomically(self.file, [text.encode()])
         except OSError as error:
             raise UnavailableError(f"{self.file} cannot be written: {error.strerror}") from None
 

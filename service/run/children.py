@@ -67,7 +67,7 @@ class Child:
             )
         if self.pid_file is not None:
             self.pid_file.parent.mkdir(parents=True, exist_ok=True)
-            self.pid_file.write_text(json.dumps([self.process.pid, start_of(self.process.pid), token]))
+            self.pid_file.write_text(json.dumps([self.process.pid, start_time(self.process.pid), token]))
         self.starts += 1
         self._started = time.monotonic()
 
@@ -82,7 +82,7 @@ class Child:
                 self._pause = _FIRST_PAUSE_S
             # A worker ends by itself with code 0 after enough work.
             level = logging.WARNING if code else logging.INFO
-            log.log(level, "%s ended (%s); it is started again in %.2g s", self.name, _ended(code), self._pause)
+            log.log(level, "%s ended (%s); it is started again in %.2g s", self.name, _exit_text(code), self._pause)
             if code > 0 and self.fix is not None and self._log_file is not None:
                 self.fix(self._log_file)
             self.process = None
@@ -131,13 +131,13 @@ def stop_children(children: Sequence[Child], grace_s: float) -> None:
         child.join(deadline)
 
 
-def end_leftovers(folder: Path) -> list[int]:
+def kill_leftovers(folder: Path) -> list[int]:
     """Kill the children of an earlier `graspd up` by its pid files, unless a pid was reused; return the pids."""
     ended = []
     for file in (folder / "run").glob("*.pid"):
         try:
             pid, started, token = json.loads(file.read_text())
-            if pid not in (os.getpid(), os.getppid()) and start_of(pid) == started and _has_token(pid, token):
+            if pid not in (os.getpid(), os.getppid()) and start_time(pid) == started and _has_token(pid, token):
                 os.kill(pid, signal.SIGKILL)
                 ended.append(pid)
         except (ValueError, TypeError, OSError, OverflowError):
@@ -155,7 +155,7 @@ def _has_token(pid: int, token: str) -> bool:
         return wanted in listing.stdout.split()
 
 
-def _ended(code: int) -> str:
+def _exit_text(code: int) -> str:
     return f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
 
 
@@ -164,7 +164,7 @@ _BOOT: Final = Path("/proc/sys/kernel/random/boot_id")
 _STARTED: Final = 19
 
 
-def start_of(pid: int) -> str:
+def start_time(pid: int) -> str:
     """Return the start time of a process, unique per pid; "" if there is no such process."""
     with contextlib.suppress(OSError, IndexError):
         words = Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(")")[2].split()

@@ -18,11 +18,11 @@ from graspd.service.cli import (
     DataDir,
     JsonFlag,
     emit,
-    keep_private,
     load_settings,
     log_to_stderr,
     plain_console,
     report,
+    restrict_file_access,
 )
 from graspd.service.model import names
 from graspd.service.model.errors import IndexDamaged, QueueUnavailable, UnavailableError, without_secrets
@@ -66,7 +66,7 @@ def up(
 
     settings = load_settings(host=host, port=port, device=device, data_dir=data_dir)
     log_to_stderr(settings, "up")
-    keep_private(settings)
+    restrict_file_access(settings)
     stop = stop_on_signals()
     console = plain_console(stderr=True)
     others = joining(settings, share, host=share_host, port=redis_port) if share is not None else None
@@ -94,7 +94,7 @@ def controller(
     """Run the controller: lost leases, retries, index. One leads, others stand by; `graspd up` starts one."""
     settings = load_settings(data_dir=data_dir)
     log_to_stderr(settings, "controller")
-    keep_private(settings)
+    restrict_file_access(settings)
     if check:
         from graspd.service.pipeline.leading import PART
         from graspd.service.queue.rq_queue import open_queue
@@ -157,14 +157,14 @@ def rebuild(
     from graspd.service.pipeline.backends import Services
     from graspd.service.pipeline.identity import identify_if_redis_answers
     from graspd.service.pipeline.integrity import scan
-    from graspd.service.store.packs import take_apart
+    from graspd.service.store.packs import unpack_all
 
     services = Services.open(load_settings(data_dir=data_dir), patience=0, make=False, anew=not check)
     store, index = services.store, services.index
 
     def make() -> dict[str, int]:
         identify_if_redis_answers(services, take_over=True)
-        for _ in take_apart(store):
+        for _ in unpack_all(store):
             pass
         return fill(index, store)
 

@@ -18,7 +18,7 @@ from graspd.service.model.errors import BusyError, QueueUnavailable
 from graspd.service.queue.connection import password_file, socket_path
 from graspd.service.run.address import ListenAddress
 from graspd.service.settings import Settings
-from graspd.service.user_cache import write_whole
+from graspd.service.user_cache import write_atomically
 
 log = logging.getLogger(__name__)
 #: Files of an append-only Redis: from version 7 on, and before.
@@ -69,8 +69,8 @@ def server_command(settings: Settings, joining: ListenAddress | None = None) -> 
     configuration = []
     if joining is not None:
         options |= {"port": str(joining.port), "bind": joining.address, "protected-mode": "yes"}
-        write_whole(secret, [joining.password.encode()])
-        write_whole(folder / "redis.conf", [f"requirepass {joining.password}\n".encode()])
+        write_atomically(secret, [joining.password.encode()])
+        write_atomically(folder / "redis.conf", [f"requirepass {joining.password}\n".encode()])
         configuration = [str(folder / "redis.conf")]
     return [str(server), *configuration, *(part for name, value in options.items() for part in (f"--{name}", value))]
 
@@ -82,7 +82,7 @@ def own_redis(settings: Settings) -> IO[str]:
     return lock_file(folder / "lock", f"the Redis of {settings.data_dir}")
 
 
-def give_up_log(settings: Settings, output: Path) -> None:
+def move_broken_log(settings: Settings, output: Path) -> None:
     """Move the append-only log aside after a failed start, if Redis reports in `output` that the log is broken.
 
     All content of Redis is queued again from the index, so an empty Redis is better than none.
@@ -92,10 +92,10 @@ def give_up_log(settings: Settings, output: Path) -> None:
         told = file.read().decode(errors="replace").rpartition("just started")[2]
         # A log that cannot be written is not damaged.
         if _READY not in told and _OF_LOG.search(told) and not _OF_DISK.search(told):
-            set_log_aside(settings, "Redis cannot read it")
+            move_log(settings, "Redis cannot read it")
 
 
-def set_log_aside(settings: Settings, why: str) -> None:
+def move_log(settings: Settings, why: str) -> None:
     """Make Redis start empty: move its append-only log to a folder `redis/aside-TIME`, and log it."""
     folder = settings.data_dir.resolve() / "redis"
     aside = folder / f"aside-{datetime.now(UTC):%Y%m%dT%H%M%S%f}"

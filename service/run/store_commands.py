@@ -87,11 +87,11 @@ def verify(
 @store_app.command(epilog="graspd admin store upgrade")
 def upgrade(data_dir: DataDir = None, json: JsonFlag = False) -> None:
     """Replace packs of graspd 0.2 by one file per shard; a controller does the same at its start."""
-    from graspd.service.store.packs import take_apart
+    from graspd.service.store.packs import unpack_all
     from graspd.service.store.store import open_store
 
     store = open_store(load_settings(data_dir=data_dir).resolved_store_url, make=False)
-    shards = sum(1 for _ in take_apart(store))
+    shards = sum(1 for _ in unpack_all(store))
     if json:
         emit({"shards": shards})
     else:

@@ -24,8 +24,8 @@ from graspd.service.pipeline.leading import PART
 from graspd.service.queue.connection import redis_url
 from graspd.service.queue.rq_queue import RqQueue, open_queue
 from graspd.service.run.address import ListenAddress, bind, forget_address, local_url, record_address
-from graspd.service.run.children import Child, end_leftovers, keep_alive, stop_children
-from graspd.service.run.embedded import find_server, give_up_log, lock_file, own_redis, server_command, set_log_aside
+from graspd.service.run.children import Child, keep_alive, kill_leftovers, stop_children
+from graspd.service.run.embedded import find_server, lock_file, move_broken_log, move_log, own_redis, server_command
 from graspd.service.settings import Settings
 from graspd.service.store.store import open_store
 
@@ -95,9 +95,9 @@ class Supervisor:
             raise UnavailableError(f"the data folder {folder} cannot be made: {error.strerror}") from None
         try:
             self._locks = [lock_file(folder / "lock", f"the data folder {self._wanted.data_dir}")]
-            if leftovers := end_leftovers(folder):
+            if leftovers := kill_leftovers(folder):
                 log.warning("ended %d processes that an earlier graspd left behind", len(leftovers))
-            self._settle()
+            self._resolve_settings()
             self._identify(folder)
             self._children = self._plan()
             self._record(folder)
@@ -123,7 +123,7 @@ class Supervisor:
         began = told = time.monotonic()
         starts, logs = self._starts(), self.settings.data_dir / "logs"
         with closing(open_queue(self.settings, patience=0)) as queue:
-            while missing := self._missing(queue):
+            while missing := self._missing_parts(queue):
                 if stop is not None and stop.is_set():
                     return False
                 if "redis" in missing:  # Other processes may have ended because Redis is missing.
@@ -152,7 +152,7 @@ class Supervisor:
     def _starts(self) -> dict[str, int]:
         return {child.name: child.starts for child in list(self._children)}
 
-    def _missing(self, queue: RqQueue) -> list[str]:
+    def _missing_parts(self, queue: RqQueue) -> list[str]:
         missing = []
         try:
             if not queue.announced(PART):
@@ -172,7 +172,7 @@ class Supervisor:
         except httpx.HTTPError:
             return False
 
-    def _settle(self) -> None:
+    def _resolve_settings(self) -> None:
         folder = self._wanted.data_dir.resolve()
         update: dict[str, object] = {"data_dir": folder}
         if self._api:
@@ -196,7 +196,7 @@ class Supervisor:
         with closing(services):
             mine = identify_if_redis_answers(services, folder=folder)
         if self._wanted.redis_url is None and before not in (None, mine):
-            set_log_aside(self.settings, "it belongs to the service that ran here before")
+            move_log(self.settings, "it belongs to the service that ran here before")
 
     def _plan(self) -> list[Child]:
         environment = {
@@ -205,7 +205,7 @@ class Supervisor:
             "GRASPD_HOST": self.settings.host,
             "GRASPD_PORT": str(self.settings.port),
             "GRASPD_API_URL": self.api_url,
-            **_stated(self._wanted),
+            **_explicit_settings(self._wanted),
         }
 
         def child(name: str, *command: str, **more: str) -> Child:
@@ -216,7 +216,7 @@ class Supervisor:
             self._locks.append(own_redis(self.settings))
             log.info("Redis: %s, from %s", *find_server())
             redis = child("redis", *server_command(self.settings, self._joining))
-            redis.fix = lambda output: give_up_log(self.settings, output)
+            redis.fix = lambda output: move_broken_log(self.settings, output)
             children.append(redis)
         # A restarted controller need not wait for the end of its predecessor's lease.
         name = self._wanted.controller_name or f"{socket.gethostname()}-up-{secrets.token_hex(8)}"
@@ -268,7 +268,7 @@ class Supervisor:
 _SETTLED: Final = frozenset({"data_dir", "redis_url", "host", "port", "api_url"})
 
 
-def _stated(settings: Settings) -> dict[str, str]:
+def _explicit_settings(settings: Settings) -> dict[str, str]:
     """Return the explicitly given settings, for the environment of the children."""
     given = settings.model_fields_set - _SETTLED
     return {f"GRASPD_{name.upper()}": _as_variable(getattr(settings, name)) for name in given}

@@ -15,7 +15,7 @@ _NOTHING_M = 1e-7
 _OVERRIDES = {"palm": "--palm LINK --approach x,y,z", "preshape": "--pre-shape JOINT=VALUE,..."}
 
 
-def say_check(kind: AssetKind, report: Mapping[str, Any]) -> None:
+def print_check(kind: AssetKind, report: Mapping[str, Any]) -> None:
     if report["verdict"] == "refuse":
         typer.echo(f"graspd: refused: {report['message']}", err=True)
         return

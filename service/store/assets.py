@@ -106,7 +106,7 @@ class ZipFiles(MutableMapping[str, bytes]):
         if name in self._added:
             yield io.BytesIO(self._added[name])
             return
-        with _damage_said(self._found[name]), self._archive.open(self._found[name]) as stream:
+        with _convert_errors(self._found[name]), self._archive.open(self._found[name]) as stream:
             yield stream
 
     def __getitem__(self, name: str) -> bytes:
@@ -155,7 +155,7 @@ def _entries(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
 
 def _measure_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, limit: int) -> tuple[int, str]:
     count, digest = 0, hashlib.sha256()
-    with _damage_said(entry), archive.open(entry) as stream:
+    with _convert_errors(entry), archive.open(entry) as stream:
         while count < limit and (piece := stream.read(min(_PIECE_BYTES, limit - count))):
             count += len(piece)
             digest.update(piece)
@@ -163,7 +163,7 @@ def _measure_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, limit: int)
 
 
 @contextmanager
-def _damage_said(entry: zipfile.ZipInfo) -> Iterator[None]:
+def _convert_errors(entry: zipfile.ZipInfo) -> Iterator[None]:
     try:
         yield
     except (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, NotImplementedError, RuntimeError) as error:

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Final, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 from pydantic_core import from_json, to_json
 
-from graspd.service.model.base import Model, refusal
+from graspd.service.model.base import Model, first_error
 from graspd.service.model.errors import ConflictError, InputError
 
 #: Size limit of facts: every list of hands or objects contains them; built-in hands need 2 KB.
@@ -47,7 +47,8 @@ def parse_description(data: bytes, what: str) -> Description:
     try:
         return Description.model_validate(given)
     except ValidationError as error:
-        raise InputError(f"{what}: asset.json must name the main file and have short facts: {refusal(error)}") from None
+        found = first_error(error)
+        raise InputError(f"{what}: asset.json must name the main file and have short facts: {found}") from None
 
 
 def json_object(text: bytes | str, what: str) -> dict[str, Any]:
@@ -141,7 +142,7 @@ def facts_of(model: bytes) -> HandFacts:
         ) from None
 
 
-def described(facts: Mapping[str, Any]) -> dict[str, Any]:
+def description_of(facts: Mapping[str, Any]) -> dict[str, Any]:
     """Return found or guessed values as keys of `asset.json`: root, palm, pre-shape, closing, fingertips."""
     palm = {"link": facts["root"], "centre": facts["palm_centre"], "approach": facts["palm_approach"]}
     same = {name: facts[name] for name in ("preshape", "closing", "fingertips")}
@@ -151,7 +152,7 @@ def described(facts: Mapping[str, Any]) -> dict[str, Any]:
 def corrected(said: Mapping[str, Any], facts: HandFacts, corrections: HandCorrections) -> dict[str, Any]:
     """Return an `asset.json` with all given, found and corrected values; InputError for a value out of range."""
     _check(facts, corrections)
-    found = described(facts.model_dump())
+    found = description_of(facts.model_dump())
     turned = {name for name, way in corrections.closing.items() if way != facts.closing[name]}
     found["preshape"] = {name: value for name, value in facts.preshape.items() if name not in turned}
     found["preshape"] |= corrections.preshape
@@ -168,21 +169,21 @@ def corrected(said: Mapping[str, Any], facts: HandFacts, corrections: HandCorrec
 def _check(facts: HandFacts, corrections: HandCorrections) -> None:
     for joint in (*corrections.closing, *corrections.preshape):
         if joint not in facts.dofs:
-            raise InputError(f"the hand has no joint {joint!r} of its own; there are: {_few(facts.dofs)}")
+            raise InputError(f"the hand has no joint {joint!r} of its own; there are: {_first(facts.dofs)}")
     for joint, value in corrections.preshape.items():
         low, high = facts.lower[joint], facts.upper[joint]
         if not low - _ROUNDING <= value <= high + _ROUNDING:
             raise InputError(f"the pre-shape of {joint!r} is {value:g}, outside its limits {low:.4g} .. {high:.4g}")
     for tip in corrections.fingertips or ():
         if tip not in facts.bodies[1:]:
-            raise InputError(f"{tip!r} is no link that a joint moves; there are: {_few(facts.bodies[1:])}")
+            raise InputError(f"{tip!r} is no link that a joint moves; there are: {_first(facts.bodies[1:])}")
     if (palm := corrections.palm) is None:
         return
     if palm.link not in facts.links:
-        raise InputError(f"the hand has no link {palm.link!r} at or below its root; there are: {_few(facts.links)}")
+        raise InputError(f"the hand has no link {palm.link!r} at or below its root; there are: {_first(facts.links)}")
     if palm.approach is not None and math.hypot(*palm.approach) < _ROUNDING:
         raise InputError("the approach is no direction; give one such as 0, 0, 1")
 
 
-def _few(names: Collection[str]) -> str:
+def _first(names: Collection[str]) -> str:
     return ", ".join(list(names)[:8]) + (", ..." if len(names) > 8 else "")

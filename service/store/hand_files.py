@@ -14,7 +14,7 @@ from typing import Final, Literal
 
 from graspd.service.model.errors import InputError, LimitError
 from graspd.service.store.assets import MAX_FILES, ZipFiles
-from graspd.service.store.mesh_files import HEAD_BYTES, MESHES, beside, named_by, one_like, read_reference
+from graspd.service.store.mesh_files import HEAD_BYTES, MESHES, file_references, match_name, read_reference, resolve
 
 #: Descriptions that supplement a hand's URDF; the first takes precedence.
 DESCRIPTIONS: Final = ("asset.json", "hand.json")
@@ -38,17 +38,17 @@ def files_of_hand(path: Path) -> tuple[dict[str, Path], str]:
     hand's
     folder are ignored.
     """
-    files, main = (_of_folder(path), "") if path.is_dir() else _of_description(path)
-    return files | _looks(files, path.resolve() if path.is_dir() else _package(path.resolve())), main
+    files, main = (_files_of_folder(path), "") if path.is_dir() else _files_of_description(path)
+    return files | _appearance_files(files, path.resolve() if path.is_dir() else _package(path.resolve())), main
 
 
-def _looks(files: Mapping[str, Path], root: Path) -> dict[str, Path]:
+def _appearance_files(files: Mapping[str, Path], root: Path) -> dict[str, Path]:
     found: dict[str, Path] = {}
     waiting = [name for name in files if name.lower().endswith(MESHES)]
     while waiting and len(files) + len(found) < MAX_FILES:
         mesh = waiting.pop()
-        for reference in named_by(mesh, _head(root / mesh)):
-            name = beside(mesh, reference, lambda one: _inside(root / one, root))
+        for reference in file_references(mesh, _head(root / mesh)):
+            name = resolve(mesh, reference, lambda one: _inside(root / one, root))
             if name and name not in files and name not in found:
                 found[name] = root / name
                 waiting += [name] if name.lower().endswith(".mtl") else []
@@ -60,15 +60,15 @@ def _head(file: Path) -> bytes:
         return opened.read(HEAD_BYTES)
 
 
-def _of_folder(folder: Path) -> dict[str, Path]:
+def _files_of_folder(folder: Path) -> dict[str, Path]:
     root = folder.resolve()
-    files = _below(root, root)
+    files = _files_below(root, root)
     if not any(name.lower().endswith(SUFFIXES) for name in files):
         raise InputError(f"{folder} holds no URDF, xacro or MJCF; give the folder of one hand")
     return files
 
 
-def _below(folder: Path, root: Path) -> dict[str, Path]:
+def _files_below(folder: Path, root: Path) -> dict[str, Path]:
     files: dict[str, Path] = {}
     for file in sorted(folder.rglob("*")):
         if (file.suffix.lower() in _TAKEN or file.name in DESCRIPTIONS) and _inside(file, root):
@@ -78,15 +78,15 @@ def _below(folder: Path, root: Path) -> dict[str, Path]:
     return files
 
 
-def _of_description(path: Path) -> tuple[dict[str, Path], str]:
+def _files_of_description(path: Path) -> tuple[dict[str, Path], str]:
     path = path.resolve() if path.is_file() else path
     root = _package(path)
     main = path.relative_to(root).as_posix()
     if path.is_file() and format_of(path.name, path.read_bytes()) == "xacro":
         # The expansion of xacro reveals included files.
-        files = _below(root if (root / "package.xml").is_file() else path.parent, root)
+        files = _files_below(root if (root / "package.xml").is_file() else path.parent, root)
     else:
-        files = {name: root / name for name in sorted(_named_by(path, root))}
+        files = {name: root / name for name in sorted(_referenced_files(path, root))}
     for note in DESCRIPTIONS:
         for folder in (root, path.parent):
             if _inside(folder / note, root):
@@ -101,7 +101,7 @@ def _package(path: Path) -> Path:
     return path.parents[1] if path.parent.name in _OF_PACKAGES else path.parent
 
 
-def _named_by(path: Path, root: Path) -> set[str]:
+def _referenced_files(path: Path, root: Path) -> set[str]:
     """Return names of files below the root that a description and its includes may refer to."""
     seen, waiting = {path}, [path]
     bases, folders, references = set(), {""}, set()
@@ -113,7 +113,7 @@ def _named_by(path: Path, root: Path) -> set[str]:
         folders |= {unescape(folder) for folder in _FOLDER.findall(text)}
         references |= {unescape(reference) for reference in _REFERENCE.findall(text)}
         # Names in an included file are relative to its folder or to the description's, depending on the reader.
-        found = {name for parts in product(references, bases, folders) for name in _names(*parts, root)}
+        found = {name for parts in product(references, bases, folders) for name in _resolve_names(*parts, root)}
         for name in sorted(found):
             inner = (root / name).resolve()
             if inner.suffix.lower() in SUFFIXES and inner not in seen and len(seen) < _MAX_INCLUDED:
@@ -122,22 +122,22 @@ def _named_by(path: Path, root: Path) -> set[str]:
     return found
 
 
-def _names(written: str, base: str, folder: str, root: Path) -> Iterator[str]:
+def _resolve_names(written: str, base: str, folder: str, root: Path) -> Iterator[str]:
     with suppress(InputError):
         reference = read_reference(posixpath.join(folder, written), base)
         if not reference.scheme or not folder:
             for name in reference.names:
-                if there := _on_disk(name, root):
+                if there := _actual_name(name, root):
                     yield there
 
 
-def _on_disk(name: str, root: Path) -> str:
+def _actual_name(name: str, root: Path) -> str:
     """Return the name of a file below the root in its actual upper and lower case; empty if there is none."""
     if _inside(root / name, root):
         return posixpath.normpath(name)
     at = root
     for part in PurePosixPath(name).parts:
-        like = part if (at / part).exists() else one_like(part, (e.name for e in _entries(at)))
+        like = part if (at / part).exists() else match_name(part, (e.name for e in _entries(at)))
         if not like:
             return ""
         at /= like
@@ -196,9 +196,9 @@ def text_of(data: bytes) -> str:
 
 def main_of(files: Mapping[str, bytes], wanted: str = "", *, where: str = "the hand") -> str:
     """Return the file that describes the hand; InputError unless exactly one matches `wanted`, a part of its name."""
-    known = {name: kind for name in sorted(files) if (kind := format_of(name, _described_head(files, name)))}
+    known = {name: kind for name in sorted(files) if (kind := format_of(name, _description_head(files, name)))}
     if wanted:
-        return _named(wanted, [name for name in sorted(files) if name in known or name == wanted], where)
+        return _match_name(wanted, [name for name in sorted(files) if name in known or name == wanted], where)
     # An included part of a xacro description may contain no macros.
     kinds_of = {name: "xacro" if name.lower().endswith(".xacro") else kind for name, kind in known.items()}
     for chosen in ("urdf", "xacro", "mjcf"):
@@ -206,19 +206,19 @@ def main_of(files: Mapping[str, bytes], wanted: str = "", *, where: str = "the h
         if chosen == "urdf" and any(name.lower().endswith(".urdf") for name in found):
             found = [name for name in found if name.lower().endswith(".urdf")]
         if len(found) > 1 and chosen != "urdf":
-            found = _outermost(files, found) or found
+            found = _outermost_files(files, found) or found
         if len(found) == 1:
             return found[0]
         if found:
             names = ", ".join(found[:8]) + (", ..." if len(found) > 8 else "")
             raise InputError(
-                f"{where} holds {len(found)} hand files ({names}); name one: --urdf {_short(found)}, or in a ZIP an "
-                f'asset.json with {{"file": "{_short(found)}"}}'
+                f"{where} holds {len(found)} hand files ({names}); name one: --urdf {_leaves(found)}, or in a ZIP an "
+                f'asset.json with {{"file": "{_leaves(found)}"}}'
             )
     raise InputError(f"{where} contains no hand file; give a URDF, xacro or MJCF, or its folder or ZIP")
 
 
-def _named(wanted: str, known: list[str], where: str) -> str:
+def _match_name(wanted: str, known: list[str], where: str) -> str:
     path = wanted.replace("\\", "/").removeprefix("./")
     for fits in (
         [name for name in known if name == path],
@@ -235,7 +235,7 @@ def _named(wanted: str, known: list[str], where: str) -> str:
     raise InputError(f"{where} names the file {wanted!r}, which is not there; hand files are: {others}")
 
 
-def _outermost(files: Mapping[str, bytes], found: list[str]) -> list[str]:
+def _outermost_files(files: Mapping[str, bytes], found: list[str]) -> list[str]:
     contents = {name: text_of(files[name]).lower() for name in found}
     return [
         name
@@ -244,7 +244,7 @@ def _outermost(files: Mapping[str, bytes], found: list[str]) -> list[str]:
     ]
 
 
-def _short(names: list[str]) -> str:
+def _leaves(names: list[str]) -> str:
     leaves = [PurePosixPath(name).name for name in names]
     return leaves[0] if leaves.count(leaves[0]) == 1 else names[0]
 
@@ -257,7 +257,7 @@ def hand_name(leaf: str) -> str:
     return path.name
 
 
-def _described_head(files: Mapping[str, bytes], name: str) -> bytes:
+def _description_head(files: Mapping[str, bytes], name: str) -> bytes:
     if PurePosixPath(name).suffix.lower() not in SUFFIXES:
         return b""
     if isinstance(files, ZipFiles) and files.size(name) > 1 << 23:

@@ -40,7 +40,7 @@ def read_checked(store: Store, key: str, sha256: str) -> bytes:
     try:
         data = store.get(key)
     except NotFoundError:
-        raise gone(key) from None
+        raise missing_error(key) from None
     check_digest(key, hashlib.sha256(data).hexdigest(), sha256)
     return data
 
@@ -50,7 +50,7 @@ def check_digest(name: str, found: str, expected: str) -> None:
         raise DamagedShard(f"{name} is damaged: its SHA-256 is {found[:12]}..., expected {expected[:12]}...; {FIX}")
 
 
-def gone(key: str) -> DamagedShard:
+def missing_error(key: str) -> DamagedShard:
     return DamagedShard(f"{key} is missing in the store, although its manifest exists; {FIX}")
 
 
@@ -88,7 +88,7 @@ class CheckedObjects:
         for number in range(start // STREAM_BYTES, -(-end // STREAM_BYTES)):
             at = number * STREAM_BYTES
             block = self._store.get_range(key, at, min(STREAM_BYTES, known.size - at))
-            if _of_block(block) != known.blocks[number]:
+            if _block_digest(block) != known.blocks[number]:
                 with self._lock:
                     self._known.pop((key, sha256), None)
                 raise DamagedShard(f"{key} is damaged: some of its bytes changed since it was read; {FIX}")
@@ -104,10 +104,10 @@ class CheckedObjects:
             digest, blocks, size = hashlib.sha256(), list[bytes](), 0
             for chunk in self._store.stream(key):
                 digest.update(chunk)
-                blocks.append(_of_block(chunk))
+                blocks.append(_block_digest(chunk))
                 size += len(chunk)
         except NotFoundError:
-            raise gone(key) from None
+            raise missing_error(key) from None
         check_digest(key, digest.hexdigest(), sha256)
         known = _Intact(stamp, time.monotonic() + _BELIEVED_S, size, tuple(blocks))
         with self._lock:
@@ -117,7 +117,7 @@ class CheckedObjects:
         return known
 
 
-def _of_block(data: bytes) -> bytes:
+def _block_digest(data: bytes) -> bytes:
     return hashlib.blake2b(data, digest_size=16).digest()
 
 
@@ -149,17 +149,17 @@ def _file_stamp(path: Path) -> tuple[int, int, int]:
 
 def _expected(path: Path) -> str | None:
     path = path.absolute()
-    if (digest := _of_manifest(path)) is not None:
+    if (digest := _manifest_checksum(path)) is not None:
         return digest
     for folder in list(path.parents)[:_LEVELS]:
         for name in CHECKSUM_LISTS:
             sums = folder / name
-            if sums.is_file() and (digest := _listed(sums, sums.stat().st_mtime_ns).get(str(path.relative_to(folder)))):
+            if sums.is_file() and (digest := _hashes(sums, sums.stat().st_mtime_ns).get(str(path.relative_to(folder)))):
                 return digest
     return None
 
 
-def _of_manifest(path: Path) -> str | None:
+def _manifest_checksum(path: Path) -> str | None:
     """Return the checksum in the manifest next to a file, as in the store's folder."""
     try:
         said = json.loads(path.with_suffix(".json").read_bytes())
@@ -170,7 +170,7 @@ def _of_manifest(path: Path) -> str | None:
 
 
 @lru_cache(maxsize=8)
-def _listed(sums: Path, _changed: int) -> dict[str, str]:
+def _hashes(sums: Path, _changed: int) -> dict[str, str]:
     lines = (line.split(maxsplit=1) for line in sums.read_text(errors="replace").splitlines())
     return {parts[1].removeprefix("*"): parts[0] for parts in lines if len(parts) == 2 and _DIGEST.fullmatch(parts[0])}
 

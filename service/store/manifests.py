@@ -16,7 +16,7 @@ from graspd.service.model.base import Digest
 from graspd.service.model.clock import timestamp
 from graspd.service.model.domain import JobRequest, batches_of
 from graspd.service.model.messages import TaskMessage
-from graspd.service.model.metric_fields import values, with_fields
+from graspd.service.model.metric_fields import insert_fields, value_fields
 from graspd.service.model.metrics import axis_word, indexed
 from graspd.service.model.records import Record
 from graspd.service.model.states import Stage
@@ -32,7 +32,7 @@ from graspd.service.store.store import Store
 INDEX_THRESHOLD_M: Final = 0.005
 
 
-@with_fields(valid=values(optional=False, default=None), last=values(optional=True, default=None))
+@insert_fields(valid=value_fields(optional=False, default=None), last=value_fields(optional=True, default=None))
 class GraspSummary(Record):
     """Quality of one grasp, in the units of the shard's columns; None for nan."""
 
@@ -82,14 +82,14 @@ class ShardManifest(Record):
 
     @model_validator(mode="before")
     @classmethod
-    def _tried_what_it_holds(cls, data: Any) -> Any:
+    def _set_candidates(cls, data: Any) -> Any:
         # Shards of early versions contain all candidates.
         if isinstance(data, dict) and "candidates" not in data and data.get("kind") == "base":
             return {**data, "candidates": data.get("counts", {}).get("N", 0)}
         return data
 
     @model_validator(mode="after")
-    def _one_summary_a_grasp(self) -> ShardManifest:
+    def _check_summaries(self) -> ShardManifest:
         if self.stage is Stage.SYNTHESIZE and len(self.grasps) != self.counts.get("N"):
             raise ValueError("a base shard's manifest sums up each of its grasps")
         return self
@@ -186,7 +186,7 @@ def publish_shard(store: Store, manifest: ShardManifest, data: bytes) -> bool:
     """Store a shard, manifest last; return False if it exists already, which is also success."""
     if not store.put(manifest.key, data):
         # After concurrent writes, or an end between both writes, the manifest describes the bytes in the store.
-        manifest = described_again(manifest.model_dump(mode="json"), store.get(manifest.key))
+        manifest = rebuild_manifest(manifest.model_dump(mode="json"), store.get(manifest.key))
     return put_record(store, names.shard_manifest(manifest.stage, manifest.shard_id), manifest)
 
 
@@ -203,7 +203,7 @@ def shard_exists(store: Store, stage: Stage, shard: str) -> bool:
     return store.exists(names.shard_manifest(stage, shard))
 
 
-def described_again(said: Mapping[str, Any], data: bytes) -> ShardManifest:
+def rebuild_manifest(said: Mapping[str, Any], data: bytes) -> ShardManifest:
     """Rebuild the manifest of a file; `said`, the shard's existing manifest as JSON, provides the other fields."""
     pictures = tuple(path for path in SCHEMAS["views"] if path.startswith("image/"))
     shard = read_shard(data, without=pictures, name=said["key"])

@@ -43,18 +43,18 @@ def read_reference(written: str, base: str) -> Reference:
     paths = [_inside(rest, "" if scheme else base)]
     with suppress(InputError):
         paths += [_inside(unquote(rest), "" if scheme else base)]
-    tails = [tail for path in dict.fromkeys(paths) for tail in (_tails(path) if scheme else [path])]
+    tails = [tail for path in dict.fromkeys(paths) for tail in (_path_suffixes(path) if scheme else [path])]
     names = [str(PurePosixPath(folder) / tail) for tail in tails for folder in (base, "")]
     return Reference(tuple(dict.fromkeys(names)), scheme, tuple(tail for tail in tails if scheme and "/" in tail))
 
 
-def one_like(name: str, files: Iterable[str]) -> str:
+def match_name(name: str, files: Iterable[str]) -> str:
     wanted = name.lower()
     like = [file for file in files if file.lower() == wanted]
     return like[0] if len(like) == 1 else ""
 
 
-def _tails(path: str) -> list[str]:
+def _path_suffixes(path: str) -> list[str]:
     parts = PurePosixPath(path).parts
     return [str(PurePosixPath(*parts[start:])) for start in range(len(parts))]
 
@@ -82,7 +82,7 @@ _PICTURES: Final = (".png", ".jpg", ".jpeg")
 _TAKEN: Final = (".mtl", *_PICTURES)
 
 
-def named_by(name: str, data: bytes) -> list[str]:
+def file_references(name: str, data: bytes) -> list[str]:
     """Return the texture and material files named in a mesh or library, as written; limited in number."""
     pattern = _NAMED_BY.get(PurePosixPath(name).suffix.lower())
     if pattern is None:
@@ -96,7 +96,7 @@ def reference_of(text: bytes) -> str:
     return words.split()[-1] if words.startswith("-") else words
 
 
-def beside(name: str, reference: str, there: Callable[[str], bool]) -> str | None:
+def resolve(name: str, reference: str, there: Callable[[str], bool]) -> str | None:
     """Resolve a mesh's reference by path, or by name in its folder; None unless a picture or library is `there`."""
     folder = posixpath.dirname(name)
     said = reference.replace("\\", "/").partition("://")[2] or reference.replace("\\", "/")
@@ -107,13 +107,13 @@ def beside(name: str, reference: str, there: Callable[[str], bool]) -> str | Non
     return next((one for one in tries if not one.startswith(("..", "/")) and there(one)), None)
 
 
-def looks_of(name: str, files: Mapping[str, bytes]) -> list[str]:
+def appearance_files(name: str, files: Mapping[str, bytes]) -> list[str]:
     """Return the names of the files that define a mesh's appearance, libraries before pictures."""
     found: list[str] = []
-    for reference in named_by(name, files[name]):
-        one = beside(name, reference, files.__contains__)
+    for reference in file_references(name, files[name]):
+        one = resolve(name, reference, files.__contains__)
         if one and one not in found:
             found.append(one)
             if one.lower().endswith(".mtl"):
-                found += [inner for inner in looks_of(one, files) if inner not in found]
+                found += [inner for inner in appearance_files(one, files) if inner not in found]
     return found[:MAX_NAMES]

@@ -20,7 +20,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from graspd.service.model.base import Digest, Name, refusal
+from graspd.service.model.base import Digest, Name, first_error
 from graspd.service.model.digests import digest_bytes
 from graspd.service.model.errors import InputError, LimitError
 from graspd.service.store.assets import asset_json
@@ -62,7 +62,7 @@ class _Meta(BaseModel):
     about: str = Field("", max_length=4000)
 
     @model_validator(mode="after")
-    def _fixed(self) -> _Meta:
+    def _check_joints(self) -> _Meta:
         if len(set(self.joint_names)) != len(self.joint_names):
             raise ValueError("a joint is named twice")
         if self.sizes != sizes(len(self.joint_names)):
@@ -125,7 +125,7 @@ def to_bytes(network: ProposalNetwork) -> bytes:
         shared = {name: getattr(network, name) for name in _SHARED}
         meta = _Meta(schema=SCHEMA, sizes=sizes(joints), **shared)
     except ValidationError as error:
-        raise InputError(f"the network cannot be written: {refusal(error)}") from None
+        raise InputError(f"the network cannot be written: {first_error(error)}") from None
     found = {"mean": network.mean, "std": network.std, **network.weights}
     arrays = {name: np.asarray(array, np.float32) for name, array in found.items()}
     _check(arrays, joints, "the network cannot be written")
@@ -185,7 +185,7 @@ def _read_meta(archive: zipfile.ZipFile, what: str) -> _Meta:
     try:
         return _Meta.model_validate(json_object(text, f"{what}: {_META}"))
     except ValidationError as error:
-        raise InputError(f"{what}: {_META}: {refusal(error)}") from None
+        raise InputError(f"{what}: {_META}: {first_error(error)}") from None
 
 
 def _read(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], what: str) -> Floats32:

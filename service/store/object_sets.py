@@ -10,7 +10,7 @@ from typing import Final
 
 from graspd.service.cli import load_settings
 from graspd.service.model.errors import InputError, LimitError
-from graspd.service.model.names import fitted
+from graspd.service.model.names import shorten
 from graspd.service.store.assets import MAX_FILES, UNPACK_FACTOR, unpack
 
 SUFFIXES: Final = (".stl", ".obj", ".ply", ".off", ".glb")
@@ -99,7 +99,7 @@ def _rank(name: str) -> tuple[int, str]:
 
 
 def _name(text: str, taken: Mapping[str, str]) -> str:
-    name = fitted(re.sub(r"[^A-Za-z0-9._-]+", "_", text).lstrip("._-") or "object", 60)
+    name = shorten(re.sub(r"[^A-Za-z0-9._-]+", "_", text).lstrip("._-") or "object", 60)
     number = 2
     while name in taken:
         name, number = f"{name[:57]}-{number}", number + 1

@@ -49,7 +49,7 @@ def has_packs(store: Store) -> bool:
     return next(iter(store.list(_FOLDER)), None) is not None
 
 
-def take_apart(store: Store) -> Iterator[ShardManifest]:
+def unpack_all(store: Store) -> Iterator[ShardManifest]:
     """Replace each pack by a file and a manifest per shard; yield the manifests. An interrupted call can be repeated.
 
     Damaged packs are moved to `damaged/`. For a damaged file only the manifest is stored, so that its replacement must
@@ -59,13 +59,13 @@ def take_apart(store: Store) -> Iterator[ShardManifest]:
     for key in keys:
         if key.endswith(".pack"):
             beside = key.removesuffix(".pack") + ".dead/"
-            yield from _take_apart(store, key, [one for one in keys if one.startswith(beside)])
+            yield from _unpack(store, key, [one for one in keys if one.startswith(beside)])
     for key in keys:
         if not key.endswith(".pack"):
             store.delete(key)
 
 
-def _take_apart(store: Store, key: str, dead: list[str]) -> Iterator[ShardManifest]:
+def _unpack(store: Store, key: str, dead: list[str]) -> Iterator[ShardManifest]:
     try:
         data = store.get(key)
         gone = {shard for record in dead for shard in json.loads(store.get(record))["shards"]}

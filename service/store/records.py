@@ -18,7 +18,7 @@ from typing import Any, Final, Literal, TypeVar
 from pydantic import BaseModel, Field, ValidationError
 
 from graspd.service.model import names
-from graspd.service.model.base import refusal
+from graspd.service.model.base import first_error
 from graspd.service.model.clock import timestamp
 from graspd.service.model.digests import digest_json
 from graspd.service.model.errors import ConflictError, DamagedError, NotFoundError
@@ -32,7 +32,7 @@ from graspd.service.model.records import (
     Snapshot,
     Tag,
 )
-from graspd.service.model.renamed import has_old_names, renamed, renamed_chart
+from graspd.service.model.renamed import convert_chart, convert_names, has_old_names
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.store.integrity import get_document, is_sealed, put_document, put_sealed
 from graspd.service.store.store import Store
@@ -51,11 +51,11 @@ def parse_record(model: type[RecordT], data: bytes, key: str) -> RecordT:
     is_sealed(key, [data], len(data))
     try:
         if has_old_names(data):
-            return model.model_validate(renamed(json.loads(data)))
+            return model.model_validate(convert_names(json.loads(data)))
         return model.model_validate_json(data)
     except ValidationError as error:
         raise DamagedError(
-            f"the record {key} in the store is damaged ({refusal(error)}); put a copy in its place, or "
+            f"the record {key} in the store is damaged ({first_error(error)}); put a copy in its place, or "
             "remove it and retry its job"
         ) from None
 
@@ -199,7 +199,7 @@ def publish(store: Store, kind: str, record: Mapping[str, Any]) -> str:
 def latest(store: Store, kind: str) -> dict[str, Any] | None:
     """Load the record of a kind that was published last, with present names; None if there is none."""
     key = latest_key(store, kind)
-    return renamed_chart(get_document(store, key)) if key else None
+    return convert_chart(get_document(store, key)) if key else None
 
 
 def latest_key(store: Store, kind: str) -> str:

@@ -19,7 +19,7 @@ from graspd.service.model.base import first_line
 from graspd.service.model.clock import timestamp
 from graspd.service.model.digests import digest_json
 from graspd.service.model.errors import DamagedShard, InputError, NotFoundError
-from graspd.service.model.renamed import COLUMNS, renamed
+from graspd.service.model.renamed import COLUMNS, convert_names
 from graspd.service.model.version import PACKAGE_VERSION
 from graspd.service.store.columns import SCHEMAS, Attribute, ShardKind, check_attributes, schema_of
 from graspd.service.store.integrity import check_file
@@ -124,7 +124,7 @@ class ShardH5(h5py.File):  # type: ignore[misc]
 
     @property
     def attrs(self) -> dict[str, Any]:
-        return dict(renamed(dict(super().attrs)))
+        return dict(convert_names(dict(super().attrs)))
 
 
 @contextmanager
@@ -210,7 +210,7 @@ def json_attribute(value: object) -> str:
     return json.dumps(value, sort_keys=True)
 
 
-def carried(shard: Shard) -> dict[str, Attribute]:
+def carried_attributes(shard: Shard) -> dict[str, Attribute]:
     return {name: value for name, value in shard.attributes.items() if name != "schema"}
 
 
@@ -220,7 +220,7 @@ def part_of_shard(shard: Shard, mask: NDArray[np.bool_]) -> bytes:
     arrays = {
         path: array[mask] if schema[path].shape.split()[0] == "N" else array for path, array in shard.arrays.items()
     }
-    attributes = carried(shard)
+    attributes = carried_attributes(shard)
     if "shard_id" in attributes:
         attributes["shard_id"] = digest_json([attributes["shard_id"], np.flatnonzero(mask).tolist()])
     return write_shard("base", arrays, attributes)

@@ -66,7 +66,7 @@ class Store:
         """Write an object from an open file; a local store copies it in pieces."""
         check_key(key)
         file.seek(0)
-        with _mapped(key, self.url):
+        with _convert_errors(key, self.url):
             if self._root is not None:
                 return _put_local(self._root, key, file)
             try:
@@ -76,15 +76,15 @@ class Store:
             return True
 
     def delete(self, key: str) -> None:
-        with suppress(NotFoundError), _mapped(key, self.url):
+        with suppress(NotFoundError), _convert_errors(key, self.url):
             obstore.delete(self._backend, check_key(key))
 
     def get(self, key: str) -> bytes:
-        with _mapped(key, self.url):
+        with _convert_errors(key, self.url):
             return bytes(obstore.get(self._backend, check_key(key)).bytes())
 
     def get_range(self, key: str, start: int, length: int) -> bytes:
-        with _mapped(key, self.url):
+        with _convert_errors(key, self.url):
             return bytes(obstore.get_range(self._backend, check_key(key), start=start, length=length))
 
     def stream(self, key: str, start: int = 0, length: int | None = None) -> Iterator[bytes]:
@@ -97,19 +97,19 @@ class Store:
             yield chunk
 
     def size(self, key: str) -> int:
-        with _mapped(key, self.url):
+        with _convert_errors(key, self.url):
             return int(obstore.head(self._backend, check_key(key))["size"])
 
     def set_aside(self, key: str) -> None:
         self.move(key, f"damaged/{key}")
 
     def move(self, key: str, to: str) -> None:
-        with suppress(NotFoundError), _mapped(key, self.url):
+        with suppress(NotFoundError), _convert_errors(key, self.url):
             obstore.rename(self._backend, check_key(key), check_key(to), overwrite=True)
 
     def stamp(self, key: str) -> Stamp:
         """Return a stamp that changes when an object is replaced; NotFoundError if there is none."""
-        with _mapped(key, self.url):
+        with _convert_errors(key, self.url):
             meta = obstore.head(self._backend, check_key(key))
             return int(meta["size"]), meta["last_modified"].isoformat(), str(meta.get("e_tag") or "")
 
@@ -122,7 +122,7 @@ class Store:
 
     def list(self, prefix: str, *, offset: str | None = None) -> Iterator[Entry]:
         """Yield objects below a folder in arbitrary order; with `offset` only those whose key sorts after it."""
-        with _mapped(prefix, self.url):
+        with _convert_errors(prefix, self.url):
             for batch in obstore.list(self._backend, check_key(prefix), offset=offset):
                 yield from (Entry(str(meta["path"]), int(meta["size"])) for meta in batch)
 
@@ -140,7 +140,7 @@ class Store:
     def probe(self) -> float:
         """Return the duration of a small write [s]; StoreUnavailable if the store is not writable."""
         start = time.perf_counter()
-        with _mapped(_PROBE, self.url):
+        with _convert_errors(_PROBE, self.url):
             obstore.put(self._backend, _PROBE, b"1", mode="overwrite")
         return time.perf_counter() - start
 
@@ -164,7 +164,7 @@ def open_store(url: str, *, public_endpoint: str | None = None, make: bool = Tru
         return _open_local(folder, url)
     if parts.scheme not in ("s3", "gs", "az"):
         raise InputError(f"the store URL {url!r} names no known store; use file://, s3://, gs:// or az://")
-    with _mapped(url, url):
+    with _convert_errors(url, url):
         own = os.environ.get("AWS_ENDPOINT_URL") or os.environ.get("AWS_ENDPOINT") or None
         endpoint = own if parts.scheme == "s3" else None
         backend: Any = from_url(url, **_remote_options(endpoint))
@@ -210,7 +210,7 @@ def _open_local(folder: Path, url: str) -> Store:
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
         return Store(LocalStore(folder), url)
     except (OSError, BaseError) as error:
-        raise StoreUnavailable(f"the store folder {folder} cannot be written: {_line(error)}") from None
+        raise StoreUnavailable(f"the store folder {folder} cannot be written: {_error_line(error)}") from None
 
 
 def _put_local(root: Path, key: str, data: IO[bytes]) -> bool:
@@ -246,14 +246,14 @@ def _sync_folder(folder: Path) -> None:
 
 
 @contextmanager
-def _mapped(key: str, url: str) -> Iterator[None]:
+def _convert_errors(key: str, url: str) -> Iterator[None]:
     try:
         yield
     except FileNotFoundError:
         raise NotFoundError(f"there is no object {key!r} in the store") from None
     except (BaseError, OSError) as error:
-        raise StoreUnavailable(f"the store {url} does not answer or cannot be written: {_line(error)}") from None
+        raise StoreUnavailable(f"the store {url} does not answer or cannot be written: {_error_line(error)}") from None
 
 
-def _line(error: Exception) -> str:
+def _error_line(error: Exception) -> str:
     return getattr(error, "strerror", None) or first_line(error)

@@ -31,6 +31,6 @@ def feasible(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
     return np.asarray(columns.get("quality/feasible", columns["quality/valid"])) == 1
 
 
-def chosen(columns: Mapping[str, NDArray[Any]], *, unvalidated: bool = False) -> NDArray[np.bool_]:
+def selection(columns: Mapping[str, NDArray[Any]], *, unvalidated: bool = False) -> NDArray[np.bool_]:
     """Return the mask (N,) of valid grasps; with `unvalidated` of feasible grasps without validation."""
     return feasible(columns) & ~validated(columns) if unvalidated else valid(columns)

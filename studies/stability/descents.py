@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from graspd.service.model.fidelity import FIDELITIES, Fidelity
-from graspd.service.model.studies import MapCell, StabilityMap, graded, reachable, short
+from graspd.service.model.studies import MapCell, StabilityMap, format_short, grade, reachable
 from graspd.service.model.transforms import Floats, quat_rotate
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
@@ -143,7 +143,7 @@ def length_map(hand: HandModel, obj: ObjectModel, *, lengths: Sequence[int], say
     for length in lengths:
         found = descend(pair, state, fidelity, iterations=length)
         (cell,) = _cells(pair, found, "draft", length, "residual")
-        cells += [cell, MapCell("draft", length, "quaternion drift", found.drift, graded(found.drift, 1e-5, 1e-3))]
+        cells += [cell, MapCell("draft", length, "quaternion drift", found.drift, grade(found.drift, 1e-5, 1e-3))]
         say(f"{length} iterations: {cell.outcome}, quaternions off by {found.drift:.1e}")
     return StabilityMap(
         "length",
@@ -182,10 +182,10 @@ def _cells(pair: Pair, found: Descent, panel: str, x: float | str, y: float | st
         return [MapCell(panel, x, y, float("nan"), "broken", "values are not finite")]
     residual = float(np.median(merits(pair.hand.model, pair.fine.obj.model, state, np.zeros(len(found.depths)))))
     depth = float(np.median(found.depths)) * 1e3
-    held, deep = graded(residual, *RESIDUAL), graded(depth, *DEPTH_MM)
+    held, deep = grade(residual, *RESIDUAL), grade(depth, *DEPTH_MM)
     is_deep = _ORDER.index(deep) > _ORDER.index(held)
     # The label shows the cause of a bad cell.
-    label = f"↓{short(depth)}" if is_deep else ""
+    label = f"↓{format_short(depth)}" if is_deep else ""
     said = f"residual {residual:.2g}, {depth:.2g} mm deep"
     return [MapCell(panel, x, y, residual, deep if is_deep else held, said, label)]
 

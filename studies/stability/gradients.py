@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 import warp as wp
 
-from graspd.service.model.studies import MapCell, StabilityMap, graded, reachable
+from graspd.service.model.studies import MapCell, StabilityMap, grade, reachable
 from graspd.service.model.transforms import Floats
 from graspd.studies.stability.integrators import Solver, sweep
 from graspd.worker.simulation import reference
@@ -91,7 +91,7 @@ def gradient_map(sizes: Sequence[float], gaps: Sequence[float], *, repeats: int)
     cells = []
     for name, size, gap in product(SOLVERS, sizes, gaps):
         worst = float(np.median([_angle(name, size, gap, seed) for seed in range(repeats)]))
-        cells.append(MapCell(name, size, gap, worst, graded(worst, *ANGLE)))
+        cells.append(MapCell(name, size, gap, worst, grade(worst, *ANGLE)))
     return StabilityMap(
         "gradient",
         "Gradient of the float32 kernels against float64 differences",

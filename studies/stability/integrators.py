@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from graspd.service.model.studies import MapCell, StabilityMap, graded, reachable, short
+from graspd.service.model.studies import MapCell, StabilityMap, format_short, grade, reachable
 from graspd.service.model.transforms import Floats
 from graspd.worker.simulation import reference
 from graspd.worker.simulation.model import LossOptions
@@ -191,11 +191,11 @@ def time_step_map(time_steps: Sequence[float], speeds: Sequence[float]) -> Stabi
 
 def _ball_cell(name: str, dt: float, speed: float, found: tuple[float, float]) -> MapCell:
     energy, deep = found
-    worst = max(graded(energy, *ENERGY), graded(deep, *SINK_M), key=("good", "weak", "broken").index)
+    worst = max(grade(energy, *ENERGY), grade(deep, *SINK_M), key=("good", "weak", "broken").index)
     said = f"energy × {energy:.3g}, {deep * 1e3:.2g} mm deep"
     # The label shows the cause of a bad cell.
-    ratio = f"{energy:.2f}" if energy < 2 else short(energy)
-    label = f"×{ratio}" if energy >= ENERGY[0] else short(round(deep * 1e3, 2))
+    ratio = f"{energy:.2f}" if energy < 2 else format_short(energy)
+    label = f"×{ratio}" if energy >= ENERGY[0] else format_short(round(deep * 1e3, 2))
     return MapCell(name, dt, speed, energy, worst, said, label)
 
 
@@ -264,4 +264,4 @@ def _wall_cell(name: str, solver: Solver, count: int, depth: float, step: float)
     world = ball_world(1.0, step)
     end = solver(contacts, np.array([0, 0, step, 0, 0, 0]), world)
     left = abs(float(end[2]) + depth) / step
-    return MapCell(name, count, depth, left, graded(left, 0.25, 1.0))
+    return MapCell(name, count, depth, left, grade(left, 0.25, 1.0))

@@ -41,7 +41,7 @@ def places(services: Services) -> list[str]:
     actions.create(services, wanted)
     publish(services.store, "charts", CHART)
     publish(services.store, "stability", a_record())
-    tagging.give(services, "good ones", [(shard, 0), (shard, 1)], project="", owner="", permit=lambda _: None)
+    tagging.tag_grasps(services, "good ones", [(shard, 0), (shard, 1)], project="", owner="", permit=lambda _: None)
     gone = add_job(services, seed=11)
     fail(services, gone, "a reason")
     deletion.delete_job(services, gone.id)

@@ -73,5 +73,5 @@ def test_the_child_tells_what_this_machine_has_and_what_is_wrong(monkeypatch: py
     assert json.loads(done.stdout.splitlines()[-1])["toolkit"][0] >= 12
     broken = Mock(side_effect=EngineError("synthesize: OSError: no kernels"))
     monkeypatch.setattr("graspd.worker.process.selfcheck.check_engine", broken)
-    told = doctor._tell_kernels("cpu")
+    told = doctor._report_kernels("cpu")
     assert told["error"] == "synthesize: OSError: no kernels" and told["device"].startswith("cpu (")

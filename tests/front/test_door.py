@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from graspd.cli import build
 from graspd.commands.exchange import EXPORTS, IMPORTS
-from graspd.service.cli import at_the_door
+from graspd.service.cli import run_command_line
 from tests.shell import completed
 
 GRASPD = f"'{sys.executable}' -m graspd"
@@ -38,8 +38,8 @@ def test_a_reader_that_has_enough_and_a_closed_output_are_no_fault() -> None:
 
 def test_a_file_does_not_take_the_place_of_a_closed_output(tmp_path: Path) -> None:
     code = (
-        "import os, sys; from graspd.service.cli import at_the_door; "
-        "at_the_door(lambda: (os.write(1, b'noise'), open(sys.argv[1], 'w').close(), os.write(1, b'noise')))"
+        "import os, sys; from graspd.service.cli import run_command_line; "
+        "run_command_line(lambda: (os.write(1, b'noise'), open(sys.argv[1], 'w').close(), os.write(1, b'noise')))"
     )
     done = run(f"'{sys.executable}' -c \"{code}\" {tmp_path}/file >&- 2>&-")
     assert done.returncode == 0
@@ -65,18 +65,18 @@ def test_a_file_does_not_take_the_place_of_a_closed_output(tmp_path: Path) -> No
 )
 def test_a_system_error_names_the_fix(error: BaseException, line: str, capsys: pytest.CaptureFixture[str]) -> None:
     with capsys.disabled(), pytest.MonkeyPatch.context() as patch:
-        patch.setattr("graspd.service.cli._silence", lambda stream: None)
+        patch.setattr("graspd.service.cli._discard_output", lambda stream: None)
         patch.setattr("typer.echo", lambda text, err: told.append(text))
         told: list[str] = []
         with pytest.raises(SystemExit) as ended:
-            at_the_door(Mock(side_effect=error))
+            run_command_line(Mock(side_effect=error))
     assert ended.value.code == 1
     assert told == [f"graspd: {line}"]
 
 
 def test_a_fault_of_graspd_keeps_its_trace() -> None:
     with pytest.raises(ZeroDivisionError):
-        at_the_door(lambda: 1 / 0)
+        run_command_line(lambda: 1 / 0)
 
 
 #: Words of the libraries that read files, and of pydantic and click.

@@ -7,7 +7,7 @@ import tomllib
 
 import pytest
 
-from graspd.service.docs import PAGES, PARTS, renewed
+from graspd.service.docs import PAGES, PARTS, update_tables
 from graspd.service.settings import GONE, Settings
 from tests.conftest import PACKAGES, REPOSITORY
 
@@ -89,7 +89,7 @@ def test_no_line_spells_a_key_of_rq(product: dict[str, str]) -> None:
 
 def test_the_tables_of_the_pages_are_up_to_date() -> None:
     pages = [(REPOSITORY / page).read_text() for page in PAGES]
-    assert [renewed(text) for text in pages] == pages, "run: make docs"
+    assert [update_tables(text) for text in pages] == pages, "run: make docs"
     assert all(f"<!-- {name} -->" in "".join(pages) for name in PARTS)
 
 

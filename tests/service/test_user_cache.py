@@ -21,15 +21,15 @@ def fresh(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 def test_an_entry_is_read_as_it_was_kept(tmp_path: Path) -> None:
     file = tmp_path / "things" / "a.npz"
     assert user_cache.load(file) is None
-    user_cache.keep(file, b"first")
-    user_cache.keep(file, b"second")
+    user_cache.store(file, b"first")
+    user_cache.store(file, b"second")
     assert user_cache.load(file) == b"second"
     assert [found.name for found in file.parent.iterdir()] == ["a.npz"]
 
 
 def test_a_damaged_or_foreign_entry_is_as_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / "a.npz"
-    user_cache.keep(file, b"x" * 100)
+    user_cache.store(file, b"x" * 100)
     whole = file.read_bytes()
     for harmed in (whole[:-1], bytes([*whole[:60], whole[60] ^ 1, *whole[61:]]), b"", whole[:20]):
         file.write_bytes(harmed)
@@ -41,11 +41,11 @@ def test_a_damaged_or_foreign_entry_is_as_none(tmp_path: Path, monkeypatch: pyte
 
 def test_the_longest_unused_entries_go_when_it_is_full(tmp_path: Path) -> None:
     for k in range(4):
-        user_cache.keep(tmp_path / f"{k}.npz", bytes(1000), limit_bytes=10_000)
+        user_cache.store(tmp_path / f"{k}.npz", bytes(1000), limit_bytes=10_000)
         os.utime(tmp_path / f"{k}.npz", (k, k))
-    user_cache.keep(tmp_path / "new.npz", bytes(1000), limit_bytes=3200)
+    user_cache.store(tmp_path / "new.npz", bytes(1000), limit_bytes=3200)
     assert sorted(file.name for file in tmp_path.glob("*.npz")) == ["2.npz", "3.npz", "new.npz"]
-    user_cache.keep(tmp_path / "large.npz", bytes(5000), limit_bytes=3200)
+    user_cache.store(tmp_path / "large.npz", bytes(5000), limit_bytes=3200)
     assert [file.name for file in tmp_path.glob("*.npz")] == ["large.npz"]
 
 
@@ -85,7 +85,7 @@ def test_a_folder_that_others_can_write_is_not_used(tmp_path: Path, monkeypatch:
     planted.mkdir()
     planted.chmod(0o777)
     file = user_cache.folder("objects") / "a.npz"
-    user_cache.keep(file, b"x")
+    user_cache.store(file, b"x")
     assert user_cache.load(file) is None
     assert list(planted.iterdir()) == []
 
@@ -94,7 +94,7 @@ def test_processes_that_keep_one_entry_leave_a_whole_one(tmp_path: Path) -> None
     write = (
         "import sys, pathlib; from graspd.service import user_cache\n"
         "for _ in range(200):\n"
-        "    user_cache.keep(pathlib.Path(sys.argv[1]), sys.argv[2].encode() * 50_000)\n"
+        "    user_cache.store(pathlib.Path(sys.argv[1]), sys.argv[2].encode() * 50_000)\n"
         "    assert user_cache.load(pathlib.Path(sys.argv[1])) is not None, 'torn'\n"
     )
     file = tmp_path / "a.npz"

@@ -11,13 +11,13 @@ import pytest
 import trimesh
 
 from graspd.commands.studies import STUDIES
-from graspd.commands.synth import _said
+from graspd.commands.synth import _format_summary
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.errors import InputError
 from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.model.metrics import Axis
 from graspd.service.model.scene_spec import SceneSpec
-from graspd.service.model.studies import MapCell, Stability, StabilityMap, from_json, graded
+from graspd.service.model.studies import MapCell, Stability, StabilityMap, from_json, grade
 from graspd.service.store.records import latest
 from graspd.service.store.store import open_store
 from graspd.studies.stability import assets, descents, gradients, integrators, scenes, studies
@@ -73,7 +73,7 @@ def pair(hand: HandModel) -> Pair:
 def test_planners_own_step_lies_where_its_integrators_are_good(name: str) -> None:
     way = LossOptions().step  # time step x speed [m]
     energy, sunk = integrators.position_based(integrators.SOLVERS[name], dt=1e-3, speed=way / 1e-3)
-    assert graded(energy, *integrators.ENERGY) == graded(sunk, *integrators.SINK_M) == "good"
+    assert grade(energy, *integrators.ENERGY) == grade(sunk, *integrators.SINK_M) == "good"
 
 
 @pytest.mark.parametrize(("share", "holds"), [(0.3, True), (2.5, False)])
@@ -145,7 +145,7 @@ def a_record(*maps: StabilityMap) -> Stability:
 
 
 def test_a_report_has_pictures_tables_and_says_what_still_breaks(tmp_path) -> None:
-    found = [graded(value, 1.0, 2.0) for value in (0.5, 1.5, 2.5, math.nan, math.inf)]
+    found = [grade(value, 1.0, 2.0) for value in (0.5, 1.5, 2.5, math.nan, math.inf)]
     assert found == ["good", "weak", "broken", "broken", "broken"]
     data, page, picture = write(a_record(), tmp_path)
     assert json.loads(data.read_text())["maps"][0]["cells"][1]["value"] is None
@@ -242,7 +242,7 @@ def test_a_plate_flat_on_a_table_ends_with_fewer_and_says_so(tmp_path) -> None:
     words = "synth --hand barrett --units m --scene table --faces all --scenes 1 -n 2 --budget 2 --fidelity draft"
     told = graspd(f"{words} --object", plate, "-o", tmp_path / "g.h5", code=3)
     assert "the budget of 2 candidates" in told["reason"]
-    assert "of the candidates are clear" in _said({"file": "g.h5", **told})
+    assert "of the candidates are clear" in _format_summary({"file": "g.h5", **told})
 
 
 @pytest.mark.parametrize("gap", [5, 30])

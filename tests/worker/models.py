@@ -141,4 +141,4 @@ def keep_arrays(file: Path, arrays: Mapping[str, np.ndarray]) -> None:
     """An entry of the user's cache, written anew."""
     whole = io.BytesIO()
     np.savez(whole, **arrays)
-    user_cache.keep(file, whole.getvalue())
+    user_cache.store(file, whole.getvalue())

@@ -131,7 +131,7 @@ def lay_out(cache: Path) -> None:
     try:
         for file in sorted(source.glob("*/*")):
             if not (target := cache / file.relative_to(source)).exists():
-                user_cache.write_whole(target, [file.read_bytes()])
+                user_cache.write_atomically(target, [file.read_bytes()])
     except OSError as error:
         log.warning("kernels of %s are not used: %s", source, error)
 

@@ -81,7 +81,7 @@ def choose(base: Shard, *, unvalidated: bool = False, every: bool = False) -> tu
     if every:
         mask, word = np.ones(count, bool), "grasps of any kind"
     else:
-        mask = validity.chosen(base.arrays, unvalidated=unvalidated)
+        mask = validity.selection(base.arrays, unvalidated=unvalidated)
         word = "feasible grasps that are not validated" if unvalidated else "valid grasps"
     if not mask.any():
         raise InputError(f"{base.path or 'the shard'} contains no {word}; {_there_are(base, count)}")
@@ -89,7 +89,7 @@ def choose(base: Shard, *, unvalidated: bool = False, every: bool = False) -> tu
 
 
 def _there_are(base: Shard, count: int) -> str:
-    waiting = int(validity.chosen(base.arrays, unvalidated=True).sum())
+    waiting = int(validity.selection(base.arrays, unvalidated=True).sum())
     valid = int(validity.valid(base.arrays).sum())
     if waiting:
         return f"{waiting} of its {count} are feasible but not validated: select them with --unvalidated"

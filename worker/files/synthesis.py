@@ -15,7 +15,7 @@ from graspd.service.model.domain import BATCH_SIZE, SHAKE_NEEDS_A_SCENE, JobOpti
 from graspd.service.model.errors import InputError
 from graspd.service.model.local_options import LocalOptions
 from graspd.service.model.metrics import DIRECTION_CELLS, GraspType, entropy_bits
-from graspd.service.model.planning import shortfall, totals
+from graspd.service.model.planning import shortfall, sum_outcomes
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.transforms import Floats
 from graspd.service.store.columns import Attribute
@@ -78,7 +78,7 @@ class SynthesisResult:
             request.counted,
             sum(batch.candidates for batch in self.batches),
             request.budget,
-            totals(batch.outcomes for batch in self.batches),
+            sum_outcomes(batch.outcomes for batch in self.batches),
             limit.line if limit is not None and limit.hopeless else "",
         )
         if limit is not None and not limit.hopeless:
@@ -108,7 +108,7 @@ class SynthesisResult:
             "want": request.want,
             "wanted": request.grasps,
             "reason": self.reason,
-            "outcomes": totals(batch.outcomes for batch in self.batches),
+            "outcomes": sum_outcomes(batch.outcomes for batch in self.batches),
             "seconds": round(self.seconds, 3),
             "grasps_per_second": round(count / self.seconds, 2),
             "mean": {
@@ -272,7 +272,7 @@ def _attributes(
         "seconds": round(seconds, 4),
     }
     candidates = sum(batch.candidates for batch in batches)
-    outcomes = totals(batch.outcomes for batch in batches)
+    outcomes = sum_outcomes(batch.outcomes for batch in batches)
     return attributes | base_attributes(
         hand, obj, request, candidates=candidates, verdict_key=batches[0].verdict_key, outcomes=outcomes
     )

@@ -13,7 +13,7 @@ from pathlib import PurePosixPath
 from typing import Final
 
 from graspd.service.model.errors import HandError, LimitError
-from graspd.service.store.mesh_files import one_like
+from graspd.service.store.mesh_files import match_name
 from graspd.worker.hands.urdf import parse_xml
 from graspd.worker.objects.stand_ins import refuse_stand_in
 
@@ -155,7 +155,7 @@ def _find(wanted: str, files: Mapping[str, bytes], folders: list[str], main: str
         inside = True
         if name in files:
             return name
-        like.append(one_like(name, files))
+        like.append(match_name(name, files))
     if not inside:
         raise HandError(f"{main}: {does} {wanted[:80]!r}, which lies outside the hand's folder; put it inside")
     below = [name for name in files if name.endswith("/" + posixpath.normpath(path).removeprefix("../"))]

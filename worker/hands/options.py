@@ -9,7 +9,7 @@ from typing import Annotated, Any, Final, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
-from graspd.service.model.base import refusal
+from graspd.service.model.base import first_error
 from graspd.service.model.errors import HandError
 from graspd.worker.objects.options import stated_options
 
@@ -83,7 +83,7 @@ def parse_options(files: Mapping[str, bytes], extra: Mapping[str, Any] | None = 
         return HandOptions.model_validate({**_hand_json(files, stated.get("file")), **stated})
     except ValidationError as error:
         place = "asset.json" if error.errors()[0]["loc"][0] in stated else "hand.json"
-        raise HandError(f"{place}: {refusal(error)}") from None
+        raise HandError(f"{place}: {first_error(error)}") from None
 
 
 def _hand_json(files: Mapping[str, bytes], urdf: object) -> dict[str, Any]:

@@ -14,7 +14,7 @@ import numpy as np
 
 from graspd.service.model.errors import HandError, InputError
 from graspd.service.model.transforms import Floats, apply
-from graspd.service.store.mesh_files import MAX_NAMES, beside, looks_of, one_like, read_reference
+from graspd.service.store.mesh_files import MAX_NAMES, appearance_files, match_name, read_reference, resolve
 from graspd.worker.hands.primitives import tessellate
 from graspd.worker.hands.robot import Ints, Shape
 from graspd.worker.objects.formats import Nearby, Soup, read_mesh
@@ -67,7 +67,7 @@ class Visuals:
             for part in shape.mesh or ():
                 whole.update(np.ascontiguousarray(part).tobytes())
             if shape.filename and (name := _file_of(item, self.files, self.base)):
-                for file in (name, *looks_of(name, self.files)):
+                for file in (name, *appearance_files(name, self.files)):
                     whole.update(hashlib.sha256(self.files[file]).digest())
         return whole.hexdigest()[:32]
 
@@ -141,7 +141,7 @@ def _nearby(mesh: str, files: Mapping[str, bytes]) -> Nearby:
         asked += 1
         if asked > MAX_NAMES:
             return None
-        found = (beside(one, reference, files.__contains__) for one in reversed(naming))
+        found = (resolve(one, reference, files.__contains__) for one in reversed(naming))
         name = next((one for one in found if one), None)
         if name is None:
             return None
@@ -175,7 +175,7 @@ def find_mesh(filename: str, files: Mapping[str, bytes], base: str, link: str) -
         if len(below) == 1:
             return below[0]
     for name in reference.names:
-        if like := one_like(name, files):
+        if like := match_name(name, files):
             return like
     hint = "unknown package: " if reference.scheme == "package" else ""
     sought = (reference.tails or reference.names)[-1]

@@ -63,7 +63,7 @@ def _expand(given: dict[str, Any]) -> str:
     from defusedxml import minidom as safe
     from xacro import substitution_args
 
-    from graspd.service.store.mesh_files import one_like
+    from graspd.service.store.mesh_files import match_name
 
     texts: dict[str, str] = given["texts"]
     names: list[str] = given["names"]
@@ -77,7 +77,7 @@ def _expand(given: dict[str, Any]) -> str:
 
     def text_of(path: str) -> str:
         name = named(path)
-        name = name if name in texts else one_like(name, texts) or name
+        name = name if name in texts else match_name(name, texts) or name
         if name in texts and texts[name].startswith("version https://git-lfs."):
             raise Refused(f"includes {name!r}, which is a Git LFS pointer, not the file itself: git lfs pull")
         if name not in texts:

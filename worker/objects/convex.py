@@ -75,7 +75,7 @@ def keep_parts(file: Path, parts: tuple[Floats, ...]) -> None:
     arrays: dict[str, Any] = {f"{i:04}": part for i, part in enumerate(parts)}
     np.savez(whole, **arrays)
     with suppress(OSError):
-        user_cache.write_whole(file, [whole.getvalue()])
+        user_cache.write_atomically(file, [whole.getvalue()])
 
 
 def _decompose(cpu_s: int) -> None:

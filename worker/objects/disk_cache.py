@@ -51,7 +51,7 @@ def arrays_kept_or_made(
     made = make()
     whole = io.BytesIO()
     np.savez(whole, **dict[str, Any](made))
-    user_cache.keep(file, whole.getvalue(), limit_bytes=_LIMIT_BYTES)
+    user_cache.store(file, whole.getvalue(), limit_bytes=_LIMIT_BYTES)
     return made
 
 

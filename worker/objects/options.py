@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from pydantic import ValidationError
 
-from graspd.service.model.base import refusal
+from graspd.service.model.base import first_error
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import AssetError, MeshError
 from graspd.service.model.object_options import ObjectOptions
@@ -31,7 +31,7 @@ def parse_options(files: Mapping[str, bytes], extra: Mapping[str, Any] | None = 
     try:
         return ObjectOptions.model_validate({**stated, **given})
     except ValidationError as error:
-        raise MeshError(f"asset.json: {refusal(error)}") from None
+        raise MeshError(f"asset.json: {first_error(error)}") from None
 
 
 def stated_options(files: Mapping[str, bytes], error: type[AssetError]) -> dict[str, Any]:

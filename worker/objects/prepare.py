@@ -82,7 +82,7 @@ def _prepared(main: str, data: bytes, options_json: str, face_error_m: float) ->
         with suppress(ValueError, KeyError, TypeError, OSError, EOFError, zipfile.BadZipFile):
             return from_bytes(held, name="", digest="")
     obj = build(repaired_mesh(main, data, ObjectOptions.model_validate_json(options_json)), face_error_m)
-    user_cache.keep(file, to_bytes(obj))
+    user_cache.store(file, to_bytes(obj))
     return obj
 
 

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 from pydantic import ValidationError
 
-from graspd.service.model.base import refusal
-from graspd.service.model.errors import InputError, known_names
-from graspd.service.model.libraries import imports
+from graspd.service.model.base import first_error
+from graspd.service.model.errors import InputError, available_names
+from graspd.service.model.libraries import pause_garbage_collection
 from graspd.worker.planners.port import BatchPlanner, Method, Options, Planner
 
 if TYPE_CHECKING:
@@ -40,12 +40,12 @@ def method(name: str) -> Method:
     Raises InputError: unknown method, or a package's entry point that cannot be loaded or is no `Method`."""
     if name in PLANNERS:
         module, attribute = PLANNERS[name]
-        with imports():
+        with pause_garbage_collection():
             own: Method = getattr(import_module(module), attribute)
         return own
     offered = _offered()
     if name not in offered:
-        raise InputError(f"unknown method {name!r}{known_names(name, method_names())}")
+        raise InputError(f"unknown method {name!r}{available_names(name, method_names())}")
     try:
         found = offered[name].load()
     except Exception as error:
@@ -79,7 +79,7 @@ def _options(name: str, options: Mapping[str, Any] | None) -> Options:
         return known.options(**(options or {}))
     except ValidationError as error:
         there_are = ", ".join(known.options.model_fields) or "none"
-        raise InputError(f"option of {name}: {refusal(error)}; its options: {there_are}") from None
+        raise InputError(f"option of {name}: {first_error(error)}; its options: {there_are}") from None
 
 
 def of_this_machine(name: str, options: Mapping[str, Any] | None) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from importlib import import_module
 from multiprocessing.connection import Connection
 from typing import Any
 
-from graspd.service.model.libraries import imports, own_process
+from graspd.service.model.libraries import mark_process, pause_garbage_collection
 
 
 @dataclass(frozen=True)
@@ -44,8 +44,8 @@ def serve(connection: Connection, modules: Sequence[str]) -> None:
 
     # Imports and work may take seconds: a separate thread detects that the peer is gone.
     threading.Thread(target=read, daemon=True).start()
-    own_process()
-    with imports():
+    mark_process()
+    with pause_garbage_collection():
         for name in modules:
             import_module(name)
     kept: dict[str, Any] = {}

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 from graspd.service import telemetry
 from graspd.service.model.cores import available_memory
 from graspd.service.model.errors import BusyError, InputError, TaskRefused, UnavailableError
-from graspd.service.model.libraries import own_process
+from graspd.service.model.libraries import mark_process
 from graspd.service.model.states import Stage
 from graspd.service.pipeline.identity import check_service
 from graspd.service.store.store import Store, open_store
@@ -235,7 +235,7 @@ def main(table: Mapping[Stage, StageFunction] | None = None, check: Check | None
     """Run the process. Signals to end are handled by the worker: this process ends with it."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
-    own_process()
+    mark_process()
     connection = Connection(int(sys.argv[-1]))
     setup: Setup = connection.recv()
     telemetry.set_up_logs(setup.settings, "worker")

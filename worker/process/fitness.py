@@ -42,7 +42,7 @@ def first_loss(task: str) -> bool:
     file = user_cache.folder("gpus") / f"{hashlib.sha256(task.encode()).hexdigest()[:32]}.lost"
     if user_cache.load(file) is not None:
         return False
-    user_cache.keep(file, b"", limit_bytes=_LOSSES_BYTES)
+    user_cache.store(file, b"", limit_bytes=_LOSSES_BYTES)
     return True
 
 

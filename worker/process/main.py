@@ -27,7 +27,7 @@ from rq.worker import WorkerStatus
 
 from graspd.service.model.errors import GraspdError, QueueUnavailable, TaskRefused
 from graspd.service.model.states import Stage
-from graspd.service.model.workers import WorkerBeat, own_ability
+from graspd.service.model.workers import WorkerBeat, capabilities
 from graspd.service.queue import allowed
 from graspd.service.queue.connection import redis_url
 from graspd.service.queue.lists import queue_names
@@ -58,7 +58,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         self, queue: RqQueue, engine: Link, heart: Heartbeat, *, stages: Collection[Stage], name: str, limit_s: float
     ) -> None:
         super().__init__(
-            queues=queue_names(stages, ability=own_ability()),
+            queues=queue_names(stages, ability=capabilities()),
             name=name,
             connection=queue.connection,
             serializer=JSONSerializer,
@@ -198,7 +198,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
                 log.warning("%s", error)
                 self.connection.delete(found[0].key)
             except Exception as error:
-                if not allowed.is_of_an_entry(error):
+                if not allowed.is_entry_error(error):
                     raise
                 log.warning("an entry of the queue cannot be read: %s", error)
 
@@ -206,7 +206,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         """Choose the queue of the next task. RQ calls this function after each task."""
         self._taken += 1
         queues = {queue.name: queue for queue in self.queues}
-        self._ordered_queues = [queues[name] for name in queue_names(self._stages, self._taken, ability=own_ability())]
+        self._ordered_queues = [queues[name] for name in queue_names(self._stages, self._taken, ability=capabilities())]
 
     def handle_warm_shutdown_request(self) -> None:
         """On SIGTERM, stop the current task at its next launch and return it to the queue."""

@@ -25,9 +25,9 @@ from graspd.service.model.errors import (
 )
 from graspd.service.model.messages import IngestMessage, Origin, TaskMessage, message_type
 from graspd.service.model.records import AttemptRecord
-from graspd.service.model.renamed import renamed
+from graspd.service.model.renamed import convert_names
 from graspd.service.model.states import Stage
-from graspd.service.model.workers import need_of, own_ability
+from graspd.service.model.workers import capabilities, requirements_of
 from graspd.service.queue.port import Event, EventKind, Message
 from graspd.service.store.manifests import ShardManifest, load_manifest, publish_shard, shard_exists
 from graspd.service.store.records import put_record
@@ -72,7 +72,7 @@ class Runner:
     def _run(self, message: Message, raw: Mapping[str, Any], context: TaskContext) -> Event | None:
         started, clock = timestamp(), time.monotonic()
         try:
-            if lacking := own_ability().lacks(need_of(message)):
+            if lacking := capabilities().lacks(requirements_of(message)):
                 # The task is for another worker. The controller reports tasks that no present worker can do.
                 return self._event(EventKind.DEFERRED, message, message=f"this worker cannot run it: {lacking}")
             return self._do(message, context)
@@ -195,7 +195,7 @@ def parse_message(raw: Mapping[str, Any]) -> Message:
         model = message_type(raw)
         # A newer schema may have more fields. Fields that identify the task must exist, so that it can be refused.
         known = {field.alias or name for name, field in model.model_fields.items()}
-        return model.model_validate({key: value for key, value in renamed(dict(raw)).items() if key in known})
+        return model.model_validate({key: value for key, value in convert_names(dict(raw)).items() if key in known})
     except (ValidationError, AttributeError) as error:
         raise TaskRefused(f"an entry of the queue is no task of graspd: {_one_line(error)}") from None
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.errors import GraspdError
-from graspd.service.model.libraries import imports
+from graspd.service.model.libraries import pause_garbage_collection
 from graspd.service.model.states import Stage
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def check_engine(device: Callable[[], str], stages: Collection[Stage], *, thread
         of_device = device()
         for stage in stages:
             name = stage.value
-            with imports():
+            with pause_garbage_collection():
                 importlib.import_module(f"graspd.worker.stages.{name}")
             if stage in _CHECKS:
                 _CHECKS[stage](ExecutionContext(of_device, threads))

@@ -12,7 +12,7 @@ from typing import Annotated, Final
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
-from graspd.service.model.base import refusal
+from graspd.service.model.base import first_error
 from graspd.service.model.errors import InputError
 from graspd.service.model.pinhole import pixel_rays
 from graspd.service.model.transforms import Floats
@@ -183,7 +183,7 @@ def read_cameras(path: Path) -> GivenCameras:
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}") from None
     except ValidationError as error:
-        raise InputError(f"{path}: {refusal(error)}") from None
+        raise InputError(f"{path}: {first_error(error)}") from None
     extrinsics = None if file.cameras is None else np.stack([_place(path, k, c) for k, c in enumerate(file.cameras)])
     return GivenCameras(_matrix(path, file.intrinsics), extrinsics, file.width, file.height)
 

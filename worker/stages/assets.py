@@ -26,7 +26,7 @@ from graspd.service.store.manifests import load_shard
 from graspd.service.store.network_file import ProposalNetwork, from_bytes, network_bytes
 from graspd.service.store.shards import Shard
 from graspd.service.store.store import Store
-from graspd.service.user_cache import write_whole
+from graspd.service.user_cache import write_atomically
 from graspd.worker.files.provenance import NEIGHBOUR_FACE_ERROR_M
 from graspd.worker.hands.load import load_hand, main_file
 from graspd.worker.hands.model import HandModel
@@ -166,7 +166,7 @@ def _fetch(store: Store, key: str, file: Path) -> None:
         return
     # Without a writable folder, the pieces are computed again at the next use.
     with suppress(OSError):
-        write_whole(file, [data])
+        write_atomically(file, [data])
 
 
 def input_of(message: TaskMessage, context: TaskContext, stage: Stage) -> Shard:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from graspd.service.model.errors import InputError, LoadError, SceneError
 from graspd.service.model.messages import TaskMessage
-from graspd.service.model.planning import told, totals
+from graspd.service.model.planning import format_outcomes, sum_outcomes
 from graspd.service.model.states import Stage
 from graspd.service.store.columns import Attribute
 from graspd.worker.files.provenance import base_attributes
@@ -74,7 +74,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
         message.request,
         candidates=sum(one.candidates for one in found),
         verdict_key=found[0].verdict_key,
-        outcomes=totals(one.outcomes for one in found),
+        outcomes=sum_outcomes(one.outcomes for one in found),
     )
     of_scenes: dict[str, Attribute] = {"scene_shard": message.inputs[0]} if scenes else {}
     whole = joined(message, made)
@@ -121,7 +121,8 @@ def _check_hope(message: TaskMessage, batch: int, found: ValidatedBatch, *, in_s
     if limit is not None and limit.hopeless:
         raise LoadError(f"{none}: {limit.line}")
     if in_scenes:
-        lost = "; ".join(filter(None, [told(found.outcomes), found.narrow, limit.line if limit is not None else ""]))
+        reasons = [format_outcomes(found.outcomes), found.narrow, limit.line if limit is not None else ""]
+        lost = "; ".join(filter(None, reasons))
         raise SceneError(
             f"{none} in its scene ({request.place.kind}): {lost}; give "
             f"a larger budget than {request.budget:g} candidates for each grasp, or another pose, scene, hand or seed"

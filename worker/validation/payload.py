@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspd.service.model.matter import ACCELERATION, MASS_KG, MOST_KG
-from graspd.service.model.planning import limit_told
+from graspd.service.model.planning import limit_text
 from graspd.service.model.transforms import Floats, cross, quat_rotate
 from graspd.worker.engines.mujoco_warnings import void
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext, measured
@@ -210,7 +210,7 @@ class Limit:
 
     @property
     def line(self) -> str:
-        return limit_told(self.hand, self.friction, self.grasps, self.lifts_kg, self.bound_kg, self.wanted_kg)
+        return limit_text(self.hand, self.friction, self.grasps, self.lifts_kg, self.bound_kg, self.wanted_kg)
 
     def facts(self) -> dict[str, Any]:
         """Return the values for JSON; an infinite bound becomes None."""

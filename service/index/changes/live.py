@@ -7,8 +7,8 @@ from typing import Any
 
 from sqlalchemy import Connection, delete, select, update
 
-from graspd.service.index.changes.rows import NO_PROGRESS, clean, fitted, settle
-from graspd.service.index.database import IndexPart, chunks, rows_among, update_rows, upsert
+from graspd.service.index.changes.rows import NO_PROGRESS, derive_states, row_from, sanitize
+from graspd.service.index.database import IndexPart, chunks, rows_in, update_rows, upsert
 from graspd.service.index.tables import assets, jobs, tasks, workers
 from graspd.service.model.states import State
 from graspd.service.model.workers import WorkerBeat
@@ -22,9 +22,9 @@ class Live(IndexPart):
         running = State.RUNNING.value
         with self.database.writing() as connection:
             waiting = select(tasks.c.id, tasks.c.job_id).where(tasks.c.state == State.QUEUED.value)
-            jobs_of = {row.id: row.job_id for row in rows_among(connection, waiting, tasks.c.id, workers)}
+            jobs_of = {row.id: row.job_id for row in rows_in(connection, waiting, tasks.c.id, workers)}
             started = {"state": running, "queued": True, "progress_done": 0.0, "progress_total": 0.0}
-            rows = [{"id": task, **started, "worker": clean(workers[task], 128)} for task in jobs_of]
+            rows = [{"id": task, **started, "worker": sanitize(workers[task], 128)} for task in jobs_of]
             update_rows(connection, tasks, rows, state=State.QUEUED.value)
             touched = sorted(set(jobs_of.values()))
             for some in chunks(touched):
@@ -35,7 +35,7 @@ class Live(IndexPart):
 
     def set_progress(self, progress: Mapping[str, tuple[float, float, str]]) -> None:
         rows = [
-            {"id": task, "progress_done": done, "progress_total": total, "progress_message": clean(message)}
+            {"id": task, "progress_done": done, "progress_total": total, "progress_message": sanitize(message)}
             for task, (done, total, message) in progress.items()
         ]
         with self.database.writing() as connection:
@@ -51,13 +51,13 @@ class Live(IndexPart):
     ) -> dict[str, State]:
         """Mark tasks as neither queued nor running, not due before `not_before`; return the states of their jobs."""
         values = {"queued": False, "not_before": not_before, "state": State.QUEUED.value, "worker": None}
-        values |= {**NO_PROGRESS, "progress_message": message and clean(message)}
+        values |= {**NO_PROGRESS, "progress_message": message and sanitize(message)}
         touched: set[str] = set()
         with self.database.writing() as connection:
             for some in chunks(task_ids):
                 statement = update(tasks).where(tasks.c.id.in_(some), _UNFINISHED).values(**values)
                 touched |= set(connection.scalars(statement.returning(tasks.c.job_id)))
-            return {job: settle(connection, job, []) for job in touched}
+            return {job: derive_states(connection, job, []) for job in touched}
 
     def set_asset_waiting(
         self, digests: Iterable[str], *, queued: bool, not_before: float = 0.0, message: str | None = None
@@ -65,14 +65,14 @@ class Live(IndexPart):
         """Mark checks as not running, with the reason if known."""
         values: dict[str, Any] = {"queued": queued, "not_before": not_before}
         if message is not None:
-            values["message"] = clean(message)
+            values["message"] = sanitize(message)
         with self.database.writing() as connection:
             connection.execute(update(assets).where(assets.c.digest.in_(list(digests))).values(**values))
 
     def set_workers(self, beats: Sequence[WorkerBeat], *, forget_before: str, lost_before: str = "9999") -> None:
         """Record living workers; mark missing ones as lost, and delete them after a while."""
         rows = [
-            fitted(workers, beat, stages=[stage.value for stage in beat.stages], task_id=beat.task_id or None)
+            row_from(workers, beat, stages=[stage.value for stage in beat.stages], task_id=beat.task_id or None)
             for beat in beats
         ]
         with self.database.writing() as connection:

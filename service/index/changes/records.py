@@ -13,17 +13,17 @@ from graspd.service.index.changes.rows import (
     NO_PROGRESS,
     Row,
     asset_row,
-    beside,
-    clean,
-    fitted,
+    derive_batch_states,
+    derive_states,
     grasp_rows,
     job_row,
-    settle,
-    settle_batches,
+    neighbour_digests,
+    row_from,
+    sanitize,
     shard_row,
     task_rows,
 )
-from graspd.service.index.database import IndexPart, chunks, rows_among, upsert
+from graspd.service.index.database import IndexPart, chunks, rows_in, upsert
 from graspd.service.index.tables import (
     assets,
     attempts,
@@ -63,7 +63,7 @@ class Changes(IndexPart):
         with self.database.writing(within) as connection:
             self._upsert_job(connection, record)
             self._upsert_tasks(connection, list(task_rows(record)))
-            return settle(connection, record.id)
+            return derive_states(connection, record.id)
 
     def enter_job(self, record: JobRecord, *, within: Connection) -> None:
         """Add a job with its first tasks; `enter_more` adds the other tasks of a large job."""
@@ -93,7 +93,7 @@ class Changes(IndexPart):
         new = {manifest.shard_id: manifest for manifest in manifests}
         touched: defaultdict[str, set[int]] = defaultdict(set)
         with self.database.writing(within) as connection:
-            charged = self._askers(connection, list(new))
+            charged = self._requesting_projects(connection, list(new))
             rows = [shard_row(manifest) | {"charged": charged.get(shard, "")} for shard, manifest in new.items()]
             upsert(connection, shards, rows, keep=("charged",))
             upsert(connection, grasps, [row for manifest in new.values() for row in grasp_rows(manifest)])
@@ -102,7 +102,7 @@ class Changes(IndexPart):
                 made = made.values(_outcome(*_OUTCOME)).returning(tasks.c.job_id, tasks.c.batch)
                 for job, batch in connection.execute(made):
                     touched[job].add(batch)
-            return settle_batches(connection, touched)
+            return derive_batch_states(connection, touched)
 
     def add_attempt(
         self, attempt: AttemptRecord, *, not_before: float = 0.0, within: Connection | None = None
@@ -111,20 +111,20 @@ class Changes(IndexPart):
         with self.database.writing(within) as connection:
             if connection.scalar(select(tasks.c.id).where(tasks.c.id == attempt.task_id)) is None:
                 return None  # The job is deleted, or the attempt is forged.
-            upsert(connection, attempts, [fitted(attempts, attempt, stage=attempt.stage.value)])
+            upsert(connection, attempts, [row_from(attempts, attempt, stage=attempt.stage.value)])
             values: dict[str, Any] = {
                 "last_attempt": attempt.number,
                 "exhausted": attempt.last,
-                "reason": clean(attempt.reason),
+                "reason": sanitize(attempt.reason),
                 "finished": attempt.ended if attempt.last else None,
-                "worker": clean(attempt.worker, 128) if attempt.last else None,
+                "worker": sanitize(attempt.worker, 128) if attempt.last else None,
                 "state": State.QUEUED.value,
             }
             values |= {"queued": False, "not_before": not_before, **NO_PROGRESS}
             is_next = (tasks.c.done.is_(False), tasks.c.last_attempt < attempt.number)
             changed = update(tasks).where(tasks.c.id == attempt.task_id, *is_next).values(**values)
             touched = connection.execute(changed.returning(tasks.c.job_id, tasks.c.batch)).first()
-            return None if touched is None else settle(connection, touched.job_id, [touched.batch])
+            return None if touched is None else derive_states(connection, touched.job_id, [touched.batch])
 
     def set_job_events(self, job_id: str, events: Sequence[JobEvent], *, within: Connection | None = None) -> State:
         """Replace the user actions on a job by all its events so far, in order."""
@@ -137,7 +137,7 @@ class Changes(IndexPart):
                     fresh = {"reason": None, "finished": None, "worker": None, "queued": False, "not_before": 0.0}
                     connection.execute(update(tasks).where(*task, tasks.c.last_attempt <= upto).values(**fresh))
                     connection.execute(update(tasks).where(*task).values(retried_upto=upto))
-            return settle(connection, job_id)
+            return derive_states(connection, job_id)
 
     def add_asset(self, asset: Asset, check: Mapping[str, Any] | None, *, within: Connection | None = None) -> None:
         """Add a hand or object with the result of its check; None: the check is pending."""
@@ -149,7 +149,7 @@ class Changes(IndexPart):
 
     def _upsert_tasks(self, connection: Connection, rows: list[Row]) -> None:
         query, ids = select(shards.c.id, *_OUTCOME), [row["shard_id"] for row in rows]
-        known = {shard: _outcome(*made) for shard, *made in rows_among(connection, query, shards.c.id, ids)}
+        known = {shard: _outcome(*made) for shard, *made in rows_in(connection, query, shards.c.id, ids)}
         for row in rows:
             row.update(known.get(row["shard_id"], {}))
         upsert(connection, tasks, rows, keep=[name for name in rows[0] if name != "priority"])
@@ -163,14 +163,14 @@ class Changes(IndexPart):
             upsert(connection, notes, [{"name": ENTERING + record.id, "value": {"range": some.stop}}])
         elif goes_on:
             connection.execute(delete(notes).where(notes.c.name == ENTERING + record.id))
-        settle(connection, record.id, [number * record.span for number in some])
+        derive_states(connection, record.id, [number * record.span for number in some])
 
-    def _askers(self, connection: Connection, ids: Sequence[str]) -> dict[str, str]:
+    def _requesting_projects(self, connection: Connection, ids: Sequence[str]) -> dict[str, str]:
         """Return the project of the first job that requested each shard, if it has one."""
         found: dict[str, str] = {}
         query = select(tasks.c.shard_id, jobs.c.project).join(jobs, jobs.c.id == tasks.c.job_id)
         oldest_first = query.order_by(jobs.c.created, jobs.c.id)
-        for shard, project in rows_among(connection, oldest_first, tasks.c.shard_id, ids):
+        for shard, project in rows_in(connection, oldest_first, tasks.c.shard_id, ids):
             found.setdefault(shard, project)
         return found
 
@@ -198,7 +198,7 @@ class DatasetChanges(IndexPart):
             "events": 0,
             "applied": 0,
             "planned": False,
-            "neighbours": beside(record.options),
+            "neighbours": neighbour_digests(record.options),
             "network_digest": record.options.network,
         }
         cells = [

@@ -11,7 +11,7 @@ from typing import Any, Final
 from sqlalchemy import ColumnElement, Connection, Table, exists, func, literal, select, tuple_, update
 
 from graspd.service.index.database import chunks
-from graspd.service.index.outbox import note_ends
+from graspd.service.index.outbox import append_ends
 from graspd.service.index.tables import attempts, jobs, notes, shards, tasks
 from graspd.service.model.domain import Asset, JobOptions
 from graspd.service.model.errors import LoadError, SceneError
@@ -41,13 +41,13 @@ def job_row(record: JobRecord) -> Row:
         "cancelled": False,
         "finished": None,
         "reason": None,
-        "neighbours": beside(record.request),
+        "neighbours": neighbour_digests(record.request),
         "choice": record.choice and record.choice.model_dump(),
         "network_digest": record.request.network,
     }
 
 
-def beside(options: JobOptions) -> str:
+def neighbour_digests(options: JobOptions) -> str:
     return " ".join(dict.fromkeys(one.digest or "" for one in options.beside))
 
 
@@ -80,16 +80,16 @@ def task_rows(record: JobRecord, ranges: range | None = None) -> Iterator[Row]:
         }
 
 
-def clean(text: str, length: int | None = None) -> str:
+def sanitize(text: str, length: int | None = None) -> str:
     """Return text that all databases accept: PostgreSQL rejects code zero and limits lengths."""
     return text.replace("\0", "")[:length]
 
 
-def fitted(table: Table, record: object, **others: Any) -> Row:
+def row_from(table: Table, record: object, **others: Any) -> Row:
     """Return a row of a record's attributes, except `others`, with text that fits its columns."""
     row = {column.name: getattr(record, column.name) for column in table.columns if column.name not in others} | others
     lengths = {column.name: getattr(column.type, "length", None) for column in table.columns}
-    return {name: clean(value, lengths[name]) if isinstance(value, str) else value for name, value in row.items()}
+    return {name: sanitize(value, lengths[name]) if isinstance(value, str) else value for name, value in row.items()}
 
 
 def shard_row(manifest: ShardManifest) -> Row:
@@ -124,16 +124,16 @@ def asset_row(asset: Asset, check: Mapping[str, Any] | None) -> Row:
         "kind": asset.kind.value,
         "files": list(asset.files),
         "verdict": found.get("verdict"),
-        "message": found.get("message") and clean(found["message"], _LONGEST_TEXT),
-        "repairs": [clean(str(one), _LONGEST_TEXT) for one in (found.get("repairs") or [])[:_MOST_REPAIRS]],
-        "facts": _short({**asset.facts, **(found.get("facts") or {})}),
+        "message": found.get("message") and sanitize(found["message"], _LONGEST_TEXT),
+        "repairs": [sanitize(str(one), _LONGEST_TEXT) for one in (found.get("repairs") or [])[:_MOST_REPAIRS]],
+        "facts": _limited_facts({**asset.facts, **(found.get("facts") or {})}),
         "last_attempt": 0,
         "queued": False,
         "not_before": 0.0,
     }
 
 
-def _short(facts: dict[str, Any]) -> dict[str, Any]:
+def _limited_facts(facts: dict[str, Any]) -> dict[str, Any]:
     """Return all facts, or only the numbers if they are too long; `check.json` has the rest."""
     if len(json.dumps(facts)) <= _MOST_FACTS:
         return facts
@@ -151,25 +151,25 @@ ENTERING: Final = "entering "
 _WHOSE: Final = (jobs.c.project, jobs.c.owner)
 
 
-def settle(connection: Connection, job_id: str, batches: Collection[int] | None = None) -> State:
+def derive_states(connection: Connection, job_id: str, batches: Collection[int] | None = None) -> State:
     """Derive the states of a job's tasks (of some batches, or all), then the state of the job; return it."""
-    return settle_batches(connection, {job_id: batches})[job_id]
+    return derive_batch_states(connection, {job_id: batches})[job_id]
 
 
-def settle_batches(connection: Connection, touched: Mapping[str, Collection[int] | None]) -> dict[str, State]:
+def derive_batch_states(connection: Connection, touched: Mapping[str, Collection[int] | None]) -> dict[str, State]:
     """Derive the states of some batches of many jobs (None: all); return the states of these jobs.
 
     If the first batch finds no grasp in its scenes, the other batches of the job are skipped, as if cancelled.
     """
     states: dict[str, State] = {}
     for some in chunks(list(touched), _JOBS_AT_ONCE):
-        _settle_tasks(connection, {job: touched[job] for job in some})
-        states |= _settle_jobs(connection, some)
+        _derive_task_states(connection, {job: touched[job] for job in some})
+        states |= _derive_job_states(connection, some)
     return states
 
 
-def _settle_tasks(connection: Connection, touched: Mapping[str, Collection[int] | None]) -> None:
-    query = select(jobs.c.id, jobs.c.cancelled, _hopeless()).where(jobs.c.id.in_(list(touched)))
+def _derive_task_states(connection: Connection, touched: Mapping[str, Collection[int] | None]) -> None:
+    query = select(jobs.c.id, jobs.c.cancelled, _first_batch_failed()).where(jobs.c.id.in_(list(touched)))
     facts = {row.id: row for row in connection.execute(query)}
     cancelled = {job for job, row in facts.items() if row.cancelled or row.hopeless}
     whole = [job for job, batches in touched.items() if batches is None or (job in facts and facts[job].hopeless)]
@@ -193,7 +193,7 @@ def _settle_tasks(connection: Connection, touched: Mapping[str, Collection[int] 
             connection.execute(update(tasks).where(tasks.c.id.in_(some)).values(state=state, ready=ready))
 
 
-def _hopeless() -> ColumnElement[bool]:
+def _first_batch_failed() -> ColumnElement[bool]:
     """Return whether the first batch of a job failed because of its scenes or of the weight."""
     last = (attempts.c.task_id == tasks.c.id) & (attempts.c.number == tasks.c.last_attempt)
     failed = (tasks.c.done.is_(False), tasks.c.exhausted.is_(True), tasks.c.last_attempt > tasks.c.retried_upto)
@@ -218,7 +218,7 @@ def _changes(chain: Sequence[Any], *, cancelled: bool) -> list[tuple[str, str, b
     ]
 
 
-def _settle_jobs(connection: Connection, ids: Sequence[str]) -> dict[str, State]:
+def _derive_job_states(connection: Connection, ids: Sequence[str]) -> dict[str, State]:
     # Six index look-ups; a query of distinct states would read every task of the job.
     of_job = tasks.c.job_id == jobs.c.id
     probes = [exists().where(of_job, tasks.c.state == state.value).label(state.value) for state in State]
@@ -248,5 +248,5 @@ def _settle_jobs(connection: Connection, ids: Sequence[str]) -> dict[str, State]
                 ended.append(about | {"project": row["project"], "owner": row["owner"]})
     # A rebuild reports no past ends of jobs and datasets.
     if not connection.get_execution_options().get(QUIET):
-        note_ends(connection, ended)
+        append_ends(connection, ended)
     return states

@@ -6,11 +6,11 @@ from collections.abc import Collection
 
 from sqlalchemy import ColumnElement, Connection, and_, case, or_, select
 
-from graspd.service.index.database import IndexPart, rows_among
-from graspd.service.index.project_scope import nearest_asset, page_rows, seen, seen_assets
+from graspd.service.index.database import IndexPart, rows_in
+from graspd.service.index.project_scope import assets_in_scope, in_scope, nearest_asset, page_rows
 from graspd.service.index.tables import assets, object_sets
 from graspd.service.index.views import AssetView, ObjectSetView, Page
-from graspd.service.model.errors import SEARCHED, NotFoundError, known_names
+from graspd.service.model.errors import SEARCHED, NotFoundError, available_names
 from graspd.service.model.projects import EVERYTHING, ProjectScope
 from graspd.service.model.states import AssetKind
 
@@ -26,7 +26,7 @@ class Assets(IndexPart):
         scope: ProjectScope = EVERYTHING,
     ) -> Page[AssetView]:
         """Return a page of hands or objects, all versions, newest first; refused ones only on request."""
-        query = select(assets).where(assets.c.kind == kind.value, *seen_assets(scope))
+        query = select(assets).where(assets.c.kind == kind.value, *assets_in_scope(scope))
         if not refused:
             query = query.where(_not_refused())
         with self.database.reading() as connection:
@@ -39,23 +39,23 @@ class Assets(IndexPart):
         named = and_(assets.c.kind == kind.value, assets.c.name == name_or_digest)
         by_digest = and_(assets.c.kind == kind.value, assets.c.digest == name_or_digest)
         refused_last = case((assets.c.verdict == "refuse", 1), else_=0)
-        query = select(assets).where(named | by_digest, *seen_assets(scope))
+        query = select(assets).where(named | by_digest, *assets_in_scope(scope))
         order = (refused_last, nearest_asset(scope), assets.c.created.desc(), assets.c.digest.desc())
         if found := self.database.rows(query.order_by(*order).limit(1)):
             return AssetView(**found[0])
-        known = select(assets.c.name).where(assets.c.kind == kind.value, _not_refused(), *seen_assets(scope))
+        known = select(assets.c.name).where(assets.c.kind == kind.value, _not_refused(), *assets_in_scope(scope))
         names = self.database.column(known.distinct().order_by(assets.c.name).limit(SEARCHED))
-        raise NotFoundError(f"there is no {kind.value} {name_or_digest!r}{known_names(name_or_digest, names)}")
+        raise NotFoundError(f"there is no {kind.value} {name_or_digest!r}{available_names(name_or_digest, names)}")
 
     def sizes(self, kind: AssetKind, wanted: Collection[str], *, scope: ProjectScope = EVERYTHING) -> dict[str, int]:
         """Return the sizes [bytes] of the named hands or objects; unknown names are omitted."""
-        query = select(assets.c.name, assets.c.size_bytes).where(assets.c.kind == kind.value, *seen_assets(scope))
+        query = select(assets.c.name, assets.c.size_bytes).where(assets.c.kind == kind.value, *assets_in_scope(scope))
         sizes = {row["name"]: row["size_bytes"] for row in self.database.rows(query.order_by(assets.c.created))}
         return {name: sizes[name] for name in wanted if name in sizes}
 
     def missing(self, wanted: Collection[tuple[AssetKind, str]], *, within: Connection) -> list[str]:
         query = select(assets.c.kind, assets.c.digest)
-        rows = rows_among(within, query, assets.c.digest, {digest for _, digest in wanted})
+        rows = rows_in(within, query, assets.c.digest, {digest for _, digest in wanted})
         known = {(AssetKind(kind), digest) for kind, digest in rows}
         return [f"{kind.value} {digest}" for kind, digest in wanted if (kind, digest) not in known]
 
@@ -67,7 +67,7 @@ def _not_refused() -> ColumnElement[bool]:
 
 class ObjectSets(IndexPart):
     def newest(self, *, scope: ProjectScope = EVERYTHING) -> list[ObjectSetView]:
-        query = select(object_sets).where(*seen(scope, object_sets))
+        query = select(object_sets).where(*in_scope(scope, object_sets))
         query = query.order_by(object_sets.c.name, object_sets.c.created, object_sets.c.digest)
         return list({row["name"]: ObjectSetView(**row) for row in self.database.rows(query)}.values())
 
@@ -80,5 +80,5 @@ class ObjectSets(IndexPart):
     def get(self, name: str, *, scope: ProjectScope = EVERYTHING) -> ObjectSetView:
         found = {view.name: view for view in self.newest(scope=scope)}
         if name not in found:
-            raise NotFoundError(f"there is no set of objects {name!r}{known_names(name, list(found)[:SEARCHED])}")
+            raise NotFoundError(f"there is no set of objects {name!r}{available_names(name, list(found)[:SEARCHED])}")
         return found[name]

@@ -9,12 +9,12 @@ from typing import Any, Final
 from sqlalchemy import ColumnElement, Connection, Float, case, cast, func, literal, select
 
 from graspd.service.index.database import IndexPart
-from graspd.service.index.project_scope import page_rows, seen
+from graspd.service.index.project_scope import in_scope, page_rows
 from graspd.service.index.queries.jobs import SHARE_DONE, outcomes_of
 from graspd.service.index.tables import attempts, dataset_cells, dataset_snapshots, datasets, jobs, shards, tasks
 from graspd.service.index.views import CellView, DatasetView, Page, SnapshotView
 from graspd.service.model.domain import JobOptions
-from graspd.service.model.errors import SEARCHED, NotFoundError, known_names
+from graspd.service.model.errors import SEARCHED, NotFoundError, available_names
 from graspd.service.model.planning import job_state, ranges_of, shortfall, stages_of
 from graspd.service.model.projects import EVERYTHING, ProjectScope
 from graspd.service.model.records import SnapshotShard
@@ -27,7 +27,7 @@ class Datasets(IndexPart):
     def page(
         self, *, limit: int = 50, cursor: str | None = None, scope: ProjectScope = EVERYTHING
     ) -> Page[DatasetView]:
-        query, key = select(datasets).where(*seen(scope, datasets)), (datasets.c.created, datasets.c.name)
+        query, key = select(datasets).where(*in_scope(scope, datasets)), (datasets.c.created, datasets.c.name)
         with self.database.reading() as connection:
             rows, following = page_rows(connection, query, *key, limit=limit, cursor=cursor)
             return Page(items=[_dataset_view(connection, row) for row in rows], next=following)
@@ -101,12 +101,12 @@ class Datasets(IndexPart):
 
 
 def _dataset_row(connection: Connection, name: str, scope: ProjectScope = EVERYTHING) -> Any:
-    query = select(datasets).where(datasets.c.name == name, *seen(scope, datasets))
+    query = select(datasets).where(datasets.c.name == name, *in_scope(scope, datasets))
     row = connection.execute(query).mappings().first()
     if row is None:
-        known = select(datasets.c.name).where(*seen(scope, datasets)).order_by(datasets.c.created.desc())
+        known = select(datasets.c.name).where(*in_scope(scope, datasets)).order_by(datasets.c.created.desc())
         names = list(connection.scalars(known.limit(SEARCHED)))
-        raise NotFoundError(f"there is no dataset {name!r}{known_names(name, names)}")
+        raise NotFoundError(f"there is no dataset {name!r}{available_names(name, names)}")
     return row
 
 
@@ -121,8 +121,8 @@ def _dataset_view(connection: Connection, row: Any) -> DatasetView:
     options = JobOptions.model_validate(row["options"])
     states = _states(connection, row)
     state = _state(row, states)
-    work = _work(connection, dataset_cells.c.dataset == row["name"])
-    made = _made(connection, dataset_cells.c.dataset == row["name"])
+    work = _task_counts(connection, dataset_cells.c.dataset == row["name"])
+    made = _grasp_counts(connection, dataset_cells.c.dataset == row["name"])
     tasks_asked = max(work["tasks"], _tasks_of_dataset(connection, row["name"], options))
     left = tasks_asked - work["share"]
     pace = made["seconds"] / work["done"] if work["done"] else None
@@ -178,7 +178,7 @@ def _tasks_of_dataset(connection: Connection, name: str, options: JobOptions) ->
     return sum(count * _tasks_of_cell(options, span) for span, count in found)
 
 
-def _work(connection: Connection, where: ColumnElement[bool]) -> dict[str, Any]:
+def _task_counts(connection: Connection, where: ColumnElement[bool]) -> dict[str, Any]:
     query = (
         select(
             func.count().label("tasks"),
@@ -195,7 +195,7 @@ def _work(connection: Connection, where: ColumnElement[bool]) -> dict[str, Any]:
     return dict(connection.execute(query).mappings().one())
 
 
-def _made(connection: Connection, where: ColumnElement[bool]) -> dict[str, Any]:
+def _grasp_counts(connection: Connection, where: ColumnElement[bool]) -> dict[str, Any]:
     query = (
         select(*_MADE)
         .select_from(dataset_cells)
@@ -208,8 +208,8 @@ def _made(connection: Connection, where: ColumnElement[bool]) -> dict[str, Any]:
 
 def _cell_views(connection: Connection, rows: Sequence[Any], options: JobOptions) -> list[CellView]:
     ids = [row["job_id"] for row in rows]
-    work = _work_by_job(connection, ids)
-    made = _made_by_job(connection, ids)
+    work = _task_counts_by_job(connection, ids)
+    made = _grasp_counts_by_job(connection, ids)
     failed = select(attempts.c.job_id, func.count()).where(attempts.c.job_id.in_(ids)).group_by(attempts.c.job_id)
     failures = {job: int(count) for job, count in connection.execute(failed)}
     views = []
@@ -242,7 +242,7 @@ def _cell_views(connection: Connection, rows: Sequence[Any], options: JobOptions
     return views
 
 
-def _work_by_job(connection: Connection, ids: Sequence[str]) -> dict[str, dict[str, float]]:
+def _task_counts_by_job(connection: Connection, ids: Sequence[str]) -> dict[str, dict[str, float]]:
     query = (
         select(tasks.c.job_id, tasks.c.state, func.count(), func.sum(cast(SHARE_DONE, Float)))
         .where(tasks.c.job_id.in_(ids))
@@ -256,7 +256,7 @@ def _work_by_job(connection: Connection, ids: Sequence[str]) -> dict[str, dict[s
     return found
 
 
-def _made_by_job(connection: Connection, ids: Sequence[str]) -> dict[str, dict[str, Any]]:
+def _grasp_counts_by_job(connection: Connection, ids: Sequence[str]) -> dict[str, dict[str, Any]]:
     wanted = [column for column in _MADE if column.name in ("grasps", "valid", "candidates", "validated", "seconds")]
     query = (
         select(tasks.c.job_id, *wanted)

@@ -7,7 +7,7 @@ its end for a rare match. There are three plans:
 2. Otherwise a bounded number of rows is read in the wanted order until the page is full.
 3. Each condition matches many rows, but the conjunction hardly any: all rows are read once.
 
-`truth` translates grasp expressions (`service.model.where`) to SQL.
+`sql_condition` translates grasp expressions (`service.model.where`) to SQL.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from sqlalchemy import (
 from sqlalchemy.sql.operators import in_op, is_
 
 from graspd.service.index.database import IndexPart, chunks
-from graspd.service.index.project_scope import decode, encode, page_size, seen_shards
+from graspd.service.index.project_scope import decode, encode, page_size, shards_in_scope
 from graspd.service.index.tables import dataset_cells, grasps, jobs, shards, tagged, tasks
 from graspd.service.index.views import GraspView, Page
 from graspd.service.model.base import Model
@@ -46,7 +46,7 @@ from graspd.service.model.metrics import indexed
 from graspd.service.model.projects import EVERYTHING, ProjectScope
 from graspd.service.model.records import Grasp
 from graspd.service.model.states import Stage
-from graspd.service.model.where import Connective, Flag, MetricComparison, Negation, Node, TypeComparison, parsed
+from graspd.service.model.where import Connective, Flag, MetricComparison, Negation, Node, TypeComparison, parse_where
 
 Metric = SortedName
 
@@ -80,7 +80,7 @@ class Grasps(IndexPart):
 
     def get(self, shard_id: str, row: int, *, scope: ProjectScope = EVERYTHING) -> GraspView:
         query = select(grasps).where(grasps.c.shard_id == shard_id, grasps.c.row == row)
-        query = query.where(*seen_shards(scope, grasps.c.shard_id))
+        query = query.where(*shards_in_scope(scope, grasps.c.shard_id))
         return GraspView(**self.database.one(query, f"grasp {row} in shard {shard_id!r}"))
 
     def members(self, where: GraspFilter, *, limit: int) -> list[Grasp]:
@@ -131,7 +131,7 @@ class Condition:
 
     def sql(self, groups: Sequence[str] | None) -> ColumnElement[bool]:
         """Return the test; outside the `listed` groups, in a form without index (None: all are listed)."""
-        return self._of(self.column if groups is None or self.group in groups else _plain(self.column))
+        return self._of(self.column if groups is None or self.group in groups else _without_index(self.column))
 
     def on(self, rows: Subquery) -> ColumnElement[bool]:
         return self._of(rows.c[str(self.column.key)])
@@ -168,10 +168,10 @@ class ExpressionCondition:
     group: str = "flag"
 
     def sql(self, groups: Sequence[str] | None) -> ColumnElement[bool]:
-        return truth(self.node, grasps.c)
+        return sql_condition(self.node, grasps.c)
 
     def on(self, rows: Subquery) -> ColumnElement[bool]:
-        return truth(self.node, rows.c)
+        return sql_condition(self.node, rows.c)
 
 
 Test = Condition | Tagged | ExpressionCondition
@@ -190,7 +190,7 @@ def conditions(where: GraspFilter | None) -> list[Test]:
     if where.tag is not None:
         found.append(Tagged(where.tag))
     if where.where is not None:
-        found.append(ExpressionCondition(parsed(where.where)))
+        found.append(ExpressionCondition(parse_where(where.where)))
     if where.project is not None:
         made = _of_project(where.project).with_only_columns(tasks.c.shard_id)
         found.append(Condition("project", grasps.c.shard_id, in_op, made))
@@ -224,7 +224,7 @@ def search(
 ) -> list[Any]:
     """Return the first `size` rows after `start`: metric, shard id and row of the previous grasp."""
     wanted = conditions(where)
-    few = _few(connection, where, wanted)
+    few = _selective_group(connection, where, wanted)
     rows: list[Any] = []
     # Databases sort NULL differently, so rows with and without the metric are two queries.
     if start is None or start[0] is not None:
@@ -248,7 +248,7 @@ def _with_metric(
 ) -> list[Any]:
     by = grasps.c[sort.by]
     if few is not None and few != sort.by:
-        return _sorted(connection, [c.sql([few]) for c in wanted], sort, size, start)
+        return _sorted_rows(connection, [c.sql([few]) for c in wanted], sort, size, start)
     # The index of the order may serve other conditions too: of its metric, or of hand and object.
     served = [sort.by, "pair"] if sort.by == "epsilon" else [sort.by]
     inside = [c.sql(served) for c in wanted if c.group in served]
@@ -266,10 +266,10 @@ def _with_metric(
             return rows
     # PostgreSQL can join indexes; SQLite would follow one index row by row, which is slower than a full scan.
     groups: list[str] | None = None if connection.dialect.name == "postgresql" else []
-    return _sorted(connection, [c.sql(groups) for c in wanted], sort, size, start)
+    return _sorted_rows(connection, [c.sql(groups) for c in wanted], sort, size, start)
 
 
-def _sorted(
+def _sorted_rows(
     connection: Connection,
     tests: Sequence[ColumnElement[bool]],
     sort: GraspSort,
@@ -277,12 +277,12 @@ def _sorted(
     start: tuple[Any, ...] | None,
 ) -> list[Any]:
     """Return the matching rows, sorted without the index of the order."""
-    by = _plain(grasps.c[sort.by])
+    by = _without_index(grasps.c[sort.by])
     query = select(grasps).where(by.is_not(None), *tests)
     return list(connection.execute(_slice(query, (by, grasps.c.shard_id, grasps.c.row), sort, size, start)).mappings())
 
 
-def _few(connection: Connection, where: GraspFilter | None, wanted: Sequence[Test]) -> str | None:
+def _selective_group(connection: Connection, where: GraspFilter | None, wanted: Sequence[Test]) -> str | None:
     """Return the group of conditions that leaves the fewest rows, if they are few enough to sort."""
     numbers: dict[str, int] = {}
     for group in dict.fromkeys(condition.group for condition in wanted):
@@ -338,36 +338,36 @@ def _slice(
     return query.order_by(*(part.desc() if sort.descending else part for part in key)).limit(size)
 
 
-def _plain(column: ColumnElement[Any]) -> ColumnElement[Any]:
+def _without_index(column: ColumnElement[Any]) -> ColumnElement[Any]:
     if isinstance(column.type, Float):
         return column + 0.0
     return column.concat("") if isinstance(column.type, String) else column
 
 
-def truth(node: Node, grasps: Columns) -> ColumnElement[bool]:
+def sql_condition(node: Node, grasps: Columns) -> ColumnElement[bool]:
     """Return an expression in SQL that is never unknown, so `not` is a complement; InputError for missing values."""
     if isinstance(node, Connective):
-        return (or_ if node.word == "or" else and_)(*(truth(part, grasps) for part in node.parts))
+        return (or_ if node.word == "or" else and_)(*(sql_condition(part, grasps) for part in node.parts))
     if isinstance(node, Negation):
-        return not_(truth(node.part, grasps))
+        return not_(sql_condition(node.part, grasps))
     if isinstance(node, Flag):
         if node.name not in _FLAGS:
-            raise _unknown(node.name)
+            raise _missing_column_error(node.name)
         return _FLAGS[node.name](grasps)
     if isinstance(node, MetricComparison):
         if node.name not in _METRICS:
-            raise _unknown(node.name)
-        return _known(grasps[node.name], node.op, node.bound)
+            raise _missing_column_error(node.name)
+        return _comparison(grasps[node.name], node.op, node.bound)
     if isinstance(node, TypeComparison):
-        return _known(grasps.grasp_type, node.op, int(node.kind))
+        return _comparison(grasps.grasp_type, node.op, int(node.kind))
     return _OPERATORS[node.op](grasps[node.name], node.word)
 
 
-def _known(column: Any, op: str, value: float) -> ColumnElement[bool]:
+def _comparison(column: Any, op: str, value: float) -> ColumnElement[bool]:
     return and_(column.is_not(None), _OPERATORS[op](column, value))
 
 
-def _unknown(name: str) -> InputError:
+def _missing_column_error(name: str) -> InputError:
     return InputError(f"the index lacks {name!r}, but the shards have it: `graspd grasps where` reads them")
 
 

@@ -9,10 +9,10 @@ from typing import Any, Final, Literal
 from sqlalchemy import Column, ColumnElement, Connection, Float, and_, case, cast, func, select
 
 from graspd.service.index.database import IndexPart
-from graspd.service.index.project_scope import page_rows, page_size, seen, seen_shards, seen_with_job
+from graspd.service.index.project_scope import in_scope, in_scope_by_job, page_rows, page_size, shards_in_scope
 from graspd.service.index.tables import attempts, jobs, shards, tasks
 from graspd.service.index.views import AttemptView, JobView, Page, ShardView, StageProgress, TaskView
-from graspd.service.model.planning import ranges_of, totals
+from graspd.service.model.planning import ranges_of, sum_outcomes
 from graspd.service.model.projects import EVERYTHING, ProjectScope
 from graspd.service.model.states import Stage, State
 
@@ -35,15 +35,15 @@ class Jobs(IndexPart):
         cursor: str | None = None,
         scope: ProjectScope = EVERYTHING,
     ) -> Page[JobView]:
-        same = _equal({jobs.c.state: state, jobs.c.hand: hand, jobs.c.object: object})
-        query, key = select(jobs).where(*seen(scope, jobs), *same), (jobs.c.created, jobs.c.id)
+        same = _equality_conditions({jobs.c.state: state, jobs.c.hand: hand, jobs.c.object: object})
+        query, key = select(jobs).where(*in_scope(scope, jobs), *same), (jobs.c.created, jobs.c.id)
         with self.database.reading() as connection:
             rows, following = page_rows(connection, query, *key, limit=limit, cursor=cursor)
             return Page(items=_job_views(connection, rows), next=following)
 
     def get(self, job_id: str, *, scope: ProjectScope = EVERYTHING) -> JobView:
         with self.database.reading() as connection:
-            query = select(jobs).where(jobs.c.id == job_id, *seen(scope, jobs))
+            query = select(jobs).where(jobs.c.id == job_id, *in_scope(scope, jobs))
             (view,) = _job_views(connection, [self.database.one(query, f"job {job_id!r}", connection)])
             if view.note is None:
                 return view
@@ -54,14 +54,14 @@ class Jobs(IndexPart):
         return {row.id for row in self.database.among(query, jobs.c.id, ids)}
 
     def tasks(self, *, job: str, state: State | None = None, limit: int = 50) -> Page[TaskView]:
-        query = select(tasks).where(tasks.c.job_id == job, *_equal({tasks.c.state: state}))
+        query = select(tasks).where(tasks.c.job_id == job, *_equality_conditions({tasks.c.state: state}))
         key = (tasks.c.job_id, tasks.c.batch, tasks.c.position)
         with self.database.reading() as connection:
             rows, following = page_rows(connection, query, *key, limit=limit, cursor=None, descending=False)
         return Page(items=[_task_view(row) for row in rows], next=following)
 
     def task(self, task_id: str, *, scope: ProjectScope = EVERYTHING) -> TaskView:
-        query = select(tasks).where(tasks.c.id == task_id, *seen_with_job(scope, tasks))
+        query = select(tasks).where(tasks.c.id == task_id, *in_scope_by_job(scope, tasks))
         return _task_view(self.database.one(query, f"task {task_id!r}"))
 
     def out_of_scope(self, task_ids: Collection[str], scope: ProjectScope) -> set[str]:
@@ -69,28 +69,28 @@ class Jobs(IndexPart):
         return {row.id for row in self.database.among(query, tasks.c.id, task_ids)}
 
     def attempts(self, *, job: str | None = None, limit: int = 50) -> list[AttemptView]:
-        query = select(attempts).where(*_equal({attempts.c.job_id: job}))
+        query = select(attempts).where(*_equality_conditions({attempts.c.job_id: job}))
         query = query.order_by(attempts.c.ended.desc(), attempts.c.number.desc()).limit(page_size(limit))
         return [AttemptView(**row) for row in self.database.rows(query)]
 
 
-def _equal(wanted: Mapping[Column[Any], str | None]) -> list[ColumnElement[bool]]:
+def _equality_conditions(wanted: Mapping[Column[Any], str | None]) -> list[ColumnElement[bool]]:
     return [column == value for column, value in wanted.items() if value is not None]
 
 
 def _job_views(connection: Connection, rows: Sequence[Any]) -> list[JobView]:
     ids = [row["id"] for row in rows]
     progress = _progress(connection, ids)
-    made = _made(connection, ids)
+    made = _grasp_counts(connection, ids)
     views = []
     for row in rows:
         view = JobView(**row, stages=progress[row["id"]], **made.get(row["id"], {}))
         number = ranges_of(view.request.grasps, row["span"])
-        views.append(view.model_copy(update={"stages": [_whole(one, number) for one in view.stages]}))
+        views.append(view.model_copy(update={"stages": [_with_pending_tasks(one, number) for one in view.stages]}))
     return views
 
 
-def _whole(stage: StageProgress, tasks: int) -> StageProgress:
+def _with_pending_tasks(stage: StageProgress, tasks: int) -> StageProgress:
     """Add the tasks of a large job that are not yet entered."""
     more = max(0, tasks - stage.tasks)
     return stage.model_copy(update={"tasks": stage.tasks + more, "queued": stage.queued + more}) if more else stage
@@ -124,7 +124,7 @@ def _progress(connection: Connection, ids: Sequence[str]) -> dict[str, list[Stag
     return {job: [StageProgress(**stages[job][position]) for position in sorted(stages[job])] for job in ids}
 
 
-def _made(connection: Connection, ids: Sequence[str]) -> dict[str, dict[str, int]]:
+def _grasp_counts(connection: Connection, ids: Sequence[str]) -> dict[str, dict[str, int]]:
     same = ("valid", "candidates", "validated", "rechecked", "recheck_held")
     columns = {"grasps": "count", **{name: name for name in same}}
     query = (
@@ -155,7 +155,7 @@ def outcomes_of(connection: Connection, of_jobs: ColumnElement[bool]) -> dict[st
         .where(of_jobs, tasks.c.stage == Stage.SYNTHESIZE.value)
         .limit(MOST_SHARDS)
     )
-    return totals(one for one in connection.scalars(query) if isinstance(one, dict))
+    return sum_outcomes(one for one in connection.scalars(query) if isinstance(one, dict))
 
 
 class Shards(IndexPart):
@@ -169,7 +169,7 @@ class Shards(IndexPart):
         scope: ProjectScope = EVERYTHING,
     ) -> Page[ShardView]:
         """Return a page of shards, newest first, without their manifests."""
-        query = select(shards).where(*seen_shards(scope, shards.c.id), *_equal({shards.c.kind: kind}))
+        query = select(shards).where(*shards_in_scope(scope, shards.c.id), *_equality_conditions({shards.c.kind: kind}))
         if job is not None:
             query = query.where(shards.c.id.in_(select(tasks.c.shard_id).where(tasks.c.job_id == job)))
         with self.database.reading() as connection:
@@ -183,10 +183,10 @@ class Shards(IndexPart):
 
     def job_of(self, shard_id: str, *, scope: ProjectScope = EVERYTHING) -> str | None:
         """Return a job in scope that requested this shard; None if the index has none."""
-        query = select(tasks.c.job_id).where(tasks.c.shard_id == shard_id, *seen_with_job(scope, tasks)).limit(1)
+        query = select(tasks.c.job_id).where(tasks.c.shard_id == shard_id, *in_scope_by_job(scope, tasks)).limit(1)
         found: str | None = self.database.value(query)
         return found
 
     def get(self, shard_id: str, *, scope: ProjectScope = EVERYTHING) -> ShardView:
-        query = select(shards).where(shards.c.id == shard_id, *seen_shards(scope, shards.c.id))
+        query = select(shards).where(shards.c.id == shard_id, *shards_in_scope(scope, shards.c.id))
         return ShardView(**self.database.one(query, f"shard {shard_id!r}"))

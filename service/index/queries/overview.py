@@ -11,7 +11,7 @@ from typing import Any, Final
 from sqlalchemy import ColumnElement, Connection, Select, Table, case, func, select
 
 from graspd.service.index.database import Database, IndexPart
-from graspd.service.index.project_scope import page_size, seen, seen_shards, seen_with_job
+from graspd.service.index.project_scope import in_scope, in_scope_by_job, page_size, shards_in_scope
 from graspd.service.index.tables import attempts, damage, jobs, shards, spent, tasks, workers
 from graspd.service.index.views import FailureGroup, MatrixCell, Stats, UsageDay, WorkerView
 from graspd.service.model.clock import age_of
@@ -29,10 +29,10 @@ class Overview(IndexPart):
     def stats(self, *, scope: ProjectScope = EVERYTHING) -> Stats:
         alive = select(func.count()).select_from(workers).where(workers.c.state != "lost")
         sums = (func.count(), *_MADE, func.sum(shards.c.size_bytes))
-        by_kind = select(shards.c.kind, *sums).where(*seen_shards(scope, shards.c.id)).group_by(shards.c.kind)
+        by_kind = select(shards.c.kind, *sums).where(*shards_in_scope(scope, shards.c.id)).group_by(shards.c.kind)
         with self.database.reading() as connection:
-            of_jobs = _by_state(connection, jobs, *seen(scope, jobs))
-            of_tasks = _by_state(connection, tasks, *seen_with_job(scope, tasks))
+            of_jobs = _by_state(connection, jobs, *in_scope(scope, jobs))
+            of_tasks = _by_state(connection, tasks, *in_scope_by_job(scope, tasks))
             of_shards = {kind: tuple(map(int, row)) for kind, *row in connection.execute(by_kind)}
             living = connection.scalar(alive)
         _, made, valid, candidates, validated, _ = of_shards.get("base", (0,) * 6)
@@ -52,14 +52,14 @@ class Overview(IndexPart):
         """Return the valid grasps of each minute (2026-11-22T08:30) since a time, without empty minutes."""
         minute = func.substr(shards.c.created, 1, 16)
         query = select(minute, func.sum(shards.c.valid)).group_by(minute)
-        query = query.where(shards.c.kind == "base", shards.c.created >= since, *seen_shards(scope, shards.c.id))
+        query = query.where(shards.c.kind == "base", shards.c.created >= since, *shards_in_scope(scope, shards.c.id))
         with self.database.reading() as connection:
             return {start: int(valid) for start, valid in connection.execute(query)}
 
     def failures(self, *, limit: int = 20, scope: ProjectScope = EVERYTHING) -> list[FailureGroup]:
         """Return failed attempts by stage and error, the most frequent first."""
         count, newest = func.count(), func.max(attempts.c.ended)
-        in_scope = seen_with_job(scope, attempts)
+        in_scope = in_scope_by_job(scope, attempts)
         of_tasks = func.count(attempts.c.task_id.distinct())
         query = (
             select(
@@ -87,13 +87,13 @@ class Overview(IndexPart):
         of_tasks = select(tasks.c.job_id, tasks.c.state, func.count()).group_by(tasks.c.job_id, tasks.c.state)
         made = (
             select(shards.c.hand, shards.c.object, *_MADE)
-            .where(shards.c.kind == "base", *seen_shards(scope, shards.c.id))
+            .where(shards.c.kind == "base", *shards_in_scope(scope, shards.c.id))
             .group_by(shards.c.hand, shards.c.object)
         )
         cells: dict[tuple[str, str], dict[str, int]] = {}
         with self.database.reading() as connection:
             pairs = {}
-            of_jobs = select(jobs.c.id, jobs.c.hand, jobs.c.object).where(*seen(scope, jobs))
+            of_jobs = select(jobs.c.id, jobs.c.hand, jobs.c.object).where(*in_scope(scope, jobs))
             for job, hand, obj in connection.execute(of_jobs):
                 pairs[job] = cells.setdefault((hand, obj), dict.fromkeys(_CELL, 0))
                 pairs[job]["jobs"] += 1
@@ -149,7 +149,7 @@ def read_index(database: Database) -> IndexStatus:
             oldest[state] = (first and age_of(first)) or 0.0
         some = select(damage.c.key).limit(MOST_JOBS).subquery()
         damaged = int(connection.scalar(select(func.count()).select_from(some)) or 0)
-        made, valid = connection.execute(made_since(since)).one()
+        made, valid = connection.execute(valid_since(since)).one()
     return IndexStatus(counted, oldest, int(made or 0) / RATE_WINDOW_S, int(valid or 0) / RATE_WINDOW_S, damaged)
 
 
@@ -162,7 +162,7 @@ def oldest_job(state: State) -> Select[Any]:
     return select(jobs.c.created).where(jobs.c.state == state.value).order_by(jobs.c.created).limit(1)
 
 
-def made_since(when: datetime) -> Select[Any]:
+def valid_since(when: datetime) -> Select[Any]:
     text = when.isoformat(timespec="milliseconds").replace("+00:00", "Z")
     base = (shards.c.kind == "base", shards.c.created >= text)
     return select(func.sum(shards.c.count), func.sum(shards.c.valid)).where(*base)
@@ -175,7 +175,7 @@ class Usage(IndexPart):
         sums = (_base(shards.c.count), _base(shards.c.valid), func.count(), func.sum(shards.c.seconds))
         made = select(shards.c.charged, day, shards.c.device, *sums)
         made = made.where(shards.c.created >= since, shards.c.created < f"{until}T99")
-        gone = select(spent).where(spent.c.day >= since, spent.c.day <= until, *seen(scope, spent))
+        gone = select(spent).where(spent.c.day >= since, spent.c.day <= until, *in_scope(scope, spent))
         if not scope.everything:
             made = made.where(shards.c.charged == scope.project)
         days: dict[tuple[str, str], dict[str, Any]] = defaultdict(lambda: dict.fromkeys(_USED, 0))
@@ -239,7 +239,7 @@ class Costs(IndexPart):
         columns = [shards.c[name] for name in BatchCost.__dataclass_fields__ if name != "request"]
         query = (
             select(*columns, shards.c.manifest["request"].label("request"))
-            .where(shards.c.kind == SHARD_KINDS[stage], *seen_shards(scope, shards.c.id))
+            .where(shards.c.kind == SHARD_KINDS[stage], *shards_in_scope(scope, shards.c.id))
             .order_by(shards.c.created.desc(), shards.c.id.desc())
             .limit(limit)
         )

@@ -124,12 +124,12 @@ class Rates:
         )
         for key, words in levels:
             if key in self._groups:
-                return self._measured(key, words)
-        return self._stored()
+                return self._measured_rate(key, words)
+        return self._stored_rate()
 
-    def _measured(self, key: Hashable, words: str) -> Rate:
+    def _measured_rate(self, key: Hashable, words: str) -> Rate:
         if key not in self._known:
-            batches = _whole(self._groups[key])
+            batches = _large_batches(self._groups[key])
             candidates = sum(batch.candidates for batch in batches)
             devices = ", ".join(sorted({batch.device for batch in batches}))
             self._known[key] = Rate(
@@ -142,13 +142,13 @@ class Rates:
             )
         return self._known[key]
 
-    def _stored(self) -> Rate:
+    def _stored_rate(self) -> Rate:
         seconds, share, origin = _stored_of(self._options)
         machine = self.machine
         return Rate(seconds * machine.factor, share, _BYTES_PER_GRASP, machine.scaled(origin), 0, machine.stored_spread)
 
 
-def tries(rate: Rate, options: JobOptions) -> float:
+def candidates(rate: Rate, options: JobOptions) -> float:
     """Return the number of candidates for a job."""
     if options.want == "candidates":
         return float(options.grasps)
@@ -182,7 +182,7 @@ def machine_of(batches: Iterable[BatchCost]) -> Machine:
     comparable = [batch for batch in batches if batch.candidates and _is_stored(batch.request)]
     ratios = [
         batch.seconds / batch.candidates / _stored_of(batch.request)[0]
-        for batch in _whole(comparable)
+        for batch in _large_batches(comparable)
         if batch.seconds > 0
     ]
     if not ratios:
@@ -204,7 +204,7 @@ def _spread(values: list[float], least: tuple[float, float]) -> tuple[float, flo
     return min(least[0], tenths[0] / middle), max(least[1], tenths[-1] / middle)
 
 
-def _whole(batches: list[BatchCost]) -> list[BatchCost]:
+def _large_batches(batches: list[BatchCost]) -> list[BatchCost]:
     """Return the costs of batches that are at least half full, if any: loading dominates small batches."""
     return [batch for batch in batches if 2 * batch.candidates >= BATCH_SIZE] or batches
 
@@ -223,7 +223,7 @@ def recipe_of(options: JobOptions) -> Hashable:
     )
 
 
-def _on(machine: Machine, stored: StageRate) -> StageRate:
+def _rate_on_machine(machine: Machine, stored: StageRate) -> StageRate:
     seconds = stored.seconds * machine.factor
     return replace(stored, seconds=seconds, origin=machine.scaled(stored.origin), spread=machine.stored_spread)
 
@@ -233,7 +233,7 @@ def scene_rate(batches: Iterable[BatchCost], options: JobOptions, machine: Machi
     found = [batch for batch in batches if batch.request.scenes and batch.request.in_scene == options.in_scene]
     rows = sum(batch.count for batch in found)
     if not rows:
-        return _on(machine, STORED_PLACE if options.in_scene else STORED_SCENE)
+        return _rate_on_machine(machine, STORED_PLACE if options.in_scene else STORED_SCENE)
     scenes = sum(batch.batches * batch.request.scenes for batch in found)
     seconds = sum(batch.seconds for batch in found) / scenes
     spread = _spread([one.seconds / (one.batches * one.request.scenes) for one in found], MEASURED_SPREAD)
@@ -246,7 +246,7 @@ def picture_rate(batches: Iterable[BatchCost], options: JobOptions, machine: Mac
     found = [batch for batch in found if batch.request.channels == options.channels] or found
     pixels = sum(batch.count * batch.request.width * batch.request.height for batch in found) / 1e6
     if not pixels:
-        return _on(machine, STORED_PICTURE)
+        return _rate_on_machine(machine, STORED_PICTURE)
     seconds = sum(batch.seconds for batch in found) / pixels
     each = [batch.seconds / (batch.count * batch.request.width * batch.request.height) for batch in found]
     sizes = sum(batch.size_bytes for batch in found) / pixels

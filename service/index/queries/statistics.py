@@ -95,7 +95,7 @@ class Statistics(IndexPart):
 
     def _values(self, where: GraspFilter, metrics: Sequence[Metric], at_most: int) -> NDArray[np.float64]:
         with self.database.reading() as connection:
-            query = select(*(grasps.c[metric] for metric in metrics)).where(*_sampled(connection, where, at_most))
+            query = select(*(grasps.c[metric] for metric in metrics)).where(*_sample(connection, where, at_most))
             rows = [tuple(row) for row in connection.execute(query)]
         return np.array(rows, float).reshape(-1, len(metrics))
 
@@ -103,7 +103,7 @@ class Statistics(IndexPart):
         """Return types and directions of about `at_most` grasps, sampled as in `side_by_side`."""
         columns = grasps.c.grasp_type, grasps.c.approach_cell
         with self.database.reading() as connection:
-            query = select(*columns, func.count()).where(*_sampled(connection, where, at_most)).group_by(*columns)
+            query = select(*columns, func.count()).where(*_sample(connection, where, at_most)).group_by(*columns)
             rows = connection.execute(query).all()
         found = GraspKinds({}, {})
         for kind, cell, count in rows:
@@ -113,7 +113,7 @@ class Statistics(IndexPart):
         return found
 
 
-def _sampled(connection: Connection, where: GraspFilter, at_most: int) -> list[ColumnElement[bool]]:
+def _sample(connection: Connection, where: GraspFilter, at_most: int) -> list[ColumnElement[bool]]:
     """Return the filter restricted to a share of shards with about `at_most` grasps."""
     group = "job" if where.job is not None else "dataset" if where.dataset is not None else "pair"
     share = min(1.0, at_most / max(1, number_of(connection, where, group)))

@@ -22,7 +22,7 @@ from graspd.service.pipeline.datasets.cost import objects_of
 from graspd.service.pipeline.datasets.spec import DatasetRequest, Matrix, describe
 from graspd.service.pipeline.fidelity_choice import Resolver
 from graspd.service.pipeline.recording import recording
-from graspd.service.pipeline.usable import refuse_deleted, usable, with_neighbours, with_network
+from graspd.service.pipeline.usable import refuse_deleted, usable_asset, with_neighbours, with_network
 from graspd.service.store.records import (
     Put,
     add_dataset_event,
@@ -62,7 +62,7 @@ def create(
     wanted += [(AssetKind.NETWORK, shared.network)] if shared.network else []
     with recording(services) as (connection, put):
         new = found is not None and put(key, found)
-        record = found if found is not None and new else _present(services, request.name)
+        record = found if found is not None and new else _load_existing(services, request.name)
         if record.project != scope.project:
             # The message reveals nothing else: names are unique in the whole service.
             raise ConflictError(f"the name {record.name!r} is taken; take another name")
@@ -139,7 +139,7 @@ def add_object_set(
 ) -> ObjectSetView:
     """Give objects a common name. Equal objects change nothing; others make a new version with the same owner.
 
-    `may_follow` receives owner and project of the set before a new version, and may raise. Errors as in `usable`;
+    `may_follow` receives owner and project of the set before a new version, and may raise. Errors as in `usable_asset`;
     InputError without objects.
     """
     assets = [services.index.assets.get(AssetKind.OBJECT, one, scope=scope) for one in objects]
@@ -177,11 +177,11 @@ def members(services: Services, matrix: Matrix, scope: ProjectScope = EVERYTHING
 
 
 def _members(services: Services, kind: AssetKind, wanted: Iterable[str], scope: ProjectScope) -> list[Member]:
-    assets = [usable(services, kind, name, scope) for name in wanted]
+    assets = [usable_asset(services, kind, name, scope) for name in wanted]
     return list(dict.fromkeys(Member(name=asset.name, digest=asset.digest) for asset in assets))
 
 
-def _present(services: Services, name: str) -> DatasetRecord:
+def _load_existing(services: Services, name: str) -> DatasetRecord:
     try:
         return load_dataset(services.store, name)
     except NotFoundError:
@@ -200,20 +200,20 @@ def _difference(known: DatasetRecord, hands: list[Member], objects: list[Member]
     words = []
     for what, ours, theirs in (("hands", hands, known.hands), ("objects", objects, known.objects)):
         if tuple(ours) != theirs:
-            words.append(f"its {what} are {_named(theirs)}")
+            words.append(f"its {what} are {_member_names(theirs)}")
     # Dumps cannot be compared: they omit defaults.
     mine, other = ({name: getattr(one, name) for name in JobOptions.model_fields} for one in (options, known.options))
-    words += [f"its {name} is {_said(other[name])}" for name in mine if mine[name] != other[name]]
+    words += [f"its {name} is {_format_value(other[name])}" for name in mine if mine[name] != other[name]]
     return "; ".join(words)
 
 
-def _said(value: object) -> str:
+def _format_value(value: object) -> str:
     if isinstance(value, tuple) and value and isinstance(value[0], NamedNeighbour):
         return ", ".join(one.object for one in value)
     return "a document of its own" if isinstance(value, SceneDocument) else repr(value)
 
 
-def _named(members: Iterable[Member]) -> str:
+def _member_names(members: Iterable[Member]) -> str:
     found = [member.name for member in members]
     more = f" and {len(found) - 5} more" if len(found) > 5 else ""
     return ", ".join(found[:5]) + more

@@ -20,7 +20,7 @@ from typing import Final
 
 from graspd.service.index.index import Index
 from graspd.service.index.queries.overview import BatchCost
-from graspd.service.index.queries.rates import Machine, Rate, Rates, StageRate, picture_rate, scene_rate, tries
+from graspd.service.index.queries.rates import Machine, Rate, Rates, StageRate, candidates, picture_rate, scene_rate
 from graspd.service.model.domain import BATCH_SIZE, JobOptions, JobRequest
 from graspd.service.model.errors import LimitError
 from graspd.service.model.planning import stages_of
@@ -97,13 +97,13 @@ def objects_of(index: Index, matrix: Matrix, scope: ProjectScope) -> list[str]:
 
 
 def _add_cell(sums: _Sums, hand: str, rate: Rate, options: JobOptions) -> None:
-    candidates = tries(rate, options)
-    valid = candidates * rate.valid_yield
+    number = candidates(rate, options)
+    valid = number * rate.valid_yield
     kept = min(valid, options.grasps) if options.want == "valid" else options.grasps
-    sums.candidates += candidates
+    sums.candidates += number
     sums.valid += min(valid, options.grasps)
     sums.kept += kept
-    seconds = candidates * rate.seconds_per_try
+    seconds = number * rate.seconds_per_try
     sums.seconds += seconds
     sums.low += seconds * rate.spread[0]
     sums.high += seconds * rate.spread[1]
@@ -124,11 +124,11 @@ def _estimate(
     storage = {"base": sums.base_bytes}
     if Stage.SCENE in stages:
         seconds[Stage.SCENE] = batches * options.scenes * scene.seconds
-        ends[Stage.SCENE] = _ends(seconds[Stage.SCENE], scene)
+        ends[Stage.SCENE] = _bounds(seconds[Stage.SCENE], scene)
         storage["scene"] = (batches if options.in_scene else sums.kept) * options.scenes * scene.size_bytes
     if Stage.RENDER in stages:
         seconds[Stage.RENDER] = pixels * picture.seconds
-        ends[Stage.RENDER] = _ends(seconds[Stage.RENDER], picture)
+        ends[Stage.RENDER] = _bounds(seconds[Stage.RENDER], picture)
         storage["views"] = pixels * picture.size_bytes
     total = sum(seconds.values())
     low, high = (sum(found) for found in zip(*ends.values(), strict=True))
@@ -151,13 +151,13 @@ def _estimate(
         storage_bytes=round(sum(storage.values())),
         storage_by_kind={kind: round(size) for kind, size in storage.items()},
         plans=[_plan(workers, (total, low, high), batches, cells, network, assets) for workers in WORKERS],
-        rates=_used(sums),
+        rates=_rates_used(sums),
         measured_share=sum(n for (_, rate), n in sums.cells.items() if rate.batches) / cells,
         unknown=unknown,
     )
 
 
-def _ends(seconds: float, rate: StageRate) -> tuple[float, float]:
+def _bounds(seconds: float, rate: StageRate) -> tuple[float, float]:
     return seconds * rate.spread[0], seconds * rate.spread[1]
 
 
@@ -189,7 +189,7 @@ def _assets(index: Index, hands: Sequence[str], objects: Sequence[str], scope: P
     return float(hand_bytes + object_bytes), unknown
 
 
-def _used(sums: _Sums) -> list[RateUsed]:
+def _rates_used(sums: _Sums) -> list[RateUsed]:
     ordered = sorted(sums.cells.items(), key=lambda entry: -entry[1])
     return [
         RateUsed(

@@ -27,7 +27,7 @@ def export_shards(snapshot: Snapshot, folder: Path, fetch: Fetch, progress: Prog
     fetched = size = 0
     for number, shard in enumerate(snapshot.shards, start=1):
         path = folder / path_of(shard)
-        if not _is_there(path, shard):
+        if not _is_exported(path, shard):
             _make(path.parent)
             _fetch(shard, path, fetch)
             fetched, size = fetched + 1, size + shard.size_bytes
@@ -50,7 +50,7 @@ def _make(folder: Path) -> None:
         raise InputError(f"the folder {folder} cannot be made: {error.strerror}") from None
 
 
-def _is_there(path: Path, shard: SnapshotShard) -> bool:
+def _is_exported(path: Path, shard: SnapshotShard) -> bool:
     if not path.is_file() or path.stat().st_size != shard.size_bytes:
         return False
     with path.open("rb") as file:

@@ -37,7 +37,7 @@ class DatasetRounds:
         """Work for at most `budget_s`; return whether work is left."""
         deadline = self._clock() + budget_s
         for work in self._services.index.dataset_feed.in_work():
-            if not self._pass_on(work, deadline) or not self._plan(work, deadline):
+            if not self._apply_event(work, deadline) or not self._plan(work, deadline):
                 return True
         return False
 
@@ -57,7 +57,7 @@ class DatasetRounds:
         self._services.index.write_dataset.set_progress(work.name, planned=True)
         return True
 
-    def _pass_on(self, work: DatasetWork, deadline: float) -> bool:
+    def _apply_event(self, work: DatasetWork, deadline: float) -> bool:
         """Cancel or retry the jobs according to the last event; return whether all are done."""
         if work.applied >= work.events:
             return True
@@ -70,7 +70,7 @@ class DatasetRounds:
             for position, job in found:
                 if self._clock() > deadline:
                     return False
-                self._pass_to(job, work)
+                self._apply_to_job(job, work)
                 self._positions[key] = position
             if not found:
                 break
@@ -78,7 +78,7 @@ class DatasetRounds:
         self._services.index.write_dataset.set_progress(work.name, applied=work.events)
         return True
 
-    def _pass_to(self, job: str, work: DatasetWork) -> None:
+    def _apply_to_job(self, job: str, work: DatasetWork) -> None:
         cause = f"{work.name}/{work.events}"
         if any(event.cause == cause for event in job_events(self._services.store, job)):
             return

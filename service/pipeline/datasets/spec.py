@@ -13,7 +13,7 @@ from graspd.service.model.digests import digest_json, job_id
 from graspd.service.model.domain import JobOptions, JobRequest
 from graspd.service.model.fidelity import AUTO
 from graspd.service.model.records import Choice, DatasetRecord, Member, request_of
-from graspd.service.model.renamed import original
+from graspd.service.model.renamed import original_request
 from graspd.service.model.version import STAGE_REVISIONS
 
 #: Most cells of a dataset: a record of this many cells has 4 MB.
@@ -77,7 +77,7 @@ def describe(
     content = {
         "hands": [[hand.name, hand.digest] for hand in hands],
         "objects": [[obj.name, obj.digest] for obj in objects],
-        "options": original(options.model_dump(mode="json", exclude=unused)),
+        "options": original_request(options.model_dump(mode="json", exclude=unused)),
         **({"fidelities": fidelities} if fidelities else {}),
     }
     return DatasetRecord(

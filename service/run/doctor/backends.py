@@ -15,7 +15,7 @@ from redis import Redis
 from redis.exceptions import RedisError
 from sqlalchemy import func, make_url, select
 
-from graspd.service.index.condition import IndexCondition, look
+from graspd.service.index.condition import IndexCondition, read_condition
 from graspd.service.index.index import Index
 from graspd.service.index.rebuild import differences, missing_names
 from graspd.service.index.tables import shards
@@ -32,7 +32,7 @@ from graspd.service.pipeline.identity import Identity, recorded, service_ids
 from graspd.service.queue.connection import connect, redis_url, socket_path
 from graspd.service.queue.rq_queue import open_queue
 from graspd.service.run.doctor.checks import Finding, bad, good, skipped, warning
-from graspd.service.run.doctor.machine import existing, local_store
+from graspd.service.run.doctor.machine import existing_ancestor, local_store
 from graspd.service.run.embedded import find_server
 from graspd.service.settings import Settings
 from graspd.service.store.store import Store, open_store
@@ -46,7 +46,7 @@ _LOCAL: Final = ("127.0.0.1", "localhost", "::1")
 _START: Final = "start it, or set GRASPD_REDIS_URL=redis://:PASSWORD@HOST:6379/0"
 
 
-def is_there(settings: Settings) -> bool:
+def is_expected(settings: Settings) -> bool:
     """Check whether a Redis is configured or may be running; False on a machine where nothing was started."""
     return settings.redis_url is not None or socket_path(settings.data_dir).exists()
 
@@ -57,7 +57,7 @@ def redis_connection(settings: Settings) -> AbstractContextManager[Redis]:
 
 def redis(settings: Settings) -> Finding:
     """Check the Redis of `GRASPD_REDIS_URL` or of the data folder."""
-    if not is_there(settings):
+    if not is_expected(settings):
         try:
             _, rung = find_server()
         except QueueUnavailable as error:
@@ -67,7 +67,7 @@ def redis(settings: Settings) -> Finding:
         with redis_connection(settings) as client:
             return _check_redis(settings, client, dict(client.info()))
     except (RedisError, OSError) as error:
-        return bad(f"{_shown(settings)} does not answer: {first_line(error)}", _fix(error, settings))
+        return bad(f"{_masked_url(settings)} does not answer: {first_line(error)}", _fix(error, settings))
 
 
 def _check_redis(settings: Settings, client: Redis, info: Mapping[str, Any]) -> Finding:
@@ -86,7 +86,7 @@ def _check_redis(settings: Settings, client: Redis, info: Mapping[str, Any]) -> 
             f"{used >> 20} of {most >> 20} MiB are used", "increase maxmemory, or find other users of this Redis"
         )
     seconds = _write(client)
-    line = f"Redis {version} at {_shown(settings)}, {1000 * seconds:.1f} ms, {used >> 20} MiB"
+    line = f"Redis {version} at {_masked_url(settings)}, {1000 * seconds:.1f} ms, {used >> 20} MiB"
     if tuple(int(part) for part in version.split(".")[:2]) < _OLDEST:
         return warning(f"{line}: older than 6.2, the oldest tested version", "install Redis 6.2 or newer, or Valkey")
     parts = urlsplit(redis_url(settings))
@@ -116,7 +116,7 @@ def _write(client: Redis) -> float:
 
 def persistence(settings: Settings) -> Finding:
     """Check whether Redis restores its tasks after a crash."""
-    if not is_there(settings):
+    if not is_expected(settings):
         return skipped("no service runs on this data folder; the Redis of `graspd up` keeps a log of writes")
     try:
         with redis_connection(settings) as client:
@@ -137,7 +137,7 @@ def persistence(settings: Settings) -> Finding:
     )
 
 
-def _shown(settings: Settings) -> str:
+def _masked_url(settings: Settings) -> str:
     parts = urlsplit(redis_url(settings))
     if parts.scheme == "unix":
         return unquote(parts.path)
@@ -170,7 +170,7 @@ _SETTLES_S: Final = 3.0
 
 def index(settings: Settings) -> Finding:
     try:
-        found = look(settings.resolved_index_url)
+        found = read_condition(settings.resolved_index_url)
     except IndexDamaged as error:
         return bad(str(error), "graspd admin index rebuild: moves the index aside and fills a new one from the store")
     except InputError as error:
@@ -182,7 +182,7 @@ def index(settings: Settings) -> Finding:
         return _check_index(settings, found)
     if settings.index_url is None:
         return skipped(_NONE_HERE)
-    where = existing(Path(str(make_url(settings.resolved_index_url).database)).resolve())
+    where = existing_ancestor(Path(str(make_url(settings.resolved_index_url).database)).resolve())
     return good(f"the index is made at the first start, in {where}")
 
 
@@ -211,10 +211,10 @@ def _check_index(settings: Settings, found: IndexCondition) -> Finding:
     return good(line)
 
 
-def _openable(settings: Settings) -> str:
+def _index_problem(settings: Settings) -> str:
     """Return why the index should not be opened; "" if opening it changes nothing."""
     try:
-        found = look(settings.resolved_index_url)
+        found = read_condition(settings.resolved_index_url)
     except (InputError, UnavailableError):
         return "the index does not answer, or is damaged"
     if found is None:
@@ -231,10 +231,10 @@ def index_identity(settings: Settings) -> Finding:
         return skipped("there is no store yet")
     store = open_store(settings.resolved_store_url)
     said, redis = None, None
-    if not _openable(settings):
+    if not _index_problem(settings):
         with closing(Index(settings.resolved_index_url)) as opened:
             said = opened.notes.service()
-    if is_there(settings):
+    if is_expected(settings):
         try:
             with closing(open_queue(settings, patience=0)) as queue:
                 redis = queue.service()
@@ -251,7 +251,7 @@ def index_identity(settings: Settings) -> Finding:
 
 def index_is_store(settings: Settings, *, full: bool = False, settles_s: float = _SETTLES_S) -> Finding:
     """Compare the rows with the store. A difference in only one of two comparisons is an event in progress."""
-    if why := _openable(settings):
+    if why := _index_problem(settings):
         return skipped(why)
     store = open_store(settings.resolved_store_url)
     with closing(Index(settings.resolved_index_url)) as opened:
@@ -279,7 +279,7 @@ def index_is_store(settings: Settings, *, full: bool = False, settles_s: float =
 
 def store_damage(settings: Settings) -> Finding:
     """Report the findings of the controller's integrity scan, or of `graspd admin store verify`."""
-    if why := _openable(settings):
+    if why := _index_problem(settings):
         return skipped(why)
     with closing(Index(settings.resolved_index_url)) as opened:
         count, known = opened.damage.known(limit=1)
@@ -320,7 +320,7 @@ def store(settings: Settings) -> Finding:
     """Try every operation that graspd uses, on an object with a random name."""
     folder = local_store(settings)
     if folder is not None and not folder.exists():
-        return good(f"{folder} is made at the first start, below {existing(folder)}")
+        return good(f"{folder} is made at the first start, below {existing_ancestor(folder)}")
     try:
         opened = open_store(settings.resolved_store_url, public_endpoint=settings.store_public_endpoint)
         return check_store(opened)
@@ -334,7 +334,7 @@ def check_store(opened: Store) -> Finding:
     key = f"{_FOLDER}/doctor-{secrets.token_hex(8)}"
     start = time.perf_counter()
     try:
-        wrong = _try(opened, key)
+        wrong = _violated_guarantee(opened, key)
     finally:
         opened.delete(key)
     seconds = time.perf_counter() - start
@@ -353,7 +353,7 @@ def check_store(opened: Store) -> Finding:
     return good(line)
 
 
-def _try(opened: Store, key: str) -> str:
+def _violated_guarantee(opened: Store, key: str) -> str:
     """Return a guarantee that the store violates; "" if none."""
     contents = [secrets.token_bytes(1000) for _ in range(_RIVALS)]
     with ThreadPoolExecutor(_RIVALS) as pool:

@@ -27,7 +27,7 @@ from graspd.service.model.workers import WorkerBeat
 from graspd.service.pipeline.leading import PART
 from graspd.service.queue.rq_queue import RqQueue, open_queue
 from graspd.service.run.address import local_url, recorded_address
-from graspd.service.run.doctor.backends import is_there, redis_connection
+from graspd.service.run.doctor.backends import is_expected, redis_connection
 from graspd.service.run.doctor.checks import Finding, bad, good, skipped, warning
 from graspd.service.run.doctor.machine import local_store
 from graspd.service.settings import Settings
@@ -36,8 +36,8 @@ from graspd.service.store.store import open_store
 _HTTP_S: Final = 5.0
 
 
-def _asked(settings: Settings, look: Callable[[RqQueue], Finding]) -> Finding:
-    if not is_there(settings):
+def _query_queue(settings: Settings, look: Callable[[RqQueue], Finding]) -> Finding:
+    if not is_expected(settings):
         return skipped("no service runs on this data folder")
     try:
         with closing(open_queue(settings, patience=0)) as queue:
@@ -50,15 +50,15 @@ def controller(settings: Settings) -> Finding:
     dead = bad(
         "no heartbeat from a controller: finished tasks are not indexed, and nothing is queued", "graspd controller"
     )
-    return _asked(settings, lambda queue: good("a controller is alive") if queue.announced(PART) else dead)
+    return _query_queue(settings, lambda queue: good("a controller is alive") if queue.announced(PART) else dead)
 
 
 def workers(settings: Settings) -> Finding:
     """Check whether every stage has a healthy worker of this version."""
-    return _asked(settings, lambda queue: _check_workers(queue.workers(), _waiting(queue)))
+    return _query_queue(settings, lambda queue: _check_workers(queue.workers(), _waiting_tasks(queue)))
 
 
-def _waiting(queue: RqQueue) -> Counter[Stage]:
+def _waiting_tasks(queue: RqQueue) -> Counter[Stage]:
     found: Counter[Stage] = Counter()
     for (_, stage), number in queue.depths().items():
         found[stage] += number
@@ -152,7 +152,7 @@ def clocks(settings: Settings) -> Finding:
 
 def _offsets(settings: Settings) -> Iterator[tuple[str, float]]:
     """Yield name and clock offset to this machine [s]; other checks report missing parts."""
-    if is_there(settings):
+    if is_expected(settings):
         with suppress(RedisError, OSError), redis_connection(settings) as client:
             before = time.time()
             seconds, micros = client.time()
@@ -166,10 +166,10 @@ def _offsets(settings: Settings) -> Iterator[tuple[str, float]]:
     folder = local_store(settings)
     if folder is None or folder.exists():
         with suppress(GraspdError):
-            yield "store", _of_store(settings)
+            yield "store", _store_time(settings)
 
 
-def _of_store(settings: Settings) -> float:
+def _store_time(settings: Settings) -> float:
     """Return the store's time of a new object; some stores have whole seconds only."""
     store, key = open_store(settings.resolved_store_url), f"health/clock-{secrets.token_hex(8)}"
     before = time.time()

@@ -39,7 +39,7 @@ def local_store(settings: Settings) -> Path | None:
 def disk(settings: Settings, *, usage: Callable[[Path], tuple[int, int, int]] = shutil.disk_usage) -> Finding:
     found = []
     for what, folder, variable in _folders(settings):
-        there = existing(folder)
+        there = existing_ancestor(folder)
         free = usage(there)[2]
         facts = os.statvfs(there)
         if facts.f_files and facts.f_favail < _FEW_INODES:
@@ -48,7 +48,7 @@ def disk(settings: Settings, *, usage: Callable[[Path], tuple[int, int, int]] = 
     free, what, folder, variable = min(found, key=lambda one: one[0] // _GIB)
     line = f"{free / _GIB:.1f} GiB free for {what} ({folder})"
     if free < _DISK_BAD:
-        return bad(f"only {line}", f"make room below {existing(folder)}, or move it: {variable}")
+        return bad(f"only {line}", f"make room below {existing_ancestor(folder)}, or move it: {variable}")
     if free < _DISK_LOW:
         return warning(f"only {line}", f"make room soon, or move it: {variable}")
     return good(f"at least {line}")
@@ -63,14 +63,14 @@ def _folders(settings: Settings) -> Iterable[tuple[str, Path, str]]:
     yield "scratch files", Path(tempfile.gettempdir()), "TMPDIR"
 
 
-def existing(folder: Path) -> Path:
+def existing_ancestor(folder: Path) -> Path:
     return next(one for one in (folder, *folder.parents) if one.exists())
 
 
 def data_folder(settings: Settings, *, mounts: Path = Path("/proc/self/mounts")) -> Finding:
     """Check whether the data folder is writable, private to its user, and on a local disk."""
     folder = settings.data_dir.resolve()
-    there = existing(folder)
+    there = existing_ancestor(folder)
     if not os.access(there, os.W_OK | os.X_OK):
         return bad(f"{there} cannot be written by user {os.getuid()}", f"chown it, or set GRASPD_DATA_DIR: {folder}")
     kept_here = [

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from graspd.client.dataset_commands import PlanRequest, read_spec, wanted
+from graspd.client.dataset_commands import PlanRequest, plan_request, read_spec
 from graspd.service.command_options import pairs
 from graspd.service.model.errors import InputError
 from graspd.service.pipeline.datasets.spec import MAX_CELLS
@@ -29,7 +29,7 @@ def spec(folder: Path, text: str, name: str = "kitchen.toml") -> Path:
 
 
 def asked(file: Path | None, *, hands: str | None = None, objects: str | None = None, **options: Any) -> PlanRequest:
-    return wanted(file, name=None, hands=hands, objects=objects, options=options)
+    return plan_request(file, name=None, hands=hands, objects=objects, options=options)
 
 
 def test_a_spec_says_it_all(tmp_path: Path) -> None:

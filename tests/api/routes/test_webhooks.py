@@ -16,7 +16,7 @@ from starlette.testclient import TestClient
 from graspd.api.access.keys import Scope
 from graspd.api.app import create_app
 from graspd.service.index.index import Index
-from graspd.service.index.outbox import note_ends
+from graspd.service.index.outbox import append_ends
 from graspd.service.index.rebuild import rebuild
 from graspd.service.model.webhooks import WAITS_S, Webhook
 from graspd.service.pipeline.backends import Services
@@ -186,7 +186,7 @@ def hooks(services: Services, count: int, project: str, host: str, created: str 
 def end_jobs_of(services: Services, projects: str, seq: str = "") -> None:
     ended = {"kind": "job", "state": "succeeded", "owner": ""}
     with services.index.database.writing() as connection:
-        note_ends(connection, [ended | {"subject": f"{project}{seq}", "project": project} for project in projects])
+        append_ends(connection, [ended | {"subject": f"{project}{seq}", "project": project} for project in projects])
 
 
 class Silent(Ear):

@@ -11,7 +11,7 @@ import pytest
 
 from graspd.service.model import cores, libraries
 from graspd.service.model.cores import available_cores, available_memory
-from graspd.service.model.libraries import imports, own_process
+from graspd.service.model.libraries import mark_process, pause_garbage_collection
 from tests.conftest import PACKAGES, REPOSITORY
 
 MACHINE = 16
@@ -91,19 +91,19 @@ def collects() -> object:
 
 
 def test_nothing_is_collected_while_modules_come_even_if_one_fails() -> None:
-    with imports():
-        with imports():
+    with pause_garbage_collection():
+        with pause_garbage_collection():
             pass
         assert not gc.isenabled()
     assert gc.isenabled()
-    with pytest.raises(ModuleNotFoundError), imports():
+    with pytest.raises(ModuleNotFoundError), pause_garbage_collection():
         import no_such_module  # type: ignore[import-not-found]  # noqa: F401
     assert gc.isenabled()
 
 
 def test_a_caller_who_collects_himself_goes_on_so() -> None:
     gc.disable()
-    with imports():
+    with pause_garbage_collection():
         pass
     assert not gc.isenabled()
 
@@ -112,11 +112,11 @@ def test_only_a_process_of_graspd_s_own_keeps_what_is_there(monkeypatch: pytest.
     frozen: list[bool] = []
     monkeypatch.setattr(gc, "freeze", lambda: frozen.append(True))
     monkeypatch.setattr(libraries, "_ours", False)
-    with imports():
+    with pause_garbage_collection():
         pass
     assert not frozen
-    own_process()
-    with imports():
+    mark_process()
+    with pause_garbage_collection():
         pass
     assert frozen
 

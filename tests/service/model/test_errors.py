@@ -9,11 +9,11 @@ from pydantic import ValidationError
 
 from graspd.api.uploads import name_of_upload
 from graspd.exchange.plan import plain_name
-from graspd.service.index.condition import look
+from graspd.service.index.condition import read_condition
 from graspd.service.index.index import Index
-from graspd.service.model.base import refusal
+from graspd.service.model.base import first_error
 from graspd.service.model.errors import ERRORS, GraspdError, InputError, without_secrets
-from graspd.service.model.names import fitted
+from graspd.service.model.names import shorten
 from graspd.service.queue.connection import connect
 from graspd.service.run.address import ListenAddress
 from graspd.service.settings import Settings
@@ -49,8 +49,8 @@ def test_controls_of_a_terminal_are_quoted_and_other_scripts_are_not() -> None:
 def test_the_first_mistake_is_one_line(given: dict[str, Any], line: str) -> None:
     with pytest.raises(ValidationError) as refused:
         request(**given)
-    assert refusal(refused.value).startswith(line)
-    assert "nput should" not in refusal(refused.value)
+    assert first_error(refused.value).startswith(line)
+    assert "nput should" not in first_error(refused.value)
 
 
 SECRET = "s3cr3t"
@@ -91,7 +91,7 @@ def test_a_redis_url_that_cannot_be_used_is_not_told(url: str) -> None:
 
 @pytest.mark.parametrize("url", [f"postgresql+psycopg://me:x@host:{SECRET}/db", f"mysql://me:{SECRET}@host/db", SECRET])
 def test_a_url_that_is_refused_is_told_without_password(url: str) -> None:
-    for opened in (Index, look):
+    for opened in (Index, read_condition):
         with pytest.raises(InputError, match=r"\(GRASPD_INDEX_URL\) cannot be used") as refused:
             opened(url)
         assert SECRET not in str(refused.value)
@@ -116,7 +116,7 @@ LONG = "mujoco-Office_Depot_Canon_CL211XL_Remanufactured_Ink_Cartridge_TriColor"
 def test_a_long_name_of_an_upload_is_refused_others_are_cut(caplog: pytest.LogCaptureFixture) -> None:
     with pytest.raises(InputError, match=f"the name {LONG} has 71 characters, and at most 64 are allowed; give"):
         name_of_upload(f"{LONG}.stl")
-    fitted.cache_clear()
+    shorten.cache_clear()
     first, second = plain_name(LONG), plain_name(f"{LONG}2")
     assert first != second and len(first) == len(second) == 64
     assert plain_name(LONG) == first

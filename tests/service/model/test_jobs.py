@@ -12,9 +12,9 @@ from graspd.service.model import planning
 from graspd.service.model.digests import digest_json, job_id, shard_id
 from graspd.service.model.domain import BATCH_SIZE, RECHECKS, SCENES, JobOptions, JobRequest
 from graspd.service.model.metrics import AXIS_MEANINGS, MIN_DISTANCE_M, ROBUST_MODELS, Axis, axis_word
-from graspd.service.model.planning import MAX_BACKOFF_S, OUTCOMES, TaskFacts, message_of, plan, shortfall, totals
+from graspd.service.model.planning import MAX_BACKOFF_S, OUTCOMES, TaskFacts, message_of, plan, shortfall, sum_outcomes
 from graspd.service.model.records import JobRecord, Member
-from graspd.service.model.renamed import original
+from graspd.service.model.renamed import original_request
 from graspd.service.model.states import Priority, Stage, State
 from graspd.service.model.version import STAGE_REVISIONS
 from graspd.service.pipeline.datasets.spec import describe
@@ -111,7 +111,7 @@ def test_a_job_without_a_scene_keeps_its_id_and_its_record() -> None:
     wanted = {**PLAIN, "hand": "gripper", "object": "ball"}
     job = record(request())
     assert job.request.model_dump(mode="json") == wanted
-    said = {"request": original(wanted), "hand": HAND, "object": OBJECT, "revisions": STAGE_REVISIONS}
+    said = {"request": original_request(wanted), "hand": HAND, "object": OBJECT, "revisions": STAGE_REVISIONS}
     assert job.id == digest_json(said)
     (task,) = plan(job)
     assert message_of(job, task, attempt=1, max_attempt=3).model_dump(mode="json")["request"] == wanted
@@ -121,7 +121,7 @@ def test_a_dataset_without_a_scene_keeps_its_digest() -> None:
     hands, objects = [Member(name="h", digest=HAND)], [Member(name="o", digest=OBJECT)]
     made = describe("d", hands, objects, JobOptions(), lambda one: (one, None))
     options = {name: value for name, value in PLAIN.items() if name not in ("options", "target")}
-    said = {"hands": [["h", HAND]], "objects": [["o", OBJECT]], "options": original(options)}
+    said = {"hands": [["h", HAND]], "objects": [["o", OBJECT]], "options": original_request(options)}
     assert made.digest == digest_json(said)
 
 
@@ -286,7 +286,7 @@ def test_the_wait_doubles_up_to_a_bound() -> None:
 
 def test_why_fewer_grasps_were_found_is_told_the_most_frequent_first() -> None:
     assert shortfall(8, 8, "valid", 12, 4, {"slipped": 4}) is None
-    lost = totals([{"slipped": 4, "no_place": 1}, {"slipped": 1, "turned": 2, "alike": 0, "fell_apart": 3}])
+    lost = sum_outcomes([{"slipped": 4, "no_place": 1}, {"slipped": 1, "turned": 2, "alike": 0, "fell_apart": 3}])
     assert lost == {"no_place": 1, "turned": 2, "slipped": 5, "fell_apart": 3}
     said = str(shortfall(0, 2, "valid", 8, 4, lost))
     known = {name: f"{count} {OUTCOMES.get(name)}" for name, count in lost.items()}
@@ -297,6 +297,6 @@ def test_why_fewer_grasps_were_found_is_told_the_most_frequent_first() -> None:
 
 
 def test_a_limit_of_the_hand_stands_where_the_budget_would() -> None:
-    limit = planning.limit_told("barrett", 0.6, 16, 5.66, math.inf, 100.0)
+    limit = planning.limit_text("barrett", 0.6, 16, 5.66, math.inf, 100.0)
     assert limit == "barrett lifts 5.7 kg at friction 0.6 in the best of 16 grasps; 100 kg are wanted"
     assert str(shortfall(0, 4, "valid", 4, 4, {}, limit)) == f"found 0 of 4 valid grasps in 4 candidates; {limit}"

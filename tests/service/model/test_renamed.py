@@ -21,7 +21,7 @@ OLD = {"want": "raw", "referee": "screen", "audits": 3}
 
 
 def test_a_request_has_the_names_of_0_2_and_back() -> None:
-    document = renamed.original(NEW.model_dump(mode="json"))
+    document = renamed.original_request(NEW.model_dump(mode="json"))
     assert document.items() >= OLD.items() and "validation" not in document
     assert renamed.has_old_names(json.dumps(document).encode())
     assert parse_record(JobRequest, json.dumps(document).encode(), "a request") == NEW
@@ -30,9 +30,9 @@ def test_a_request_has_the_names_of_0_2_and_back() -> None:
 def test_a_planners_own_options_keep_their_names() -> None:
     own = {"tried": 1, "lane": 2, "want": "raw"}
     made = request(method="other", options=own)
-    for document in (made.model_dump(mode="json"), renamed.original(made.model_dump(mode="json"))):
-        assert renamed.renamed(document)["options"] == own
-    assert renamed.renamed({"options": made.model_dump(mode="json")})["options"]["options"] == own
+    for document in (made.model_dump(mode="json"), renamed.original_request(made.model_dump(mode="json"))):
+        assert renamed.convert_names(document)["options"] == own
+    assert renamed.convert_names({"options": made.model_dump(mode="json")})["options"]["options"] == own
 
 
 def test_a_chart_of_0_2_has_todays_measures() -> None:
@@ -41,7 +41,7 @@ def test_a_chart_of_0_2_has_todays_measures() -> None:
     others = {"gsr": 1.0, "options": {"letters": 1}, "remark": "a letter"}
     old = {"by_hand": {"allegro": [row]}, "referee": {"level": "certificate"}, "raw_end_to_end_per_second": 2.0}
     new = {"by_hand": {"allegro": [today]}, "validation": {"level": "standard"}}
-    assert renamed.renamed_chart(old | others) == new | others | {"candidates_end_to_end_per_second": 2.0}
+    assert renamed.convert_chart(old | others) == new | others | {"candidates_end_to_end_per_second": 2.0}
     store = open_store("memory://")
     publish(store, CHARTS, {"created": "2026-11-25", "summary": [row]})
     assert latest(store, CHARTS) == {"created": "2026-11-25", "summary": [today]}
@@ -49,8 +49,8 @@ def test_a_chart_of_0_2_has_todays_measures() -> None:
 
 def test_only_a_worker_of_0_2_gets_its_names() -> None:
     message = {"request": NEW.model_dump(mode="json"), "stage": "synthesize"}
-    assert renamed.for_worker_of(24, "synthesize", message) == message
-    assert renamed.for_worker_of(23, "synthesize", message)["request"].items() >= OLD.items()
+    assert renamed.message_for_revision(24, "synthesize", message) == message
+    assert renamed.message_for_revision(23, "synthesize", message)["request"].items() >= OLD.items()
 
 
 def test_a_shard_of_0_2_is_read_with_todays_columns_and_attributes(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from graspd.service.model.studies import MapCell, Stability, StabilityMap, counts, from_json, short, tick
+from graspd.service.model.studies import MapCell, Stability, StabilityMap, counts, format_short, from_json, tick
 from graspd.service.store.records import publish
 from graspd.service.store.store import open_store
 
@@ -20,8 +20,8 @@ TICKS = {1e-5: "1e-5", 3e-4: "3e-4", 0.001: "0.001", 30.0: "30", 1e5: "1e5", 123
 
 
 def test_numbers_on_cells_and_axes_are_short() -> None:
-    assert [short(value) for value in SHORT] == list(SHORT.values())
-    assert max(len(short(1.9999 * 10.0**k)) for k in range(-9, 9)) <= 5
+    assert [format_short(value) for value in SHORT] == list(SHORT.values())
+    assert max(len(format_short(1.9999 * 10.0**k)) for k in range(-9, 9)) <= 5
     assert [tick(value) for value in (*TICKS, 0.0)] == [*TICKS.values(), "0"]
 
 

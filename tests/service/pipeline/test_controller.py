@@ -276,7 +276,7 @@ def test_tasks_queued_while_the_controller_looks_are_queued_once(bench: Bench, m
         return seen
 
     monkeypatch.setattr(feed, "ready_tasks", beside)
-    bench.controller._look_after_queue()
+    bench.controller._reconcile_queue()
     assert len(taken) == 1 and bench.queue.waiting() == set(), "the worker's task waits a second time"
 
 
@@ -287,7 +287,7 @@ def test_a_check_queued_meanwhile_is_queued_once(bench: Bench, monkeypatch: pyte
     assert isinstance(bench.take().message, IngestMessage)
     bench.services.index.live.set_asset_waiting([asset.digest], queued=False)
     monkeypatch.setattr(MemoryQueue, "leases", lambda _: [])
-    bench.controller._look_after_queue()
+    bench.controller._reconcile_queue()
     assert bench.queue.waiting() == set(), "the worker's check waits a second time"
 
 

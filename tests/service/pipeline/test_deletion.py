@@ -266,8 +266,8 @@ def test_a_job_is_restored_after_its_object(services: Services, collected: bool)
 def test_a_deleted_tag_is_restored_with_its_grasps(services: Services) -> None:
     job = finished(services)
     shard = next(shard.id for shard in services.index.shards.page(job=job).items if shard.kind == "base")
-    tagging.give(services, "good", [(shard, 0), (shard, 3)], project="", owner="", permit=lambda _: None)
-    tagging.remove(services, tag_id("good", ""), permit=lambda _: None)
+    tagging.tag_grasps(services, "good", [(shard, 0), (shard, 3)], project="", owner="", permit=lambda _: None)
+    tagging.delete_tag(services, tag_id("good", ""), permit=lambda _: None)
     restore(services, "tag", "good", permit=lambda _: None)
     assert [(tag.name, tag.grasps) for tag in services.index.tags.all()] == [("good", 2)]
     assert not deletions(services.store)

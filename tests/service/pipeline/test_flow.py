@@ -14,7 +14,7 @@ from graspd.service.model import names
 from graspd.service.model.clock import timestamp
 from graspd.service.model.errors import ConflictError
 from graspd.service.model.states import Priority, Stage, State
-from graspd.service.model.workers import own_ability
+from graspd.service.model.workers import capabilities
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.controller import Controller, PeriodicDuty
@@ -94,7 +94,7 @@ def test_progress_of_a_task_reaches_the_index_and_goes(services: Services, contr
 
 def test_a_fleet_larger_than_the_window_finds_work(services: Services) -> None:
     small = with_settings(services, queue_window=1)
-    own = own_ability()
+    own = capabilities()
     can = {"stages": (Stage.SYNTHESIZE,), "schemas": own.schemas, "revisions": dict(own.revisions)}
     services.queue._workers.update({name: beat_of(name, **can) for name in map(str, range(20))})
     controller = Controller(small, clock=(clock := Clock()))

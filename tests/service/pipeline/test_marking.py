@@ -185,7 +185,7 @@ ACTS: dict[str, tuple[Callable[[Services], str | object], Callable[[Services, st
     "create": (lambda services: "", lambda services, _: create(services)),
     "cancel a dataset": (create, lambda services, _: actions.cancel(services, "d")),
     "name objects": (lambda services: "", lambda services, _: actions.add_object_set(services, "s", ["ball"])),
-    "tag": (lambda services: "", lambda services, _: tagging.give(services, "t", [("a" * 32, 0)], **NOBODYS)),
+    "tag": (lambda services: "", lambda services, _: tagging.tag_grasps(services, "t", [("a" * 32, 0)], **NOBODYS)),
 }
 
 

@@ -31,7 +31,7 @@ def tasks(count: int) -> list[TaskMessage]:
 
 @pytest.mark.parametrize(
     "query",
-    [overview.count_jobs(State.QUEUED), overview.oldest_job(State.RUNNING), overview.made_since(datetime.now(UTC))],
+    [overview.count_jobs(State.QUEUED), overview.oldest_job(State.RUNNING), overview.valid_since(datetime.now(UTC))],
 )
 def test_no_read_of_the_index_for_metrics_scans_a_table(tmp_path: Path, query: Any) -> None:
     index = empty_index(f"sqlite:///{tmp_path / 'index.sqlite'}")

@@ -27,7 +27,7 @@ from graspd.service.run import commands, store_commands
 from graspd.service.store import packs
 from graspd.service.store.integrity import read_checked
 from graspd.service.store.manifests import ShardManifest, load_manifest, load_shard, publish_shard, shard_exists
-from graspd.service.store.packs import has_packs, take_apart
+from graspd.service.store.packs import has_packs, unpack_all
 from graspd.service.store.records import put_record
 from graspd.service.store.store import Store, open_store
 from tests.damage import flipped, overwrite
@@ -175,7 +175,7 @@ def test_what_was_in_a_pack_has_a_file_of_its_own(store: Store) -> None:
     messages = batches(3)
     pack(store, messages)
     assert has_packs(store)
-    found = list(take_apart(store))
+    found = list(unpack_all(store))
     assert not has_packs(store)
     assert [manifest.shard_id for manifest in found] == [message.output for message in messages]
     for message, manifest in zip(messages, found, strict=True):
@@ -184,7 +184,7 @@ def test_what_was_in_a_pack_has_a_file_of_its_own(store: Store) -> None:
         assert load_shard(store, Stage.SYNTHESIZE, message.output).attributes["batch"] == message.batch
         assert load_manifest(store, Stage.SYNTHESIZE, message.output) == manifest
         assert (manifest.key, manifest.batches) == (wanted.key, 1)
-    assert list(take_apart(store)) == []
+    assert list(unpack_all(store)) == []
 
 
 @pytest.mark.parametrize("breaks_at", range(1, 8))
@@ -207,8 +207,8 @@ def test_it_may_break_off_and_is_continued(tmp_path: Path, monkeypatch: pytest.M
         for name in ("put", "delete"):
             patch.setattr(Store, name, breaking(getattr(Store, name)))
         with pytest.raises(StoreUnavailable):
-            list(take_apart(store))
-    list(take_apart(store))
+            list(unpack_all(store))
+    list(unpack_all(store))
     assert there(store, messages) == [True, False, True]
     assert not has_packs(store)
     for message in (messages[0], messages[2]):
@@ -221,7 +221,7 @@ def test_a_file_of_its_own_counts_before_one_in_a_pack(store: Store) -> None:
     manifest, data = made_of(message, worker="first")
     publish_shard(store, manifest, data)
     pack(store, [message], worker="second")
-    assert list(take_apart(store)) == [manifest]
+    assert list(unpack_all(store)) == [manifest]
     assert load_manifest(store, Stage.SYNTHESIZE, message.output).worker == "first"
 
 
@@ -233,7 +233,7 @@ def test_harm_moves_the_pack_aside_and_costs_no_more(store: Store, place: str) -
     body, rows = packs._directory(key, data)
     at = {"directory": 40, "manifest": body + rows[0].manifest_start + 10, "file": body + rows[0].start + 50}
     overwrite(store, key, data[: body + rows[1].start - 1] if place == "end" else flipped(data, at[place]))
-    list(take_apart(store))
+    list(unpack_all(store))
     assert store.exists(f"damaged/{key}")
     assert not has_packs(store)
     wanted = {"directory": [False, False], "manifest": [False, True], "file": [True, True], "end": [True, True]}[place]

@@ -17,7 +17,7 @@ from graspd.service.model.planning import message_of, needed_schema, plan
 from graspd.service.model.records import JobRecord
 from graspd.service.model.states import AssetKind, Priority, Stage, State
 from graspd.service.model.version import SCHEMA_OF_RANGES, STAGE_REVISIONS, TASK_SCHEMA
-from graspd.service.model.workers import FIRST_SCHEMA, Requirements, WorkerBeat, own_ability
+from graspd.service.model.workers import FIRST_SCHEMA, Requirements, WorkerBeat, capabilities
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.datasets import actions
@@ -25,7 +25,7 @@ from graspd.service.pipeline.datasets.spec import DatasetRequest
 from graspd.service.pipeline.job_actions import Route, Routes
 from graspd.service.pipeline.ranges import TaskRanges, span_of
 from graspd.service.queue import entries
-from graspd.service.queue.lists import known_lists, queue_name, queue_names
+from graspd.service.queue.lists import list_names, queue_name, queue_names
 from graspd.service.queue.rq_queue import RqQueue
 from graspd.service.store.library import publish_asset
 from graspd.service.store.manifests import ShardManifest, publish_shard
@@ -33,7 +33,7 @@ from graspd.worker.stages.context import TaskContext, shard_of
 from tests.fakes import OBJECT_FILES, beat_of, fake_stages, message_for, plan_all, request, with_settings
 from tests.service.pipeline.test_controller import Bench
 
-OWN = own_ability()
+OWN = capabilities()
 REVISION = OWN.revisions["synthesize"]
 NEED = Requirements(Stage.SYNTHESIZE, OWN.schemas[0], OWN.schemas[1], REVISION)
 
@@ -109,16 +109,16 @@ def test_tasks_that_wait_apart_are_seen_and_leave(rq_queue: RqQueue) -> None:
     assert rq_queue.waiting() == {message.task_id}
     rq_queue.clear_untaken([NEXT])
     assert rq_queue.waiting() == set()
-    assert known_lists(rq_queue.connection) == known_lists(rq_queue.connection)[:8]
+    assert list_names(rq_queue.connection) == list_names(rq_queue.connection)[:8]
     assert rq_queue.enqueue([message], Priority.BULK) == 1, "nothing of it is left"
 
 
 def test_forged_names_of_lists_are_nobodys(rq_queue: RqQueue) -> None:
     forged = [f"rq:queue:bulk-synthesize.{n}.1" for n in range(200)]
     rq_queue.connection.sadd("rq:queues", "rq:queue:other.2.10", "rq:queue:bulk-synthesize.x.1", b"\xff", *forged)
-    assert len(known_lists(rq_queue.connection)) == 8 + 64
+    assert len(list_names(rq_queue.connection)) == 8 + 64
     rq_queue.connection.set("rq:queues", "no set")
-    assert len(known_lists(rq_queue.connection)) == 8
+    assert len(list_names(rq_queue.connection)) == 8
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import pytest
 from graspd.service.model.errors import InputError
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.transforms import quat_from_axis_angle
-from graspd.service.readers.trajectories import Waypoint, point_at, scene_spec_of, stop_places, way_of, wrists_of
+from graspd.service.readers.trajectories import Waypoint, point_at, scene_spec_of, slider_axis, trajectory_of, wrists_of
 from graspd.service.store.shards import Shard, json_attribute
 
 WAYPOINTS = 4
@@ -29,20 +29,20 @@ def shard(*, in_scene: bool) -> Shard:
 
 
 def test_a_way_goes_from_standoff_or_pregrasp_to_lift_or_squeeze():
-    free, way = way_of(shard(in_scene=False), 0), way_of(shard(in_scene=True), 0)
+    free, way = trajectory_of(shard(in_scene=False), 0), trajectory_of(shard(in_scene=True), 0)
     assert [point.name for point in free] == ["pregrasp", "grasp", "squeeze"]
     assert [point.name for point in way if point.name] == ["standoff", "pregrasp", "grasp", "squeeze", "lift"]
     assert way[0].hand_pose[0] == 0.2
     assert all((point.joint_positions == -0.3).all() for point in way[:WAYPOINTS])
     assert way[-1].carried.tolist() == [0, 0, 0.1] and not any(point.carried.any() for point in way[:-1])
-    np.testing.assert_allclose(stop_places(way), [0, 0.25, 0.5, 0.75, 1, 2, 3, 4])
+    np.testing.assert_allclose(slider_axis(way), [0, 0.25, 0.5, 0.75, 1, 2, 3, 4])
     assert point_at(way, 3.5).carried == pytest.approx([0, 0, 0.05]), "half way up"
 
 
 @pytest.mark.parametrize("at", [(-1, 0.2, -0.3), (0.375, 0.15, -0.3), (1.5, 0.1, 0.05), (9, 0.1, 0.2)])
 def test_between_two_postures_positions_and_joints_go_straight(at: tuple[float, float, float]):
     place, x, joint = at
-    point = point_at(way_of(shard(in_scene=True), 0), place)
+    point = point_at(trajectory_of(shard(in_scene=True), 0), place)
     assert point.hand_pose[0] == pytest.approx(x) and point.joint_positions == pytest.approx([joint, joint])
 
 

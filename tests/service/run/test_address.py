@@ -14,7 +14,7 @@ import pytest
 from graspd.client.reports import open_client
 from graspd.service.model.errors import InputError, UnavailableError
 from graspd.service.run.address import bind, forget_address, joining, record_address, recorded_address
-from graspd.service.run.children import Child, end_leftovers, start_of
+from graspd.service.run.children import Child, kill_leftovers, start_time
 from graspd.service.run.supervisor import Supervisor
 from graspd.service.settings import Settings
 from tests.servers import free_ports
@@ -61,7 +61,7 @@ def test_a_record_of_nonsense_or_of_another_process_is_none(folder: Path, change
 
 def test_only_the_process_that_wrote_the_record_takes_it_away(folder: Path) -> None:
     record_address(folder, URL)
-    parent = {"api_url": URL, "pid": os.getppid(), "started": start_of(os.getppid())}
+    parent = {"api_url": URL, "pid": os.getppid(), "started": start_time(os.getppid())}
     (folder / "api.json").write_text(json.dumps(parent))
     forget_address(folder)
     assert recorded_address(folder) == URL
@@ -175,7 +175,7 @@ def pid_file(folder: Path, content: object) -> Path:
 
 def test_a_child_that_was_left_behind_is_ended(child: Child, tmp_path: Path) -> None:
     assert child.process is not None
-    assert end_leftovers(tmp_path) == [child.process.pid]
+    assert kill_leftovers(tmp_path) == [child.process.pid]
     assert child.process.wait(timeout=60) < 0
     assert not list((tmp_path / "run").iterdir())
 
@@ -185,12 +185,12 @@ def test_a_stranger_with_that_pid_lives_on(child: Child, stranger: subprocess.Po
     _, started, token = json.loads(child.pid_file.read_text())
     for stale in (
         [stranger.pid, started, token],
-        [stranger.pid, start_of(stranger.pid), token],
+        [stranger.pid, start_time(stranger.pid), token],
         [stranger.pid, "", ""],
         str(stranger.pid),
     ):
         file = pid_file(tmp_path, stale)
-        assert end_leftovers(tmp_path) == []
+        assert kill_leftovers(tmp_path) == []
         assert stranger.poll() is None
         assert not file.exists()
 
@@ -201,6 +201,6 @@ def test_a_stranger_with_that_pid_lives_on(child: Child, stranger: subprocess.Po
     ids=["itself", "parent", "0", "-1", "1", "text", "none", "huge", "true"],
 )
 def test_up_ends_neither_itself_nor_its_parent_nor_nonsense(pid: object, tmp_path: Path) -> None:
-    started = start_of(pid) if isinstance(pid, int) else ""
+    started = start_time(pid) if isinstance(pid, int) else ""
     pid_file(tmp_path, [pid, started, ""])
-    assert end_leftovers(tmp_path) == []
+    assert kill_leftovers(tmp_path) == []

@@ -25,7 +25,7 @@ from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.leading import PART
 from graspd.service.queue.rq_queue import RqQueue
 from graspd.service.run.commands import app
-from graspd.service.run.supervisor import _SETTLED, Supervisor, _stated
+from graspd.service.run.supervisor import _SETTLED, Supervisor, _explicit_settings
 from graspd.service.settings import Settings
 from graspd.service.store.store import open_store
 from tests.conftest import REPOSITORY
@@ -185,10 +185,10 @@ def test_a_service_keeps_its_data_from_other_users(tmp_path: Path) -> None:
     folder.chmod(0o755)
     environment = os.environ | {"GRASPD_DATA_DIR": str(folder), "GRASPD_REDIS_URL": f"unix://{tmp_path}/none.sock"}
     program = (
-        "from graspd.service.cli import keep_private, load_settings\n"
+        "from graspd.service.cli import restrict_file_access, load_settings\n"
         "from graspd.service.pipeline.backends import Services\n"
         "settings = load_settings()\n"
-        "keep_private(settings)\n"
+        "restrict_file_access(settings)\n"
         "services = Services.open(settings)\n"
         "services.store.put('jobs/a/job.json', b'1')\n"
         "services.close()\n"
@@ -202,7 +202,7 @@ def test_a_service_keeps_its_data_from_other_users(tmp_path: Path) -> None:
 @pytest.mark.parametrize("room", ["api/server_command.py", "service/run/commands.py", "graspd/commands/worker.py"])
 def test_every_service_command_is_private(room: str) -> None:
     text = (REPOSITORY / room).read_text()
-    assert text.count('log_to_stderr(settings, "') == text.count("keep_private(settings)") > 0
+    assert text.count('log_to_stderr(settings, "') == text.count("restrict_file_access(settings)") > 0
 
 
 #: Values of each setting that its default is none of; texts hold what shells, JSON and URLs give a meaning.
@@ -238,7 +238,7 @@ def value_of(name: str) -> Any:
 @pytest.mark.parametrize("name", sorted(Settings.model_fields.keys() - _SETTLED))
 def test_a_setting_reaches_the_children(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     given = Settings(**{name: value_of(name)})
-    for variable, text in _stated(given).items():
+    for variable, text in _explicit_settings(given).items():
         monkeypatch.setenv(variable, text)
     assert getattr(Settings(), name) == getattr(given, name)
 
@@ -250,7 +250,7 @@ def test_a_setting_taken_back_does_not_come_from_the_environment(name: str, monk
     value = value_of(name)
     text = value.get_secret_value() if isinstance(value, SecretStr) else str(value)
     monkeypatch.setenv(f"GRASPD_{name.upper()}", text)
-    for variable, text in _stated(Settings(**{name: None})).items():
+    for variable, text in _explicit_settings(Settings(**{name: None})).items():
         monkeypatch.setenv(variable, text)
     assert getattr(Settings(), name) is None
 

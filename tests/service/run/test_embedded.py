@@ -14,7 +14,7 @@ from graspd.service.queue.connection import connect, redis_url, socket_path
 from graspd.service.queue.rq_queue import RqQueue
 from graspd.service.run import embedded
 from graspd.service.run.children import Child
-from graspd.service.run.embedded import find_server, give_up_log, own_redis, server_command
+from graspd.service.run.embedded import find_server, move_broken_log, own_redis, server_command
 from graspd.service.settings import Settings
 from tests.service.conftest import is_up, wait_for_redis
 from tests.waiting import until
@@ -102,7 +102,7 @@ def test_a_log_that_redis_cannot_read_gives_way_to_an_empty_one(
 
     def child() -> Child:
         made = Child("redis", server_command(settings), {}, tmp_path)
-        made.fix = lambda output: give_up_log(settings, output)
+        made.fix = lambda output: move_broken_log(settings, output)
         return made
 
     first, second = child(), child()
@@ -119,7 +119,7 @@ def test_a_redis_that_ends_for_want_of_room_keeps_its_log(tmp_path: Path) -> Non
     settings, output = Settings(data_dir=tmp_path), tmp_path / "redis.log"
     (tmp_path / "redis" / "appendonlydir").mkdir(parents=True)
     output.write_text("Redis just started\n# Can't open the append-only file: No space left on device\n")
-    give_up_log(settings, output)
+    move_broken_log(settings, output)
     assert (tmp_path / "redis" / "appendonlydir").exists()
 
 

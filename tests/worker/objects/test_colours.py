@@ -11,7 +11,7 @@ from PIL import Image
 
 from graspd.service.model.errors import LimitError, MeshError
 from graspd.service.store.hand_files import files_of_hand
-from graspd.service.store.mesh_files import MAX_NAMES, beside, looks_of
+from graspd.service.store.mesh_files import MAX_NAMES, appearance_files, resolve
 from graspd.worker.hands.load import hand_from_path, load_hand
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.formats import read_mesh
@@ -161,7 +161,7 @@ def test_pictures_that_promise_too_much_and_endless_names_end() -> None:
     assert np.isnan(material_colour(document, picture, {"material": 0})).all()
     many = b"".join(b"newmtl m%d\nmap_Kd p%d.png\n" % (k, k) for k in range(10_000))
     files = {"a.obj": b"mtllib a.mtl\n" * 10_000, "a.mtl": many, **{f"p{k}.png": b"" for k in range(10_000)}}
-    assert len(looks_of("a.obj", files)) <= MAX_NAMES
+    assert len(appearance_files("a.obj", files)) <= MAX_NAMES
     asked: list[str] = []
     text = OBJ.replace(b"looks/part.mtl", b"a.mtl")
     read_mesh("a.obj", text, lambda name: asked.append(name) or (many if name == "a.mtl" else None))
@@ -216,7 +216,7 @@ def test_a_dae_has_the_mean_of_a_picture_beside_it(named: str) -> None:
 
 def test_a_change_of_a_picture_is_another_look() -> None:
     files = {"m/part.obj": OBJ, "m/looks/part.mtl": MTL, "m/looks/skin.png": picture()}
-    assert looks_of("m/part.obj", files) == ["m/looks/part.mtl", "m/looks/skin.png"]
+    assert appearance_files("m/part.obj", files) == ["m/looks/part.mtl", "m/looks/skin.png"]
     other = {**files, "m/looks/skin.png": picture() + b" "}
     one, two = (hand_seen_as("m/part.obj", given).visuals.content for given in (files, other))
     assert one != two
@@ -225,7 +225,7 @@ def test_a_change_of_a_picture_is_another_look() -> None:
 @pytest.mark.parametrize("reference", OUTSIDE)
 def test_names_lead_nowhere_else(reference: str) -> None:
     there = {"secret.png", "/etc/secret.png", "../secret.png", "m/secret.stl", "etc/secret.png"}
-    assert beside("m/part.obj", reference, there.__contains__) is None
+    assert resolve("m/part.obj", reference, there.__contains__) is None
 
 
 def test_a_hand_brings_looks_its_meshes_name_none_from_outside(tmp_path) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from graspd.commands.synth import _said
+from graspd.commands.synth import _format_summary
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.model.scene_spec import SceneSpec
@@ -385,4 +385,4 @@ def test_candidate_grasps_none_of_which_is_valid_come_with_the_reason(tmp_path) 
     place, request = SceneSpec(kind="table"), JobOptions(want="candidates", grasps=1, fidelity="draft", scene="table")
     found = synthesized("allegro", str(sheet), request, place=place, scenes=1).summary()
     assert (found["grasps"], found["valid"], found["reason"]) == (1, 0, None)
-    assert "is 4 mm high" in found["narrow"] and _said({"file": "g.h5", **found}).endswith(found["narrow"])
+    assert "is 4 mm high" in found["narrow"] and _format_summary({"file": "g.h5", **found}).endswith(found["narrow"])

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 import graspd
 from graspd.cli import build
-from graspd.commands.synth import _said
+from graspd.commands.synth import _format_summary
 from graspd.service.cli import write_output
 from graspd.service.model.errors import ConflictError, NotFoundError
 from graspd.service.readers import Grasps, open_shards
@@ -77,7 +77,7 @@ def test_grasps_that_nobody_validated_are_sound_and_never_valid(unvalidated: tup
     assert (said["grasps"], said["valid"], said["feasible"], said["validation"]) == (3, 0, 3, "none")
     assert shard.attributes["verdict_level"] == "none" and "quality/success" not in shard.arrays
     assert not shard["quality/valid"].any()
-    line = _said({"file": "g.h5", **said})
+    line = _format_summary({"file": "g.h5", **said})
     assert "3 feasible of" in line and "not validated" in line and not re.search(r"\bvalid\b", line)
 
 
