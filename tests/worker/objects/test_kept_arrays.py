@@ -72,7 +72,7 @@ def test_entries_differ_with_terms_and_code_bad_ones_are_remade(own_cache: Path)
     assert arrays_kept_or_made("things", ("x", 2), (disk_cache,), lambda: made(2))["a"][0, 0] == 2
     assert arrays_kept_or_made("things", ("x", 1), (surface,), lambda: made(3))["a"][0, 0] == 3
     for file in (own_cache / "things").iterdir():
-        user_cache.keep(file, b"no arrays")
+        user_cache.store(file, b"no arrays")
     assert arrays_kept_or_made("things", ("x", 1), (disk_cache,), lambda: made(4))["a"][0, 0] == 4
 
 
@@ -143,7 +143,7 @@ def test_an_entry_that_is_none_is_made_again_and_replaced(own_cache: Path, built
     if harm == "damaged":
         entry.write_bytes(entry.read_bytes()[:-9])
     else:
-        user_cache.keep(entry, b"whole, but no object")
+        user_cache.store(entry, b"whole, but no object")
     assert same(load_balls(), fresh) and same(load_balls(), fresh)
     assert len(built) == 2
 
