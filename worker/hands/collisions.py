@@ -9,6 +9,7 @@ import numpy as np
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.disk_cache import recalled
 
 #: Pieces closer than this [m] at rest count as touching.
 TOUCH_M = 1e-4
@@ -47,6 +48,10 @@ def hull_distance(a: Floats, b: Floats) -> float:
     """Compute the distance [m] of the convex hulls of two point sets (N, 3) and (M, 3); 0 if they overlap.
     Least squares over convex weights x, y: min |a'x - b'y| with sum x = sum y = 1. The sums are rows of large
     weight."""
+    return float(recalled("distance", [a, b], lambda: [_hull_distance(a, b)])["0"])
+
+
+def _hull_distance(a: Floats, b: Floats) -> Floats:
     from scipy.optimize import nnls  # slow to load
 
     scale = max(float(np.ptp(a, axis=0).max()), float(np.ptp(b, axis=0).max()))
@@ -58,4 +63,4 @@ def hull_distance(a: Floats, b: Floats) -> float:
     rows[3, : len(a)] = weight
     rows[4, len(a) :] = weight
     solution, _ = nnls(rows, np.array([0, 0, 0, weight, weight]), maxiter=20 * rows.shape[1])
-    return float(np.linalg.norm(rows[:3] @ solution) * scale)
+    return np.asarray(np.linalg.norm(rows[:3] @ solution) * scale)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel, PalmFrame
 from graspd.worker.hands.options import HandOptions
 from graspd.worker.hands.tree import Tree
+from graspd.worker.objects.disk_cache import recalled
 
 #: Share of the range from open to closed in the approach posture.
 PRESHAPE_SHARE = 0.25
@@ -287,11 +289,9 @@ def _palm(hand: HandModel, tree: Tree, options: HandOptions, approach: Floats) -
 def _leaves(parts: Sequence[Floats], point: Floats, direction: Floats) -> float | None:
     """Return the distance along `direction` at which a line through `point` leaves the last convex part.
     Parts are (V, 3); None if the line meets no part."""
-    from scipy.spatial import ConvexHull  # slow to load
-
     ends = []
     for corners in parts:
-        planes = ConvexHull(corners).equations  # (F, 4): n x + d <= 0
+        planes = recalled("planes", [corners], partial(_planes, corners))["0"]
         rate, room = planes[:, :3] @ direction, -(planes[:, :3] @ point + planes[:, 3])
         # Planes parallel to the line bound nothing. If such a plane excludes the point, the line does not meet its
         # part.
@@ -301,6 +301,13 @@ def _leaves(parts: Sequence[Floats], point: Floats, direction: Floats) -> float 
         if first <= last and (room[~across] >= 0).all():
             ends.append(float(point @ direction) + float(last))
     return max(ends, default=None)
+
+
+def _planes(corners: Floats) -> list[Floats]:
+    """Return one array (F, 4): planes n x + d <= 0 of the hull of corners (V, 3)."""
+    from scipy.spatial import ConvexHull  # slow to load
+
+    return [np.asarray(ConvexHull(corners).equations)]
 
 
 def _preshape(hand: HandModel, tree: Tree, options: HandOptions, share: float = PRESHAPE_SHARE) -> Floats:

@@ -17,6 +17,7 @@ from graspd.service.model.transforms import Floats, compose
 from graspd.service.store.assets import builtin_files, builtin_names, unpack_file, without_common_folder
 from graspd.service.store.hand_files import files_of_hand, hand_name, main_of
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
+from graspd.worker.hands import collisions, guess, primitives, shapes
 from graspd.worker.hands.collisions import resting_neighbours
 from graspd.worker.hands.guess import complete
 from graspd.worker.hands.jaws import jaws_of, slides
@@ -37,6 +38,7 @@ from graspd.worker.hands.tendons import tendons_of
 from graspd.worker.hands.tree import Tree, build_tree
 from graspd.worker.hands.visuals import PlacedShape, Visuals
 from graspd.worker.hands.xacro import read_robot
+from graspd.worker.objects.disk_cache import recalling
 
 log = logging.getLogger(__name__)
 
@@ -52,7 +54,8 @@ def load_hand(
     armature and dry friction in the files.
     Raises HandError: the files describe no usable hand; the message names the fault and the fix."""
     source = HandSource.read(files, options, name=name, digest=digest)
-    hand = assemble(source)
+    with recalling("hand_shapes", (digest_files(AssetKind.HAND, files),), (collisions, guess, primitives, shapes)):
+        hand = assemble(source)
     return replace(hand, drag=_drag(source.robot, hand)) if drag else hand
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from graspd.service.model.errors import HandError
 from graspd.service.model.transforms import Floats, quat_rotate
 from graspd.worker.hands.robot import Ints
+from graspd.worker.objects.disk_cache import recalled
 from graspd.worker.objects.topology import directed_edges, face_areas, face_vectors, on_faces, outward_hull
 
 if TYPE_CHECKING:
@@ -26,6 +27,11 @@ SEGMENTS = 32
 def hull(points: Floats) -> tuple[Floats, Ints]:
     """Compute corners (V, 3) and outward triangles (F, 3) of the convex hull of points (N, 3).
     Raises HandError: the points lie in a plane."""
+    made = recalled("hull", [points], lambda: new_hull(points))
+    return made["0"], made["1"]
+
+
+def new_hull(points: Floats) -> tuple[Floats, Ints]:
     from scipy.spatial import ConvexHull, QhullError  # slow to load
 
     scale = float(np.ptp(points, axis=0).max()) if len(points) else 0.0

@@ -18,10 +18,11 @@ from graspd.service.model.errors import HandError, MeshError
 from graspd.service.model.libraries import version_of
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, quat_to_matrix
 from graspd.worker.hands.model import ConvexPiece
-from graspd.worker.hands.primitives import hull, hull_planes, signed_distance, tessellate, volume
+from graspd.worker.hands.primitives import hull, hull_planes, new_hull, signed_distance, tessellate, volume
 from graspd.worker.hands.robot import Ints, Shape
 from graspd.worker.hands.visuals import find_mesh, merged_and_thinned
 from graspd.worker.objects.convex import WorkLimitExceeded, coacd_parts, default_cache, keep_parts, load_parts
+from graspd.worker.objects.disk_cache import recalled
 from graspd.worker.objects.formats import read_mesh
 from graspd.worker.objects.topology import face_areas, on_faces
 
@@ -86,7 +87,12 @@ def reduce_hull(points: Floats, limit: int = MAX_HULL_VERTICES) -> tuple[Floats,
     """Compute a convex hull of points (N, 3) with at most `limit` corners and the volume of the full hull.
     Corners are added one by one at the largest distance to the full hull, then scaled about their centroid until the
     volumes agree. The surface error has both signs, with half the size of an inscribed hull's error."""
-    vertices, faces = hull(points)
+    made = recalled("reduced hull", [points, np.array(limit)], lambda: _reduced(points, limit))
+    return made["0"], made["1"]
+
+
+def _reduced(points: Floats, limit: int) -> tuple[Floats, Ints]:
+    vertices, faces = new_hull(points)
     if len(vertices) <= limit:
         return vertices, faces
     full = volume("hull", (), vertices, faces)
@@ -97,7 +103,7 @@ def reduce_hull(points: Floats, limit: int = MAX_HULL_VERTICES) -> tuple[Floats,
         if farthest in chosen:
             break
         chosen.append(farthest)
-    corners, faces = hull(vertices[chosen])
+    corners, faces = new_hull(vertices[chosen])
     centre = corners.mean(axis=0)
     growth = (full / volume("hull", (), corners, faces)) ** (1 / 3)
     return centre + (corners - centre) * growth, faces
@@ -108,7 +114,7 @@ def _outside(points: Floats, corners: Floats) -> Floats:
     spread = np.linalg.svd(corners - corners.mean(axis=0), compute_uv=False)
     if len(corners) < 4 or spread[2] < 1e-6 * spread[0]:
         return np.linalg.norm(points[:, None] - corners[None], axis=2).min(axis=1)
-    return signed_distance("hull", (), *hull(corners), points)
+    return signed_distance("hull", (), *new_hull(corners), points)
 
 
 #: Error of a hull above which the mesh is decomposed [m]: an object would rest this far off the finger.

@@ -6,8 +6,9 @@ import hashlib
 import io
 import platform
 import zipfile
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import fields, is_dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -27,6 +28,7 @@ _LIBRARIES: Final = ("numpy", "scipy")
 _LIMIT_BYTES: Final = 256 << 20
 
 Arrays = Mapping[str, NDArray[Any]]
+_recalled: ContextVar[dict[str, NDArray[Any]] | None] = ContextVar("recalled", default=None)
 
 
 def arrays_kept_or_made(
@@ -40,19 +42,66 @@ def arrays_kept_or_made(
     """Load arrays from a folder of the user's cache, or compute and cache them; the same bit for bit.
     All inputs that determine the arrays are in `terms`, besides the code of some modules. Errors of `make` are not
     cached. Loaded arrays that do not `fit` are recomputed."""
-    address = digest_json([*terms, _revision(tuple(str(module.__file__) for module in code))])
-    file = user_cache.folder(kind) / f"{address}.npz"
-    if (held := user_cache.load(file)) is not None:
-        with suppress(ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile):
-            with np.load(io.BytesIO(held), allow_pickle=False) as stored:
-                found = {name: stored[name] for name in stored.files}
-            if fits(found):
-                return found
+    file = _file(kind, terms, code)
+    if (held := _read(file)) is not None and fits(held):
+        return held
     made = make()
-    whole = io.BytesIO()
-    np.savez(whole, **dict[str, Any](made))
-    user_cache.store(file, whole.getvalue(), limit_bytes=_LIMIT_BYTES)
+    _write(file, made)
     return made
+
+
+@contextmanager
+def recalling(kind: str, terms: tuple[str | int, ...], code: tuple[ModuleType, ...]) -> Iterator[None]:
+    """Cache the results of `recalled` inside this context in one entry, and load them the next time.
+    Use it for small steps of a large computation whose library is slow to load. The terms only distinguish entries."""
+    file = _file(kind, terms, code)
+    known = _read(file) or {}
+    now = dict(known)
+    token = _recalled.set(now)
+    try:
+        yield
+    finally:
+        _recalled.reset(token)
+    if len(now) > len(known):
+        _write(file, now)
+
+
+def recalled(what: str, given: Sequence[NDArray[Any]], make: Callable[[], Sequence[NDArray[Any]]]) -> Arrays:
+    """Return arrays that depend on `given` only, as "0", "1", ...: cached by `recalling`, or computed."""
+    known = _recalled.get()
+    if known is None:
+        return {str(number): array for number, array in enumerate(make())}
+    whole = hashlib.sha256(what.encode())
+    for array in given:
+        whole.update(f"{array.dtype.str}{array.shape}".encode() + np.ascontiguousarray(array).tobytes())
+    key = f"{whole.hexdigest()[:32]}-"
+    if key + "0" not in known:
+        known |= {f"{key}{number}": array for number, array in enumerate(make())}
+    found: dict[str, NDArray[Any]] = {}
+    while (name := f"{key}{len(found)}") in known:
+        found[str(len(found))] = known[name].copy()
+    return found
+
+
+def _file(kind: str, terms: tuple[str | int, ...], code: tuple[ModuleType, ...]) -> Path:
+    address = digest_json([*terms, _revision(tuple(str(module.__file__) for module in code))])
+    return user_cache.folder(kind) / f"{address}.npz"
+
+
+def _read(file: Path) -> dict[str, NDArray[Any]] | None:
+    if (held := user_cache.load(file)) is None:
+        return None
+    try:
+        with np.load(io.BytesIO(held), allow_pickle=False) as stored:
+            return {name: stored[name] for name in stored.files}
+    except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile):
+        return None
+
+
+def _write(file: Path, arrays: Arrays) -> None:
+    whole = io.BytesIO()
+    np.savez(whole, **dict[str, Any](arrays))
+    user_cache.store(file, whole.getvalue(), limit_bytes=_LIMIT_BYTES)
 
 
 @lru_cache(maxsize=16)

@@ -2,6 +2,8 @@
 
 import dataclasses
 import io
+import subprocess
+import sys
 from dataclasses import fields
 from pathlib import Path
 
@@ -25,7 +27,7 @@ from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.surface import sample_surface
 from graspd.worker.objects import disk_cache, prepare
-from graspd.worker.objects.disk_cache import arrays_kept_or_made, content_of
+from graspd.worker.objects.disk_cache import arrays_kept_or_made, content_of, recalled, recalling
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import load_object, object_from_path
 from graspd.worker.quality.probe import probe_of
@@ -84,6 +86,34 @@ def test_samples_are_those_of_a_process_without_a_cache(own_cache: Path) -> None
         found, fresh = surface._kept.__wrapped__(shapes, 120, 2), surface._sample(shapes, 120, 2)
         assert all(np.array_equal(getattr(found, name), array) for name, array in vars(fresh).items())
         assert np.array_equal(sampling.object_samples(ball, 90, seed=1), sampling._sampled(ball, 90, 1))
+
+
+def test_small_steps_are_kept_together_each_by_what_it_is_given(own_cache: Path) -> None:
+    def halves(array: np.ndarray) -> np.ndarray:
+        return recalled("half", [array], lambda: [array / 2])["0"]
+
+    for _ in range(2):
+        with recalling("steps", ("one thing",), (disk_cache,)):
+            assert halves(np.arange(3.0)).tolist() == [0, 0.5, 1]
+            assert halves(np.arange(2.0)).tolist() == [0, 0.5]
+    assert len(list((own_cache / "steps").iterdir())) == 1
+    with recalling("steps", ("one thing",), (disk_cache,)):
+        step = recalled("half", [np.arange(3.0)], lambda: pytest.fail("it is cached"))["0"]
+        step += 1
+        assert halves(np.arange(3.0)).tolist() == [0, 0.5, 1], "nobody writes into what is kept"
+        assert halves(np.arange(3)).dtype == float, "another type is another step"
+    assert halves(np.arange(2.0)).tolist() == [0, 0.5]
+
+
+def test_a_hand_is_the_same_from_kept_shapes_and_needs_no_scipy(tmp_path: Path) -> None:
+    first, again = hand_from_path("barrett"), hand_from_path("barrett")
+    assert first.content == again.content
+    code = (
+        "import sys; from graspd.worker.hands.load import hand_from_path; import graspd.worker.generation; "
+        "print(hand_from_path('barrett').content, *{'scipy', 'trimesh', 'pydantic_settings'} & set(sys.modules))"
+    )
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert told.split() == [first.content]
 
 
 def load_balls(files: dict[str, bytes] = BALLS, error: float = 3e-4, **options) -> ObjectModel:
