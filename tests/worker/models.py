@@ -1,14 +1,10 @@
 """Small hands and objects for tests of the parts that only read them; comparison of grasps bit for bit."""
 
-import io
-from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import trimesh
 
-from graspd.service import user_cache
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.store.shards import json_attribute
 from graspd.worker.generation import ValidatedBatch
@@ -135,10 +131,3 @@ def assert_same_batch(one: ValidatedBatch, other: ValidatedBatch) -> None:
     assert one.columns.keys() == other.columns.keys()
     for name, values in other.columns.items():
         np.testing.assert_array_equal(one.columns[name], values, err_msg=name)
-
-
-def keep_arrays(file: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """An entry of the user's cache, written anew."""
-    whole = io.BytesIO()
-    np.savez(whole, **arrays)
-    user_cache.store(file, whole.getvalue())

@@ -19,6 +19,7 @@ from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.surface import sample_surface
+from graspd.worker.objects import disk_cache
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.quality import diversity, probe
 from graspd.worker.quality.contact import contact_distance_consistency_mm, finger_of_body, spread_contacts
@@ -28,7 +29,7 @@ from graspd.worker.quality.intervals import wilson, wilson_of_mean
 from graspd.worker.quality.probe import HAND_POINTS, REACH_M, Probe
 from graspd.worker.quality.table import measure
 from graspd.worker.quality.volume import VOXEL_M, Overlap, SharedVolume
-from tests.worker.models import keep_arrays, object_from_mesh, two_finger_hand
+from tests.worker.models import object_from_mesh, two_finger_hand
 from tests.worker.quality.helpers import choose_contacts, grasp_set, pad_hand, plate_hand, posture
 from tests.worker.simulation.rigs import ball
 
@@ -303,7 +304,7 @@ def test_an_entry_that_is_not_sound_is_made_again(own_cache, harm: str) -> None:
     (file,) = own_cache.iterdir()
     whole, grid = file.read_bytes(), first[0]
     harms = {"shape": {"coarse": grid[1:]}, "kind": {"coarse": grid.astype(float)}, "name": {"other": grid}}
-    keep_arrays(file, harms[harm])
+    disk_cache._write(file, harms[harm])
     assert same(distances_of(Probe(FINGERS, BALL, hand_points=100, object_points=64)), first)
     assert file.read_bytes() == whole
 

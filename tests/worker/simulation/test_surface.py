@@ -1,15 +1,13 @@
 """Distances and normals of surfaces and pieces against closed forms, the mesh and NumPy; grids kept on disk."""
 
-import io
-
 import numpy as np
 import pytest
 import trimesh
 import warp as wp
 
-from graspd.service import user_cache
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.surface import piece_distance
+from graspd.worker.objects import disk_cache
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.simulation import grids, kernels
@@ -17,7 +15,6 @@ from graspd.worker.simulation.device import DeviceHand, DeviceObject, face_plane
 from graspd.worker.simulation.grids import feature_normals
 from graspd.worker.simulation.kernels import pieces, surface
 from graspd.worker.simulation.sampling import object_samples
-from tests.worker.models import keep_arrays
 from tests.worker.simulation.rigs import ball, object_of
 
 FLOAT32 = 2e-8  # float32 coordinates of size 0.1 m
@@ -279,8 +276,8 @@ def test_another_cell_faces_or_binary_is_another_grid(computed: list, monkeypatc
 def test_an_entry_that_would_lead_kernels_astray_is_made_again(computed, own_cache, name: str, change) -> None:
     first = kept_grid()
     (file,) = own_cache.iterdir()
-    arrays = dict(np.load(io.BytesIO(user_cache.load(file))))
+    arrays = disk_cache._read(file)
     array = arrays.pop(name)
-    keep_arrays(file, arrays | ({name: change(array)} if change else {}))
+    disk_cache._write(file, arrays | ({name: change(array)} if change else {}))
     for _ in range(2):  # the second time the entry is whole again
         assert same(kept_grid(), first) and len(computed) == 2
