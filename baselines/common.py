@@ -39,7 +39,7 @@ _searches: Final[LRUCache[tuple[object, ...], Any]] = LRUCache(8)
 _lock: Final = threading.Lock()
 
 
-def search_of(make: Callable[..., T], pair: Pair, *options: object) -> T:
+def cached_search(make: Callable[..., T], pair: Pair, *options: object) -> T:
     """Return `make(pair, *options)`; the most recent results are cached."""
     key = (make, id(pair), *options)
     with _lock:
@@ -49,7 +49,7 @@ def search_of(make: Callable[..., T], pair: Pair, *options: object) -> T:
         return _searches[key][1]
 
 
-def ground_of(hand: HandModel, obj: ObjectModel, device: str, *kernels: ModuleType) -> Pair:
+def load_pair(hand: HandModel, obj: ObjectModel, device: str, *kernels: ModuleType) -> Pair:
     """Return the pair on a device; also load the caller's kernel modules, in one thread only."""
     pair = pair_of(hand, obj, GROUND, device)
     with _lock:

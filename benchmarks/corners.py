@@ -20,7 +20,7 @@ from benchmarks.cells import HANDS
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import InputError
 from graspd.service.model.scene_spec import Box, HalfSpace, NeighbourSpec, SceneSpec
-from graspd.worker.files.synthesis import synthesized
+from graspd.worker.files.synthesis import synthesize_grasps
 
 #: Seed that was not used to choose any setting.
 SEED = 1400
@@ -89,7 +89,7 @@ def lifts(given: Any, hand: str, name: str, gap: float, mesh: str) -> str:
         grasps=given.grasps, want="candidates", rechecks=0, seed=given.seed, scene="table", density=700.0
     )
     try:
-        made = synthesized(
+        made = synthesize_grasps(
             str(given.data / "hands" / HANDS[hand]), mesh, request, place=place_of(name, gap, mesh), scenes=1
         )
     except InputError as error:

@@ -25,7 +25,7 @@ import yourdfpy
 
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.scene_spec import Box, NeighbourSpec, SceneSpec, supports_in
-from graspd.worker.files.synthesis import SynthesisResult, synthesized
+from graspd.worker.files.synthesis import SynthesisResult, synthesize_grasps
 from graspd.worker.hands.load import hand_from_path
 
 OBJECTS = ("005_tomato_soup_can", "006_mustard_bottle", "025_mug", "011_banana", "035_power_drill", "077_rubiks_cube")
@@ -178,7 +178,7 @@ def planned(urdf: Path, given: argparse.Namespace, name: str, count: int) -> Syn
     request = JobOptions(grasps=count, seed=given.seed, want="candidates")
     beside = tuple(NeighbourSpec(object=str(given.data / "objects" / one / "clean.stl")) for one in given.beside)
     place = SceneSpec(kind=given.scene, neighbours=beside)
-    return synthesized(str(urdf), str(mesh), request, place=place, scenes=given.scenes, device="cpu", threads=1)
+    return synthesize_grasps(str(urdf), str(mesh), request, place=place, scenes=given.scenes, device="cpu", threads=1)
 
 
 def ready(urdf: Path, given: argparse.Namespace) -> None:

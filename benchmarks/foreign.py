@@ -26,13 +26,13 @@ from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.model.transforms import Floats, apply, compose, invert
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.collisions import resting_neighbours
+from graspd.worker.hands.hand_matching import HandMatch, match_hands
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import ConvexPiece, HandModel
-from graspd.worker.hands.same_hand import SameHand, same_hand
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.quality.intervals import wilson
-from graspd.worker.validation.foreign import driven_as, in_other_model
+from graspd.worker.validation.foreign import transfer_grasps, with_drives_of
 from graspd.worker.validation.validator import validate
 
 HAND = "hands/shadow/shadow_hand_right.urdf"
@@ -62,7 +62,7 @@ TRACED = "tendons"
 Flags = NDArray[np.bool_]
 
 
-def with_our_shapes(same: SameHand) -> HandModel:
+def with_our_shapes(same: HandMatch) -> HandModel:
     """Return the other model with the collision shapes of `same.ours`: isolates the effect of shapes on verdicts."""
     there = np.zeros(same.ours.bodies, np.intp)
     there[same.bodies] = np.arange(same.theirs.bodies)
@@ -70,7 +70,7 @@ def with_our_shapes(same: SameHand) -> HandModel:
     return _dressed(same.theirs, tuple(_moved(p, int(there[p.body]), frames[p.body]) for p in same.ours.pieces))
 
 
-def with_their_shapes(same: SameHand) -> HandModel:
+def with_their_shapes(same: HandMatch) -> HandModel:
     """Return `same.ours` with the collision shapes of the other model."""
     pieces = tuple(_moved(p, int(same.bodies[p.body]), same.frames[p.body]) for p in same.theirs.pieces)
     return _dressed(same.ours, pieces)
@@ -116,8 +116,8 @@ class Bench:
     def __init__(self, ours: Path, theirs: Path) -> None:
         other = hand_from_path(theirs, drag=True)
         self.hands = {plan: hand_from_path(ours, options) for plan, options in PLANS.items()}
-        found = {plan: same_hand(hand, other) for plan, hand in self.hands.items()}
-        self.same = {plan: replace(same, theirs=driven_as(same)) for plan, same in found.items()}
+        found = {plan: match_hands(hand, other) for plan, hand in self.hands.items()}
+        self.same = {plan: replace(same, theirs=with_drives_of(same)) for plan, same in found.items()}
 
     def candidates(self, obj: ObjectModel, count: int, seed: int) -> dict[str, dict[str, list[int]]]:
         """Return, for each variant of planning and each model, the success of each grasp."""
@@ -132,8 +132,8 @@ class Bench:
 
     def models(self, plan: str, grasps: GraspSet) -> dict[str, tuple[HandModel, GraspSet]]:
         """Return the models of the validator, each with its grasps; most models are only for variant `TRACED`."""
-        same: SameHand = self.same[plan]
-        ours, theirs, there = same.ours, same.theirs, in_other_model(same, grasps)
+        same: HandMatch = self.same[plan]
+        ours, theirs, there = same.ours, same.theirs, transfer_grasps(same, grasps)
         found = {NOMINAL: (ours, grasps), FOREIGN: (theirs, there), TOUCH: (self.hands["tendons"], grasps)}
         return (
             found

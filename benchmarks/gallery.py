@@ -26,7 +26,7 @@ from graspd.worker.hands.jaws import jaws_of
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
 from graspd.worker.rendering.pictures import grasp_pictures
-from graspd.worker.stages.hand_self_test import GRASPS, READY, BestGrasp, failed, self_test
+from graspd.worker.stages.hand_self_test import GRASPS, READY, BestGrasp, failed_facts, self_test
 
 PACKAGES = "airo-models example-robot-data robosuite robosuite-models robopianist"
 #: Paths under the folder of the docs.
@@ -190,7 +190,7 @@ def candidates(
             return before
         found = self_test(hand, grasps=grasps)
     except GraspdError as error:
-        return {"key": "", "title": entry.title, "self_test": failed(str(error))}
+        return {"key": "", "title": entry.title, "self_test": failed_facts(str(error))}
     if found.best:
         draw(hand, found.best, picture, entry.sides)
     jaws = jaws_of(hand)

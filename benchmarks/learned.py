@@ -32,7 +32,7 @@ from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
-from graspd.worker.planners.known_networks import keep_file, kept
+from graspd.worker.planners.network_cache import cache_file, load_network
 from graspd.worker.scenes.placement import scenes_of
 from graspd.worker.simulation.environment import Scenes
 from graspd.worker.validation.decomposition import decompose
@@ -164,8 +164,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     rows, networks = [], {}
     try:
         for file in given.network:
-            digest = keep_file(file)
-            network = kept(digest)
+            digest = cache_file(file)
+            network = load_network(digest)
             networks[digest] = f"{network.hand}. {network.about}"
             methods: dict[str, dict[str, Any]] = {"fast_graspd": {}} | {
                 f"learned starts={n}": {"network": digest, "starts": n} for n in given.starts

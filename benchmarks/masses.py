@@ -17,7 +17,7 @@ from benchmarks.cells import HANDS
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.matter import MASS_KG
 from graspd.service.model.scene_spec import parse_scene
-from graspd.worker.files.synthesis import SynthesisResult, synthesized
+from graspd.worker.files.synthesis import SynthesisResult, synthesize_grasps
 
 #: Seed that was not used to choose any setting.
 SEED = 1200
@@ -80,7 +80,7 @@ def on_table(given: Any, hand: str, mesh: Path, **matter: float) -> SynthesisRes
     common: dict[str, Any] = {"grasps": given.grasps, "want": "candidates", "rechecks": 0, "seed": given.seed}
     request = JobOptions(**common, scene="table", scenes=given.scenes, **matter)
     urdf = str(given.data / "hands" / HANDS[hand])
-    return synthesized(urdf, str(mesh), request, place=parse_scene("table"), scenes=given.scenes)
+    return synthesize_grasps(urdf, str(mesh), request, place=parse_scene("table"), scenes=given.scenes)
 
 
 def line(hand: str, name: str, mass: str, shares: list[float]) -> str:

@@ -172,7 +172,7 @@ def valid_grasps(
     given: Any, hand: HandModel, mesh: Path, mass: float
 ) -> tuple[GraspSet, ObjectModel, PlacedGrasps | None]:
     """Return valid grasps in the frame of the object's centre, and their scenes; None: the object is free."""
-    obj = object_from_path(str(mesh), face_error_m=FIDELITIES["standard"].face_error_m).weighing(mass=mass)
+    obj = object_from_path(str(mesh), face_error_m=FIDELITIES["standard"].face_error_m).with_mass(mass=mass)
     request = JobOptions(grasps=given.grasps, rechecks=0, seed=given.seed)
     scenes = None
     if not given.free:

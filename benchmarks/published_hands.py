@@ -32,7 +32,7 @@ from graspd.worker.hands.pinch_postures import oppositions_of
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners.fast_graspd.antipodal_starts import crossings_of
 from graspd.worker.scenes.placement import scenes_of
-from graspd.worker.stages.hand_self_test import TABLE_READY, tried_softly
+from graspd.worker.stages.hand_self_test import TABLE_READY, self_test_facts
 
 #: Hands besides those of the gallery; DIR has LEAP in the folders of MuJoCo Menagerie.
 _SKILL, _MATE = "mani_skill/assets/robots", "dexmate_urdf/robots/hands/f5d6_hand"
@@ -86,7 +86,7 @@ def main() -> None:
         if done.get(entry.name, {}).get("key") == key:
             continue
         began = time.perf_counter()
-        candidates = tried_softly(lambda hand=hand: hand)  # type: ignore[misc]
+        candidates = self_test_facts(lambda hand=hand: hand)  # type: ignore[misc]
         seconds = time.perf_counter() - began
         lifts = {name: lift_share(hand, asked.data / "objects" / name, asked.grasps) for name in OBJECTS}
         done[entry.name] = {

@@ -31,11 +31,11 @@ from graspd.exchange.inputs import Case, load_case
 from graspd.service.model.digests import digest_json
 from graspd.service.model.transforms import quat_rotate
 from graspd.worker.control.postures import TOTAL_NORMAL_FORCE, squeeze
-from graspd.worker.engines.mujoco_warnings import void
+from graspd.worker.engines.mujoco_warnings import is_invalid
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.quality.intervals import wilson
 from graspd.worker.quality.table import measure
-from graspd.worker.scenes.trajectory import plan_way
+from graspd.worker.scenes.trajectory import plan_trajectory
 from graspd.worker.simulation.environment import RISE_M, Obstacle, PlacedGrasps
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.lift import Lift, LiftOutcome
@@ -119,12 +119,12 @@ class Pick(Lift):
 
     def _lost(self) -> bool:
         moved, turned = self._motion()
-        return bool(void(self.data) or moved > 2 * FALLEN_M or turned > 2 * TURNED)
+        return bool(is_invalid(self.data) or moved > 2 * FALLEN_M or turned > 2 * TURNED)
 
     def _validate(self, rollout: Rollout) -> Outcome:
         if not self.terms.published_limits:
             return super()._validate(rollout)
-        if void(self.data):
+        if is_invalid(self.data):
             return Outcome.DIVERGED
         if abs(float(self._offset() @ self._up)) >= FALLEN_M:
             return Outcome.DISPLACED
@@ -147,7 +147,7 @@ def picked(case: Case, pieces: ConvexPieces, terms: Terms) -> dict[str, Any]:
     if terms.from_grasp:
         grasps = replace(grasps, pregrasp=grasps.grasp)
     placed = on_table(case)
-    obj = obj.weighing(density=DENSITY) if terms.light else obj
+    obj = obj.with_mass(density=DENSITY) if terms.light else obj
     scene = build(hand, obj, pieces, MujocoOptions(friction=(terms.friction, 0.02)), placed.supports)
 
     def part(rows: range) -> list[tuple[str, float]]:
@@ -180,7 +180,7 @@ def pushed(case: Case, pieces: ConvexPieces, **terms: Any) -> dict[str, Any]:
 
 def lifted(case: Case, pieces: ConvexPieces) -> dict[str, Any]:
     placed = on_table(case)
-    way = plan_way(case.hand, case.obj, case.grasps, placed)
+    way = plan_trajectory(case.hand, case.obj, case.grasps, placed)
     grasps = replace(case.grasps, approach=way.approach, coming=way.open, lift=way.lift)
     found = validate_lifts(case.hand, case.obj, grasps, placed, pieces=pieces)
     return {

@@ -24,7 +24,7 @@ from graspd.worker.planners import synthesize
 from graspd.worker.planners.port import PlanRequest
 from graspd.worker.quality.table import measure
 from graspd.worker.validation.decomposition import decompose
-from graspd.worker.validation.prescreening import push_rollout
+from graspd.worker.validation.prescreening import ShortTests
 from graspd.worker.validation.validator import validate
 
 #: Seeds that were not used to choose any setting.
@@ -40,7 +40,7 @@ def found_of(hand: HandModel, mesh: Path, count: int) -> dict[str, dict[str, Any
     """Return, for each of `WAYS`, counts and seconds of all grasps."""
     obj = object_from_path(mesh, face_error_m=FIDELITY.face_error_m)
     pieces = decompose(obj)
-    rollouts = {"merit": None, "rollout": push_rollout(hand, obj, lambda: pieces)}
+    rollouts = {"merit": None, "rollout": ShortTests(hand, obj, lambda: pieces).scores}
     found: dict[str, dict[str, Any]] = {}
     for way, rollout in rollouts.items():
         synthesize(hand, obj, PlanRequest(1, FIDELITY, WARM_SEED, rollout=rollout), ONE)

@@ -36,7 +36,7 @@ from graspd.worker.planners.fast_graspd.antipodal_starts import Openings
 from graspd.worker.scenes.clearance import MARGIN_M
 from graspd.worker.scenes.kinds import rest_poses, supports_of
 from graspd.worker.scenes.rollout import rollout_on
-from graspd.worker.scenes.trajectory import plan_way
+from graspd.worker.scenes.trajectory import plan_trajectory
 from graspd.worker.simulation.environment import PlacedGrasps, Scenes
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.lifting import validate_lifts
@@ -131,7 +131,7 @@ def _validated(
     *,
     only_lift: bool = False,
 ) -> dict[str, Any]:
-    way = plan_way(hand, obj, grasps, placed)
+    way = plan_trajectory(hand, obj, grasps, placed)
     grasps = replace(grasps, approach=way.approach, coming=way.open, lift=way.lift)
     clear = np.flatnonzero(way.clear)
     share = {"clear_contact": float((way.contact >= MARGIN_M).mean()), "clear_way": float(way.clear.mean())}

@@ -22,7 +22,7 @@ from graspd.worker.planners import synthesize
 from graspd.worker.planners.port import PlanRequest
 from graspd.worker.scenes.clearance import MARGIN_M
 from graspd.worker.scenes.placement import scenes_of
-from graspd.worker.scenes.trajectory import Trajectory, plan_way
+from graspd.worker.scenes.trajectory import Trajectory, plan_trajectory
 
 HANDS: Final = ("barrett", "allegro", "shadow")
 #: Target, kind of its scene, and its neighbours.
@@ -69,7 +69,7 @@ def run(count: int) -> list[dict[str, Any]]:
             scenes, _ = scenes_of(spec, things[target], [things[one] for one in beside], count=SCENES, seed=SEEDS[0])
             placed = scenes.placed(np.arange(count) % SCENES)
             wanted = PlanRequest(count=count, fidelity=fidelity, seed=SEEDS[1], placed=placed)
-            way = plan_way(hand, things[target], synthesize(hand, things[target], wanted), placed)
+            way = plan_trajectory(hand, things[target], synthesize(hand, things[target], wanted), placed)
             told = {"hand": name, "object": target, "scene": kind, "beside": len(beside), "grasps": count}
             rows.append(told | blocked(way))
             sys.stderr.write(f"{name}: {target}, {kind}\n")

@@ -23,7 +23,7 @@ from benchmarks.masses import arguments, masses
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.scene_spec import parse_scene
 from graspd.service.model.transforms import compose
-from graspd.worker.files.synthesis import synthesized
+from graspd.worker.files.synthesis import synthesize_grasps
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel, JointType
 
@@ -72,7 +72,7 @@ def again(given: Any, name: str, hand: HandModel, obj: str, mass: float) -> tupl
     request = JobOptions(
         grasps=given.grasps, rechecks=0, seed=given.seed, scene="table", scenes=given.scenes, mass=mass
     )
-    made = synthesized(
+    made = synthesize_grasps(
         str(given.data / "hands" / HANDS[name]),
         str(mesh_file),
         request,

@@ -262,16 +262,18 @@ _ALLEGRO_ROOT: Final = (0.0, 0.0, 0.0, 0.0, 0.5**0.5, 0.0, 0.5**0.5)
 _SHADOW_ROOT: Final = (0.0, 0.0, 0.034, 1.0, 0.0, 0.0, 0.0)
 
 
-def of_the_benchmark(hand: HandModel) -> HandMapping | None:
+def benchmark_mapping(hand: HandModel) -> HandMapping | None:
     """Return the mapping to DexGraspBench's own model of the hand; None if it has none."""
     for names in _ALLEGRO_URDFS:
         if set(names) == set(hand.joint_names) and hand.root_link in ("base_link", "palm"):
             joints = tuple(zip(_ALLEGRO, names, strict=True))
-            return _theirs(hand, "allegro", _ALLEGRO_ROOT, joints)
+            return _published_mapping(hand, "allegro", _ALLEGRO_ROOT, joints)
     if set(_SHADOW) == set(hand.joint_names) and hand.root_link == "palm":
-        return _theirs(hand, "shadow", _SHADOW_ROOT, tuple((f"rh_{name}", name) for name in _SHADOW))
+        return _published_mapping(hand, "shadow", _SHADOW_ROOT, tuple((f"rh_{name}", name) for name in _SHADOW))
     return None
 
 
-def _theirs(hand: HandModel, config: str, root: tuple[float, ...], joints: tuple[tuple[str, str], ...]) -> HandMapping:
+def _published_mapping(
+    hand: HandModel, config: str, root: tuple[float, ...], joints: tuple[tuple[str, str], ...]
+) -> HandMapping:
     return HandMapping(hand.name, hand.root_link, config, f"assets/hand/{config}/right_hand.xml", root, joints)

@@ -126,7 +126,7 @@ def tabletop_fields(mapping: HandMapping, hand: HandModel, grasps: GraspSet, row
     }
 
 
-def placed_of(obj_pose: Floats) -> PlacedGrasps:
+def tables_at(obj_pose: Floats) -> PlacedGrasps:
     """Return tables, which fingertips may touch, for object poses (N, 7); equal poses share one."""
     _, first, index = np.unique(np.round(obj_pose / SAME), axis=0, return_index=True, return_inverse=True)
     order = np.argsort(first)
@@ -156,7 +156,7 @@ def object_of_scene(file: Path, scene_path: str) -> Row:
     return {"obj_pose": pose, "obj_scale": float(scale[0])}
 
 
-def with_way(
+def with_trajectory(
     hand: HandModel, grasps: GraspSet, rows: Sequence[Row], obj_pose: Floats, mapping: HandMapping | None
 ) -> GraspSet:
     """Add approach and lift from files, in the object frame, if waypoint numbers are equal and the hand stays open."""

@@ -16,17 +16,17 @@ from typing import Any, Final
 import mujoco
 import numpy as np
 
-from graspd.exchange.bench_hand import GRASPS, HandMapping, body_names, mapping_of, of_the_benchmark, write_hand
+from graspd.exchange.bench_hand import GRASPS, HandMapping, benchmark_mapping, body_names, mapping_of, write_hand
 from graspd.exchange.bench_scene import (
     SCALE,
     TABLETOP,
     Row,
     check_table,
     object_of_scene,
-    placed_of,
     save_record,
+    tables_at,
     tabletop_fields,
-    with_way,
+    with_trajectory,
     write_object,
     write_table,
 )
@@ -120,7 +120,7 @@ def models_of(hand: HandModel, folder: Path) -> list[HandMapping]:
     joints = tuple((built.joint(number).name,) * 2 for number in range(built.njnt))
     links = tuple(zip(body_names(hand), hand.body_names, strict=True))
     ours = HandMapping(hand.name, hand.root_link, config, model.as_posix(), tuple(IDENTITY_POSE), joints, links)
-    return [ours, *filter(None, [of_the_benchmark(hand)])]
+    return [ours, *filter(None, [benchmark_mapping(hand)])]
 
 
 def experiment(placed: PlacedGrasps | None) -> str:
@@ -201,7 +201,7 @@ def _set(
     grasps = GraspSet(grasp, pregrasp, squeeze, np.full(len(rows), np.nan))
     published = np.array([int(bool(row["succ_flag"])) if "succ_flag" in row else -1 for row in rows], np.int8)
     name = str(rows[0].get("obj_path", obj.name)).rstrip("/").rsplit("/", 1)[-1]
-    placed = placed_of(pose) if on_table else None
+    placed = tables_at(pose) if on_table else None
     if placed is not None:
-        grasps = replace(with_way(hand, grasps, rows, pose, mapping), scene=placed.index)
+        grasps = replace(with_trajectory(hand, grasps, rows, pose, mapping), scene=placed.index)
     return ImportedGrasps(hand, obj, grasps, name, scale, published, placed)

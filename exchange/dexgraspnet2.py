@@ -51,7 +51,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-from graspd.exchange.imported import ImportedGrasps, completed, joints_by_name, scaled_object, verdicts
+from graspd.exchange.imported import ImportedGrasps, add_postures, joints_by_name, scaled_object, verdicts
 from graspd.exchange.plan import ExportPart, ExportSummary, PictureReference, by_scene, plain_name
 from graspd.service.model.base import error_text
 from graspd.service.model.errors import InputError
@@ -116,7 +116,7 @@ class SceneGraspness:
     def of(cls, hand: HandModel, grasps: Posture, samples: Floats) -> SceneGraspness:
         """Compute the graspness from K grasps in the object's frame; without grasps all values are 0."""
         pointed = pointed_at(*lines_of_sight(hand, grasps), samples)
-        return cls(samples, pointed, summed(samples, pointed))
+        return cls(samples, pointed, sum_graspness(samples, pointed))
 
     def of_view(
         self, depth: Floats, labels: NDArray[np.uint8], intrinsics: Floats, camera: Floats, object_pose: Floats
@@ -175,7 +175,7 @@ def pointed_at(palm: Floats, line: Floats, samples: Floats) -> NDArray[np.intp]:
     return found
 
 
-def summed(samples: Floats, pointed: NDArray[np.intp]) -> Floats:
+def sum_graspness(samples: Floats, pointed: NDArray[np.intp]) -> Floats:
     """Return (S,) graspness of points (S, 3) [m] from the aim points' indices (K,)."""
     count = np.bincount(pointed, minlength=len(samples))
     some = np.flatnonzero(count)
@@ -307,10 +307,10 @@ def _write_scene(
     # The loader samples among 256 views, so further views repeat the same files.
     for view in range(len(some), VIEWS):
         for folder, suffix in kinds:
-            _again(folder / f"{view % len(some):04}.{suffix}", folder / f"{view:04}.{suffix}")
+            _link_or_copy(folder / f"{view % len(some):04}.{suffix}", folder / f"{view:04}.{suffix}")
 
 
-def _again(file: Path, copy: Path) -> None:
+def _link_or_copy(file: Path, copy: Path) -> None:
     if not file.exists():
         return
     try:
@@ -363,15 +363,15 @@ def read(path: Path, *, hand: str, obj: str, number: int = 0) -> list[ImportedGr
     except ValueError as error:
         raise InputError(f"{path} needs one value of each joint for each of {count} grasps: {error}") from None
     grasp = Posture(compose(away, pose_from_matrix(matrices)), joints_by_name(model, names, values, what=str(path)))
-    grasps = _with_ours(path, model, found, grasp, away)
+    grasps = _add_own_columns(path, model, found, grasp, away)
     if grasps is None:
-        grasps = completed(model, thing, grasp)
+        grasps = add_postures(model, thing, grasp)
     success = found.get("success")
     published = None if success is None or np.size(success) != count else verdicts(success)
     return [ImportedGrasps(model, thing, grasps, path.stem, published=published)]
 
 
-def _with_ours(
+def _add_own_columns(
     path: Path, hand: HandModel, found: dict[str, NDArray[Any]], grasp: Posture, away: Floats
 ) -> GraspSet | None:
     if not {"pregrasp_qpos", "squeeze_qpos"} <= set(found):

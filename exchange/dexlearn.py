@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from graspd.exchange.bench_hand import COLLECTED, HandMapping
 from graspd.exchange.bench_scene import SET, TABLETOP, check_table, save_record, write_object, write_table
 from graspd.exchange.dexgraspbench import POSTURES, experiment, models_of, postures
-from graspd.exchange.plan import ExportPart, ExportSummary, PictureReference, looks
+from graspd.exchange.plan import ExportPart, ExportSummary, PictureReference, pictures_without_pixels
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, invert
 from graspd.service.readers import DepthNoise, Pictures
@@ -100,7 +100,7 @@ def _clouds(
     """Write the object's cloud of each picture; return the numbers of clouds and of scenes without one."""
     on_table = {lot.id: lot.placed is not None for lot in lots}
     written = Counter[Path]()
-    for look in looks(pictures):
+    for look in pictures_without_pixels(pictures):
         scene = scenes.get((look.base, look.scene if on_table.get(look.base) else _FREE))
         if scene is None or not len(points := points_of(pictures, look, noise, on_table=on_table[look.base])):
             continue

@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 
 from graspd.baselines.autograsp import kernels
 from graspd.baselines.autograsp.method import HandCloser
-from graspd.baselines.common import ground_of
-from graspd.exchange.imported import ImportedGrasps, completed, joints_by_name, mesh_file, scaled_object
+from graspd.baselines.common import load_pair
+from graspd.exchange.imported import ImportedGrasps, add_postures, joints_by_name, mesh_file, scaled_object
 from graspd.exchange.plan import ExportPart, ExportSummary, plain_name
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import Floats, apply, pose_from_matrix, pose_to_matrix, quat_from_matrix
@@ -172,7 +172,7 @@ def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[Impo
         raise InputError(f"{file} has an object of scale {scale:g}")
     model, thing = hand_from_path(hand), scaled_object(obj, scale)
     pose = pose_from_matrix(matrices)
-    made = _grasps(file, model, record, pose) or completed(model, thing, closed_at(model, thing, pose))
+    made = _grasps(file, model, record, pose) or add_postures(model, thing, closed_at(model, thing, pose))
     name = object_name or Path(str(record["object"].get("file", ""))).stem or thing.name
     return [ImportedGrasps(model, thing, made, name, scale, held.astype(np.int8))]
 
@@ -240,7 +240,7 @@ def _json(path: Path, value: Any) -> None:
 
 def closed_at(hand: HandModel, obj: ObjectModel, hand_pose: NDArray[np.float64]) -> Posture:
     """Return hands at poses (N, 7) in the object frame, closed from the preshape to contact or limits."""
-    pair = ground_of(hand, obj, "cpu", kernels)
+    pair = load_pair(hand, obj, "cpu", kernels)
     joints = np.zeros((len(hand_pose), len(hand.joint_names)))
     for first in range(0, len(hand_pose), _AT_ONCE):
         pose = hand_pose[first : first + _AT_ONCE]

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from graspd.exchange.bench_scene import placed_of
+from graspd.exchange.bench_scene import tables_at
 from graspd.exchange.imported import ImportedGrasps, joints_by_name, scaled_object, verdicts
 from graspd.exchange.plan import ExportPart, ExportSummary
 from graspd.service import parquet
@@ -30,7 +30,7 @@ from graspd.service.readers.trajectories import scene_spec_of
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.rendering.export import PNG_STEP_M
-from graspd.worker.rendering.sheets import quoted
+from graspd.worker.rendering.sheets import metric_at_threshold
 
 POSTURES: Final = ("pregrasp", "grasp", "squeeze")
 #: Kinds of scenes of planned grasps, as in the rows.
@@ -119,7 +119,7 @@ def write(
 
 def _grasps(lot: ExportPart) -> list[dict[str, Any]]:
     said, arrays = lot.shard.attributes, lot.shard.arrays
-    epsilon = quoted(arrays, "quality/epsilon")
+    epsilon = metric_at_threshold(arrays, "quality/epsilon")
     spec = scene_spec_of(lot.shard)
     kind = FREE if lot.placed is None or spec is None else spec.kind
     types = np.asarray(arrays.get("quality/grasp_type", np.zeros(len(lot.grasps), int)))
@@ -238,7 +238,7 @@ def _set(
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise InputError(f"{path} is no table of grasps: {error}") from None
     grasps = GraspSet(parts["grasp"], parts["pregrasp"], parts["squeeze"], np.full(len(rows), np.nan))
-    placed = None if place is None else placed_of(place)
+    placed = None if place is None else tables_at(place)
     if placed is not None:
         grasps.scene = placed.index
     return ImportedGrasps(model, thing, grasps, name, 1.0, verdict, placed)

@@ -50,7 +50,7 @@ class ImportedGrasps:
     placed: PlacedGrasps | None = None
 
 
-def completed(hand: HandModel, obj: ObjectModel, grasp: Posture) -> GraspSet:
+def add_postures(hand: HandModel, obj: ObjectModel, grasp: Posture) -> GraspSet:
     """Add our postures before and after contact to grasps, for sources without them."""
     return GraspSet(grasp, pregrasp(hand, obj, grasp), squeeze(hand, obj, grasp), np.full(len(grasp), np.nan))
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from graspd.exchange import dexgraspbench, published
 from graspd.service.model.errors import InputError, NotFoundError
 from graspd.service.store.shards import kind_of, open_shard, read_shard
-from graspd.worker.files.provenance import hand_of_shard, object_of_shard, placed_of_shard
+from graspd.worker.files.provenance import hand_of_shard, object_of_shard, scenes_of_shard
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
@@ -97,7 +97,7 @@ def _shard(path: Path, hand: str | None, obj: str | None) -> Case:
         friction=float(said["mu"]) if "mu" in said else None,  # type: ignore[arg-type]
         seconds=float(said["seconds"]) if "seconds" in said else None,  # type: ignore[arg-type]
         validated=said.get("verdict_level", "none") != "none",
-        placed=placed_of_shard(shard),
+        placed=scenes_of_shard(shard),
     )
 
 

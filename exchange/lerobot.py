@@ -21,7 +21,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.exchange.bench_scene import placed_of
+from graspd.exchange.bench_scene import tables_at
 from graspd.exchange.huggingface import png
 from graspd.exchange.imported import ImportedGrasps, joints_by_name, scaled_object, verdicts
 from graspd.exchange.plan import ExportPart, ExportSummary, PictureReference, by_scene
@@ -78,7 +78,7 @@ def write(lots: Sequence[ExportPart], pictures: Pictures, folder: Path, out: fro
     if not ways:
         raise InputError("grasps of free objects have no approach; plan grasps in a scene: --scene table")
     seen = {(some[0].base, some[0].scene): some for some in by_scene(pictures)}
-    episodes = [(lot, row, look) for lot in ways for row, look in _seen(lot, seen)]
+    episodes = [(lot, row, look) for lot in ways for row, look in _pictured_rows(lot, seen)]
     if not episodes:
         raise InputError("no picture shows the scene of a grasp; put views beside the grasps: graspd render")
     tasks = {name: k for k, name in enumerate(dict.fromkeys(lot.name for lot, _, _ in episodes))}
@@ -92,7 +92,7 @@ def write(lots: Sequence[ExportPart], pictures: Pictures, folder: Path, out: fro
     return done
 
 
-def _seen(
+def _pictured_rows(
     lot: ExportPart, seen: Mapping[tuple[str, int], list[PictureReference]]
 ) -> Iterator[tuple[int, PictureReference]]:
     assert lot.placed is not None
@@ -244,7 +244,7 @@ def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[Impo
     """Read the grasps on one object, on tables, with trajectories if all have equal numbers of waypoints."""
     names = _names(path)
     task = _task(path, object_name)
-    ways, rest, numbers = _ways(path, task)
+    ways, rest, numbers = _trajectories(path, task)
     if not len(ways) or min(map(len, ways)) < _STOPS:
         raise InputError(f"{path} has no episodes of task {task} with a complete trajectory")
     model, thing = hand_from_path(hand), scaled_object(obj)
@@ -257,7 +257,7 @@ def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[Impo
 
     pregrasp, grasp, squeeze, lift = (posture(np.array([way[k] for way in ways])) for k in range(-_STOPS, 0))
     grasps = GraspSet(grasp, pregrasp, squeeze, np.full(len(ways), np.nan))
-    placed = placed_of(rest)
+    placed = tables_at(rest)
     grasps.scene, grasps.lift = placed.index, lift
     if len({len(way) for way in ways}) == 1 and len(ways[0]) > _STOPS:
         coming = [posture(np.array([way[k] for way in ways])) for k in range(len(ways[0]) - _STOPS)]
@@ -288,7 +288,7 @@ def _task(path: Path, object_name: str) -> int:
     return int(numbers[words.index(task_of(object_name))])
 
 
-def _ways(path: Path, task: int) -> tuple[list[Floats], Floats, list[int]]:
+def _trajectories(path: Path, task: int) -> tuple[list[Floats], Floats, list[int]]:
     """Return all postures (W, 7 + J) of a task's episodes, the object's poses, and the episodes' numbers."""
     ways, rest, numbers = list[Floats](), list[Floats](), list[int]()
     wanted = (STATE, ACTION, OBJECT, EPISODE, "frame_index", "task_index")

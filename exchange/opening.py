@@ -20,7 +20,7 @@ from graspd.service.parquet import arrow
 
 
 @contextmanager
-def opened(folder: Path) -> Iterator[None]:
+def check_written_files(folder: Path) -> Iterator[None]:
     """Open all files written into a folder within this context. Raises GraspdError: a library cannot read one."""
     before = _stamps(folder)
     yield

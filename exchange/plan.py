@@ -71,7 +71,7 @@ class PictureReference:
     """Rows of the base shard whose grasps belong to this scene."""
 
 
-def looks(pictures: Pictures) -> Iterator[PictureReference]:
+def pictures_without_pixels(pictures: Pictures) -> Iterator[PictureReference]:
     """Yield the pictures without their pixels; only the left one of a stereo pair."""
     for index, place in enumerate(pictures.places):
         camera = pictures.columns_of(place, ("camera/extrinsics", "camera/eye"))
@@ -91,7 +91,7 @@ RIGHT: Final = 2
 def by_scene(pictures: Pictures) -> list[list[PictureReference]]:
     """Group pictures by views shard and scene, in order."""
     scenes: dict[tuple[str, int], list[PictureReference]] = defaultdict(list)
-    for look in looks(pictures):
+    for look in pictures_without_pixels(pictures):
         scenes[look.shard, look.scene].append(look)
     return list(scenes.values())
 

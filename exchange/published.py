@@ -28,7 +28,7 @@ from typing import Any, Final
 import numpy as np
 from pydantic_core import from_json
 
-from graspd.exchange.imported import ImportedGrasps, completed, joints_by_name, load_npy, scaled_object, verdicts
+from graspd.exchange.imported import ImportedGrasps, add_postures, joints_by_name, load_npy, scaled_object, verdicts
 from graspd.service.model.base import error_text
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import (
@@ -68,7 +68,7 @@ def read_ddgc(path: Path, *, hand: str, obj: str, number: int = 0) -> list[Impor
     pose = np.concatenate([place[:, :3], place[:, 6:], place[:, 3:6]], axis=1)
     names = _names(model)
     grasp = Posture(pose, joints_by_name(model, names, values * _signs(model, names), what=str(path)))
-    return [ImportedGrasps(model, thing, completed(model, thing, grasp), thing.name)]
+    return [ImportedGrasps(model, thing, add_postures(model, thing, grasp), thing.name)]
 
 
 def _names(hand: HandModel) -> list[str]:
@@ -106,7 +106,7 @@ def read_dexgraspnet(path: Path, *, hand: str, obj: str) -> list[ImportedGrasps]
     sets = []
     for scale, some in sorted(by_scale.items()):
         thing = scaled_object(obj, scale)
-        grasps = completed(model, thing, _grasp(path, model, some))
+        grasps = add_postures(model, thing, _grasp(path, model, some))
         sets.append(ImportedGrasps(model, thing, grasps, path.stem, scale))
     return sets
 
@@ -146,7 +146,7 @@ def read_multidex(path: Path, *, hand: str, obj: str, robot: str, object_name: s
         raise InputError(f"{path}: q has {q.shape[1]} numbers, {model.name} needs 9 + {joints} or 6 + {joints}")
     turn = rotation_of_columns(q[:, 3:9]) if q.shape[1] == 9 + joints else rotation_of_angles(q[:, 3:6])
     grasp = Posture(np.concatenate([q[:, :3], turn], axis=1), q[:, -joints:])
-    return [ImportedGrasps(model, thing, completed(model, thing, grasp), object_name.rpartition("+")[2])]
+    return [ImportedGrasps(model, thing, add_postures(model, thing, grasp), object_name.rpartition("+")[2])]
 
 
 def rotation_of_columns(columns: Floats) -> Floats:
@@ -197,7 +197,7 @@ def read_reference(path: Path, *, hand: str | None = None, obj: str | None = Non
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise InputError(f"{path} is no file of reference grasps: {error!r}") from None
     published = verdicts([row.get("pick_success_published") for row in rows])
-    grasps = completed(model, thing, Posture(pose, joints))
+    grasps = add_postures(model, thing, Posture(pose, joints))
     return [ImportedGrasps(model, thing, grasps, str(stored["object"]), published=published)]
 
 

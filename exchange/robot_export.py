@@ -21,7 +21,7 @@ from graspd.exchange.robots.execution import (
     hand_limits,
     parse_pose,
     straight_paths,
-    timed,
+    time_motions,
     tool_frame,
 )
 from graspd.exchange.robots.reach import Description, ReachSearch, describe, read_arm
@@ -29,9 +29,9 @@ from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import IDENTITY_POSE
 from graspd.service.store.shards import Shard, read_shard
 from graspd.worker.files.provenance import hand_files_of_shard
-from graspd.worker.files.subsets import choose
+from graspd.worker.files.subsets import select_grasps
 from graspd.worker.rendering.sheets import best as best_of
-from graspd.worker.rendering.sheets import quoted
+from graspd.worker.rendering.sheets import metric_at_threshold
 from graspd.worker.validation.decomposition import decompose
 
 
@@ -67,24 +67,24 @@ def export_grasps(source: Path, format_: str, wishes: RobotExportOptions, folder
     files = hand_files_of_shard(shard, wishes.hand)
     description = describe(files.files, files.options)
     written = ExportSummary({})
-    found = _found(source, shard, description, wishes, written)
+    found = _plan_executions(source, shard, description, wishes, written)
     limits = hand_limits(found.hand)
     written.notes += _assumptions(limits)
     if wishes.arm is None:
         found = found.take(np.arange(len(found))[: wishes.best or None])
         names, velocity = found.hand.joint_names, limits.velocity
         trajectories = [
-            timed(straight_paths(found, row), names, velocity, speed=wishes.speed) for row in range(len(found))
+            time_motions(straight_paths(found, row), names, velocity, speed=wishes.speed) for row in range(len(found))
         ]
         bundle = Bundle(found, trajectories, description)
     else:
-        bundle = _carried(found, description, limits, wishes, written)
+        bundle = _plan_for_arm(found, description, limits, wishes, written)
     paths = _write(bundle, format_, folder, files.files)
     written.counts |= {"grasps": len(bundle.found), "files": len(paths)}
     return written
 
 
-def _carried(
+def _plan_for_arm(
     found: Executions, description: Description, limits: Limits, wishes: RobotExportOptions, written: ExportSummary
 ) -> Bundle:
     assert wishes.arm is not None and wishes.mount is not None
@@ -109,16 +109,16 @@ def _carried(
     written.notes += _assumptions(of_arm)
     names = (*arm.model.joint_names, *found.hand.joint_names)
     velocity = np.concatenate([of_arm.velocity, limits.velocity])
-    trajectories = [timed(paths, names, velocity, speed=wishes.speed) for paths in reached.paths]
+    trajectories = [time_motions(paths, names, velocity, speed=wishes.speed) for paths in reached.paths]
     kept = found.take(np.array(reached.rows, np.intp))
     return Bundle(kept, trajectories, description, Carrier(arm, base, reach.world, reached.paths))
 
 
-def _found(
+def _plan_executions(
     source: Path, shard: Shard, description: Description, wishes: RobotExportOptions, written: ExportSummary
 ) -> Executions:
     case = load_case(source, hand=wishes.hand, obj=wishes.obj)
-    mask, word = choose(shard, unvalidated=wishes.unvalidated, every=wishes.every)
+    mask, word = select_grasps(shard, unvalidated=wishes.unvalidated, every=wishes.every)
     rows = best_of(shard.arrays, len(mask), mask) if wishes.best else np.flatnonzero(mask)
     tool = tool_frame(wishes.tool, case.hand.root_link, description.links)
     grasps, placed = case.grasps.take(rows), None if case.placed is None else case.placed.take(rows)
@@ -134,7 +134,7 @@ def _found(
 def _quality(shard: Shard, rows: NDArray[np.intp]) -> dict[str, NDArray[Any]]:
     arrays = shard.arrays
     success = np.asarray(arrays.get("quality/success", np.full(len(arrays["quality/valid"]), -1)))
-    epsilon = quoted(arrays, "quality/epsilon")[rows]
+    epsilon = metric_at_threshold(arrays, "quality/epsilon")[rows]
     return {"valid": np.asarray(arrays["quality/valid"])[rows], "success": success[rows], "epsilon": epsilon}
 
 

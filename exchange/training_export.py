@@ -22,7 +22,7 @@ from graspd.service.readers.clouds import COLUMNS
 from graspd.service.readers.depth_noise import noise_of
 from graspd.service.store import validity
 from graspd.service.store.shards import Shard, read_shard
-from graspd.worker.files.subsets import choose
+from graspd.worker.files.subsets import select_grasps
 from graspd.worker.objects.model import ObjectModel
 
 
@@ -45,8 +45,8 @@ def export_training(source: Path, format_: str, wishes: TrainingExportOptions, f
     if not 0 < wishes.held_out < 1:
         raise InputError(f"--held-out is {wishes.held_out:g}; give a share of the objects between 0 and 1")
     shards = open_shards(source)
-    lots = _lots(shards, format_, wishes)
-    out = held_out(families({lot.name: lot.obj for lot in lots}), wishes.held_out)
+    lots = _export_parts(shards, format_, wishes)
+    out = held_out(object_families({lot.name: lot.obj for lot in lots}), wishes.held_out)
     from graspd.exchange import dexgraspnet2, dexlearn, graspgen, huggingface, lerobot
 
     if format_ == "graspgen":
@@ -59,7 +59,7 @@ def export_training(source: Path, format_: str, wishes: TrainingExportOptions, f
     return writer(lots, pictures, folder, out, noise_of(wishes.noise or None))
 
 
-def _lots(shards: Shards, format_: str, wishes: TrainingExportOptions) -> list[ExportPart]:
+def _export_parts(shards: Shards, format_: str, wishes: TrainingExportOptions) -> list[ExportPart]:
     lots: list[ExportPart] = []
     digests: dict[str, str] = {}
     refused: InputError | None = None
@@ -67,7 +67,7 @@ def _lots(shards: Shards, format_: str, wishes: TrainingExportOptions) -> list[E
         path = shards.path(file)
         shard = read_shard(path, kind="base")
         try:
-            mask = _chosen(shard, format_, wishes)
+            mask = _exported_rows(shard, format_, wishes)
         except InputError as error:
             refused = error
             continue
@@ -83,10 +83,10 @@ def _lots(shards: Shards, format_: str, wishes: TrainingExportOptions) -> list[E
     return lots
 
 
-def _chosen(shard: Shard, format_: str, wishes: TrainingExportOptions) -> np.ndarray:
+def _exported_rows(shard: Shard, format_: str, wishes: TrainingExportOptions) -> np.ndarray:
     """Return (N,) exported grasps. GraspGen, which has labels, gets good and bad ones."""
     if format_ != "graspgen":
-        return choose(shard, unvalidated=wishes.unvalidated, every=wishes.every)[0]
+        return select_grasps(shard, unvalidated=wishes.unvalidated, every=wishes.every)[0]
     validated = validity.validated(shard.arrays)
     if wishes.unvalidated or not validated.any():
         raise InputError(f"{format_} needs a verdict on each grasp: make them without --validation none")
@@ -102,7 +102,7 @@ QUANTILES: Final = np.linspace(0.01, 0.99, 50)
 SAME: Final = 0.006
 
 
-def signature(obj: ObjectModel) -> Floats:
+def shape_signature(obj: ObjectModel) -> Floats:
     """Return (50,) quantiles of the distance between two surface points, over its root mean square."""
     corners = np.asarray(obj.vertices, float)[np.asarray(obj.faces)]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
@@ -114,10 +114,10 @@ def signature(obj: ObjectModel) -> Floats:
     return np.asarray(np.quantile(distance, QUANTILES) / np.sqrt(np.mean(distance**2)))
 
 
-def families(objects: Mapping[str, ObjectModel]) -> dict[str, str]:
+def object_families(objects: Mapping[str, ObjectModel]) -> dict[str, str]:
     """Return each object's family: the least digest of the files of all transitively similar objects."""
     names = sorted(objects, key=lambda name: objects[name].digest)
-    found = np.array([signature(objects[name]) for name in names]).reshape(len(names), len(QUANTILES))
+    found = np.array([shape_signature(objects[name]) for name in names]).reshape(len(names), len(QUANTILES))
     family: dict[str, str] = {}
     for k, name in enumerate(names):
         apart = np.sqrt(np.mean((found[:k] - found[k]) ** 2, axis=1))

@@ -51,14 +51,14 @@ def synthesize(
     except TypeError as error:
         raise TypeError(f"synthesize() {error}") from None
     try:
-        from graspd.worker.files.synthesis import synthesized_as
+        from graspd.worker.files.synthesis import synthesize_with
     except ModuleNotFoundError as error:
         raise ImportError(f"synthesize needs {error.name}; run pip install 'graspd[worker]'") from error
     # None means that the option was not given.
     asked = validate(LocalOptions, {name: value for name, value in options.items() if value is not None})
     told = (lambda done, total, _message: progress(done / total)) if progress else None
     try:
-        made = synthesized_as(str(hand), str(object), asked, progress=told)
+        made = synthesize_with(str(hand), str(object), asked, progress=told)
     except InputError as error:
         # The engine's messages spell options as on the command line.
         error.args = (_FLAG.sub(lambda flag: _KEYWORDS.get(flag[0], flag[0]), str(error)),)

@@ -18,12 +18,12 @@ from graspd.service.model.errors import InputError, MeshError
 from graspd.service.model.metrics import axis_word
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.grasps import GraspSet
-from graspd.worker.hands.same_hand import SameHand
+from graspd.worker.hands.hand_matching import HandMatch
 from graspd.worker.quality.contact import contact_distance_consistency_mm
-from graspd.worker.quality.diversity import explained_variance, hand_points, nearest
+from graspd.worker.quality.diversity import explained_variance, hand_points, least_distance
 from graspd.worker.quality.probe import HAND_POINTS, OBJECT_POINTS, probe_of
 from graspd.worker.quality.table import DEFAULT_FRICTION, measure
-from graspd.worker.scenes.trajectory import plan_way
+from graspd.worker.scenes.trajectory import plan_trajectory
 from graspd.worker.simulation.environment import PlacedGrasps
 from graspd.worker.validation.decomposition import decompose
 from graspd.worker.validation.displacement import simulated_displacement_cm
@@ -60,7 +60,7 @@ def evaluate(
     hard: bool = False,
     friction: float | None = None,
     models: int = 0,
-    validation_hand: SameHand | None = None,
+    validation_hand: HandMatch | None = None,
     tell: Callable[[Robustness], None] = lambda found: None,
     cache: Path | None = None,
     run: ExecutionContext = DEFAULT_CONTEXT,
@@ -74,7 +74,7 @@ def evaluate(
       sgs_without_validation (per second of planning alone).
     - Medians: pd_mm and spd_mm (penetration, self-penetration), ca_cm2, iv_cm3, epsilon, wrench_volume, cdc_mm, sd_cm.
     - Set: diversity (variance explained by the first principal component), nearest_mm (least distance of two grasps).
-    - After validation: verdicts, see `_told`.
+    - After validation: verdicts, see `_verdict_rows`.
     - With `models` models around the nominal one: robust_share (mean over held grasps), robust_n (their number),
       robust_axes (share by axis). `tell` receives the results.
     - With protocol lift: clear_share (no collision with the scene in approach, closing and lift).
@@ -88,7 +88,7 @@ def evaluate(
         raise InputError(f"{case.name} has grasps around a free object: `graspd synth --scene` makes some to lift")
     case = case.centred
     if level == "dexgraspbench":
-        case = replace(case, obj=case.obj.published)
+        case = replace(case, obj=case.obj.for_dexgraspbench)
     mu = friction or case.friction or DEFAULT_FRICTION
     table = measure(case.hand, case.obj, case.grasps, friction=mu, thresholds_m=[THRESHOLD_M], run=run)
     row: dict[str, Any] = {
@@ -111,7 +111,7 @@ def evaluate(
         verdicts = validate(case.hand, case.obj, case.grasps, level=cast(Level, level), **common)
         row |= _success(case, verdicts)
         if models:
-            row |= _in_others(case, case.grasps, row, models, tell, held=verdicts.success, **common)
+            row |= _model_results(case, case.grasps, row, models, tell, held=verdicts.success, **common)
         if validation_hand is not None:
             both = foreign_verdicts(validation_hand, case.obj, case.grasps, verdicts, pieces=pieces, run=run)
             row |= both.facts()
@@ -119,16 +119,16 @@ def evaluate(
                 one |= {"held_foreign": bool(held), "reason_foreign": reason}
     elif protocol == "lift" and case.placed is not None:
         common |= {"placed": case.placed, "level": "dexgraspbench" if level == "dexgraspbench" else "lift"}
-        grasps, clear = _with_ways(case, case.placed)
+        grasps, clear = _with_trajectories(case, case.placed)
         lifts = validate_lifts(case.hand, case.obj, grasps, **common)
-        row |= _lifted(lifts, clear)
+        row |= _lift_rates(lifts, clear)
         if models:
-            row |= _in_others(case, grasps, row, models, tell, held=lifts.success, **common)
+            row |= _model_results(case, grasps, row, models, tell, held=lifts.success, **common)
     sd = simulated_displacement_cm(case.hand, case.obj, case.grasps.grasp, pieces=pieces, run=run)
     return row | pieces.facts | _medians(case, table, sd)
 
 
-def _in_others(
+def _model_results(
     case: Case, grasps: GraspSet, row: dict[str, Any], models: int, tell: Callable[[Robustness], None], **given: Any
 ) -> dict[str, Any]:
     """Return results of models around the nominal one; add each grasp's share to its verdict."""
@@ -153,7 +153,7 @@ def _success(case: Case, verdicts: Verdicts) -> dict[str, Any]:
         "published": 0,
         "reasons": dict(Counter(verdicts.reasons).most_common()),
         "verdict_key": verdicts.terms,
-        "verdicts": _told(verdicts.success, verdicts.outcome, verdicts.margin, verdicts.reasons, Outcome),
+        "verdicts": _verdict_rows(verdicts.success, verdicts.outcome, verdicts.margin, verdicts.reasons, Outcome),
         "agreement_published": None,
     }
     if case.published is not None and (known := case.published >= 0).any():
@@ -162,17 +162,17 @@ def _success(case: Case, verdicts: Verdicts) -> dict[str, Any]:
     return row
 
 
-def _with_ways(case: Case, placed: PlacedGrasps) -> tuple[GraspSet, NDArray[np.bool_]]:
-    way, grasps = plan_way(case.hand, case.obj, case.grasps, placed), case.grasps
+def _with_trajectories(case: Case, placed: PlacedGrasps) -> tuple[GraspSet, NDArray[np.bool_]]:
+    way, grasps = plan_trajectory(case.hand, case.obj, case.grasps, placed), case.grasps
     if grasps.approach is None or grasps.coming is None:
         # Imported files have grasps but rarely have trajectories.
         grasps = replace(grasps, approach=way.approach, coming=way.open, lift=way.lift)
     return grasps, way.clear
 
 
-def _lifted(verdicts: LiftVerdicts, clear: NDArray[np.bool_]) -> dict[str, Any]:
+def _lift_rates(verdicts: LiftVerdicts, clear: NDArray[np.bool_]) -> dict[str, Any]:
     count, held = len(clear), int(verdicts.success.sum())
-    rows = _told(verdicts.success, verdicts.outcome[:, None], verdicts.margin, verdicts.reasons, LiftOutcome)
+    rows = _verdict_rows(verdicts.success, verdicts.outcome[:, None], verdicts.margin, verdicts.reasons, LiftOutcome)
     return {
         "level": verdicts.level,
         "gsr": _plain(held / max(1, count)),
@@ -201,7 +201,7 @@ def _in_models(found: Robustness, verdicts: list[dict[str, Any]]) -> dict[str, A
     }
 
 
-def _told(
+def _verdict_rows(
     success: NDArray[Any],
     outcomes: NDArray[Any],
     margins: NDArray[np.float64],
@@ -226,7 +226,7 @@ def _medians(case: Case, table: dict[str, NDArray[Any]], sd: NDArray[np.float64]
     cdc = contact_distance_consistency_mm(case.hand, probe.body_distance(probe.measure(case.grasps.grasp)))
     row = {key: _median(table[f"quality/{name}"]) for key, name in COLUMNS.items()}
     shares = explained_variance(case.grasps.grasp)
-    apart = nearest(hand_points(case.hand, case.grasps.grasp))
+    apart = least_distance(hand_points(case.hand, case.grasps.grasp))
     return row | {
         "cdc_mm": _median(cdc),
         "sd_cm": None if sd is None else _median(sd),

@@ -142,7 +142,7 @@ def parallel_map(
     return [one.result() for one in futures]
 
 
-def answers(
+def evaluate_rows(
     rows: Sequence[int], make: Callable[[], T], ask: Callable[[T, int], R], *, threads: int, name: str
 ) -> list[R]:
     """Run tests on some grasps in parallel; return the results in their order."""
@@ -166,7 +166,7 @@ def answers(
         return list(pool.map(work, rows))
 
 
-def measured(
+def measure_rows(
     count: int,
     held: NDArray[np.bool_] | None,
     make: Callable[[], T],
@@ -183,5 +183,5 @@ def measured(
 
     out = np.full(count, np.nan)
     rows = np.arange(count) if held is None else np.flatnonzero(held)
-    out[rows] = answers(rows.tolist(), make, asked, threads=run.cores, name=name)
+    out[rows] = evaluate_rows(rows.tolist(), make, asked, threads=run.cores, name=name)
     return out

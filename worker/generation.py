@@ -28,11 +28,11 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.pinch_postures import require_opposing
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners import NoStartFound, PlanRequest, Rollout, fitting_pairs, method, synthesize
-from graspd.worker.planners.fast_graspd.antipodal_starts import why_narrow
+from graspd.worker.planners.fast_graspd.antipodal_starts import narrow_reason
 from graspd.worker.quality.diversity import POINTS, distinct, hand_points
 from graspd.worker.quality.gate import GATES, failed_gate, passes
 from graspd.worker.quality.table import measure
-from graspd.worker.rounds import ROUND_STRIDE, Arrays, Round, enough, next_round, parts_of, taken
+from graspd.worker.rounds import ROUND_STRIDE, Arrays, Round, expected_need, next_round, parts_of, select_rows
 from graspd.worker.scenes.rollout import lift_level, outcomes_in_scenes, rollout_on, scene_verdicts
 from graspd.worker.simulation.environment import PlacedGrasps, Scenes
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
@@ -41,7 +41,7 @@ from graspd.worker.validation.key import verdict_key
 from graspd.worker.validation.lift import LiftOutcome
 from graspd.worker.validation.lifting import lift_key, validate_lifts
 from graspd.worker.validation.payload import ENOUGH, Limit, limit_of, payloads, shake_margins
-from graspd.worker.validation.prefilter.prefilter import PrefilterVerdicts, first_terms
+from graspd.worker.validation.prefilter.prefilter import PrefilterVerdicts, prefilter_key_terms
 from graspd.worker.validation.protocol import DIRECTIONS, Outcome
 from graspd.worker.validation.robust import reaches, robust
 from graspd.worker.validation.validator import prefiltered, validate
@@ -116,11 +116,11 @@ def validated_grasps(
         work = Batch(scoring, batch, count, run)
         try:
             while work.needed is not None:
-                work.add(work.made(work.needed))
+                work.add(work.run_round(work.needed))
         except TaskCancelled:
             if not partial or not work.rounds:
                 raise
-            scoring.goes_on()
+            scoring.ignore_cancellation()
         return work.finish()
 
 
@@ -130,7 +130,7 @@ def require_graspable(hand: HandModel, obj: ObjectModel) -> None:
     fitting_pairs(hand, obj.centred)
 
 
-def scored(
+def score_grasps(
     hand: HandModel,
     obj: ObjectModel,
     grasps: GraspSet,
@@ -145,7 +145,7 @@ def scored(
     request = request.model_copy(update={"want": "candidates"})
     with Scoring(hand, obj, request, scenes=scenes, pieces=pieces, run=run) as scoring:
         work = Batch(scoring, 0, len(grasps), run)
-        work.add(scoring.scored(grasps.moved(np.negative(obj.centre)), run))
+        work.add(scoring.evaluate(grasps.moved(np.negative(obj.centre)), run))
         return work.finish()
 
 
@@ -172,7 +172,7 @@ class Scoring(AbstractContextManager["Scoring"]):
     def __exit__(self, *error: object) -> None:
         self.beside.shutdown()
 
-    def goes_on(self) -> None:
+    def ignore_cancellation(self) -> None:
         self.run = replace(self.run, cancelled=DEFAULT_CONTEXT.cancelled)
 
     def rollout(self, known: Known) -> Rollout | None:
@@ -187,7 +187,7 @@ class Scoring(AbstractContextManager["Scoring"]):
         assert self.pieces is not None
         pieces = self.pieces.result()
         if self.scenes is None:
-            prefilter = first_terms(self.hand, self._level, self.run)
+            prefilter = prefilter_key_terms(self.hand, self._level, self.run)
             return verdict_key(self.hand, self.obj, self._level, False, pieces=pieces, prefilter=prefilter)
         placed = self.scenes.placed(np.zeros(0, int))
         return lift_key(self.hand, self.obj, placed, lift_level(self.request.validation), False, pieces=pieces)
@@ -198,14 +198,14 @@ class Scoring(AbstractContextManager["Scoring"]):
 
     def prefiltered(self, planned: GraspSet) -> PrefilterVerdicts | None:
         """Return the GPU prefilter's verdicts on the finite grasps; None: the prefilter is not used."""
-        if self.pieces is None or self.scenes is not None or not first_terms(self.hand, self._level, self.run):
+        if self.pieces is None or self.scenes is not None or not prefilter_key_terms(self.hand, self._level, self.run):
             return None
         finite = planned.take(np.flatnonzero(planned.finite))
         return prefiltered(
             self.hand, self.obj, finite, level=self._level, pieces=self.pieces.result(), run=self.run.quiet()
         )
 
-    def scored(
+    def evaluate(
         self,
         planned: GraspSet,
         run: ExecutionContext,
@@ -222,13 +222,13 @@ class Scoring(AbstractContextManager["Scoring"]):
         size, every = len(planned), self.request.want == "candidates"
         in_scene: dict[str, NDArray[np.bool_]] = {}
         with _timed(seconds, "validation"):
-            planned, columns = self._validated(planned, run.part(*PARTS[:2]), known, prefilter)
+            planned, columns = self._validate(planned, run.part(*PARTS[:2]), known, prefilter)
         if self.scenes is not None:
             fates[finite[columns["quality/success"] < 0]] = "no_place"
             for name, those in outcomes_in_scenes(columns).items():
                 in_scene[name] = np.zeros(len(fates), bool)
                 in_scene[name][finite] = those
-        why = _why(columns, size)
+        why = _rejection_reasons(columns, size)
         rows = np.arange(size) if every or not columns else np.flatnonzero(columns["quality/success"] == 1)
         grasps = planned.take(rows)
         columns = {path: array[rows] for path, array in columns.items()}
@@ -255,11 +255,11 @@ class Scoring(AbstractContextManager["Scoring"]):
                 enough = columns["quality/payload_kg"] >= least
                 fates[finite[rows[wanted & ~enough]]] = "weak"
                 wanted &= enough
-            grasps, columns = taken(grasps, columns, np.flatnonzero(wanted))
+            grasps, columns = select_rows(grasps, columns, np.flatnonzero(wanted))
             rows = rows[wanted]
         return Round(grasps, columns, finite[rows], fates, in_scene, seconds)
 
-    def _validated(
+    def _validate(
         self, grasps: GraspSet, run: ExecutionContext, known: Known | None, prefilter: PrefilterVerdicts | None
     ) -> tuple[GraspSet, Arrays]:
         pieces = None if self.pieces is None else self.pieces.result()
@@ -278,7 +278,7 @@ class Scoring(AbstractContextManager["Scoring"]):
             "quality/verdict_outcome": verdicts.outcome.reshape(-1, len(DIRECTIONS)),
             "quality/verdict_margin": verdicts.margin,
         }
-        if first_terms(self.hand, self._level, self.run):
+        if prefilter_key_terms(self.hand, self._level, self.run):
             columns["quality/validated_by"] = verdicts.validated_by
         return grasps, columns
 
@@ -331,7 +331,7 @@ def _timed(seconds: dict[str, float], name: str) -> Iterator[None]:
 
 
 @dataclass(frozen=True)
-class Needed:
+class RoundRequest:
     number: int
     rows: range
     begun: int
@@ -357,28 +357,28 @@ class Batch:
         self._scenes = every if scenes is None else scenes
         self._rechecks: Future[NDArray[np.int8]] | None = None
         self._kept = np.zeros((0, POINTS, 3))
-        self._needs = self._all_needed()
+        self._needs = self._round_requests()
         self.needed = next(self._needs, None)
         """Candidates to make and add next; None: the batch is ready for `finish`."""
 
-    def _all_needed(self) -> Iterator[Needed]:
+    def _round_requests(self) -> Iterator[RoundRequest]:
         """Yield the needs of each round, until `count` grasps are found or the budget is used up; `add` must follow."""
         wish, count = self.request, self.count
         if wish.want == "candidates":
-            yield Needed(0, range(count), self.candidates, (0.0, 1.0))
+            yield RoundRequest(0, range(count), self.candidates, (0.0, 1.0))
             return
         budget, number, valid = math.ceil(wish.budget * count), 0, 0
         # In scenes a retry has the cost of another candidate.
         while size := next_round(count, valid, self.candidates, budget - self.repeated):
             first = 0
             while first < size and valid < count:
-                share = min(size - first, enough(count, valid, self.candidates) if self._in_parts else size)
+                share = min(size - first, expected_need(count, valid, self.candidates) if self._is_divisible else size)
                 done = valid / count
                 hoped = done + (1 - done) * min(1.0, share / (count - valid)) * 0.9
-                yield Needed(number, range(first, first + share), self.candidates - first, (done, hoped))
+                yield RoundRequest(number, range(first, first + share), self.candidates - first, (done, hoped))
                 first += share
                 valid = sum(len(one.grasps) for one in self.rounds)
-            if not valid and self._hopeless():
+            if not valid and self._is_unreachable():
                 return
             number += 1
 
@@ -392,11 +392,11 @@ class Batch:
             kept = distinct(points, self.request.min_distance, given=len(self._kept))
             wanted, self._kept = kept[len(self._kept) :], points[kept]
             made.fates[made.rows[~wanted]] = "alike"
-            made.grasps, made.columns = taken(made.grasps, made.columns, np.flatnonzero(wanted))
+            made.grasps, made.columns = select_rows(made.grasps, made.columns, np.flatnonzero(wanted))
         self.rounds.append(made)
         self.needed = next(self._needs, None)
 
-    def _hopeless(self) -> bool:
+    def _is_unreachable(self) -> bool:
         """Check whether the latest grasps, none of them selected, show that the hand lifts far less than wanted."""
         scoring = self.scoring
         if scoring.pieces is None or (self.limit is not None and self.limit.grasps >= ENOUGH):
@@ -407,28 +407,28 @@ class Batch:
         hand, obj, placed = scoring.hand, scoring.obj, scoring.placed(planned)
         pieces, run, wanted = scoring.pieces.result(), scoring.run.quiet(), max(obj.mass, self.request.min_payload)
         self.limit = limit_of(hand, obj, planned, wanted=wanted, pieces=pieces, placed=placed, run=run)
-        return self.limit is not None and self.limit.hopeless
+        return self.limit is not None and self.limit.is_unreachable
 
     @property
-    def _in_parts(self) -> bool:
+    def _is_divisible(self) -> bool:
         """Whether a round may be made in parts, so that it ends as soon as enough grasps are found.
         The CPU runs the parts in parallel; a GPU makes the whole round in the time of a few grasps."""
         return not self.scoring.run.device.startswith("cuda") and method(self.request.method).in_parts
 
-    def made(self, asked: Needed) -> Round:
+    def run_round(self, asked: RoundRequest) -> Round:
         known: Known = {}
         run = self.run.part(*asked.progress)
         rollout = self.scoring.rollout(known)  # one for all parts
-        parts = parts_of(asked.rows, run.cores if self._in_parts and run.pool is None else 1)
+        parts = parts_of(asked.rows, run.cores if self._is_divisible and run.pool is None else 1)
 
         def planned(part: range, own: ExecutionContext, others: bool) -> Round:
-            wanted = self.wanted(replace(asked, rows=part), rollout, others_have_place=others)
+            wanted = self.plan_request(replace(asked, rows=part), rollout, others_have_place=others)
             hand, obj, request, run = self.scoring.hand, self.scoring.obj, self.request, own.part(0.0, PARTS[0])
             found = synthesize(hand, obj, wanted, run, method=request.method, options=request.options)
-            told = self.told(wanted, found)
+            told = self.grasps_to_store(wanted, found)
             # Verdicts and metrics are many short tasks: they may use all cores, also while other parts run.
-            made = self.scoring.scored(told, replace(own, sharing=None), known)
-            return self.noted(replace(asked, rows=part), made, told)
+            made = self.scoring.evaluate(told, replace(own, sharing=None), known)
+            return self.complete_round(replace(asked, rows=part), made, told)
 
         def run_part(part: range, own: ExecutionContext) -> Round | NoStartFound:
             try:
@@ -438,7 +438,7 @@ class Batch:
 
         found = parallel_map(parts, run_part, run, size=len)
         if len(refused := [one for one in found if isinstance(one, NoStartFound)]) == len(found):
-            raise self.refused(refused[0])
+            raise self.explain_refusal(refused[0])
         made = [
             planned(part, run.quiet(), True) if isinstance(one, NoStartFound) else one
             for part, one in zip(parts, found, strict=True)
@@ -447,7 +447,7 @@ class Batch:
         whole.seconds = {name: value / len(made) for name, value in whole.seconds.items()}
         return whole
 
-    def wanted(self, asked: Needed, rollout: Rollout | None, *, others_have_place: bool) -> PlanRequest:
+    def plan_request(self, asked: RoundRequest, rollout: Rollout | None, *, others_have_place: bool) -> PlanRequest:
         number = self.number + asked.number * ROUND_STRIDE
         rows, scenes, placed = asked.rows, self.scoring.scenes, None
         if scenes is not None:
@@ -458,12 +458,12 @@ class Batch:
         knobs, seed = self.request.knobs, self.request.seed
         return PlanRequest(len(rows), knobs, seed, number, placed, rollout, rows.start, others_have_place)
 
-    def told(self, wanted: PlanRequest, planned: GraspSet) -> GraspSet:
+    def grasps_to_store(self, wanted: PlanRequest, planned: GraspSet) -> GraspSet:
         """Return the grasps to validate and store: positions on the grid, scene numbers of the job."""
         index = None if wanted.placed is None else self._scenes.start + wanted.placed.index
         return replace(planned, scene=index).moved(np.zeros(3))
 
-    def noted(self, asked: Needed, made: Round, told: GraspSet) -> Round:
+    def complete_round(self, asked: RoundRequest, made: Round, told: GraspSet) -> Round:
         """Return the round with the planner's info; the batch's first grasps also start the rechecks."""
         made.planned = [told]
         made.grasps = replace(made.grasps, info=told.info, seconds=told.seconds)
@@ -473,8 +473,8 @@ class Batch:
             self._begin_rechecks(made)
         return made
 
-    def refused(self, error: NoStartFound) -> NoStartFound:
-        why = self._narrow()
+    def explain_refusal(self, error: NoStartFound) -> NoStartFound:
+        why = self._narrow_reason()
         return NoStartFound(f"{error}: {why}") if why else error
 
     def finish(self) -> ValidatedBatch:
@@ -495,7 +495,7 @@ class Batch:
         rejected = dict.fromkeys(reasons, 0)
         for name, number in outcomes.items():
             rejected[_REJECTION_OF.get(name, name if name in reasons else "dropped")] += number
-        grasps, columns = taken(grasps, columns, np.arange(min(count, len(grasps))))
+        grasps, columns = select_rows(grasps, columns, np.arange(min(count, len(grasps))))
         if self.repeated:
             outcomes["repeated"] = self.repeated
         found = ValidatedBatch(
@@ -511,17 +511,17 @@ class Batch:
             limit=None if len(grasps) else self.limit,
         )
         if scoring.pieces is not None:
-            columns |= self._second_opinions(grasps, columns["quality/valid"])
-            narrow = None if columns["quality/valid"].any() else self._narrow()
+            columns |= self._further_columns(grasps, columns["quality/valid"])
+            narrow = None if columns["quality/valid"].any() else self._narrow_reason()
             found = replace(found, columns=columns, verdict_key=scoring.key(), narrow=narrow)
         scene = None if grasps.scene is None else grasps.scene - self._scenes.start
         return replace(found, grasps=replace(grasps, scene=scene)).moved(scoring.centre)
 
-    def _narrow(self) -> str | None:
+    def _narrow_reason(self) -> str | None:
         if self.scoring.scenes is None:
             return None
         around = self.scoring.scenes.placed(np.zeros(0, int)).scenes
-        return why_narrow(self.scoring.hand, self.scoring.obj, around[self._scenes.start : self._scenes.stop])
+        return narrow_reason(self.scoring.hand, self.scoring.obj, around[self._scenes.start : self._scenes.stop])
 
     def _shares(self) -> dict[str, float]:
         planned = max(1, sum(len(part.fates) for part in self.rounds))
@@ -530,7 +530,7 @@ class Batch:
             for name in self.rounds[0].in_scene
         }
 
-    def _second_opinions(self, grasps: GraspSet, valid: NDArray[np.uint8]) -> Arrays:
+    def _further_columns(self, grasps: GraspSet, valid: NDArray[np.uint8]) -> Arrays:
         """Return displacements of all grasps and, if wanted, rechecks.
         Rechecks validate the first valid grasps at level `dexgraspbench`."""
         scoring = self.scoring
@@ -542,7 +542,7 @@ class Batch:
             if count := self.request.rechecks_of(self.number):
                 rechecked, recheck = np.flatnonzero(valid)[:count], np.full(len(grasps), -1, np.int8)
                 if len(rechecked):
-                    known = self._rechecks.result() if self._rechecks else self._rechecked(grasps.take(rechecked))
+                    known = self._rechecks.result() if self._rechecks else self._recheck(grasps.take(rechecked))
                     recheck[rechecked] = known[: len(rechecked)]
                 columns["quality/recheck"] = recheck
         return columns
@@ -558,9 +558,9 @@ class Batch:
             points = hand_points(self.scoring.hand, first.grasps.grasp.take(valid))
             valid = valid[distinct(points, self.request.min_distance)]
         if len(valid) >= count:
-            self._rechecks = self.scoring.beside.submit(self._rechecked, first.grasps.take(valid[:count]))
+            self._rechecks = self.scoring.beside.submit(self._recheck, first.grasps.take(valid[:count]))
 
-    def _rechecked(self, grasps: GraspSet) -> NDArray[np.int8]:
+    def _recheck(self, grasps: GraspSet) -> NDArray[np.int8]:
         scoring = self.scoring
         assert scoring.pieces is not None
         run, pieces = scoring.run.quiet(), scoring.pieces.result()
@@ -571,7 +571,7 @@ class Batch:
         ).success
 
 
-def _why(columns: Arrays, count: int) -> NDArray[np.object_]:
+def _rejection_reasons(columns: Arrays, count: int) -> NDArray[np.object_]:
     found = np.full(count, "not_lifted", object)
     if "quality/lift_outcome" in columns:
         for lift, name in _LIFTED.items():

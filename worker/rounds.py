@@ -61,7 +61,7 @@ class Round:
         found, ends = [], list(accumulate(sizes, initial=0))
         for first, end in pairwise(ends):
             mine = np.flatnonzero((first <= self.rows) & (self.rows < end))
-            grasps, columns = taken(self.grasps, self.columns, mine)
+            grasps, columns = select_rows(self.grasps, self.columns, mine)
             in_scene = {name: rows[first:end] for name, rows in self.in_scene.items()}
             seconds = {name: value * (end - first) / max(1, ends[-1]) for name, value in self.seconds.items()}
             found.append(Round(grasps, columns, self.rows[mine] - first, self.fates[first:end], in_scene, seconds))
@@ -76,10 +76,10 @@ def next_round(wanted: int, valid: int, candidates: int, budget: int) -> int:
         return 0
     if candidates == 0:
         return min(wanted, budget)
-    return min(max(SMALLEST_ROUND, enough(wanted, valid, candidates)), BATCH_SIZE, budget - candidates)
+    return min(max(SMALLEST_ROUND, expected_need(wanted, valid, candidates)), BATCH_SIZE, budget - candidates)
 
 
-def enough(wanted: int, valid: int, candidates: int) -> int:
+def expected_need(wanted: int, valid: int, candidates: int) -> int:
     """Return the number of grasps expected to be enough at the rate so far, plus 10 %; see `next_round`."""
     if candidates == 0:
         return wanted
@@ -92,5 +92,5 @@ def parts_of(rows: range, cores: int) -> list[range]:
     return [range(int(low), int(high)) for low, high in pairwise(bounds)]
 
 
-def taken(grasps: GraspSet, columns: Arrays, rows: NDArray[np.intp]) -> tuple[GraspSet, Arrays]:
+def select_rows(grasps: GraspSet, columns: Arrays, rows: NDArray[np.intp]) -> tuple[GraspSet, Arrays]:
     return grasps.take(rows), {path: array if path == THRESHOLDS else array[rows] for path, array in columns.items()}

@@ -23,8 +23,8 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.quality.probe import Probe, probe_of
 from graspd.worker.rendering.hands import drawn_parts, drawn_poses
-from graspd.worker.rendering.scenery import Supports, seen_share, slab_poses, slabs
-from graspd.worker.rendering.sheets import quoted
+from graspd.worker.rendering.scenery import Supports, slab_poses, slabs, visible_share
+from graspd.worker.rendering.sheets import metric_at_threshold
 from graspd.worker.scenes.neighbours import Neighbours
 
 #: Hand points whose distance from the object is shown, and the largest distance shown [m].
@@ -153,7 +153,7 @@ class Viewer:
         if said := missing():
             raise InputError(said)
         self._shown, self._arrays = shown, shown.shard.arrays
-        self._choices = _choices(shown.shard)
+        self._choices = _rows_by_filter(shown.shard)
         self._rows = next(iter(self._choices.values()))
         self._at, self._lock = 0, threading.RLock()
         spec = scene_spec_of(shown.shard) or SceneSpec()
@@ -212,12 +212,15 @@ class Viewer:
             distance = self.models.pose(point, wrist=self._wrist, contacts=contacts)
             self.models.show_scene(bool(self._scene.value))
             touching, least = int((distance < 0.001).sum()), 1e3 * float(distance.min())
-            self._said.content = f"**{_doing(self._way, place)}**: {touching} points of the hand within 1 mm, " + (
-                f"deepest {-least:.2f} mm inside"
-                if least < 0
-                else f"nearest {least:.1f} mm away"
-                if least < 10
-                else "free"
+            self._said.content = (
+                f"**{_motion_label(self._way, place)}**: {touching} points of the hand within 1 mm, "
+                + (
+                    f"deepest {-least:.2f} mm inside"
+                    if least < 0
+                    else f"nearest {least:.1f} mm away"
+                    if least < 10
+                    else "free"
+                )
             )
             self.server.flush()
 
@@ -266,7 +269,7 @@ class Viewer:
             for e in (0.45, 0.8)
             for a in (first + _STEP * ((k + 1) // 2) * (-1) ** k for k in range(16))
         ]
-        eye = next((eye for eye in eyes if seen_share(self._supports, eye, points) > 0.8), eyes[0])
+        eye = next((eye for eye in eyes if visible_share(self._supports, eye, points) > 0.8), eyes[0])
         camera = self.server.initial_camera
         camera.position, camera.look_at, camera.up, camera.fov = eye, middle, (0.0, 0.0, 1.0), 0.75
 
@@ -286,7 +289,7 @@ def _served(host: str, port: int) -> Any:
         raise InputError(f"cannot serve on {host}: {error.strerror or error}") from None
 
 
-def _choices(shard: Shard) -> dict[str, NDArray[np.intp]]:
+def _rows_by_filter(shard: Shard) -> dict[str, NDArray[np.intp]]:
     found: dict[str, NDArray[np.intp]] = {}
     for name in ("valid", "lift_hard", "feasible"):
         column = shard.arrays.get(f"quality/{name}")
@@ -300,7 +303,7 @@ def _choices(shard: Shard) -> dict[str, NDArray[np.intp]]:
 
 def _figures(shard: Shard, row: int) -> str:
     arrays = shard.arrays
-    rows = [("ε at 5 mm", f"{quoted(arrays, 'quality/epsilon')[row]:.3f}")]
+    rows = [("ε at 5 mm", f"{metric_at_threshold(arrays, 'quality/epsilon')[row]:.3f}")]
     rows.append(("penetration", f"{float(arrays['quality/penetration_depth_mm'][row]):.2f} mm"))
     verdicts = {
         "success": "lift" if "quality/lift_outcome" in arrays else "verdict",
@@ -319,7 +322,7 @@ def _figures(shard: Shard, row: int) -> str:
     return "\n".join(["| | |", "| --- | --- |", *(f"| {name} | {value} |" for name, value in rows)])
 
 
-def _doing(way: Any, place: float) -> str:
+def _motion_label(way: Any, place: float) -> str:
     places = slider_axis(way)
     names = [(float(at), point.name) for at, point in zip(places, way, strict=True) if point.name]
     near = next((name for at, name in names if abs(at - place) < 0.02), "")

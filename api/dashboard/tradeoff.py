@@ -14,7 +14,7 @@ from pydantic import BaseModel
 
 from graspd.service.model.errors import DamagedError
 from graspd.service.model.scene_spec import SceneSpec
-from graspd.service.model.studies import FILTERED
+from graspd.service.model.studies import FILTERED, pareto
 from graspd.service.store.records import CHARTS, latest, scene_kinds
 from graspd.service.store.store import Store
 
@@ -184,15 +184,6 @@ def draw(measured: Measured, *, axis: str, hand: str = "", object: str = "") -> 
     line = " ".join(f"{point.x:.1f},{point.y:.1f}" for point in placed if point.on_front)
     nothing = [group[0].label for group in _groups(chosen) if not _speed(group)]
     return Drawing(placed, line, x_ticks, y_ticks, shown, nothing)
-
-
-def pareto(points: Sequence[tuple[float, float]]) -> set[int]:
-    """Return indices of points (more, more) that no other point beats in both."""
-    return {
-        index
-        for index, (x, y) in enumerate(points)
-        if not any((a >= x and b >= y) and (a > x or b > y) for a, b in points)
-    }
 
 
 def _groups(runs: Sequence[Run]) -> list[list[Run]]:

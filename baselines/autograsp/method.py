@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from graspd.baselines.autograsp import kernels
-from graspd.baselines.common import free_starts, grasp_set, ground_of
+from graspd.baselines.common import free_starts, grasp_set, load_pair
 from graspd.service.model.transforms import Floats, quat_rotate
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet
@@ -24,7 +24,7 @@ from graspd.worker.hands.model import HandModel, JointType, SurfacePoints
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners.fast_graspd.pairs import Pair
 from graspd.worker.planners.port import Method, Options, PlanRequest
-from graspd.worker.planners.threads import StepCounter, cut, run_parts
+from graspd.worker.planners.threads import StepCounter, run_parts, split_batch
 from graspd.worker.simulation.data import Data, HandState
 from graspd.worker.simulation.launches import Launches
 from graspd.worker.simulation.model import Model
@@ -41,7 +41,7 @@ class Autograsp:
 
     def __call__(self, hand: HandModel, obj: ObjectModel, wanted: PlanRequest, run: ExecutionContext) -> GraspSet:
         began = time.perf_counter()
-        pair = ground_of(hand, obj, run.device, kernels)
+        pair = load_pair(hand, obj, run.device, kernels)
         steps = StepCounter(3 * wanted.count, run)
 
         def work(indices: range) -> HandState:
@@ -55,7 +55,7 @@ class Autograsp:
             steps(n, "closing")
             return state
 
-        states = run_parts(cut(wanted.count, run), work)
+        states = run_parts(split_batch(wanted.count, run), work)
         return grasp_set(pair, HandState.joined(states), began, {})
 
 

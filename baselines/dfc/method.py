@@ -14,7 +14,7 @@ import warp as wp
 from numpy.typing import NDArray
 from pydantic import Field
 
-from graspd.baselines.common import frame_along, grasp_set, ground_of, inside_points
+from graspd.baselines.common import frame_along, grasp_set, inside_points, load_pair
 from graspd.baselines.dfc import kernels
 from graspd.service.model.transforms import (
     IDENTITY_POSE,
@@ -32,7 +32,7 @@ from graspd.worker.objects.distance import sample_faces
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners.fast_graspd.pairs import Pair
 from graspd.worker.planners.port import Method, Options, PlanRequest
-from graspd.worker.planners.threads import StepCounter, cut, run_parts
+from graspd.worker.planners.threads import StepCounter, run_parts, split_batch
 from graspd.worker.simulation.data import Data, HandState
 from graspd.worker.simulation.kernels import optimizers
 from graspd.worker.simulation.launches import Launches
@@ -59,7 +59,7 @@ class Dfc:
 
     def __call__(self, hand: HandModel, obj: ObjectModel, wanted: PlanRequest, run: ExecutionContext) -> GraspSet:
         began = time.perf_counter()
-        pair = ground_of(hand, obj, run.device, kernels)
+        pair = load_pair(hand, obj, run.device, kernels)
         steps = StepCounter(wanted.count * (self.options.steps + 1), run)
 
         def work(indices: range) -> tuple[HandState, Floats]:
@@ -69,7 +69,7 @@ class Dfc:
             descent.run(self.options.steps, steps)
             return descent.hands(), descent.energies()
 
-        found = run_parts(cut(wanted.count, run), work)
+        found = run_parts(split_batch(wanted.count, run), work)
         energies = np.concatenate([part[1] for part in found])
         passed = (energies[:, :3] < np.array(PASSES)).all(axis=1)
         return grasp_set(pair, HandState.joined([part[0] for part in found]), began, {"passed": passed.tolist()})

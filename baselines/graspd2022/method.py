@@ -15,7 +15,7 @@ import warp as wp
 from numpy.typing import NDArray
 from pydantic import Field
 
-from graspd.baselines.common import free_starts, grasp_set, ground_of, search_of
+from graspd.baselines.common import cached_search, free_starts, grasp_set, load_pair
 from graspd.baselines.graspd2022 import kernels
 from graspd.service.model.cores import available_cores
 from graspd.service.model.transforms import Floats, quat_rotate
@@ -26,7 +26,7 @@ from graspd.worker.hands.surface import sample_surface
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners.fast_graspd.pairs import Pair
 from graspd.worker.planners.port import Method, Options, PlanRequest
-from graspd.worker.planners.threads import StepCounter, cut, run_parts
+from graspd.worker.planners.threads import StepCounter, run_parts, split_batch
 from graspd.worker.simulation.data import Data, HandState, Schedule
 from graspd.worker.simulation.device import DeviceObject
 from graspd.worker.simulation.kernels import surface
@@ -66,8 +66,8 @@ class Graspd2022:
 
     def __call__(self, hand: HandModel, obj: ObjectModel, wanted: PlanRequest, run: ExecutionContext) -> GraspSet:
         began = time.perf_counter()
-        pair = ground_of(hand, obj, run.device, kernels)
-        search = search_of(Search, pair, self.options.grid)
+        pair = load_pair(hand, obj, run.device, kernels)
+        search = cached_search(Search, pair, self.options.grid)
         steps = StepCounter(wanted.count * (self.options.steps + 1), run)
 
         def work(indices: range) -> tuple[HandState, Floats]:
@@ -75,7 +75,7 @@ class Graspd2022:
             steps(len(indices), "starts")
             return search.run(starts, steps=self.options.steps, tell=steps)
 
-        found = run_parts(cut(wanted.count, run), work)
+        found = run_parts(split_batch(wanted.count, run), work)
         residual = np.concatenate([part[1] for part in found])
         return grasp_set(
             pair, HandState.joined([part[0] for part in found]), began, {"residual": residual.round(4).tolist()}

@@ -276,7 +276,7 @@ def begin(
 
 
 @wp.func
-def unlikeness(problem: Problem, x: vec8, y: vec8):
+def state_difference(problem: Problem, x: vec8, y: vec8):
     """Return the mean difference of two states, relative to the largest jumps."""
     total = float(0.0)
     for i in range(VARIABLES):
@@ -288,7 +288,7 @@ def unlikeness(problem: Problem, x: vec8, y: vec8):
 
 
 @wp.func
-def remember(
+def insert_best(
     problem: Problem,
     b: wp.int32,
     x: vec8,
@@ -303,7 +303,7 @@ def remember(
         if best_energy[b, k] > best_energy[b, row]:
             row = k
     for k in range(best_energy.shape[1]):
-        if best_energy[b, k] < 1.0e8 and unlikeness(problem, x, best[b, k]) < alike:
+        if best_energy[b, k] < 1.0e8 and state_difference(problem, x, best[b, k]) < alike:
             row = k
     if e < best_energy[b, row]:
         best[b, row] = x
@@ -351,7 +351,7 @@ def anneal(
             if acceptance(energy - e, t) > wp.randf(rng):
                 x = y
                 e = energy
-                remember(problem, b, x, e, alike_in, best_inout, best_energy_inout)
+                insert_best(problem, b, x, e, alike_in, best_inout, best_energy_inout)
             k += 1
     state_inout[b] = x
     energy_inout[b] = e

@@ -21,7 +21,7 @@ from pydantic import Field
 
 from graspd.baselines.autograsp import kernels as closing_kernels
 from graspd.baselines.autograsp.method import HandCloser
-from graspd.baselines.common import frame_along, grasp_set, ground_of, inside_points, search_of
+from graspd.baselines.common import cached_search, frame_along, grasp_set, inside_points, load_pair
 from graspd.baselines.graspit import kernels
 from graspd.baselines.graspit.kernels import FIRST_STEP
 from graspd.service.model.errors import InputError
@@ -33,7 +33,7 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners.fast_graspd.pairs import Pair
 from graspd.worker.planners.port import Method, Options, PlanRequest
-from graspd.worker.planners.threads import StepCounter, cut, run_parts
+from graspd.worker.planners.threads import StepCounter, run_parts, split_batch
 from graspd.worker.simulation.data import Data, HandState
 from graspd.worker.simulation.device import to_wxyz, to_xyzw
 from graspd.worker.simulation.model import body_points
@@ -121,8 +121,8 @@ class Graspit:
 
     def __call__(self, hand: HandModel, obj: ObjectModel, wanted: PlanRequest, run: ExecutionContext) -> GraspSet:
         began = time.perf_counter()
-        pair = ground_of(hand, obj, run.device, kernels, closing_kernels)
-        search = search_of(Search, pair)
+        pair = load_pair(hand, obj, run.device, kernels, closing_kernels)
+        search = cached_search(Search, pair)
         keep, moves = self.options.keep, self.options.steps - FIRST_STEP
         chains = -(-wanted.count // keep)
         steps = StepCounter(chains * moves, run)
@@ -132,7 +132,7 @@ class Graspit:
             state = search.run(seeds, steps=self.options.steps, keep=keep, tell=steps)
             return HandCloser(pair, len(state.pivot)).close(state).state
 
-        states = HandState.joined(run_parts(cut(chains, run), work))
+        states = HandState.joined(run_parts(split_batch(chains, run), work))
         return grasp_set(pair, states[: wanted.count], began, {"chains": chains, "moves": moves})
 
 
@@ -216,7 +216,7 @@ class Eigengrasps:
         return np.clip(self.origin + np.asarray(amplitudes) @ self.directions, hand.lower, hand.upper)
 
 
-def places(hand: HandModel) -> NDArray[np.int32]:
+def dof_ranks(hand: HandModel) -> NDArray[np.int32]:
     """Return (D,) numbers of closing dofs between each closing dof and the palm; -1 for other dofs."""
     moved = ancestors(hand)
     first = [int(np.flatnonzero(hand.dof == d)[0]) for d in range(hand.dofs)]
@@ -229,7 +229,7 @@ def places(hand: HandModel) -> NDArray[np.int32]:
 
 
 def eigengrasps(hand: HandModel) -> Eigengrasps:
-    place, closing = places(hand), np.asarray(hand.closing, float)
+    place, closing = dof_ranks(hand), np.asarray(hand.closing, float)
     closes = closing != 0
     if place.max() <= 0:
         directions = np.array([(~closes).astype(float), closing])

@@ -26,7 +26,7 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners.fast_graspd.planner import plan, plan_joined
 from graspd.worker.planners.fast_graspd.scene_starts import ROOM, clear_scene_starts
 from graspd.worker.planners.fast_graspd.starts import CLEAR, Probe
-from graspd.worker.planners.known_networks import keep_file, kept
+from graspd.worker.planners.network_cache import cache_file, load_network
 from graspd.worker.planners.port import BatchRequest, Method, Options, PlanRequest
 from graspd.worker.simulation.data import HandState
 from graspd.worker.simulation.environment import UP, Obstacle, PlacedGrasps
@@ -55,7 +55,7 @@ class LearnedPlanner:
         return plan_joined(hand, obj, asked, warm=self._seeds(hand))
 
     def _seeds(self, hand: HandModel) -> Seeds:
-        network = kept(self.options.network)
+        network = load_network(self.options.network)
         if network.joint_names != hand.joint_names or network.hand_digest != hand.digest:
             raise InputError(
                 f"network {self.options.network[:12]} proposes grasps of {network.hand} ({network.hand_digest[:12]}), "
@@ -74,7 +74,7 @@ METHOD: Final = Method(
     free=False,
     options=LearnedOptions,
     uses=tuple(name for name in Fidelity.model_fields if name not in ("name", "starts")),
-    files={"network": keep_file},
+    files={"network": cache_file},
 )
 
 #: Retreat steps along the approach for a hand in collision [m].

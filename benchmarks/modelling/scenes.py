@@ -20,7 +20,7 @@ from graspd.worker.planners import synthesize
 from graspd.worker.planners.port import PlanRequest
 from graspd.worker.scenes.clearance import MARGIN_M
 from graspd.worker.scenes.kinds import rest_poses, supports_of
-from graspd.worker.scenes.trajectory import Trajectory, plan_way
+from graspd.worker.scenes.trajectory import Trajectory, plan_trajectory
 from graspd.worker.simulation.environment import Obstacle, PlacedGrasps, Scenes
 from graspd.worker.validation.lift import Lift
 from graspd.worker.validation.model import MujocoOptions, Scene, build
@@ -56,7 +56,7 @@ class OnTable:
 
     @cached_property
     def way(self) -> Trajectory:
-        return plan_way(self.subject.hand, self.subject.obj, self.grasps, self.placed)
+        return plan_trajectory(self.subject.hand, self.subject.obj, self.grasps, self.placed)
 
     @cached_property
     def clear(self) -> tuple[GraspSet, PlacedGrasps]:
@@ -157,7 +157,7 @@ def slabs(tables: list[OnTable]) -> Row:
         with cpu() as clock:
             found = one.planned(on_slab)
         slab += clock.seconds
-        clear.append(plan_way(one.subject.hand, one.subject.obj, found, one.placed).clear)
+        clear.append(plan_trajectory(one.subject.hand, one.subject.obj, found, one.placed).clear)
     now = np.concatenate(clear)
     return {
         "cost_ratio": slab / half,

@@ -24,7 +24,7 @@ from graspd.worker.hands.surface import sample_surface
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.quality.table import measure
 from graspd.worker.simulation.environment import CLEAR_M, RISE_M, STANDOFF_M, UP, Environment, Obstacle, PlacedGrasps
-from graspd.worker.simulation.obstacles import obstacle_room
+from graspd.worker.simulation.obstacles import obstacle_clearance
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.lift import LiftOutcome
 from graspd.worker.validation.lifting import validate_lifts
@@ -60,7 +60,7 @@ def made_ready(hand: HandModel, proposed: Proposals, sight: Sight) -> Ready:
 
     How far the hand is to squeeze is no place where it will stand: the object is between.
     """
-    at_grasp = obstacle_room(hand, Posture(proposed.hand_pose, proposed.joints), [table()])
+    at_grasp = obstacle_clearance(hand, Posture(proposed.hand_pose, proposed.joints), [table()])
     first = _raised(proposed, CLEAR_M - at_grasp)
     opened, room = wider(hand, proposed.pregrasp, OPENED[0]), np.full(len(proposed), -np.inf)
     for share in OPENED:
@@ -70,7 +70,8 @@ def made_ready(hand: HandModel, proposed: Proposals, sight: Sight) -> Ready:
             room[tight] = _room_on_the_way(hand, part_of(first, tight), opened[tight])
     hands = _raised(first, CLEAR_M - room)
     lowest = np.minimum(
-        obstacle_room(hand, Posture(hands.hand_pose, hands.joints), [table()]), _room_on_the_way(hand, hands, opened)
+        obstacle_clearance(hand, Posture(hands.hand_pose, hands.joints), [table()]),
+        _room_on_the_way(hand, hands, opened),
     )
     clear = (lowest >= 0.5 * CLEAR_M) & _passes(hand, hands, opened, sight)
     return Ready(hands, opened, at_grasp < 0.0, clear)
@@ -127,7 +128,7 @@ def _room_on_the_way(hand: HandModel, hands: Proposals, opened: Floats) -> Float
     path = way_in(hands)
     n, steps = path.shape[:2]
     coming = Posture(path.reshape(-1, 7), np.repeat(opened, steps, axis=0))
-    return np.asarray(obstacle_room(hand, coming, [table()]).reshape(n, steps).min(axis=1))
+    return np.asarray(obstacle_clearance(hand, coming, [table()]).reshape(n, steps).min(axis=1))
 
 
 def _passes(hand: HandModel, hands: Proposals, opened: Floats, sight: Sight) -> NDArray[np.bool_]:

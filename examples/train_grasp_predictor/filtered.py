@@ -16,9 +16,9 @@ from graspd.service.store.shards import read_shard
 from graspd.worker.grasps import GraspSet, joined
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.scenes.trajectory import plan_way
+from graspd.worker.scenes.trajectory import plan_trajectory
 from graspd.worker.simulation.environment import PlacedGrasps
-from graspd.worker.simulation.obstacles import MARGIN_M, obstacle_room
+from graspd.worker.simulation.obstacles import MARGIN_M, obstacle_clearance
 
 #: Grasps whose way is planned at a time.
 _TOGETHER: Final = 32
@@ -94,12 +94,12 @@ def _to_be_proposed(scenes: Sequence[Scene], rows: Floats) -> TrainedModel:
 def _stands(free: GraspSet, order: NDArray[np.intp], pose: Floats, hand: HandModel) -> NDArray[np.bool_]:
     """(N,) whether the hand stands clear of the table at the grasp."""
     scene = PlacedGrasps(table().obstacles, pose[None], np.zeros(1, np.intp)).scenes
-    return np.asarray(obstacle_room(hand, free.grasp.take(order), list(scene)) >= MARGIN_M)
+    return np.asarray(obstacle_clearance(hand, free.grasp.take(order), list(scene)) >= MARGIN_M)
 
 
 def _on_their_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet, pose: Floats) -> GraspSet:
     """Those of the grasps whose way in and out is clear, with it."""
     placed = PlacedGrasps(table().obstacles, pose[None], np.zeros(len(grasps), np.intp))
-    way = plan_way(hand, obj, grasps, placed)
+    way = plan_trajectory(hand, obj, grasps, placed)
     found = replace(grasps, approach=way.approach, coming=way.open, lift=way.lift, scene=placed.index)
     return found.take(np.flatnonzero(way.clear))

@@ -44,13 +44,13 @@ class Bundle:
             return self.carrier.arm.model.root_link
         return "scene" if self.found.placed is not None else plain_name(self.found.obj.name)
 
-    def seen(self, pose: Floats) -> Floats:
+    def to_frame(self, pose: Floats) -> Floats:
         """Return poses (..., 7) in the frame `frame`."""
         return np.asarray(pose, float) if self.carrier is None else compose(invert(self.carrier.base), pose)
 
-    def seen_tool(self, root_pose: Floats) -> Floats:
+    def tool_in_frame(self, root_pose: Floats) -> Floats:
         """Return poses (..., 7) of the tool frame in the frame `frame`, from those of the hand's root link."""
-        return self.seen(compose(root_pose, self.found.tool.pose))
+        return self.to_frame(compose(root_pose, self.found.tool.pose))
 
     @property
     def prims(self) -> tuple[str, str]:
@@ -62,7 +62,7 @@ class Bundle:
         return f"grasp_{self.found.rows[row]:04}"
 
     @property
-    def steered(self) -> list[int]:
+    def commanded_joints(self) -> list[int]:
         """Columns of the hand's commanded joints: those that the URDF does not couple to others."""
         names = self.found.hand.joint_names
         return [k for k, name in enumerate(names) if name not in self.description.mimics]

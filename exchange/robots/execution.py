@@ -20,7 +20,7 @@ from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel, JointType
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.scenes.trajectory import plan_free_way
+from graspd.worker.scenes.trajectory import plan_free_trajectory
 from graspd.worker.simulation.environment import STANDOFF_M, PlacedGrasps
 
 #: Postures of a grasp in order. The open hand moves from `standoff` to `arrival`, takes the shape of `pregrasp`, closes
@@ -100,7 +100,7 @@ def executions(
     frame, at = "object", np.tile(IDENTITY_POSE, (len(grasps), 1))
     free = np.ones(len(grasps), bool)
     if placed is None or grasps.approach is None or grasps.coming is None or grasps.lift is None:
-        way = plan_free_way(hand, obj, grasps)
+        way = plan_free_trajectory(hand, obj, grasps)
         free, coming = ~way.touching, way.open
         ends, lift = (way.approach[:, 0], way.approach[:, -1]), way.lift
     else:
@@ -247,7 +247,7 @@ def straight_paths(found: Executions, row: int, points: int = 2) -> list[Path]:
     return paths
 
 
-def timed(paths: Sequence[Path], names: Sequence[str], velocity: Floats, *, speed: float) -> RobotTrajectory:
+def time_motions(paths: Sequence[Path], names: Sequence[str], velocity: Floats, *, speed: float) -> RobotTrajectory:
     """Time the motions in sequence, each at rest at both ends; each starts at the end of the previous one.
     `speed` is the used share of the limits `velocity` (J,) [rad/s or m/s] and of the hand's limits; above 0, at most
     1."""

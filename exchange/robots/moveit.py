@@ -35,10 +35,10 @@ def write(bundle: Bundle, folder: Path, hand_files: Mapping[str, bytes]) -> list
 def _grasp(bundle: Bundle, row: int) -> dict[str, Any]:
     found = bundle.found
     postures = found.postures
-    names = [found.hand.joint_names[k] for k in bundle.steered]
+    names = [found.hand.joint_names[k] for k in bundle.commanded_joints]
 
     def point(posture: str, seconds: float, effort: Floats | None = None) -> dict[str, Any]:
-        return _point(postures[posture].joint_positions[row, bundle.steered], seconds, effort=effort)
+        return _point(postures[posture].joint_positions[row, bundle.commanded_joints], seconds, effort=effort)
 
     # End of each motion: the last time with its name.
     times = dict(zip(bundle.trajectories[row].phase, bundle.trajectories[row].time, strict=True))
@@ -49,9 +49,12 @@ def _grasp(bundle: Bundle, row: int) -> dict[str, Any]:
         "id": bundle.name(row),
         "pre_grasp_posture": _joint_trajectory(bundle, names, [point("pregrasp", times["shape"] - times["approach"])]),
         "grasp_posture": _joint_trajectory(
-            bundle, names, [point("grasp", closing), point("squeeze", squeezing, press[bundle.steered])]
+            bundle, names, [point("grasp", closing), point("squeeze", squeezing, press[bundle.commanded_joints])]
         ),
-        "grasp_pose": {"header": _header(bundle), "pose": _pose(bundle.seen_tool(postures["grasp"].hand_pose[row]))},
+        "grasp_pose": {
+            "header": _header(bundle),
+            "pose": _pose(bundle.tool_in_frame(postures["grasp"].hand_pose[row])),
+        },
         "grasp_quality": numbers(found.quality["epsilon"][row])[0],
         "pre_grasp_approach": _translation(bundle, row, "standoff", "arrival"),
         "post_grasp_retreat": _translation(bundle, row, "squeeze", "lift"),
@@ -71,7 +74,7 @@ def _pose(pose: Floats) -> dict[str, Any]:
 
 
 def _translation(bundle: Bundle, row: int, start: str, end: str) -> dict[str, Any]:
-    a, b = (bundle.seen_tool(bundle.found.postures[name].hand_pose[row])[:3] for name in (start, end))
+    a, b = (bundle.tool_in_frame(bundle.found.postures[name].hand_pose[row])[:3] for name in (start, end))
     length = float(np.linalg.norm(b - a))
     x, y, z = numbers((b - a) / length)
     return {
@@ -111,7 +114,7 @@ def _trajectory(bundle: Bundle, path: RobotTrajectory) -> dict[str, Any]:
         for joints, time, rate in zip(path.joints, path.time, path.velocity, strict=True)
     ]
     ways = []
-    for pose, time in zip(map(_pose, bundle.seen_tool(path.hand_pose)), path.time, strict=True):
+    for pose, time in zip(map(_pose, bundle.tool_in_frame(path.hand_pose)), path.time, strict=True):
         transform = {"translation": pose["position"], "rotation": pose["orientation"]}
         empty: dict[str, list[float]] = {"velocities": [], "accelerations": []}
         ways.append({"transforms": [transform], **empty, "time_from_start": _duration(time)})

@@ -44,9 +44,11 @@ def write(bundle: Bundle, folder: Path) -> list[Path]:
         number = scene.model.geom(geom.attrib["name"]).id
         geom.set("user", element_text([scene.tip_geoms[number], scene.pressing[number]]))
     site = {"name": "object_frame", "pos": element_text(-scene.centre), "size": "0.002", "group": "4"}
-    SubElement(one(tree, ".//body[@name='object']"), "site", site)
+    SubElement(only_element(tree, ".//body[@name='object']"), "site", site)
     _settle(tree, found)
-    dress(tree, found, ("body0", "object", "supports", *(f"neighbour{k}" for k in range(len(scene.neighbours)))))
+    add_appearance(
+        tree, found, ("body0", "object", "supports", *(f"neighbour{k}" for k in range(len(scene.neighbours))))
+    )
     keys = SubElement(tree, "keyframe")
     for row, posture in product(range(len(found)), POSTURES):
         SubElement(keys, "key", {"name": f"{bundle.name(row)}/{posture}", **_key(found, scene, posture, row)})
@@ -74,7 +76,7 @@ def _restore_digits(tree: Element, spec: Any) -> None:
 
 def _settle(tree: Element, found: Executions) -> None:
     """Fix supports in the world; set gravity as in the lift test, on the object alone."""
-    option = one(tree, "option")
+    option = only_element(tree, "option")
     support = tree.find(".//body[@name='supports']")
     if support is not None:
         support.attrib.pop("mocap", None)
@@ -82,20 +84,20 @@ def _settle(tree: Element, found: Executions) -> None:
         option.set("gravity", "0 0 0")
     else:
         option.set("gravity", f"0 0 {-ACCELERATION:g}")
-        for body in one(tree, ".//body[@name='body0']").iter("body"):
+        for body in only_element(tree, ".//body[@name='body0']").iter("body"):
             body.set("gravcomp", "1")
     flag = option.find("flag")
     if flag is not None:
         flag.attrib.pop("gravity", None)
 
 
-def dress(tree: Element, found: Executions, names: tuple[str, ...]) -> None:
+def add_appearance(tree: Element, found: Executions, names: tuple[str, ...]) -> None:
     """Add colours of hand, object and neighbours (`names`), light and a camera; physics stays the same."""
     for name, colour in zip_longest(names, _COLOURS[: len(names)], fillvalue=_COLOURS[-1]):
         for body in tree.findall(f".//body[@name='{name}']"):
             for geom in body.iter("geom"):
                 geom.set("rgba", colour)
-    world, size = one(tree, "worldbody"), 2 * found.obj.radius + 0.3
+    world, size = only_element(tree, "worldbody"), 2 * found.obj.radius + 0.3
     middle = found.object_pose[0, :3]
     above = element_text(middle + np.array([0.5, -0.5, 2.0]))
     world.insert(0, Element("light", pos=above, dir="-0.25 0.25 -1", diffuse="0.9 0.9 0.9"))
@@ -145,7 +147,7 @@ def rename(tree: Element, names: Mapping[str, str]) -> None:
             element.attrib.update({key: names[text] for key, text in element.attrib.items() if text in names})
 
 
-def one(tree: Element, path: str) -> Element:
+def only_element(tree: Element, path: str) -> Element:
     found = tree.find(path)
     assert found is not None, path
     return found
@@ -161,10 +163,10 @@ def _write_arm(bundle: Bundle, folder: Path) -> list[Path]:
         return []
     tree = ElementTree.fromstring(carrier.world.spec.to_xml())
     tree.set("model", f"{carrier.arm.model.name} with {bundle.found.hand.name}")
-    dress(tree, bundle.found, ("hand0", "object"))
+    add_appearance(tree, bundle.found, ("hand0", "object"))
     for geom in tree.iterfind("./worldbody/geom"):
         geom.set("rgba", "0.75 0.75 0.72 1")
-    for geom in one(tree, ".//body[@name='arm0']").iter("geom"):
+    for geom in only_element(tree, ".//body[@name='arm0']").iter("geom"):
         if "rgba" not in geom.attrib:
             geom.set("rgba", "0.85 0.85 0.87 1")
     _add_arm_keys(tree, bundle, carrier)

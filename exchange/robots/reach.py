@@ -290,7 +290,7 @@ class ArmScene:
         for k, support in enumerate(supports):
             add_support(self.spec, self.spec.worldbody.add_geom(name=f"support{k}", **_OTHER), support)
         self.spec.add_exclude(bodyname1=f"arm{arm.mount_body}", bodyname2="hand0")
-        self._exclude_what_always_touches()
+        self._exclude_permanent_contacts()
         self.model: Any = self.spec.compile()
         self.data: Any = mujoco.MjData(self.model)
         self.arm_qpos = _addresses(self.model, arm.model, "arm")
@@ -304,10 +304,10 @@ class ArmScene:
         mujoco.mj_collision(self.model, self.data)
         for contact in self.data.contact:
             if contact.dist < 0:
-                return " and ".join(self._told(int(geom)) for geom in contact.geom)
+                return " and ".join(self._geom_label(int(geom)) for geom in contact.geom)
         return ""
 
-    def _told(self, geom: int) -> str:
+    def _geom_label(self, geom: int) -> str:
         body = self.model.body(int(self.model.geom_bodyid[geom])).name
         for prefix, names in (("arm", self.arm.model.body_names), ("hand", self.hand.body_names)):
             if body.startswith(prefix):
@@ -318,7 +318,7 @@ class ArmScene:
         data.qpos[_addresses(model, self.arm.model, "arm")] = self.arm.model.expand(arm_joints)
         data.qpos[_addresses(model, self.hand, "hand")] = hand_joints
 
-    def _exclude_what_always_touches(self) -> None:
+    def _exclude_permanent_contacts(self) -> None:
         """Exclude body pairs in contact in nearly all random postures, as in MoveIt's setup."""
         model = self.spec.compile()
         data, rng = mujoco.MjData(model), np.random.default_rng(0)

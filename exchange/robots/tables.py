@@ -44,7 +44,7 @@ def _grasps(bundle: Bundle) -> Iterable[list[Any]]:
         scene = "" if found.placed is None else int(found.placed.index[row])
         place = [bundle.name(row), int(found.rows[row]), bundle.frame, found.tool.name, scene]
         verdicts = [int(found.quality[name][row]) for name in ("valid", "success")]
-        pose = numbers(bundle.seen(found.object_pose[row]))
+        pose = numbers(bundle.to_frame(found.object_pose[row]))
         yield [*place, *verdicts, *numbers(found.quality["epsilon"][row]), *pose]
 
 
@@ -52,13 +52,13 @@ def _postures(bundle: Bundle) -> Iterable[list[Any]]:
     for row in range(len(bundle.found)):
         for name in POSTURES:
             part = bundle.found.postures[name]
-            pose = bundle.seen_tool(part.hand_pose[row])
+            pose = bundle.tool_in_frame(part.hand_pose[row])
             yield [bundle.name(row), name, *numbers(pose), *numbers(part.joint_positions[row])]
 
 
 def _trajectories(bundle: Bundle) -> Iterable[list[Any]]:
     for row, path in enumerate(bundle.trajectories):
-        poses = bundle.seen_tool(path.hand_pose)
+        poses = bundle.tool_in_frame(path.hand_pose)
         for phase, time, pose, joints in zip(path.phase, path.time, poses, path.joints, strict=True):
             yield [bundle.name(row), phase, *numbers(time), *numbers(pose), *numbers(joints)]
 
@@ -101,7 +101,7 @@ def _grasp(bundle: Bundle, row: int) -> dict[str, Any]:
 
     def joints(posture: str) -> dict[str, float]:
         values = numbers(found.postures[posture].joint_positions[row])
-        return {found.hand.joint_names[k]: values[k] for k in bundle.steered}
+        return {found.hand.joint_names[k]: values[k] for k in bundle.commanded_joints}
 
     return {
         "confidence": 1.0 if found.quality["valid"][row] else 0.0,

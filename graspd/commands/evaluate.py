@@ -19,8 +19,8 @@ from graspd.service.store.shards import carried_attributes, json_attribute, read
 from graspd.studies.evaluation import Protocol, combine, evaluate
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.files.subsets import require_empty
+from graspd.worker.hands.hand_matching import TOLERANCE_M, match_hands
 from graspd.worker.hands.load import hand_from_path
-from graspd.worker.hands.same_hand import TOLERANCE_M, same_hand
 from graspd.worker.validation.key import Level
 from graspd.worker.validation.lifting import LiftLevel
 from graspd.worker.validation.robust import Robustness
@@ -115,7 +115,7 @@ def evaluate_command(
                 )
             twin = None
             if other is not None:
-                twin = same_hand(case.hand, other, twins, tolerance_m=validation_tolerance / 1e3)
+                twin = match_hands(case.hand, other, twins, tolerance_m=validation_tolerance / 1e3)
             row = evaluate(
                 case,
                 protocol=protocol,  # type: ignore[arg-type]

@@ -11,7 +11,7 @@ import numpy as np
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from graspd.exchange.opening import opened
+from graspd.exchange.opening import check_written_files
 from graspd.exchange.plan import ExportSummary
 from graspd.service.cli import CommandGroup, DataDir, JsonFlag, load_settings, plain_console, report
 from graspd.service.model.errors import InputError, one_of
@@ -19,7 +19,7 @@ from graspd.service.store import validity
 from graspd.service.store.shards import read_shard
 from graspd.service.store.store import open_store
 from graspd.worker.execution_context import ExecutionContext
-from graspd.worker.files.subsets import EveryOption, UnvalidatedOption, choose
+from graspd.worker.files.subsets import EveryOption, UnvalidatedOption, select_grasps
 
 app = CommandGroup(no_args_is_help=True)
 
@@ -77,7 +77,7 @@ def export(
         raise InputError(f"there is no export format {format_!r}; choose one of {one_of(format_, EXPORTS)}")
     if depth not in ("exr", "png"):
         raise InputError(f"there is no depth format {depth!r}; use exr or png")
-    with opened(output):
+    with check_written_files(output):
         if format_ in ROBOTS:
             from graspd.exchange.robot_export import RobotExportOptions, export_grasps
 
@@ -216,7 +216,7 @@ def _bench(
     from graspd.exchange.inputs import load_case
 
     case = load_case(source, hand=hand, obj=obj)
-    mask, _ = choose(read_shard(source, kind="base"), unvalidated=unvalidated, every=every)
+    mask, _ = select_grasps(read_shard(source, kind="base"), unvalidated=unvalidated, every=every)
     rows = np.flatnonzero(mask)
     written = dexgraspbench.write(case.hand, case.obj, case.grasps, rows.tolist(), output, case.placed)
     return ExportSummary({"grasps": len(written), "files": len(written)})

@@ -17,7 +17,7 @@ from graspd.exchange.robots.execution import (
     executions,
     hand_limits,
     straight_paths,
-    timed,
+    time_motions,
     tool_frame,
 )
 from graspd.service.model.scene_spec import SceneSpec, supports_in
@@ -25,7 +25,7 @@ from graspd.service.model.transforms import compose, invert
 from graspd.service.readers.trajectories import Waypoint, scene_spec_of, trajectory_of, wrists_of
 from graspd.service.store.shards import Shard
 from graspd.worker.execution_context import ExecutionContext
-from graspd.worker.files.provenance import neighbours_of_shard, placed_of_shard
+from graspd.worker.files.provenance import neighbours_of_shard, scenes_of_shard
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
@@ -37,7 +37,7 @@ from graspd.worker.rendering.trajectory_pictures import (
     PictureScenes,
     animation,
     animation_kind,
-    way_pictures,
+    trajectory_pictures,
 )
 
 Kind = Literal["one side", "three sides", "way"]
@@ -102,7 +102,9 @@ class GraspSheet:
 
     def _render(self, frames: list[list[Waypoint]], sides: int) -> NDArray[np.uint8]:
         around, samples = surroundings_of(self.shard, self.rows), LOOKS[self.kind][1]
-        return way_pictures(self.hand, self.obj, frames, around, self.size, sides=sides, run=self.run, samples=samples)
+        return trajectory_pictures(
+            self.hand, self.obj, frames, around, self.size, sides=sides, run=self.run, samples=samples
+        )
 
 
 def surroundings_of(shard: Shard, rows: NDArray[np.intp]) -> PictureScenes:
@@ -155,7 +157,7 @@ class GraspAnimation:
         for row in self.rows:
             found = self._execute(row)
             limits, names = hand_limits(found.hand), found.hand.joint_names
-            way = timed(straight_paths(found, 0), names, limits.velocity, speed=SPEED)
+            way = time_motions(straight_paths(found, 0), names, limits.velocity, speed=SPEED)
             pictures.append(self._render(row, waypoints(found, way)))
             shown = [STEP_S, *np.diff(way.time).tolist()]
             shown[0] += BEFORE_S
@@ -164,7 +166,7 @@ class GraspAnimation:
         return animation(np.concatenate(pictures), seconds, suffix)
 
     def _execute(self, row: np.intp) -> Executions:
-        one, placed = np.array([row]), placed_of_shard(self.shard)
+        one, placed = np.array([row]), scenes_of_shard(self.shard)
         grasps = GraspSet.from_columns(self.shard.arrays).take(one)
         placed = None if placed is None else placed.take(one)
         tool = tool_frame(None, self.hand.root_link, {})
@@ -174,7 +176,7 @@ class GraspAnimation:
         width = self.width or WIDTH
         around = surroundings_of(self.shard, np.array([row]))
         size = (width, round(HIGH * width))
-        (sides,) = way_pictures(
+        (sides,) = trajectory_pictures(
             self.hand, self.obj, [way], around, size, whole=True, run=self.run, samples=FILM_SAMPLES
         )
         return np.asarray(sides[0])

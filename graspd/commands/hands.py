@@ -73,10 +73,10 @@ def check(
 
 
 def _self_test(file: str, options: dict[str, Any], *, quiet: bool) -> dict[str, Any]:
-    from graspd.worker.stages.hand_self_test import tried_softly
+    from graspd.worker.stages.hand_self_test import self_test_facts
 
     with _bar("self-test   ", "starting; the first run on a machine compiles its kernels", quiet=quiet) as run:
-        return tried_softly(lambda: hand_from_path(file, options), run)
+        return self_test_facts(lambda: hand_from_path(file, options), run)
 
 
 @contextmanager

@@ -31,11 +31,11 @@ from graspd.worker.files.provenance import (
     INHERITED,
     hand_of_shard,
     id_of_columns,
-    made_of,
     neighbours_of_shard,
     object_of_shard,
+    source_attributes,
 )
-from graspd.worker.files.subsets import EveryOption, UnvalidatedOption, choose
+from graspd.worker.files.subsets import EveryOption, UnvalidatedOption, select_grasps
 from graspd.worker.rendering.annotate import parse_channels
 from graspd.worker.rendering.cameras import BASELINE_M, SAMPLED, read_cameras
 from graspd.worker.rendering.hands import DrawnHand
@@ -115,7 +115,7 @@ def render(
     seconds = perf_counter() - started
     inherited = (*INHERITED, "neighbours", "neighbour_digests", "neighbour_sources")
     kept = {key: scene.attributes[key] for key in (*inherited, "scene") if key in scene.attributes}
-    kept |= made_of(scene) | {"seed": number, "device": used, "seconds": round(seconds, 4)}
+    kept |= source_attributes(scene) | {"seed": number, "device": used, "seconds": round(seconds, 4)}
     write_output(output, write_shard("views", result, {**kept, "shard_id": id_of_columns(result)}))
     count = len(result["image/rgb"])
     if page is not None:
@@ -166,7 +166,7 @@ def pictures(
     if animate:
         animation_kind(output.suffix)
     base = read_shard(grasps, kind="base")
-    chosen, word = choose(base, unvalidated=unvalidated, every=every)
+    chosen, word = select_grasps(base, unvalidated=unvalidated, every=every)
     if row:
         rows = _named_rows(base, row, chosen, word)
     else:

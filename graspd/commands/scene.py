@@ -14,11 +14,11 @@ from graspd.service.store.shards import read_shard, write_shard
 from graspd.worker.files.provenance import (
     INHERITED,
     NEIGHBOUR_FACE_ERROR_M,
-    beside_attributes,
     hand_of_shard,
     id_of_columns,
-    made_of,
+    neighbour_attributes,
     object_of_shard,
+    source_attributes,
     wrist_attributes,
 )
 from graspd.worker.grasps import Posture
@@ -62,8 +62,8 @@ def scene(
     seconds = perf_counter() - started
     attributes: dict[str, Attribute] = {key: base.attributes[key] for key in INHERITED if key in base.attributes}
     attributes |= {"seed": number, "device": "cpu", "seconds": round(seconds, 4)}
-    attributes |= wrist_attributes(model) | beside_attributes(others, with_ or [])
-    attributes |= made_of(base) | {"shard_id": id_of_columns(result)}
+    attributes |= wrist_attributes(model) | neighbour_attributes(others, with_ or [])
+    attributes |= source_attributes(base) | {"shard_id": id_of_columns(result)}
     write_output(output, write_shard("scene", result, attributes))
     clear, total = int(result["grasp/valid"].sum()), len(result["grasp/valid"])
     rolling = rolling_poses(obj, poses)

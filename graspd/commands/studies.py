@@ -228,14 +228,14 @@ def chart(
     """Compare speed and accuracy: methods and fidelities on the same hands and objects, in MuJoCo."""
     from graspd.studies.chart.chart import settings_of
     from graspd.studies.chart.report import write
+    from graspd.studies.chart.sweeps import knob_values
     from graspd.studies.chart.sweeps import sweep as turn
-    from graspd.studies.chart.sweeps import turns
     from graspd.worker.hands.load import hand_from_path
 
     if source is not None:
         _finish(_read_chart(source), out, data_dir, publish=publish, json=json)
         return
-    turns(knobs=knob or ())  # Report a wrong name before an hour of work.
+    knob_values(knobs=knob or ())  # Report a wrong name before an hour of work.
     if scene != "free" and sweep:
         raise InputError("--sweep is for charts of free objects; omit --scene")
     place = _place(scene)

@@ -49,7 +49,7 @@ def synth(
     Exit code 3: fewer grasps than requested. Ctrl-C saves the validated ones.
     """
     from graspd.worker.files.provenance import id_of_columns  # Help and completion need no engine.
-    from graspd.worker.files.synthesis import synthesized_as
+    from graspd.worker.files.synthesis import synthesize_with
 
     if not out.parent.is_dir():
         raise InputError(f"the folder {out.parent} does not exist; create it or choose another --out")
@@ -62,7 +62,7 @@ def synth(
     settings = engine_settings()
     with catch_stop_signals() as stop, _bar(quiet=json) as progress:
         try:
-            made = synthesized_as(
+            made = synthesize_with(
                 hand,
                 object_,
                 asked,

@@ -89,7 +89,7 @@ def kernels(
 
     backend.start()
     architectures = (arch or backend.ARCHITECTURES) if cuda else ()
-    files = backend.bake(backend.modules(), architectures=architectures, cpu=cpu)
+    files = backend.compile_modules(backend.modules(), architectures=architectures, cpu=cpu)
     size = sum(file.stat().st_size for file in files)
     made = {"folder": str(folder), "files": len(files), "bytes": size, "architectures": list(architectures), "cpu": cpu}
     line = f"{len(files)} kernel files, {size / 1e6:.1f} MB, in {folder}; GRASPD_KERNELS={folder.resolve()}"

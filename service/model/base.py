@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from typing import Annotated, Any, Final, get_args, get_origin
@@ -111,3 +112,12 @@ def first_line(error: BaseException) -> str:
 def error_text(error: Exception) -> str:
     """Return a library's message about a file; for a system error, its text without number and path."""
     return getattr(error, "strerror", None) or str(error)
+
+
+def json_value(value: Any) -> Any:
+    """Return a nested value for JSON, with None for nan and infinity."""
+    if isinstance(value, dict):
+        return {str(key): json_value(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [json_value(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -243,15 +243,11 @@ class NamedNeighbour(NeighbourSpec):
     object: Name = Field(description="name of an object known to the service")
 
 
-def _as_neighbour(value: str | NamedNeighbour) -> NamedNeighbour:
-    return NamedNeighbour(object=value) if isinstance(value, str) else value
-
-
 #: Neighbour in a request: a name, or a name with a pose.
 BesideOption = Annotated[
     Annotated[Name, Tag("name")] | Annotated[NamedNeighbour, Tag("neighbour")],
     Discriminator(lambda value: "name" if isinstance(value, str) else "neighbour"),
-    AfterValidator(_as_neighbour),
+    AfterValidator(lambda value: NamedNeighbour(object=value) if isinstance(value, str) else value),
 ]
 
 
@@ -277,14 +273,10 @@ class SceneDocument(Model):
     )
 
 
-def _form(value: object) -> str:
-    return "document" if isinstance(value, dict | SceneDocument) else "kind"
-
-
 #: Scene in a request: a kind or a document, discriminated so that errors refer to the intended form.
 SceneOption = Annotated[
     Annotated[Literal["free", "table", "bin", "shelf"], Tag("kind")] | Annotated[SceneDocument, Tag("document")],
-    Discriminator(_form),
+    Discriminator(lambda value: "document" if isinstance(value, dict | SceneDocument) else "kind"),
 ]
 
 

@@ -10,6 +10,8 @@ from typing import Annotated, Any, Final, Literal
 
 from pydantic import BeforeValidator, TypeAdapter
 
+from graspd.service.model.base import json_value
+
 Outcome = Literal["good", "weak", "broken", "refused"]
 
 #: Outcomes from best to worst; `refused`: a check rejected the input before the computation.
@@ -95,12 +97,21 @@ class Stability:
 
     def as_json(self) -> dict[str, Any]:
         """Return a JSON object with None for numbers that JSON lacks; `from_json` reads None as nan."""
-        return dict(_plain(asdict(self)))
+        return dict(json_value(asdict(self)))
 
 
 def from_json(record: Mapping[str, Any]) -> Stability:
     """Read a record of `as_json`; ValueError if it is invalid."""
     return _RECORD.validate_python(record)
+
+
+def pareto(points: Sequence[tuple[float, float]]) -> set[int]:
+    """Return indices of points (more, more) that no other point dominates: as good in both, better in one."""
+    return {
+        index
+        for index, (x, y) in enumerate(points)
+        if not any((a >= x and b >= y) and (a > x or b > y) for a, b in points)
+    }
 
 
 def counts(cells: Iterable[MapCell]) -> dict[Outcome, int]:
@@ -151,14 +162,6 @@ def _exponent(text: str) -> str:
         return min(text, shorter, key=len)
     mantissa, exponent = text.split("e")
     return f"{mantissa}e{int(exponent)}"
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(part) for key, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(part) for part in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 _RECORD: Final = TypeAdapter(Stability)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import math
 from collections.abc import Mapping
 from typing import Any, Final, Literal
 
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from graspd.service.model import names
-from graspd.service.model.base import Digest
+from graspd.service.model.base import Digest, json_value
 from graspd.service.model.clock import timestamp
 from graspd.service.model.domain import JobRequest, batches_of
 from graspd.service.model.messages import TaskMessage
@@ -168,7 +167,7 @@ def _summaries(
     at = int(np.argmin(np.abs(thresholds - INDEX_THRESHOLD_M)))
     count = len(arrays["quality/valid"])
     columns: dict[str, list[Any]] = {
-        metric.name: _numbers(arrays[metric.path][:, at] if metric.swept else arrays[metric.path])
+        metric.name: json_value(np.asarray(arrays[metric.path], float)[(..., at) if metric.swept else ...].tolist())
         for metric in indexed()
         if not metric.optional or metric.path in arrays
     }
@@ -209,10 +208,6 @@ def rebuild_manifest(said: Mapping[str, Any], data: bytes) -> ShardManifest:
     shard = read_shard(data, without=pictures, name=said["key"])
     told = {"sha256": hashlib.sha256(data).hexdigest(), "size_bytes": len(data)}
     return ShardManifest.model_validate({**said, **told, **_contents(said["kind"], shard.arrays, shard.attributes)})
-
-
-def _numbers(values: NDArray[Any]) -> list[float | None]:
-    return [float(v) if math.isfinite(v) else None for v in values]
 
 
 def _verdict(value: int) -> bool | None:

@@ -107,11 +107,11 @@ def with_provenance(contents: Contents, file: Path) -> Contents:
         raise InputError(f"{file} cannot be read: {error.strerror}") from None
     except (ValueError, AttributeError, TypeError):
         raise InputError(f'{file} is not as {{"objects": {{"mug": {{"licence": "...", "source": "..."}}}}}}') from None
-    hands, objects = (_informed(getattr(contents, kind), said, file) for kind, said in groups.items())
+    hands, objects = (_with_facts(getattr(contents, kind), said, file) for kind, said in groups.items())
     return replace(contents, hands=hands, objects=objects)
 
 
-def _informed(
+def _with_facts(
     assets: Mapping[str, AssetFacts], said: Mapping[str, Mapping[str, Any]], file: Path
 ) -> dict[str, AssetFacts]:
     if unknown := set(said) - set(assets) - {"*"}:
@@ -235,7 +235,7 @@ def pieces(contents: Contents) -> Iterator[ShardContents]:
 
 def _piece(contents: Contents, file: ShardFile, size: int | None) -> ShardContents:
     manifest = _manifest(contents, file)
-    unopened = None if manifest is None else _unopened(file, manifest)
+    unopened = None if manifest is None else _unread_shard(file, manifest)
     if unopened is not None and file.kind == "views":
         return unopened
     path = contents.shards.path(file)
@@ -259,7 +259,7 @@ def _manifest(contents: Contents, file: ShardFile) -> ShardManifest | None:
         return None
 
 
-def _unopened(file: ShardFile, manifest: ShardManifest) -> ShardContents:
+def _unread_shard(file: ShardFile, manifest: ShardManifest) -> ShardContents:
     copied = ("seconds", "device", "worker", "seed", "created", "code_version")
     said: dict[str, Any] = {name: getattr(manifest, name) for name in copied}
     said |= {

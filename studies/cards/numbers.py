@@ -43,7 +43,7 @@ def numbers(contents: Contents, tally: Tally, *, licence: str = "", source: str 
         "graspd": PACKAGE_VERSION,
         "snapshot": taken and {"digest": taken.digest, "created": taken.created, "complete": taken.complete},
         "composition": _composition(contents, tally, whole),
-        "making": _making(contents, tally, whole),
+        "making": _provenance(contents, tally, whole),
         "validity": {**_validity(whole), "by_hand": {hand: _validity(tally.of_hand(hand)) for hand in contents.hands}},
         "quality": {hand: _quality(tally.of_hand(hand)) for hand in contents.hands},
         "contact_threshold_m": next((value for value, _ in tally.threshold_m.most_common(1)), None),
@@ -94,25 +94,25 @@ def _asset(asset: AssetFacts, cell: CellTally, kind: AssetKind) -> Row:
     return {**known, **{key: facts.get(key) for key in ("extents_m", "volume_m3", "mass_kg", "faces")}, **counts}
 
 
-def _making(contents: Contents, tally: Tally, whole: CellTally) -> Row:
+def _provenance(contents: Contents, tally: Tally, whole: CellTally) -> Row:
     valid = whole.n["valid"]
     total = sum(tally.seconds.values())
-    scenes = [_knobs(text) for text in _said(tally, "scene")]
+    scenes = [_parse_scene(text) for text in _distinct_values(tally, "scene")]
     return {
-        "methods": _said(tally, "method"),
-        "fidelities": [_knobs(text) for text in _said(tally, "fidelity")],
-        "levels": _said(tally, "verdict_level"),
+        "methods": _distinct_values(tally, "method"),
+        "fidelities": [_parse_scene(text) for text in _distinct_values(tally, "fidelity")],
+        "levels": _distinct_values(tally, "verdict_level"),
         "verdict_keys": len(tally.values.get("verdict_key", {})),
         "scenes": sorted({str(spec.get("kind", "")) for spec in scenes} - {"", "free"}),
         "neighbours": sorted({str(one.get("object", "")) for spec in scenes for one in spec.get("neighbours") or ()}),
-        "wants": _said(tally, "want"),
-        "seeds": _said(tally, "seed"),
-        "friction": _said(tally, "mu"),
-        "devices": _said(tally, "device"),
+        "wants": _distinct_values(tally, "want"),
+        "seeds": _distinct_values(tally, "seed"),
+        "friction": _distinct_values(tally, "mu"),
+        "devices": _distinct_values(tally, "device"),
         "workers": len(tally.values.get("worker", {})) or None,
-        "code_versions": _said(tally, "code_version"),
+        "code_versions": _distinct_values(tally, "code_version"),
         "revisions": {kind: sorted(counts) for kind, counts in tally.revisions.items()},
-        "imported_from": _said(tally, "source"),
+        "imported_from": _distinct_values(tally, "source"),
         "options": contents.record.options.model_dump(mode="json") if contents.record else None,
         "first_shard": tally.created[0] if tally.created else None,
         "last_shard": tally.created[-1] if tally.created else None,
@@ -122,11 +122,11 @@ def _making(contents: Contents, tally: Tally, whole: CellTally) -> Row:
     }
 
 
-def _said(tally: Tally, name: str) -> list[Any]:
+def _distinct_values(tally: Tally, name: str) -> list[Any]:
     return sorted(tally.values.get(name, {}))
 
 
-def _knobs(text: str) -> Any:
+def _parse_scene(text: str) -> Any:
     try:
         return from_json(text)
     except ValueError:

@@ -65,7 +65,7 @@ def chart(
                     cell.repeat()
                     cell.time_first(cell.setting.run.cores)
             for cell in cells:
-                cell.scrutinise(models)
+                cell.validate_strictly(models)
                 runs.append(_row(cell, hand, thing))
                 say(_line(runs[-1]))
             keep(_result(runs, settings, models))

@@ -6,7 +6,7 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.kernel
-def forget(
+def clear_contacts(
     # Data in:
     active_in: wp.array(dtype=wp.int32),
     # Data out:

@@ -36,7 +36,7 @@ from graspd.worker.quality.intervals import wilson, wilson_of_mean
 from graspd.worker.quality.table import measure
 from graspd.worker.scenes.kinds import rest_poses, supports_of
 from graspd.worker.scenes.rollout import lift_rollout
-from graspd.worker.scenes.trajectory import plan_way
+from graspd.worker.scenes.trajectory import plan_trajectory
 from graspd.worker.simulation.environment import PlacedGrasps, Scenes
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.lifting import validate_lifts
@@ -99,14 +99,14 @@ def scene_chart(
     for thing in things:
         place = ObjectScenes(thing, spec)
         for hand in hands:
-            for setting, way in _ways(settings):
-                runs.append(_kept(setting, way, hand, place, models, work))
+            for setting, way in _planning_modes(settings):
+                runs.append(_cached_result(setting, way, hand, place, models, work))
                 say(_line(runs[-1]))
             keep(_result(runs, settings, spec, models))
     return _result(runs, settings, spec, models)
 
 
-def _ways(settings: Sequence[Setting]) -> list[tuple[Setting, str]]:
+def _planning_modes(settings: Sequence[Setting]) -> list[tuple[Setting, str]]:
     found = []
     for setting in settings:
         able = method(setting.method).in_scenes
@@ -114,7 +114,9 @@ def _ways(settings: Sequence[Setting]) -> list[tuple[Setting, str]]:
     return found
 
 
-def _kept(setting: Setting, way: str, hand: HandModel, place: ObjectScenes, models: int, work: Path | None) -> Row:
+def _cached_result(
+    setting: Setting, way: str, hand: HandModel, place: ObjectScenes, models: int, work: Path | None
+) -> Row:
     """Return the setting's result on the pair, from its cache file if it exists."""
     said = {
         "way": way,
@@ -126,7 +128,7 @@ def _kept(setting: Setting, way: str, hand: HandModel, place: ObjectScenes, mode
         "options": dict(setting.options),
     }
     if work is None:
-        return said | _tried(setting, way, hand, place, models)
+        return said | _run_setting(setting, way, hand, place, models)
     told = place.spec.model_dump(mode="json")
     terms = [FORM, models, said, setting.knobs.model_dump(mode="json"), told, hand.digest, place.true.digest]
     # Results also depend on the planners' code: another revision or device does not use the cache.
@@ -136,14 +138,14 @@ def _kept(setting: Setting, way: str, hand: HandModel, place: ObjectScenes, mode
         work.mkdir(parents=True, exist_ok=True)
         partial = file.with_suffix(".tmp")
         partial.write_text(
-            json.dumps(said | _tried(setting, way, hand, place, models), indent=1, allow_nan=False) + "\n"
+            json.dumps(said | _run_setting(setting, way, hand, place, models), indent=1, allow_nan=False) + "\n"
         )
         partial.replace(file)
     found: Row = json.loads(file.read_text())
     return found
 
 
-def _tried(setting: Setting, way: str, hand: HandModel, place: ObjectScenes, models: int) -> Row:
+def _run_setting(setting: Setting, way: str, hand: HandModel, place: ObjectScenes, models: int) -> Row:
     """Return number, shares and rate of the grasps of one setting for a hand and an object."""
     obj = place.thing.load(setting.knobs.face_error_m)
     placed = place.scenes.placed(np.arange(setting.batch) % len(place.scenes.object_pose))
@@ -152,9 +154,9 @@ def _tried(setting: Setting, way: str, hand: HandModel, place: ObjectScenes, mod
     clock = clock_of(setting.run.device)
     try:
         rollout = lift_rollout(hand, obj, lambda: place.pieces) if way == IN_SCENE else None
-        _planned(setting, hand, obj, placed.take(slice(0, 1)), rollout, warm=True)
+        _plan_grasps(setting, hand, obj, placed.take(slice(0, 1)), rollout, warm=True)
         began = clock()
-        grasps = _planned(setting, hand, obj, placed, rollout)
+        grasps = _plan_grasps(setting, hand, obj, placed, rollout)
         row["seconds"] = clock() - began
         validated = ValidatedGrasps(hand, place, grasps, placed)
         row["end_seconds"] = clock() - began
@@ -163,7 +165,7 @@ def _tried(setting: Setting, way: str, hand: HandModel, place: ObjectScenes, mod
         if each < _SHORT_S:
             began = clock()
             start = placed.take(slice(0, few))
-            ValidatedGrasps(hand, place, _planned(setting, hand, obj, start, rollout), start)
+            ValidatedGrasps(hand, place, _plan_grasps(setting, hand, obj, start, rollout), start)
             row["first_seconds"] = clock() - began
         row |= validated.counts(models)
     except InputError as error:
@@ -175,7 +177,7 @@ def _tried(setting: Setting, way: str, hand: HandModel, place: ObjectScenes, mod
     return {**row, **told, "scenes": len(place.scenes.object_pose), "note": note}
 
 
-def _planned(
+def _plan_grasps(
     setting: Setting,
     hand: HandModel,
     obj: ObjectModel,
@@ -193,7 +195,7 @@ class ValidatedGrasps:
     """Grasps with trajectories and lift verdicts, measured if held."""
 
     def __init__(self, hand: HandModel, place: ObjectScenes, grasps: GraspSet, placed: PlacedGrasps) -> None:
-        way = plan_way(hand, place.true, grasps, placed)
+        way = plan_trajectory(hand, place.true, grasps, placed)
         self.grasps = replace(grasps, approach=way.approach, coming=way.open, lift=way.lift)
         self.hand, self.place, self.placed = hand, place, placed
         self.clear = np.flatnonzero(way.clear)

@@ -7,6 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from graspd.service.model.studies import pareto
 from graspd.service.model.transforms import Floats
 from graspd.studies.chart.trials import Rollout
 from graspd.worker.quality.intervals import wilson, wilson_of_mean
@@ -45,7 +46,7 @@ def figures(cell: Rollout) -> dict[str, Any]:
         row[f"{key}_low"], row[f"{key}_high"] = np.percentile(values, BAR)
     widen(row, int(held.sum()), len(held), len(held) / float(seconds.sum()))
     widen_speed(row, "end_to_end_per_second", int(kept.sum()), len(kept), len(kept) / sum(cell.end_seconds))
-    row |= _scrutinised(cell) if cell.dexgraspbench else {}
+    row |= _strict_success(cell) if cell.dexgraspbench else {}
     return {key: plain(value) for key, value in row.items()}
 
 
@@ -62,7 +63,7 @@ def widen_speed(row: dict[str, Any], key: str, valid: int, grasps: int, per_seco
     row[f"{key}_high"] = max(row[f"{key}_high"], high * per_second)
 
 
-def _scrutinised(cell: Rollout) -> dict[str, Any]:
+def _strict_success(cell: Rollout) -> dict[str, Any]:
     """Return success by DexGraspBench's protocol and at half friction, and the robust share of held grasps."""
     row: dict[str, Any] = {}
     for key, verdicts in (("dexgraspbench", cell.dexgraspbench), ("hard", cell.hard)):
@@ -170,15 +171,6 @@ def most_valid(row: Mapping[str, Any]) -> float:
     The bound on the share is 3 / n. In scenes it applies to lifted grasps."""
     raw = row.get("candidates_end_to_end_per_second", row["grasps_per_second"])
     return float(raw) * min(1.0, 3.0 / row["grasps"])
-
-
-def pareto(points: Sequence[tuple[float, float]]) -> set[int]:
-    """Return indices of points (more, more) that no other point dominates: as good in both, better in one."""
-    return {
-        index
-        for index, (x, y) in enumerate(points)
-        if not any((a >= x and b >= y) and (a > x or b > y) for a, b in points)
-    }
 
 
 def plain(value: Any) -> Any:

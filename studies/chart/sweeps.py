@@ -55,7 +55,7 @@ def _options(**changes: Any) -> Change:
     return change
 
 
-def turns(quick: bool = False, knobs: Sequence[str] = ()) -> list[KnobValue]:
+def knob_values(quick: bool = False, knobs: Sequence[str] = ()) -> list[KnobValue]:
     """Return values of all settings, of a few (`quick`), or of the named ones; each setting includes its default.
     Raises InputError: a name is not a setting."""
 
@@ -76,7 +76,7 @@ def turns(quick: bool = False, knobs: Sequence[str] = ()) -> list[KnobValue]:
     for passes in (1, 2, 4, 8):
         change = None if passes == LossOptions().passes else _options(passes=passes)
         found.append(KnobValue("solver passes", str(passes), change=change))
-    found += [KnobValue("queries", "shared"), KnobValue("queries", "one per velocity", change=asking_each)]
+    found += [KnobValue("queries", "shared"), KnobValue("queries", "one per velocity", change=query_per_velocity)]
     found += [
         KnobValue("culling", "grid and band"),
         KnobValue("culling", "band", change=_options(exact_below=1.0)),
@@ -109,7 +109,7 @@ def sweep(
     true = thing.load(TRUE_ERROR_M)
     pieces = decompose(true)
     cells: dict[tuple[str, str], Rollout] = {}
-    for turn in [default, *turns(quick, knobs)]:
+    for turn in [default, *knob_values(quick, knobs)]:
         if turn is default or not turn.default:
             make = partial(_make, turn=turn, run=run)
             setting = Setting("fast_graspd", turn.value, turn.fidelity, batch=batch, run=run, make=make)
@@ -121,7 +121,7 @@ def sweep(
             cell.repeat()
     base = figures(cells[default.knob, default.value])
     rows = []
-    for turn in turns(quick, knobs):
+    for turn in knob_values(quick, knobs):
         found = base if turn.default else figures(cells[turn.knob, turn.value])
         faster = found["grasps_per_second"] / base["grasps_per_second"]
         row = {"knob": turn.knob, "value": turn.value, "default": turn.default, "hand": hand.name, "object": thing.name}
@@ -150,7 +150,7 @@ class QueryPerVelocity(Pair):
         record.add_distances(out, model, data)
         for _ in range(model.options.velocities - 1):
             counts = [data.contacts.count, data.contacts.near_count]
-            out.add(kernels.forget, data.capacity, inputs=[data.active], outputs=counts)
+            out.add(kernels.clear_contacts, data.capacity, inputs=[data.active], outputs=counts)
             record.add_distances(out, model, data)
         record.add_contact(out, model, data)
         record.add_penalties(out, model, data)
@@ -159,5 +159,5 @@ class QueryPerVelocity(Pair):
         return out
 
 
-def asking_each(pair: Pair) -> Pair:
+def query_per_velocity(pair: Pair) -> Pair:
     return QueryPerVelocity(pair.coarse, pair.fine, pair.options, pair.hand)

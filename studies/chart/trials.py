@@ -106,13 +106,13 @@ class Rollout:
     """Seconds of calls with `first_grasps` grasps, end to end."""
     first_grasps: int = 1
     dexgraspbench: list[NDArray[np.int8]] = field(default_factory=list)
-    """Verdicts of the unmodified DexGraspBench protocol; `scrutinise` sets these, `hard` and `shares`."""
+    """Verdicts of the unmodified DexGraspBench protocol; `validate_strictly` sets these, `hard` and `shares`."""
     hard: list[NDArray[np.int8]] = field(default_factory=list)
     shares: list[Floats] = field(default_factory=list)
     """Share of other models in which a grasp holds; nan if it does not hold in the nominal one."""
 
     @cached_property
-    def tried(self) -> Tried | None:
+    def planner_rollout(self) -> Tried | None:
         """Rollouts of candidates, as in jobs."""
         return rollout_on(self.setting.run, self.hand, self.obj, lambda: self.pieces, in_scenes=False)
 
@@ -122,15 +122,15 @@ class Rollout:
 
     def warm_up(self) -> None:
         """Make one untimed call to prepare kernels, grids and samples."""
-        self.setting.grasps(self.hand, self.obj, 1, WARM_SEED, rollout=self.tried, warm=True)
+        self.setting.grasps(self.hand, self.obj, 1, WARM_SEED, rollout=self.planner_rollout, warm=True)
 
     def repeat(self) -> None:
         """Make one timed call, then measure and validate its grasps."""
         batch = self.setting.batch
         began = self._clock()
-        found = self.setting.grasps(self.hand, self.obj, batch, SEED + len(self.seconds), rollout=self.tried)
+        found = self.setting.grasps(self.hand, self.obj, batch, SEED + len(self.seconds), rollout=self.planner_rollout)
         self.seconds.append(self._clock() - began)
-        success, feasible, table = self._finished(found)
+        success, feasible, table = self._validate_and_measure(found)
         self.end_seconds.append(self._clock() - began)
         lost = self._measured(found.take(np.flatnonzero(success != 1)))
         self.made.append(found)
@@ -142,7 +142,7 @@ class Rollout:
             columns[key][success == 1], columns[key][success != 1] = table[key], lost[key]
         self.columns.append(columns)
 
-    def _finished(self, found: GraspSet) -> tuple[NDArray[np.int8], NDArray[np.int8], dict[str, Floats]]:
+    def _validate_and_measure(self, found: GraspSet) -> tuple[NDArray[np.int8], NDArray[np.int8], dict[str, Floats]]:
         """Validate and measure planned grasps as in a job: return verdicts, valid flags, and columns of held grasps."""
         success = validate(self.hand, self.true, found, pieces=self.pieces, run=self.setting.run).success
         held = np.flatnonzero(success == 1)
@@ -158,7 +158,7 @@ class Rollout:
         columns = {key: np.asarray(table[f"quality/{name}"], float).reshape(-1) for key, name in COLUMNS.items()}
         return columns | {"feasible": np.asarray(passes(table), float)}
 
-    def scrutinise(self, models: int) -> None:
+    def validate_strictly(self, models: int) -> None:
         """Validate by DexGraspBench's protocol, at half the friction, and in models around the nominal one."""
         common: dict[str, Any] = {"pieces": self.pieces, "run": self.setting.run}
         for found, success in zip(self.made, self.success, strict=True):
@@ -175,7 +175,9 @@ class Rollout:
             self.first_calls.append(each * grasps)
             return
         began = self._clock()
-        self._finished(self.setting.grasps(self.hand, self.obj, grasps, SEED - len(self.seconds), rollout=self.tried))
+        self._validate_and_measure(
+            self.setting.grasps(self.hand, self.obj, grasps, SEED - len(self.seconds), rollout=self.planner_rollout)
+        )
         self.first_calls.append(self._clock() - began)
 
     def values(self, key: str) -> Floats:

@@ -68,7 +68,7 @@ def _half_inverted(faces: Any) -> Any:
     return faces
 
 
-def defective(name: str) -> Any:
+def box_with_defect(name: str) -> Any:
     """Return a box with a defect of `DEFECTS`."""
     mesh = trimesh.creation.box((0.07, 0.06, 0.05))
     return trimesh.Trimesh(mesh.vertices, DEFECTS[name](mesh.faces.copy()), process=False)
@@ -114,7 +114,7 @@ def shape_map(
         for family in families
         for value in FAMILIES[family][2]
     ]
-    jobs += [("mesh of a box", name, defective(name)) for name in defects]
+    jobs += [("mesh of a box", name, box_with_defect(name)) for name in defects]
     cells = []
     for (panel, value, mesh), fidelity in product(jobs, fidelities):
         place, allow_open = (panel, value, fidelity), value == _ALLOW_OPEN
@@ -161,7 +161,7 @@ def shape_cell(
         obj = prepared(mesh, request.knobs.face_error_m, allow_open=allow_open)
         found = validated_grasps(hand, obj, request, count=options.count, run=options.run)
     except GraspdError as error:
-        return refused(*place, error)
+        return refused_cell(*place, error)
     valid = float(found.columns["quality/valid"].mean())
     depth = float(np.median(found.columns["quality/penetration_depth_mm"]))
     finite = bool(np.isfinite(found.grasps.grasp.hand_pose).all() and np.isfinite(depth))
@@ -173,7 +173,7 @@ def outcome_of(valid: float) -> Outcome:
     return "broken" if valid == 0 else "weak" if valid < 0.5 else "good"
 
 
-def refused(panel: str, x: float | str, y: float | str, error: GraspdError) -> MapCell:
+def refused_cell(panel: str, x: float | str, y: float | str, error: GraspdError) -> MapCell:
     return MapCell(panel, x, y, float("nan"), "refused", str(error))
 
 
@@ -274,7 +274,7 @@ def hand_map(
         try:
             cell = shape_cell(make(), (panel, x, y), cube(CUBE_MM), options, fidelity=options.fidelity)
         except GraspdError as error:
-            cell = refused(panel, x, y, error)
+            cell = refused_cell(panel, x, y, error)
         options.say(f"{panel} {x:g} {y}: {cell.outcome} {cell.value:.2f} {cell.note}")
         cells.append(cell)
     return StabilityMap(

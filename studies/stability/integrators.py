@@ -105,7 +105,7 @@ def _extremes(points: Floats, flight: Iterator[tuple[Floats, float]]) -> tuple[f
     """Return largest energy and deepest penetration of a flight, given as centres and energies over the initial one."""
     most, deepest = 1.0, 0.0
     for centre, energy in flight:
-        most, deepest = max(most, energy), max(deepest, _sunk(points, centre))
+        most, deepest = max(most, energy), max(deepest, _largest_depth(points, centre))
         if not np.isfinite(most) or most > 1e6:
             return math.inf, deepest
     return most, deepest
@@ -121,7 +121,7 @@ def _penalty(contacts: Contacts, v: Floats, w: Floats, stiffness: float) -> tupl
     return forces.sum(axis=0), np.cross(contacts.points, forces).sum(axis=0)
 
 
-def _sunk(points: Floats, centre: Floats) -> float:
+def _largest_depth(points: Floats, centre: Floats) -> float:
     """Return the depth of the deepest cage point in the ball [m]; the ball's size once the ball has left the cage."""
     if float(np.linalg.norm(centre)) > 2 * RADIUS_M:
         return 2 * RADIUS_M

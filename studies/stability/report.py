@@ -41,7 +41,7 @@ def write(found: Stability, folder: Path) -> list[Path]:
 def markdown(found: Stability) -> str:
     """Return the page: remaining failures, then each map with symptom, guard and test."""
     said = ", ".join(f"{name} {value}" for name, value in found.versions.items())
-    lines = ["# Failure maps", "", f"`{found.command}`; {said}.", "", *_still_breaks(found.maps)]
+    lines = ["# Failure maps", "", f"`{found.command}`; {said}.", "", *_unguarded_failures(found.maps)]
     for one in found.maps:
         lines += [f"## {one.title}", "", f"![{one.title}](stability-{one.name}.png)", ""]
         lines += [f"Value of a cell: {one.measure}. {one.bounds[0].upper()}{one.bounds[1:]}.", ""]
@@ -54,7 +54,7 @@ def markdown(found: Stability) -> str:
     return "\n".join(lines)
 
 
-def _still_breaks(maps: Sequence[StabilityMap]) -> list[str]:
+def _unguarded_failures(maps: Sequence[StabilityMap]) -> list[str]:
     """Return broken cells that a job can reach: failures that no guard prevents."""
     lines = ["## What still breaks", ""]
     lines += ["Counts of cells that a job can reach. Other cells need settings that jobs do not have."]

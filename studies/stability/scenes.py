@@ -16,7 +16,7 @@ from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.model.scene_spec import Box, HalfSpace, SceneSpec
 from graspd.service.model.studies import MapCell, Outcome, StabilityMap, reachable
 from graspd.service.model.transforms import quat_rotate
-from graspd.studies.stability.assets import MILLIMETRES, MapOptions, outcome_of, prepared, refused
+from graspd.studies.stability.assets import MILLIMETRES, MapOptions, outcome_of, prepared, refused_cell
 from graspd.worker.generation import ValidatedBatch, validated_grasps
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
@@ -72,21 +72,21 @@ _STUDIES: Final = {
     "scene_height": _Study(
         "boxes on a table",
         ("height [mm]", "side of the footprint [mm]"),
-        lambda hand, height, side: _standing((side, side, height)),
+        lambda hand, height, side: _upright_box((side, side, height)),
         "test_a_plate_flat_on_a_table_ends_with_fewer_and_says_so",
         "uploaded objects can have such shapes",
     ),
     "scene_wall": _Study(
         f"a box of {_TARGET} beside walls",
         ("distance from the walls [mm]", "walls"),
-        lambda hand, gap, name: _standing(TARGET_MM, _walls(WALLS[name], gap)),
+        lambda hand, gap, name: _upright_box(TARGET_MM, _walls(WALLS[name], gap)),
         "test_object_in_a_narrow_well_is_refused_or_comes_out_valid",
         "bins, shelves and scene files have such walls",
     ),
     "scene_neighbours": _Study(
         f"a box of {_TARGET} among equal boxes",
         ("gap between them [mm]", "fixed boxes around it"),
-        lambda hand, gap, name: _standing(TARGET_MM, _neighbours(NEIGHBOURS[name], gap)),
+        lambda hand, gap, name: _upright_box(TARGET_MM, _neighbours(NEIGHBOURS[name], gap)),
         "test_a_box_among_boxes_is_lifted_out_or_not_valid",
         "clutter has such neighbours",
     ),
@@ -134,7 +134,7 @@ def span_of(hand: HandModel) -> float:
     return float(np.linalg.norm(places[:, None] - places[None], axis=2).max())
 
 
-def _standing(sides_mm: tuple[float, ...], around: Iterable[Box] = ()) -> Placement:
+def _upright_box(sides_mm: tuple[float, ...], around: Iterable[Box] = ()) -> Placement:
     """Return a box of these sides [mm] upright on a table, with boxes around it."""
     height = sides_mm[2] * MILLIMETRES
     target = (0.0, 0.0, height / 2, 1.0, 0.0, 0.0, 0.0)
@@ -163,16 +163,16 @@ def _neighbours(directions: Sequence[tuple[int, int]], gap_mm: float) -> list[Bo
 
 def _cell(hand: HandModel, x: float | str, y: float | str, placement: Placement, options: MapOptions) -> MapCell:
     try:
-        found = planned(hand, *placement, options)
+        found = plan_candidates(hand, *placement, options)
     except GraspdError as error:
-        cell = refused(hand.name, x, y, error)
+        cell = refused_cell(hand.name, x, y, error)
     else:
-        cell = MapCell(hand.name, x, y, *_told(found))
+        cell = MapCell(hand.name, x, y, *_cell_values(found))
     options.say(f"{hand.name} {x} {y}: {cell.outcome} {cell.note}")
     return cell
 
 
-def planned(hand: HandModel, sides_mm: Sequence[float], spec: SceneSpec, options: MapOptions) -> ValidatedBatch:
+def plan_candidates(hand: HandModel, sides_mm: Sequence[float], spec: SceneSpec, options: MapOptions) -> ValidatedBatch:
     """Return candidates of a box of these sides [mm] in a scene; the box is prepared like an upload.
     Raises GraspdError: the box or the scene is refused."""
     mesh: Any = trimesh.creation.box(np.asarray(sides_mm) * MILLIMETRES)
@@ -185,7 +185,7 @@ def planned(hand: HandModel, sides_mm: Sequence[float], spec: SceneSpec, options
     return validated_grasps(hand, obj, request, count=count, scenes=scenes, run=options.run)
 
 
-def _told(found: ValidatedBatch) -> tuple[float, Outcome, str, str]:
+def _cell_values(found: ValidatedBatch) -> tuple[float, Outcome, str, str]:
     """Return value, outcome, note and label of a cell."""
     valid = float(found.columns["quality/valid"].mean())
     clear = found.shares.get("clear_share", 1.0)

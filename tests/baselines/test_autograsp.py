@@ -6,7 +6,7 @@ import trimesh
 
 from graspd.baselines.autograsp import kernels
 from graspd.baselines.autograsp.method import TOUCH_M, ClosedHands, HandCloser
-from graspd.baselines.common import ground_of
+from graspd.baselines.common import load_pair
 from graspd.worker.simulation.data import HandState
 from tests.worker.models import object_from_mesh, two_finger_hand
 
@@ -16,7 +16,7 @@ SAMPLED = 1.5e-3
 
 def closer_on(*box: float) -> HandCloser:
     obj = object_from_mesh(trimesh.creation.box(box))
-    return HandCloser(ground_of(two_finger_hand(), obj, "cpu", kernels), 1)
+    return HandCloser(load_pair(two_finger_hand(), obj, "cpu", kernels), 1)
 
 
 def closed(box: tuple[float, float, float], shift: float = 0.0) -> tuple[ClosedHands, np.ndarray]:

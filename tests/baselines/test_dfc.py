@@ -5,7 +5,7 @@ import pytest
 import trimesh
 import warp as wp
 
-from graspd.baselines.common import ground_of
+from graspd.baselines.common import load_pair
 from graspd.baselines.dfc import kernels
 from graspd.baselines.dfc.method import DISTANCE, Descent, sample_starts
 from graspd.worker.execution_context import DEFAULT_CONTEXT
@@ -18,7 +18,7 @@ WEIGHTS = np.array([1.0, 100.0, 100.0, 10.0, 1.0])
 
 
 def descent(pivot: tuple[float, float, float] = (0.0, 0.0, -0.2), q: tuple[float, float] = (0.0, 0.0)) -> Descent:
-    pair = ground_of(two_finger_hand(), BOX, "cpu", kernels)
+    pair = load_pair(two_finger_hand(), BOX, "cpu", kernels)
     return Descent(pair, HandState(np.array([pivot]), np.array([[1.0, 0, 0, 0]]), np.array([q])), [[0, 0, 0]])
 
 

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 import warp as wp
 
-from graspd.baselines.common import ground_of
+from graspd.baselines.common import load_pair
 from graspd.baselines.graspd2022 import kernels, method
 from graspd.baselines.graspd2022.method import Search, _Batch, distance_grid, physics_of
 from graspd.worker.simulation.data import HandState
@@ -24,7 +24,7 @@ SAGITTA = RADIUS - float(np.linalg.norm(SPHERE.vertices[SPHERE.faces].mean(axis=
 
 @cache
 def grid_of_sphere(cells: int):
-    return distance_grid(ground_of(two_finger_hand(), SPHERE, "cpu", kernels).fine.obj, cells)
+    return distance_grid(load_pair(two_finger_hand(), SPHERE, "cpu", kernels).fine.obj, cells)
 
 
 @wp.kernel(enable_backward=False)
@@ -66,7 +66,7 @@ def ring(depth: float) -> np.ndarray:
 
 
 def test_points_inside_push_the_object_away_and_rub_against_it() -> None:
-    box = distance_grid(ground_of(two_finger_hand(), BOX, "cpu", kernels).fine.obj, CELLS)
+    box = distance_grid(load_pair(two_finger_hand(), BOX, "cpu", kernels).fine.obj, CELLS)
     faces = 0.024 * np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, -1]])
     distance, force, _ = probed(faces, (0.0, 0.0, 0.01), box)
     depth = -distance
@@ -96,7 +96,7 @@ def test_points_outside_leak_a_share_of_the_slope() -> None:
 
 def touching_batch() -> _Batch:
     """The palm 0.02 mm inside a face of the box, the fingers clear of it, all standing still."""
-    pair = ground_of(two_finger_hand(), BOX, "cpu", kernels)
+    pair = load_pair(two_finger_hand(), BOX, "cpu", kernels)
     start = HandState(np.array([[0.0, 0, -0.025 + 2e-5]]), np.array([[1.0, 0, 0, 0]]), np.zeros((1, 2)))
     batch = _Batch(Search(pair, CELLS), start, 10)
     batch.data.pivot.assign([wp.vec3(*start.pivot[0])])

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 import warp as wp
 
-from graspd.baselines.common import ground_of, inside_points
+from graspd.baselines.common import inside_points, load_pair
 from graspd.baselines.graspit import kernels
 from graspd.baselines.graspit.kernels import FIRST_STEP
 from graspd.baselines.graspit.method import EACH, ON_PALM, Search, eigengrasps
@@ -52,7 +52,7 @@ def test_temperature_jumps_and_chances_follow_ingbers_schedule() -> None:
 
 def search_on(*sides: float) -> Search:
     box = object_from_mesh(trimesh.creation.box(sides))
-    return Search(ground_of(two_finger_hand(), box, "cpu", kernels))
+    return Search(load_pair(two_finger_hand(), box, "cpu", kernels))
 
 
 def palm_only(gap: float, turn: float) -> float:

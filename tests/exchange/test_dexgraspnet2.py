@@ -23,7 +23,14 @@ import trimesh
 from PIL import Image
 
 from graspd.exchange import dexgraspnet2
-from graspd.exchange.dexgraspnet2 import SceneGraspness, lines_of_sight, load_npz, pointed_at, summed, surface_samples
+from graspd.exchange.dexgraspnet2 import (
+    SceneGraspness,
+    lines_of_sight,
+    load_npz,
+    pointed_at,
+    sum_graspness,
+    surface_samples,
+)
 from graspd.exchange.plan import PictureReference
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import IDENTITY_POSE, apply, compose, pose_from_matrix
@@ -359,7 +366,7 @@ def test_many_grasps_take_no_more_memory(block) -> None:
         palm = np.random.default_rng(0).normal(size=(count, 3)) * 0.2
         line = -palm / np.linalg.norm(palm, axis=1, keepdims=True)
         tracemalloc.start()
-        summed(surface, pointed_at(palm, line, surface))
+        sum_graspness(surface, pointed_at(palm, line, surface))
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         return peak

@@ -4,26 +4,29 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from graspd.exchange.opening import READERS, opened
+from graspd.exchange.opening import READERS, check_written_files
 from graspd.exchange.plan import prim_name, prim_names
 from graspd.service.model.errors import GraspdError
 
 
 @pytest.mark.parametrize("suffix", sorted(READERS))
 def test_a_file_that_its_library_cannot_read_is_named(suffix: str, tmp_path) -> None:
-    with pytest.raises(GraspdError, match=rf"broken\{suffix} was written but .* cannot read it"), opened(tmp_path):
+    with (
+        pytest.raises(GraspdError, match=rf"broken\{suffix} was written but .* cannot read it"),
+        check_written_files(tmp_path),
+    ):
         (tmp_path / f"broken{suffix}").write_bytes(b"\x00<broken\n1,2\xff")
 
 
 def test_files_that_were_there_before_are_not_looked_at(tmp_path) -> None:
     (tmp_path / "old.xml").write_bytes(b"broken")
-    with opened(tmp_path):
+    with check_written_files(tmp_path):
         (tmp_path / "new.json").write_text("{}")
 
 
 def test_a_file_that_is_written_anew_is_looked_at(tmp_path) -> None:
     (tmp_path / "scene.xml").write_text("<mujoco/>")
-    with pytest.raises(GraspdError, match="scene"), opened(tmp_path):
+    with pytest.raises(GraspdError, match="scene"), check_written_files(tmp_path):
         (tmp_path / "scene.xml").write_text("<mujoco><tendon><fixed/></tendon></mujoco>")
 
 

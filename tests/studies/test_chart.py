@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from graspd.service.model.fidelity import FIDELITIES
-from graspd.service.model.studies import FILTERED, IN_SCENE
+from graspd.service.model.studies import FILTERED, IN_SCENE, pareto
 from graspd.service.pipeline.fidelity_choice import cheapest
 from graspd.service.store.records import latest
 from graspd.service.store.store import open_store
@@ -20,8 +20,8 @@ from graspd.studies.chart.figure import Label, place
 from graspd.studies.chart.report import markdown
 from graspd.studies.chart.scenes import figures
 from graspd.studies.chart.scenes import summed as summed_in_scenes
-from graspd.studies.chart.statistics import METRICS, first_valid, pareto, summed
-from graspd.studies.chart.sweeps import KnobValue, _make, asking_each, turns
+from graspd.studies.chart.statistics import METRICS, first_valid, summed
+from graspd.studies.chart.sweeps import KnobValue, _make, knob_values, query_per_velocity
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
@@ -157,10 +157,10 @@ def test_a_ratio_to_a_method_without_a_valid_grasp_is_a_bound() -> None:
 
 
 def test_each_knob_has_its_default_once_and_can_be_turned_alone() -> None:
-    found = turns()
+    found = knob_values()
     for knob in {turn.knob for turn in found}:
         assert sum(turn.default for turn in found if turn.knob == knob) == 1
-    assert [turn.value for turn in turns(knobs=["queries"])] == ["shared", "one per velocity"]
+    assert [turn.value for turn in knob_values(knobs=["queries"])] == ["shared", "one per velocity"]
 
 
 def test_asking_for_distances_anew_changes_no_grasp() -> None:
@@ -168,7 +168,7 @@ def test_asking_for_distances_anew_changes_no_grasp() -> None:
     little = FIDELITIES["draft"].model_copy(update={"coarse_iterations": 12, "fine_iterations": 5})
     shared, anew = (
         _make(hand, obj, 2, 0, turn=KnobValue("queries", "", little, change), run=ExecutionContext(threads=1))
-        for change in (None, asking_each)
+        for change in (None, query_per_velocity)
     )
     np.testing.assert_array_equal(shared.grasp.hand_pose, anew.grasp.hand_pose)
     np.testing.assert_array_equal(shared.grasp.joint_positions, anew.grasp.joint_positions)
@@ -239,7 +239,7 @@ def test_a_run_that_was_stopped_plans_only_what_is_missing(in_scenes: tuple[dict
         planned.append((setting.method, way))
         return runs[setting.method, way]
 
-    monkeypatch.setattr("graspd.studies.chart.scenes._tried", tried)
+    monkeypatch.setattr("graspd.studies.chart.scenes._run_setting", tried)
     assert graspd(f"{ON_TABLE} --work", folder / "work")["runs"] == found["runs"] and len(planned) == 1
 
 

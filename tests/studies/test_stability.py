@@ -232,7 +232,7 @@ def assert_valid_ones_are_clear(hand: HandModel, found: ValidatedBatch, spec: Sc
     rows = np.flatnonzero(found.columns["quality/valid"] == 1)
     assert (found.columns["quality/clearance_m"][rows] >= MARGIN_M).all() and spec.target is not None
     for support in supports_of(spec) if len(rows) else ():
-        seen = support.seen_from(np.asarray(spec.target, float))
+        seen = support.in_frame(np.asarray(spec.target, float))
         assert mujoco_room(hand, found.grasps.grasp.take(rows), seen).min() >= MARGIN_M - 1e-6
 
 
@@ -247,9 +247,9 @@ def test_a_plate_flat_on_a_table_ends_with_fewer_and_says_so(tmp_path) -> None:
 
 @pytest.mark.parametrize("gap", [5, 30])
 def test_object_in_a_narrow_well_is_refused_or_comes_out_valid(hand: HandModel, gap: float) -> None:
-    sides, spec = scenes._standing(scenes.TARGET_MM, scenes._walls(scenes.WALLS["four"], gap))
+    sides, spec = scenes._upright_box(scenes.TARGET_MM, scenes._walls(scenes.WALLS["four"], gap))
     try:
-        found = scenes.planned(hand, sides, spec, MapOptions(2))
+        found = scenes.plan_candidates(hand, sides, spec, MapOptions(2))
     except InputError as error:
         assert "\n" not in str(error) and ("no room" in str(error) or "on every side" in str(error))
     else:
@@ -257,15 +257,15 @@ def test_object_in_a_narrow_well_is_refused_or_comes_out_valid(hand: HandModel, 
 
 
 def test_a_box_among_boxes_is_lifted_out_or_not_valid(hand: HandModel) -> None:
-    sides, spec = scenes._standing(scenes.TARGET_MM, scenes._neighbours(scenes.NEIGHBOURS["four"], 120))
-    found = scenes.planned(hand, sides, spec, MapOptions(6))
+    sides, spec = scenes._upright_box(scenes.TARGET_MM, scenes._neighbours(scenes.NEIGHBOURS["four"], 120))
+    found = scenes.plan_candidates(hand, sides, spec, MapOptions(6))
     assert found.shares["lift_share"] > 0, "with so much room some must come out"
     assert_valid_ones_are_clear(hand, found, spec)
 
 
 def test_a_cube_that_does_not_fit_its_bin_is_refused(hand: HandModel) -> None:
     with pytest.raises(InputError, match="there is room for 380 x 280 mm"):
-        scenes.planned(hand, (350, 350, 350), SceneSpec(kind="bin"), MapOptions(2))
+        scenes.plan_candidates(hand, (350, 350, 350), SceneSpec(kind="bin"), MapOptions(2))
 
 
 def test_refused_scenes_are_cells_that_say_why_walls_stand_off(hand: HandModel) -> None:
@@ -283,7 +283,7 @@ def test_refused_scenes_are_cells_that_say_why_walls_stand_off(hand: HandModel) 
 @pytest.mark.parametrize(("valid", "outcome"), [([0, 0], "broken"), ([1, 0, 0], "weak"), ([1, 0], "good")])
 def test_a_cell_of_a_scene_tells_the_share_of_valid_grasps(valid: list[int], outcome: str) -> None:
     found = SimpleNamespace(columns={"quality/valid": np.array(valid)}, shares={"clear_share": 0.0})
-    assert scenes._told(found)[:2] == (np.mean(valid), outcome)  # type: ignore[arg-type]
+    assert scenes._cell_values(found)[:2] == (np.mean(valid), outcome)  # type: ignore[arg-type]
 
 
 def test_maps_of_several_runs_are_drawn_and_published_as_one(tmp_path) -> None:

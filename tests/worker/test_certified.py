@@ -23,7 +23,7 @@ from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import PlanRequest
 from graspd.worker.quality.diversity import distances, hand_points
-from graspd.worker.rounds import next_round, taken
+from graspd.worker.rounds import next_round, select_rows
 from graspd.worker.validation.protocol import Outcome
 from graspd.worker.validation.robust import Robustness
 from tests.worker.models import object_from_mesh, two_finger_hand
@@ -89,17 +89,17 @@ def test_what_the_validator_saw_of_each_try_is_counted(hand, monkeypatch) -> Non
 
 @pytest.mark.parametrize("after", [0, 1])
 def test_a_batch_that_is_stopped_is_what_was_validated_before(hand, monkeypatch, after: int) -> None:
-    rounds, real = [], generation.Batch.made
+    rounds, real = [], generation.Batch.run_round
 
     def counted(*given):
         if len(rounds) == after:
             raise TaskCancelled("stopped")
         rounds.append(real(*given))
-        rounds[-1].grasps, rounds[-1].columns = taken(rounds[-1].grasps, rounds[-1].columns, np.arange(1))
+        rounds[-1].grasps, rounds[-1].columns = select_rows(rounds[-1].grasps, rounds[-1].columns, np.arange(1))
         rounds[-1].rows = rounds[-1].rows[:1]
         return rounds[-1]
 
-    monkeypatch.setattr(generation.Batch, "made", counted)
+    monkeypatch.setattr(generation.Batch, "run_round", counted)
     if not after:
         with pytest.raises(TaskCancelled):
             validated_grasps(hand, BLOCK, wish(rechecks=0), count=COUNT, partial=True)

@@ -11,10 +11,11 @@ import pytest
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import MeshError, TaskCancelled
 from graspd.service.model.fidelity import resolve_fidelity
-from graspd.worker import generation, together
-from graspd.worker.engines.joins import batches_at_once, fitting
+from graspd.worker import batched_generation, generation
+from graspd.worker.batched_generation import validated_batches
+from graspd.worker.engines.batch_sizes import batches_at_once, batches_that_fit
 from graspd.worker.execution_context import CoreSharing, ExecutionContext, parallel_map
-from graspd.worker.files.synthesis import synthesized
+from graspd.worker.files.synthesis import synthesize_grasps
 from graspd.worker.generation import ValidatedBatch, validated_grasps
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.load import hand_from_path
@@ -22,7 +23,6 @@ from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import BatchRequest, NoStartFound, PlanRequest
 from graspd.worker.pool.pool import MODULES, Pool
 from graspd.worker.rounds import SMALLEST_PART, parts_of
-from graspd.worker.together import validated_batches
 from tests.worker.models import assert_same_batch, on_tables
 
 REQUEST = JobOptions(fidelity=resolve_fidelity("draft"), rechecks=2, seed=3)
@@ -78,7 +78,7 @@ def test_a_round_ends_as_soon_as_enough_are_found(pair, monkeypatch: pytest.Monk
     calls = noted(monkeypatch)
     parts = validated_grasps(*pair, wish, count=6, run=ExecutionContext(threads=1))
     assert any(first > 0 or count < 8 for number, first, count in calls if number > 0)
-    monkeypatch.setattr(generation.Batch, "_in_parts", False)
+    monkeypatch.setattr(generation.Batch, "_is_divisible", False)
     rounds = validated_grasps(*pair, wish, count=6, run=ExecutionContext(threads=1))
     assert parts.planned <= rounds.planned
     assert_same_batch(parts, rounds)
@@ -109,9 +109,9 @@ def test_lane_without_a_place_ends_blocked_where_another_has_one(pair, scenes, m
 
 def test_the_first_valid_grasps_are_audited_whoever_finds_them(pair, monkeypatch: pytest.MonkeyPatch) -> None:
     rechecked: list[GraspSet] = []
-    recheck = generation.Batch._rechecked
+    recheck = generation.Batch._recheck
     told = lambda work, some: (rechecked.append(some), recheck(work, some))[1]  # noqa: E731
-    monkeypatch.setattr(generation.Batch, "_rechecked", told)
+    monkeypatch.setattr(generation.Batch, "_recheck", told)
     found = validated_grasps(*pair, REQUEST, count=COUNT, run=ExecutionContext(threads=2))
     (first,) = (some.moved(pair[1].centre) for some in rechecked)  # the engine works about the middle of the object
     np.testing.assert_array_equal(first.grasp.hand_pose, found.grasps.grasp.hand_pose[:2])
@@ -190,13 +190,13 @@ def assert_same(batches, others) -> None:
 
 
 def test_joined_batches_of_a_job_are_the_same_from_plan_to_verdict(pair, alone, monkeypatch) -> None:
-    launches, whole = list[list[int]](), together.synthesize_batches
+    launches, whole = list[list[int]](), batched_generation.synthesize_batches
 
     def noted(hand, obj, asked: Sequence[BatchRequest], **named):
         launches.append([one.wanted.batch for one in asked])
         return whole(hand, obj, asked, **named)
 
-    monkeypatch.setattr(together, "synthesize_batches", noted)
+    monkeypatch.setattr(batched_generation, "synthesize_batches", noted)
     told: list[tuple[float, float]] = []
     run = ExecutionContext(threads=2, progress=lambda done, total, message: told.append((done, total)))
     joined = validated_batches(*pair, ASKED, sizes=[2, 2, 2], join=3, run=run)
@@ -219,7 +219,7 @@ def test_a_run_in_this_process_makes_the_batches_of_a_job(pair) -> None:
     quick = REQUEST.fidelity.model_copy(update={"coarse_iterations": 20, "fine_iterations": 6, "polish_iterations": 2})
     request = JobOptions(grasps=33, validation="none", fidelity=quick, min_distance=0.03, budget=2, rechecks=0)
     batches = validated_batches(*pair, request, sizes=[32, 1], run=ExecutionContext(threads=2))
-    made = synthesized("barrett", "block", request, device="cpu", threads=2)
+    made = synthesize_grasps("barrett", "block", request, device="cpu", threads=2)
     assert_same(made.batches, batches)
     assert len(made.arrays["grasp/hand_pose"]) == sum(len(one.grasps) for one in batches)
 
@@ -243,13 +243,13 @@ def test_waves_of_batches_in_scenes_are_the_same(pair, own_scenes, apart: bool) 
 
 @pytest.mark.parametrize("refused", [0, 1])
 def test_a_batch_without_a_place_has_no_grasps_but_for_the_first(pair, own_scenes, monkeypatch, refused) -> None:
-    whole = together.synthesize_batches
+    whole = batched_generation.synthesize_batches
 
     def narrow(hand, obj, asked: Sequence[BatchRequest], **named):
         made = whole(hand, obj, asked, **named)
         return [NoStartFound("no way in") if k == refused else grasps for k, grasps in enumerate(made)]
 
-    monkeypatch.setattr(together, "synthesize_batches", narrow)
+    monkeypatch.setattr(batched_generation, "synthesize_batches", narrow)
     wish = ASKED.model_copy(update={"validation": "none", "want": "candidates"})
     asked = {"sizes": [2, 2], "scenes": own_scenes[:2], "join": 2, "empty_on": (NoStartFound,)}
     with nullcontext() if refused else pytest.raises(NoStartFound, match="no way in"):
@@ -280,4 +280,9 @@ def test_what_becomes_of_one_batch_ends_the_job(pair) -> None:
 def test_how_many_are_joined_where_nobody_says() -> None:
     assert batches_at_once("cpu", None) == 1 and batches_at_once("cpu", 4) == 4
     # Of an H100 and an H200 (132 multiprocessors), of a GPU with 20, and of one whose memory is nearly full.
-    assert [fitting(132, 80 << 30), fitting(20, 8 << 30), fitting(132, 1 << 30), fitting(132, 0)] == [32, 4, 4, 1]
+    assert [
+        batches_that_fit(132, 80 << 30),
+        batches_that_fit(20, 8 << 30),
+        batches_that_fit(132, 1 << 30),
+        batches_that_fit(132, 0),
+    ] == [32, 4, 4, 1]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from graspd.service.model.transforms import Floats, quat_rotate
 from graspd.worker.grasps import Posture
-from graspd.worker.hands.jaws import jaws_of, slides
+from graspd.worker.hands.jaws import jaws_of, prismatic_dofs
 from graspd.worker.hands.model import HandModel
 from graspd.worker.quality.contact import finger_of_body
 from graspd.worker.quality.posed import PostureData
@@ -84,9 +84,9 @@ class Openings:
     def open_from(self, grasp: Posture) -> None:
         """Open each finger on its own as far from the object as possible; `grasp` is the start."""
         first, plain = self._sweep(), self._sweep()
-        self._leave(grasp, first)
+        self._open_directions(grasp, first)
         self._step(first)
-        self._launch(opening.open_plainly, self.count, [self.fingers, STUCK_M, first], [plain, self.step])
+        self._launch(opening.open_against_closing, self.count, [self.fingers, STUCK_M, first], [plain, self.step])
         self._step(plain)
         inputs = [self.fingers, self.hands, STUCK_M, first, plain]
         self._launch(opening.take_opening, self.open.shape, inputs, [self.open])
@@ -104,8 +104,8 @@ class Openings:
             if blocked is not None:
                 jams.blocked.assign(self._blocked(jams, blocked))
             less = wp.float64(0.5 if look < JAM_LOOKS - 1 else 0.0)
-            self._launch(jamming.hold_back, self.count, [less], [jams])
-        self._launch(jamming.take_way, self.open.shape, [self.fingers, self.hands, jams], [self.open])
+            self._launch(jamming.shorten_paths, self.count, [less], [jams])
+        self._launch(jamming.take_path, self.open.shape, [self.fingers, self.hands, jams], [self.open])
         return np.array(self.open.numpy())
 
     def retreated(self) -> Floats:
@@ -141,7 +141,7 @@ class Openings:
             out.chosen = wp.empty(shape, dtype=wp.int32)
         return out
 
-    def _leave(self, grasp: Posture, sweep: Any) -> None:
+    def _open_directions(self, grasp: Posture, sweep: Any) -> None:
         posing, hand = self.posing, self.posing.hand
         bodies, near = posing.touch(grasp, CLEARANCE_M)
         with wp.ScopedDevice(posing.device):
@@ -150,7 +150,7 @@ class Openings:
         inputs = [posing.points, bodies, near, CLEARANCE_M]
         self._launch(opening.body_wrenches, (self.count, hand.bodies), inputs, wrench)
         inputs = [posing.chain, self.fingers, wp.float64(PLAIN_OPENING), bodies]
-        self._launch(opening.leave, self.count, inputs, [*wrench, away, sweep])
+        self._launch(opening.opening_directions, self.count, inputs, [*wrench, away, sweep])
 
     def _step(self, sweep: Any) -> None:
         posing, out = self.posing, Launches(self.posing.device)
@@ -173,7 +173,7 @@ class Openings:
 
     def _place(self, out: Launches, jams: Any, way: float) -> Launches:
         inputs = [self.posing.chain, self.fingers, self.hands, jams, self.open, wp.float64(way)]
-        out.add(jamming.place_on_way, self.count, inputs=inputs, outputs=[self.bodies])
+        out.add(jamming.place_on_path, self.count, inputs=inputs, outputs=[self.bodies])
         return out
 
     def _depths(self, jams: Any) -> list[Launches]:
@@ -209,7 +209,7 @@ def _fingers(hand: HandModel) -> Any:
     out.of_body = wp.array(fingers_of_bodies(hand), dtype=wp.int32)
     out.of_dof = wp.array(fingers_of_dofs(hand), dtype=wp.int32)
     out.closing = wp.array(np.asarray(hand.closing, float), dtype=wp.float64)
-    out.step = wp.array(np.where(slides(hand), SLIDING_STEP_M, OPENING_STEP), dtype=wp.float64)
+    out.step = wp.array(np.where(prismatic_dofs(hand), SLIDING_STEP_M, OPENING_STEP), dtype=wp.float64)
     out.lower = wp.array(hand.lower, dtype=wp.float64)
     out.upper = wp.array(hand.upper, dtype=wp.float64)
     return out

@@ -15,14 +15,14 @@ from graspd.service.model.matter import ACCELERATION
 from graspd.service.model.transforms import Floats
 from graspd.worker.control.jaw_squeeze import jaw_squeeze
 from graspd.worker.control.opening import Blocked, Openings, count_fingers, fingers_of_bodies, fingers_of_dofs
-from graspd.worker.control.squeeze import HoldForces, balanced
+from graspd.worker.control.squeeze import HoldForces, balance_forces
 from graspd.worker.grasps import Posture
 from graspd.worker.hands.jaws import jaws_of
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.quality.posed import posing_of
 from graspd.worker.simulation.environment import CLEAR_M, PlacedGrasps
-from graspd.worker.simulation.obstacles import body_room, obstacle_room
+from graspd.worker.simulation.obstacles import body_clearance, obstacle_clearance
 
 #: Clearance of opening fingers from obstacles [m].
 ROOM_M: Final = 0.0025
@@ -61,10 +61,10 @@ def pregrasp(
         some, scene = grasp.take(rows), placed.take(rows) if placed is not None else None
         opening = Openings(posing, some.hand_pose, hand.reduce(some.joint_positions))
         opening.open_from(some)
-        joints[rows] = hand.expand(opening.without_jams(_in_the_way(hand, opening, scene)))
+        joints[rows] = hand.expand(opening.without_jams(_blocked_paths(hand, opening, scene)))
         poses[rows] = opening.retreated()
     found = Posture(poses, joints)
-    return found if placed is None else raised(hand, grasp, found, placed)
+    return found if placed is None else raise_pregrasps(hand, grasp, found, placed)
 
 
 def wide_open(hand: HandModel, obj: ObjectModel, pregrasp: Posture, placed: PlacedGrasps) -> Floats:
@@ -78,7 +78,7 @@ def wide_open(hand: HandModel, obj: ObjectModel, pregrasp: Posture, placed: Plac
         far = np.where(hand.closing > 0, hand.lower, np.where(hand.closing < 0, hand.upper, q))
         wide = np.where(fingers_of_dofs(hand) >= 0, q + np.clip(far - q, -WIDE * hand.span, WIDE * hand.span), q)
         opening = Openings(posing, some.hand_pose, q, wide)
-        joints[rows] = hand.expand(opening.without_jams(_in_the_way(hand, opening, scene)))
+        joints[rows] = hand.expand(opening.without_jams(_blocked_paths(hand, opening, scene)))
     return joints
 
 
@@ -111,7 +111,7 @@ def hold_forces(
     total, reach = normal_force(obj) if total_normal_force is None else total_normal_force, (PRESSING_M, closing)
     found = HoldForces(np.ones(len(grasp)), np.zeros((len(grasp), hand.dofs)))
     for rows in posing.parts(len(grasp)):
-        residual, torque = balanced(posing, grasp.take(rows), total, friction, reach, MAX_PRESSING)
+        residual, torque = balance_forces(posing, grasp.take(rows), total, friction, reach, MAX_PRESSING)
         found.residual[rows], found.torque[rows] = residual, torque
     return found
 
@@ -126,35 +126,35 @@ def touching_links(hand: HandModel, obj: ObjectModel, grasp: Posture, *, device:
     return posing_of(hand, obj, points=_POINTS, device=device).touching_links(grasp)
 
 
-def standing_off(hand: HandModel, obj: ObjectModel, grasp: Posture, *, device: str = "cpu") -> NDArray[np.bool_]:
+def fingers_off_object(hand: HandModel, obj: ObjectModel, grasp: Posture, *, device: str = "cpu") -> NDArray[np.bool_]:
     """Return a mask (N,) of grasps with a finger whose distance from the object is in `STANDS_OFF_M`."""
     near, far = STANDS_OFF_M
     gap = posing_of(hand, obj, points=_POINTS, device=device).finger_gaps(grasp, 2 * far)
     return np.asarray(((gap > near) & (gap < far)).any(axis=1))
 
 
-def _in_the_way(hand: HandModel, opening: Openings, placed: PlacedGrasps | None) -> Blocked | None:
+def _blocked_paths(hand: HandModel, opening: Openings, placed: PlacedGrasps | None) -> Blocked | None:
     if placed is None:
         return None
     pose = opening.hand_pose
     # A finger may be closer to an obstacle in the grasp than allowed; opening must not bring it closer.
-    room = np.minimum(_finger_room(hand, pose, opening.q[:, None], placed), ROOM_M)
+    room = np.minimum(_finger_clearance(hand, pose, opening.q[:, None], placed), ROOM_M)
 
     def blocked(rows: NDArray[np.intp], way: Floats) -> NDArray[np.bool_]:
-        near: NDArray[np.bool_] = _finger_room(hand, pose[rows], way, placed.take(rows)) < room[rows] - 1e-6
+        near: NDArray[np.bool_] = _finger_clearance(hand, pose[rows], way, placed.take(rows)) < room[rows] - 1e-6
         return near
 
     return blocked
 
 
-def _finger_room(hand: HandModel, hand_pose: Floats, paths: Floats, placed: PlacedGrasps) -> Floats:
+def _finger_clearance(hand: HandModel, hand_pose: Floats, paths: Floats, placed: PlacedGrasps) -> Floats:
     """Return fingers' least clearance (B, fingers) on paths (B, K, D), by `body_room`; inf for dofs without a
     finger."""
     count, steps, _ = paths.shape
     finger = fingers_of_bodies(hand)
     out = np.full((count, count_fingers(hand)), np.inf)
     postures = Posture(np.repeat(hand_pose, steps, axis=0), hand.expand(paths).reshape(count * steps, -1))
-    found = body_room(hand, postures, placed.scenes, np.repeat(placed.index, steps))
+    found = body_clearance(hand, postures, placed.scenes, np.repeat(placed.index, steps))
     found = found.reshape(count, steps, -1).min(axis=1)
     for f in np.unique(finger[finger >= 0]):
         out[:, f] = found[:, finger == f].min(axis=1)
@@ -171,7 +171,7 @@ RAISE_LOOKS: Final = tuple(np.arange(8) / 8)
 HIGHEST_RAISE_M: Final = 0.008
 
 
-def raised(hand: HandModel, grasp: Posture, pregrasp: Posture, placed: PlacedGrasps) -> Posture:
+def raise_pregrasps(hand: HandModel, grasp: Posture, pregrasp: Posture, placed: PlacedGrasps) -> Posture:
     """Return pregrasps (N), raised against gravity by the missing clearance on the straight trajectory.
     Pregrasps with enough clearance, or with more missing than `HIGHEST_RAISE_M`, are unchanged."""
     poses = np.array(pregrasp.hand_pose, float)
@@ -179,7 +179,7 @@ def raised(hand: HandModel, grasp: Posture, pregrasp: Posture, placed: PlacedGra
     rows = np.flatnonzero(near[placed.index])
     if not len(rows):
         return pregrasp
-    lack = _lack(hand, grasp.take(rows), pregrasp.take(rows), placed.take(rows))
+    lack = _missing_clearance(hand, grasp.take(rows), pregrasp.take(rows), placed.take(rows))
     # The raise at the pregrasp decreases to zero along the trajectory.
     height = (lack / (1 - np.array(RAISE_LOOKS))).max(axis=1)
     height = np.where(height <= HIGHEST_RAISE_M, height, 0.0)
@@ -188,13 +188,13 @@ def raised(hand: HandModel, grasp: Posture, pregrasp: Posture, placed: PlacedGra
     return Posture(poses, pregrasp.joint_positions)
 
 
-def _lack(hand: HandModel, grasp: Posture, pregrasp: Posture, placed: PlacedGrasps) -> Floats:
+def _missing_clearance(hand: HandModel, grasp: Posture, pregrasp: Posture, placed: PlacedGrasps) -> Floats:
     """Return the missing clearance (n, looks) of hands at the shares `RAISE_LOOKS` of their trajectory."""
     share = np.array(RAISE_LOOKS)[None, :, None]
     pose = (1 - share) * pregrasp.hand_pose[:, None] + share * grasp.hand_pose[:, None]
     pose[..., 3:] = pregrasp.hand_pose[:, None, 3:]  # a pregrasp has the orientation of its grasp
     joints = (1 - share) * pregrasp.joint_positions[:, None] + share * grasp.joint_positions[:, None]
     postures = Posture(pose.reshape(-1, 7), joints.reshape(-1, joints.shape[-1]))
-    room = obstacle_room(hand, postures, placed.scenes, np.repeat(placed.index, len(RAISE_LOOKS)))
+    room = obstacle_clearance(hand, postures, placed.scenes, np.repeat(placed.index, len(RAISE_LOOKS)))
     wanted = np.where(np.array(RAISE_LOOKS) > 0, RAISE_CLOSING_M, RAISE_OPEN_M)
     return np.maximum(0.0, wanted - room.reshape(len(grasp), -1))

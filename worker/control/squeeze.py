@@ -36,7 +36,7 @@ class HoldForces:
     """(N, D) torques of the dofs that exert the forces [N m or N]."""
 
 
-def balanced(
+def balance_forces(
     posing: PostureData, grasp: Posture, total: float, friction: float, reach: tuple[float, float], most: int
 ) -> tuple[Floats, Floats]:
     """Compute balanced contact forces of grasps within the hand's torque limits: residuals and torques of `HoldForces`.
@@ -61,15 +61,15 @@ def balanced(
         launch(touching.scale_torques, count, inputs=[wp.float64(TORQUE)], outputs=[used, matrix, unit])
         target = np.zeros(rows)
         target[6] = SUM
-        share = solved(matrix, target, SPREAD, used)
+        share = solve_nonnegative(matrix, target, SPREAD, used)
         residual = wp.empty(count, dtype=wp.float64)
         torque = wp.empty((count, posing.hand.dofs), dtype=wp.float64)
         inputs = [posing.effort, matrix, share, used, unit, wp.float64(total)]
-        launch(touching.hold, count, inputs=inputs, outputs=[residual, torque])
+        launch(touching.net_wrench, count, inputs=inputs, outputs=[residual, torque])
     return residual.numpy(), torque.numpy()
 
 
-def solved(matrix: Any, target: Floats, ridge: float, count: Any) -> Any:
+def solve_nonnegative(matrix: Any, target: Floats, ridge: float, count: Any) -> Any:
     """Return the x >= 0 (B, K) that minimise |M x - t|^2 + ridge^2 |x|^2 for B systems, on their device.
     `matrix` (B, K, R) has the columns of M; the first `count` (B,) of them are used; x is 0 for the others."""
     (batch, columns, rows), device = matrix.shape, matrix.device
@@ -86,12 +86,12 @@ def solved(matrix: Any, target: Floats, ridge: float, count: Any) -> Any:
     if len(unsolved):
         found, columns, used = x.numpy(), matrix.numpy(), count.numpy()
         for b in unsolved:
-            found[b] = _plain(columns[b], target, ridge, int(used[b]))
+            found[b] = _solve_by_scipy(columns[b], target, ridge, int(used[b]))
         x.assign(found)
     return x
 
 
-def _plain(matrix: Floats, target: Floats, ridge: float, count: int) -> Floats:
+def _solve_by_scipy(matrix: Floats, target: Floats, ridge: float, count: int) -> Floats:
     from scipy.optimize import nnls
 
     system = np.vstack([matrix[:count].T, ridge * np.eye(count)])

@@ -27,7 +27,7 @@ _started = False
 log = logging.getLogger(__name__)
 
 
-def _default_of_each_thread() -> None:
+def _set_thread_defaults() -> None:
     """Give every thread its own default device, since Warp has one for the process.
     A `ScopedDevice` would move another thread's arrays to its device and leave it as the default. Until every array
     names its device, this is the only place that accesses Warp's internals."""
@@ -69,8 +69,8 @@ def start() -> None:
             for line in caught:
                 if _HARMLESS not in line:
                     os.write(2, line)
-        _default_of_each_thread()
-        lay_out(Path(wp.config.kernel_cache_dir))
+        _set_thread_defaults()
+        copy_compiled(Path(wp.config.kernel_cache_dir))
         _started = True
 
 
@@ -111,7 +111,9 @@ def _has_kernels(name: str) -> bool:
     return any(isinstance(value, wp.Kernel) for value in vars(import_module(name)).values())
 
 
-def bake(names: Iterable[str], *, architectures: Sequence[int] = ARCHITECTURES, cpu: bool = True) -> list[Path]:
+def compile_modules(
+    names: Iterable[str], *, architectures: Sequence[int] = ARCHITECTURES, cpu: bool = True
+) -> list[Path]:
     """Compile modules into Warp's cache for these architectures and this CPU; return all files. No GPU is needed."""
     for name in names:
         module = import_module(name)
@@ -123,7 +125,7 @@ def bake(names: Iterable[str], *, architectures: Sequence[int] = ARCHITECTURES, 
     return sorted(file for file in Path(wp.config.kernel_cache_dir).glob("*/*") if file.is_file())
 
 
-def lay_out(cache: Path) -> None:
+def copy_compiled(cache: Path) -> None:
     """Copy missing kernels from `$GRASPD_KERNELS` into the cache, if the folder is readable."""
     if not (named := os.environ.get(VARIABLE, "")):
         return

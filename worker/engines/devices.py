@@ -33,7 +33,7 @@ class Device:
     """Device by Warp name, or `auto`, resolved in the background: Warp takes most of a second to import."""
 
     def __init__(self, wanted: str, *, number: int | None = None) -> None:
-        """`number`: index of a worker on its machine, see `take`.
+        """`number`: index of a worker on its machine, see `select_gpu`.
         Raises InputError for an invalid name, or a CUDA device that does not exist."""
         if not re.fullmatch(r"auto|cpu|cuda:\d+", wanted):
             raise InputError(f"there is no device {wanted!r}; use cpu, cuda:0 (or another number), or auto")
@@ -44,7 +44,7 @@ class Device:
         if wanted.startswith("cuda"):
             self.resolve()
 
-    def find_out(self, then: Callable[[], None]) -> None:
+    def start_resolving(self, then: Callable[[], None]) -> None:
         def work() -> None:
             self.resolve()
             then()
@@ -55,7 +55,7 @@ class Device:
         """Return cpu, cuda:0, ...; waits until it is resolved."""
         with self._lock:
             if not self._resolved:
-                self._resolved, self.name = _ask_warp(self.wanted, self._number)
+                self._resolved, self.name = _find_device(self.wanted, self._number)
             return self._resolved
 
 
@@ -68,7 +68,7 @@ def cpu_name() -> str:
     return found.group(1) if found else platform.machine()
 
 
-def _ask_warp(wanted: str, number: int | None) -> tuple[str, str]:
+def _find_device(wanted: str, number: int | None) -> tuple[str, str]:
     gpus = visible_gpus()
     if wanted == "cpu" or (wanted == "auto" and not gpus):
         return "cpu", cpu_name()
@@ -77,7 +77,7 @@ def _ask_warp(wanted: str, number: int | None) -> tuple[str, str]:
         if wanted not in names:
             raise InputError(f"Warp finds no device {wanted!r}; there are: {', '.join(['cpu', *names])}")
         gpus, number = [gpus[names.index(wanted)]], None
-    gpu = take(gpus, user_cache.folder("gpus"), number=number)
+    gpu = select_gpu(gpus, user_cache.folder("gpus"), number=number)
     return gpu.name, gpu.model
 
 
@@ -99,7 +99,7 @@ class Gpu:
     model: str = ""
 
 
-def take(gpus: Sequence[Gpu], folder: Path, *, number: int | None = None) -> Gpu:
+def select_gpu(gpus: Sequence[Gpu], folder: Path, *, number: int | None = None) -> Gpu:
     """Select one of the GPUs (at least one): that of worker `number`, else one with the fewest processes.
     The GPU counts as taken until this process ends. Without a writable folder: the GPU of `number`, else the first."""
     eligible = [gpus[number % len(gpus)]] if number is not None else list(gpus)

@@ -27,7 +27,7 @@ _VOIDING: Final = [
 ARENA: Final = 64 * 2**20
 
 
-def void(data: Any) -> bool:
+def is_invalid(data: Any) -> bool:
     """Check whether a simulation since its last `mj_resetData` is invalid."""
     return bool(data.warning.number[_VOIDING].any())
 

@@ -35,7 +35,7 @@ def write_clouds(clouds: Clouds, folder: Path, said: Mapping[str, Any]) -> dict[
     done = {"files": 0, "clouds": 0, "empty": 0}
     for _, samples in groupby(clouds, key=lambda sample: sample["shard_id"]):
         together = list(samples)
-        np.savez_compressed(folder / f"clouds-{done['files']:05}.npz", **stacked(together))
+        np.savez_compressed(folder / f"clouds-{done['files']:05}.npz", **stack_samples(together))
         done["files"] += 1
         done["clouds"] += len(together)
         done["empty"] += sum(sample["cloud/seen"] == 0 for sample in together)
@@ -43,7 +43,7 @@ def write_clouds(clouds: Clouds, folder: Path, said: Mapping[str, Any]) -> dict[
     return done
 
 
-def stacked(samples: list[dict[str, Any]]) -> dict[str, Any]:
+def stack_samples(samples: list[dict[str, Any]]) -> dict[str, Any]:
     found: dict[str, NDArray[Any]] = {name: np.array(str(samples[0][name])) for name in _WORDS}
     found["grasp/count"] = np.array([len(sample["grasp/base_row"]) for sample in samples], np.int32)
     for name in samples[0]:

@@ -46,7 +46,7 @@ class Balance:
         kinds = self._kinds(shards)
         wanted = np.concatenate([validity.valid(shard.arrays) for shard in shards])
         if self.min_distance > 0 and wanted.any():
-            wanted[np.flatnonzero(wanted)[~self._apart(shards, wanted)]] = False
+            wanted[np.flatnonzero(wanted)[~self._distinct(shards, wanted)]] = False
         _, kind = np.unique(kinds, axis=0, return_inverse=True)
         counts = np.bincount(kind.ravel()[wanted])
         limit = self.at_most or int(np.median(counts[counts > 0])) if wanted.any() else 0
@@ -61,14 +61,14 @@ class Balance:
         columns = []
         for name in self.by:
             if name == "face":
-                columns.append(faces(np.concatenate([_down(shard) for shard in shards])))
+                columns.append(face_numbers(np.concatenate([_down_directions(shard) for shard in shards])))
                 continue
             if old := [shard for shard in shards if _COLUMNS[name] not in shard.arrays]:
                 raise InputError(f"{old[0].path} does not record the {name} of its grasps: an older graspd made it")
             columns.append(np.concatenate([np.asarray(shard[_COLUMNS[name]], np.int64) for shard in shards]))
         return np.stack(columns, axis=1)
 
-    def _apart(self, shards: list[Shard], wanted: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def _distinct(self, shards: list[Shard], wanted: NDArray[np.bool_]) -> NDArray[np.bool_]:
         hand = hand_of_shard(shards[0], self.hand)
         parts = [Posture.from_columns(shard.arrays) for shard in shards]
         pose = np.concatenate([part.hand_pose for part in parts])[wanted]
@@ -76,7 +76,7 @@ class Balance:
         return distinct(hand_points(hand, Posture(pose, joints)), self.min_distance)
 
 
-def _down(shard: Shard) -> NDArray[np.float64]:
+def _down_directions(shard: Shard) -> NDArray[np.float64]:
     """Return the down direction (N, 3) in the scene of each grasp, object frame; zero for free objects."""
     if "grasp/scene_index" not in shard.arrays:
         return np.zeros((len(shard["quality/valid"]), 3))
@@ -85,7 +85,7 @@ def _down(shard: Shard) -> NDArray[np.float64]:
     return np.asarray(down[np.asarray(shard["grasp/scene_index"], np.intp)])
 
 
-def faces(down: NDArray[np.float64]) -> NDArray[np.int64]:
+def face_numbers(down: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return face numbers (N,) of down directions (N, 3); a face covers 20 degrees about its first direction."""
     seen = np.zeros((0, 3))
     found = np.full(len(down), -1, np.int64)

@@ -66,7 +66,7 @@ class AssetFiles:
     options: dict[str, Any]
 
 
-def remembered(hand: str, obj: str, options: Mapping[str, Any]) -> dict[str, Attribute]:
+def path_attributes(hand: str, obj: str, options: Mapping[str, Any]) -> dict[str, Attribute]:
     """Return root attributes with the paths of hand and object; built-in ones need none."""
     found: dict[str, Attribute] = {}
     for kind, path in (("hand", Path(hand)), ("object", Path(obj))):
@@ -75,7 +75,7 @@ def remembered(hand: str, obj: str, options: Mapping[str, Any]) -> dict[str, Att
     return found | ({"object_options": json_attribute(dict(options))} if options else {})
 
 
-def find(sought: AssetReference) -> AssetFiles:
+def find_files(sought: AssetReference) -> AssetFiles:
     """Find the files of a hand or object: built in, at the shard's path, in the store or shard's folder.
     Raises NotFoundError: in none of these; the message lists the places."""
     if sought.name in builtin_names(sought.kind):
@@ -85,12 +85,12 @@ def find(sought: AssetReference) -> AssetFiles:
     looked: list[str] = []
     if sought.source:
         looked.append(f"at {sought.source}, where the shard was made")
-        if (found := at(sought, Path(sought.source))) is not None:
+        if (found := files_at(sought, Path(sought.source))) is not None:
             return found
-    if (found := _stored(sought, looked)) is not None:
+    if (found := _files_in_store(sought, looked)) is not None:
         return found
-    for path in _beside(sought, looked):
-        if (found := at(sought, path)) is not None:
+    for path in _nearby_paths(sought, looked):
+        if (found := files_at(sought, path)) is not None:
             return found
     raise NotFoundError(
         f"the {sought.kind} {sought.name!r} of digest {sought.digest[:12]} is not {', not '.join(looked)}; "
@@ -98,7 +98,7 @@ def find(sought: AssetReference) -> AssetFiles:
     )
 
 
-def _stored(sought: AssetReference, looked: list[str]) -> AssetFiles | None:
+def _files_in_store(sought: AssetReference, looked: list[str]) -> AssetFiles | None:
     from graspd.service.settings import Settings
 
     url = Settings().resolved_store_url
@@ -109,7 +109,7 @@ def _stored(sought: AssetReference, looked: list[str]) -> AssetFiles | None:
         return None
 
 
-def _beside(sought: AssetReference, looked: list[str]) -> Iterator[Path]:
+def _nearby_paths(sought: AssetReference, looked: list[str]) -> Iterator[Path]:
     if sought.folder is None:
         return
     looked.append(f"in {sought.folder}")
@@ -118,7 +118,7 @@ def _beside(sought: AssetReference, looked: list[str]) -> Iterator[Path]:
     yield from islice(fitting, LOOKED_AT)
 
 
-def at(sought: AssetReference, path: Path) -> AssetFiles | None:
+def files_at(sought: AssetReference, path: Path) -> AssetFiles | None:
     """Return the files at a path if they match the reference."""
     try:
         if not path.is_file():
@@ -147,14 +147,14 @@ _MATTER: Final = {"object_mass_kg": MASS_KG, "object_friction": FRICTION}
 
 
 def hand_of_shard(shard: Shard, given: str | None) -> HandModel:
-    """Load the hand `given` (a file or a built-in); by default the shard's own, see `find`.
+    """Load the hand `given` (a file or a built-in); by default the shard's own, see `find_files`.
     Raises NotFoundError: there is no such file, built-in or hand. ConflictError: it is not that of the shard."""
     if given:
         hand = hand_from_path(given)
-        _check(shard, "hand", hand.digest, given)
+        _check_digest(shard, "hand", hand.digest, given)
         return hand
-    wanted = _wanted(shard, AssetKind.HAND)
-    found = find(wanted)
+    wanted = _reference_of(shard, AssetKind.HAND)
+    found = find_files(wanted)
     return load_hand(found.files, name=wanted.name, digest=wanted.digest, options=found.options)
 
 
@@ -162,7 +162,7 @@ def hand_files_of_shard(shard: Shard, given: str | None) -> AssetFiles:
     if given:
         _, files, stated = hand_files(given)
         return AssetFiles(files, stated)
-    return find(_wanted(shard, AssetKind.HAND))
+    return find_files(_reference_of(shard, AssetKind.HAND))
 
 
 def object_of_shard(shard: Shard, given: str | None) -> ObjectModel:
@@ -172,24 +172,24 @@ def object_of_shard(shard: Shard, given: str | None) -> ObjectModel:
     mass, friction = (float(said.get(key, default)) for key, default in _MATTER.items())  # type: ignore[arg-type]
     stated = options_of(said.get("fidelity")).get("face_error_m")
     error = float(stated) if isinstance(stated, int | float) else 3e-4
-    wanted = _wanted(shard, AssetKind.OBJECT)
+    wanted = _reference_of(shard, AssetKind.OBJECT)
     if not given:
-        obj = _loaded(wanted, find(wanted), error)
-    elif (found := at(wanted, Path(given))) is not None:
-        obj = _loaded(wanted, found, error)
+        obj = _load_object(wanted, find_files(wanted), error)
+    elif (found := files_at(wanted, Path(given))) is not None:
+        obj = _load_object(wanted, found, error)
     else:
         obj = object_from_path(given, face_error_m=error)
-        _check(shard, "object", obj.digest, given)
-    return obj.weighing(mass=mass, friction=friction)
+        _check_digest(shard, "object", obj.digest, given)
+    return obj.with_mass(mass=mass, friction=friction)
 
 
-def _loaded(wanted: AssetReference, found: AssetFiles, face_error_m: float) -> ObjectModel:
+def _load_object(wanted: AssetReference, found: AssetFiles, face_error_m: float) -> ObjectModel:
     return load_object(
         found.files, name=wanted.name, digest=wanted.digest, face_error_m=face_error_m, options=found.options
     )
 
 
-def _wanted(shard: Shard, kind: AssetKind) -> AssetReference:
+def _reference_of(shard: Shard, kind: AssetKind) -> AssetReference:
     said = shard.attributes
     return AssetReference(
         kind,
@@ -203,7 +203,7 @@ def _wanted(shard: Shard, kind: AssetKind) -> AssetReference:
 
 def neighbours_of_shard(shard: Shard, given: Sequence[str]) -> Neighbours | None:
     """Load the other objects of a scene shard with their poses; None if the object is alone.
-    Raises NotFoundError: `find` does not find one. ConflictError: the given objects are not those of the shard."""
+    Raises NotFoundError: `find_files` fails. ConflictError: the given objects are not those of the shard."""
     names, digests = (shard.attributes.get(key, []) for key in ("neighbours", "neighbour_digests"))
     if "scene/neighbour_pose" not in shard.arrays or not isinstance(names, list) or not isinstance(digests, list):
         return None
@@ -214,7 +214,7 @@ def neighbours_of_shard(shard: Shard, given: Sequence[str]) -> Neighbours | None
     objects = (
         [object_from_path(name, face_error_m=NEIGHBOUR_FACE_ERROR_M) for name in given]
         if given
-        else [_neighbour(shard, *one) for one in zip_longest(names, digests, sources, fillvalue="")]
+        else [_load_neighbour(shard, *one) for one in zip_longest(names, digests, sources, fillvalue="")]
     )
     for obj, name, digest in zip(objects, names, digests, strict=True):
         if obj.digest != digest:
@@ -225,7 +225,7 @@ def neighbours_of_shard(shard: Shard, given: Sequence[str]) -> Neighbours | None
     return Neighbours(objects, np.asarray(shard["scene/neighbour_pose"], float))
 
 
-def beside_attributes(others: Sequence[ObjectModel], given: Sequence[str]) -> dict[str, Attribute]:
+def neighbour_attributes(others: Sequence[ObjectModel], given: Sequence[str]) -> dict[str, Attribute]:
     """Return a shard's attributes for other objects, given as files or names; empty if there are none."""
     if not others:
         return {}
@@ -236,13 +236,13 @@ def beside_attributes(others: Sequence[ObjectModel], given: Sequence[str]) -> di
     }
 
 
-def _neighbour(shard: Shard, name: str, digest: str, source: str) -> ObjectModel:
+def _load_neighbour(shard: Shard, name: str, digest: str, source: str) -> ObjectModel:
     folder = None if shard.path is None else shard.path.resolve().parent
     wanted = AssetReference(AssetKind.OBJECT, name, digest, source, folder=folder)
-    return _loaded(wanted, find(wanted), NEIGHBOUR_FACE_ERROR_M)
+    return _load_object(wanted, find_files(wanted), NEIGHBOUR_FACE_ERROR_M)
 
 
-def placed_of_shard(shard: Shard) -> PlacedGrasps | None:
+def scenes_of_shard(shard: Shard) -> PlacedGrasps | None:
     """Return the scenes of a base shard's grasps; None if they were planned around a free object.
     Raises InputError: the shard's scene attribute is invalid."""
     if "scene/object_pose" not in shard.arrays or "grasp/scene_index" not in shard.arrays:
@@ -256,7 +256,7 @@ def placed_of_shard(shard: Shard) -> PlacedGrasps | None:
     return scenes.placed(np.asarray(shard["grasp/scene_index"], np.intp))
 
 
-def _check(shard: Shard, kind: str, digest: str, given: str) -> None:
+def _check_digest(shard: Shard, kind: str, digest: str, given: str) -> None:
     expected = str(shard.attributes.get(f"{kind}_digest", ""))
     if expected != digest:
         raise ConflictError(
@@ -275,7 +275,7 @@ def id_of_columns(columns: Columns) -> str:
     return found.hexdigest()
 
 
-def made_of(source: Shard) -> dict[str, Attribute]:
+def source_attributes(source: Shard) -> dict[str, Attribute]:
     """Return the attributes of a shard that name the shard of its scenes or grasps."""
     return {f"{source.kind}_shard": str(source.attributes.get("shard_id") or id_of_columns(source.arrays))}
 

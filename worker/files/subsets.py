@@ -72,7 +72,7 @@ UnvalidatedOption = Annotated[
 EveryOption = Annotated[bool, typer.Option("--all", help="Select all grasps, including failed ones.")]
 
 
-def choose(base: Shard, *, unvalidated: bool = False, every: bool = False) -> tuple[NDArray[np.bool_], str]:
+def select_grasps(base: Shard, *, unvalidated: bool = False, every: bool = False) -> tuple[NDArray[np.bool_], str]:
     """Select grasps (N,), and return a name for the selection.
     Raises InputError: both options at once, or no such grasp; the message states what the shard contains."""
     if unvalidated and every:
@@ -84,11 +84,11 @@ def choose(base: Shard, *, unvalidated: bool = False, every: bool = False) -> tu
         mask = validity.selection(base.arrays, unvalidated=unvalidated)
         word = "feasible grasps that are not validated" if unvalidated else "valid grasps"
     if not mask.any():
-        raise InputError(f"{base.path or 'the shard'} contains no {word}; {_there_are(base, count)}")
+        raise InputError(f"{base.path or 'the shard'} contains no {word}; {_available_text(base, count)}")
     return mask, word
 
 
-def _there_are(base: Shard, count: int) -> str:
+def _available_text(base: Shard, count: int) -> str:
     waiting = int(validity.selection(base.arrays, unvalidated=True).sum())
     valid = int(validity.valid(base.arrays).sum())
     if waiting:

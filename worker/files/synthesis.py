@@ -21,14 +21,15 @@ from graspd.service.model.transforms import Floats
 from graspd.service.store.columns import Attribute
 from graspd.service.store.manifests import INDEX_THRESHOLD_M
 from graspd.service.store.shards import json_attribute
+from graspd.worker.batched_generation import validated_batches
+from graspd.worker.engines.batch_sizes import batches_at_once, processes_at_once
 from graspd.worker.engines.devices import Device
-from graspd.worker.engines.joins import batches_at_once, processes_at_once
 from graspd.worker.execution_context import ExecutionContext, PrefilterMode, Progress
 from graspd.worker.files.provenance import (
     NEIGHBOUR_FACE_ERROR_M,
     base_attributes,
-    beside_attributes,
-    remembered,
+    neighbour_attributes,
+    path_attributes,
     wrist_attributes,
 )
 from graspd.worker.generation import ValidatedBatch
@@ -36,14 +37,13 @@ from graspd.worker.grasps import joined_columns
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.objects.options import as_asked
+from graspd.worker.objects.options import for_request
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import planner
-from graspd.worker.planners.registry import of_this_machine
+from graspd.worker.planners.registry import local_options
 from graspd.worker.pool.pool import MODULES, Pool
 from graspd.worker.scenes.placement import scenes_of
 from graspd.worker.scenes.rest import rolling_poses
-from graspd.worker.together import validated_batches
 from graspd.worker.validation.payload import Limit
 
 Arrays = dict[str, NDArray[Any]]
@@ -79,9 +79,9 @@ class SynthesisResult:
             sum(batch.candidates for batch in self.batches),
             request.budget,
             sum_outcomes(batch.outcomes for batch in self.batches),
-            limit.line if limit is not None and limit.hopeless else "",
+            limit.line if limit is not None and limit.is_unreachable else "",
         )
-        if limit is not None and not limit.hopeless:
+        if limit is not None and not limit.is_unreachable:
             reason = f"{reason}; {limit.line}"
         return f"{reason}; {narrow}" if reason and narrow else reason
 
@@ -119,10 +119,10 @@ class SynthesisResult:
             },
         }
         if request.measures_payload:
-            payload = self._known("payload_kg")
+            payload = self._finite_values("payload_kg")
             told["payload_kg"] = round(float(np.median(payload)), 4) if len(payload) else None
         if request.shake:
-            margin = self._known("shake_margin")
+            margin = self._finite_values("shake_margin")
             told["shake_share"] = round(float((margin < 1).mean()), 4) if len(margin) else None
         if self.limit is not None:
             told["limit"] = self.limit.facts()
@@ -149,7 +149,7 @@ class SynthesisResult:
             "direction_entropy_bits": round(entropy_bits(cells.tolist()), 4),
         }
 
-    def _known(self, name: str) -> Floats:
+    def _finite_values(self, name: str) -> Floats:
         values = np.asarray(self.arrays[f"quality/{name}"], float)
         return values[np.isfinite(values)]
 
@@ -168,12 +168,12 @@ class SynthesisResult:
         }
 
 
-def synthesized_as(hand: str, obj: str, options: LocalOptions, **run: Any) -> SynthesisResult:
-    """Run `synthesized` with a local user's options; `run`: further arguments."""
-    return synthesized(
+def synthesize_with(hand: str, obj: str, options: LocalOptions, **run: Any) -> SynthesisResult:
+    """Run `synthesize_grasps` with a local user's options; `run`: further arguments."""
+    return synthesize_grasps(
         hand,
         obj,
-        options.request(of_this_machine(options.method, options.options)),
+        options.request(local_options(options.method, options.options)),
         place=options.place,
         scenes=options.scenes,
         mesh=options.mesh,
@@ -184,7 +184,7 @@ def synthesized_as(hand: str, obj: str, options: LocalOptions, **run: Any) -> Sy
     )
 
 
-def synthesized(
+def synthesize_grasps(
     hand: str,
     obj: str,
     request: JobOptions,
@@ -211,7 +211,7 @@ def synthesized(
         raise InputError(SHAKE_NEEDS_A_SCENE)
     options = dict(mesh or {})
     model = hand_from_path(hand)
-    thing = as_asked(object_from_path(obj, face_error_m=request.knobs.face_error_m, options=options), request)
+    thing = for_request(object_from_path(obj, face_error_m=request.knobs.face_error_m, options=options), request)
     chosen = Device(device).resolve()
     began = time.perf_counter()
     others = [object_from_path(one.object, face_error_m=NEIGHBOUR_FACE_ERROR_M) for one in place.neighbours]
@@ -235,12 +235,12 @@ def synthesized(
     seconds = time.perf_counter() - began
     arrays = joined_columns([{**batch.grasps.to_columns(), **batch.columns} for batch in batches])
     arrays |= {name: poses[name] for name in _KEPT if name in poses}
-    attributes = _attributes(model, thing, request, batches, chosen, seconds) | remembered(hand, obj, options)
+    attributes = _attributes(model, thing, request, batches, chosen, seconds) | path_attributes(hand, obj, options)
     if interrupted:
         attributes["grasps_wanted"] = request.grasps
     if poses:
-        attributes |= {"scene": json_attribute(_as_stored(place, others))} | wrist_attributes(model)
-        attributes |= beside_attributes(others, [one.object for one in place.neighbours])
+        attributes |= {"scene": json_attribute(_stored_scene(place, others))} | wrist_attributes(model)
+        attributes |= neighbour_attributes(others, [one.object for one in place.neighbours])
     rolling = rolling_poses(thing, poses["scene/object_pose"]) if poses and place.target is None else 0
     made = SynthesisResult(arrays, attributes, batches, request, place, interrupted, seconds, rolling)
     if made.reason is not None:
@@ -248,7 +248,7 @@ def synthesized(
     return made
 
 
-def _as_stored(place: SceneSpec, others: Sequence[ObjectModel]) -> dict[str, Any]:
+def _stored_scene(place: SceneSpec, others: Sequence[ObjectModel]) -> dict[str, Any]:
     """Return the scene as stored in a shard: neighbours by name, not by local file."""
     said = place.told()
     for one, other in zip(said["neighbours"], others, strict=True):

@@ -18,7 +18,7 @@ from graspd.worker.hands.options import HandOptions
 from graspd.worker.hands.pinch_postures import require_opposing
 from graspd.worker.hands.robot import Robot, chain_to
 from graspd.worker.hands.surface import sample_surface
-from graspd.worker.hands.tree import build_tree, cut_drives, passed_limits
+from graspd.worker.hands.tree import build_tree, exceeded_limits, reduced_ranges
 
 #: Number of points that measure the outer surface.
 _SURFACE_POINTS = 512
@@ -50,15 +50,15 @@ def check_hand(
         "closing": bool(settings.closing),
         "effort": not assumed_efforts(source, hand.dof_names),
     }
-    tie = _tie(hand, settings)
+    tie = _approach_note(hand, settings)
     fault = "" if hand.mounting else mounting_of(source, hand)[1]
     notes = [
         *robot.notes,
         *tie,
-        *_open(hand),
+        *_unclosed_fingers(hand),
         *_tendons(hand),
         *_limits(robot, settings),
-        *_left_out(robot, hand, settings),
+        *_omitted_links(robot, hand, settings),
         *_mounting(hand, fault),
     ]
     facts = {
@@ -85,13 +85,13 @@ def _tendons(hand: HandModel) -> list[str]:
     return [f"{', '.join(pairs)} on one tendon{' each' if len(pairs) > 1 else ''}"] if pairs else []
 
 
-def _open(hand: HandModel) -> list[str]:
+def _unclosed_fingers(hand: HandModel) -> list[str]:
     chains = zip(hand.fingertips, chains_of(hand), strict=True)
     still = [hand.body_names[tip] for tip, chain in chains if not hand.closing[hand.dof[chain]].any()]
     return [f"no joint closes the finger of {', '.join(still)}: name one with --closing JOINT=1"] if still else []
 
 
-def _tie(hand: HandModel, settings: HandOptions) -> list[str]:
+def _approach_note(hand: HandModel, settings: HandOptions) -> list[str]:
     stated = settings.approach or (settings.palm and settings.palm.approach)
     if stated or jaws_of(hand) is not None or not guess_approach(hand)[1]:
         return []
@@ -100,15 +100,15 @@ def _tie(hand: HandModel, settings: HandOptions) -> list[str]:
 
 def _limits(robot: Robot, settings: HandOptions) -> list[str]:
     tree = build_tree(robot, settings)
-    passed = passed_limits(robot, tree, settings)
+    passed = exceeded_limits(robot, tree, settings)
     notes = (
         [f"limits of {', '.join(passed)} are not used, as in ROS, because these joints are coupled"] if passed else []
     )
-    notes += cut_drives(robot, tree)
+    notes += reduced_ranges(robot, tree)
     return notes + ([f"{', '.join(tree.still)} cannot move: the limits leave one value"] if tree.still else [])
 
 
-def _left_out(robot: Robot, hand: HandModel, settings: HandOptions) -> list[str]:
+def _omitted_links(robot: Robot, hand: HandModel, settings: HandOptions) -> list[str]:
     """Return a note on links left out when a hand was separated from its arm without an option."""
     chain = chain_to(robot, hand.root_link)
     above = [joint.name for joint in chain if joint.type != "fixed"]

@@ -31,7 +31,7 @@ def closing_by_limits(hand: HandModel) -> Floats:
     0."""
     up, down = np.maximum(hand.upper, 0), np.maximum(-hand.lower, 0)
     closing = np.where(up > FAR * down, 1.0, np.where(down > FAR * up, -1.0, 0.0))
-    carrying = set(carriers(hand))
+    carrying = set(shared_bodies(hand))
     for body, name in zip(hand.joint_body, hand.joint_names, strict=True):
         if body in carrying and name in hand.dof_names:
             closing[hand.dof_names.index(name)] = 0.0
@@ -45,7 +45,8 @@ def closing_by_tips(hand: HandModel) -> Floats:
     other tips and away from the palm. It spreads if it turns about the approach or has symmetric limits. A joint in
     line with its finger does neither."""
     limits, (flexing, opposing, ways) = closing_by_limits(hand), _gains(hand)
-    opened, half = (_axes(hand, posture(hand, share)) for share in (0.0, 0.5))
+    postures = (hand.expand(closing_posture(hand, share)) for share in (0.0, 0.5))
+    opened, half = (quat_rotate(body_poses(hand, IDENTITY_POSE, q)[0, :, 3:], hand.axis) for q in postures)
     flexed, crossed, flexed_way, crossed_way = np.zeros((4, hand.dofs))
     seen = np.zeros(hand.dofs, bool)
     for number, chain in enumerate(chains_of(hand)):
@@ -78,10 +79,10 @@ def _gains(hand: HandModel) -> tuple[Floats, Floats, Floats]:
     flexing, opposing, ways = np.zeros((3, hand.dofs, len(hand.fingertips)))
     for share in _SHARES:
         for dof in range(hand.dofs):
-            q = np.tile(posture(hand, share), (3, 1))
+            q = np.tile(closing_posture(hand, share), (3, 1))
             q[:, dof] = hand.lower[dof] + np.array([0.0, 0.5, 1.0]) * hand.span[dof]
-            low, _, high = seen = tips(hand, q)
-            nearer = _apart(low) - _apart(high)
+            low, _, high = seen = tip_positions(hand, q)
+            nearer = _tip_distances(low) - _tip_distances(high)
             to_palm = (np.linalg.norm(one - hand.palm.centre, axis=1) for one in (low, high))
             flexing[dof] += nearer + next(to_palm) - next(to_palm)
             opposing[dof] += nearer + (high - low) @ hand.palm.approach
@@ -89,7 +90,7 @@ def _gains(hand: HandModel) -> tuple[Floats, Floats, Floats]:
     return flexing, opposing, ways
 
 
-def _apart(tip: Floats) -> Floats:
+def _tip_distances(tip: Floats) -> Floats:
     """Return the distance (T,) of each tip from the mean of the other tips; tips (T, 3) [m]."""
     others = (tip.sum(axis=0) - tip) / max(len(tip) - 1, 1)
     return np.asarray(np.linalg.norm(tip - others, axis=1)) if len(tip) > 1 else np.zeros(1)
@@ -97,17 +98,13 @@ def _apart(tip: Floats) -> Floats:
 
 def chains_of(hand: HandModel) -> list[list[int]]:
     """Return the bodies whose joints move each fingertip, the last one first, up to the palm."""
-    carrying = set(carriers(hand))
+    carrying = set(shared_bodies(hand))
     return [
         [body for body in hand.chain(tip) if body not in carrying and hand.dof[body] >= 0] for tip in hand.fingertips
     ]
 
 
-def _axes(hand: HandModel, q: Floats) -> Floats:
-    return np.asarray(quat_rotate(body_poses(hand, IDENTITY_POSE, hand.expand(q))[0, :, 3:], hand.axis))
-
-
-def carriers(hand: HandModel) -> list[int]:
+def shared_bodies(hand: HandModel) -> list[int]:
     """Return the bodies that carry all fingertips: root, forearm and wrist, palm."""
     if len(hand.fingertips) < 2:
         return [0]
@@ -115,7 +112,7 @@ def carriers(hand: HandModel) -> list[int]:
     return [same[0] for same in zip(*chains, strict=False) if len(set(same)) == 1]
 
 
-def posture(hand: HandModel, share: float | Floats) -> Floats:
+def closing_posture(hand: HandModel, share: float | Floats) -> Floats:
     """Return the posture (..., D) at shares (..., 1) from open (0) to closed (1); other dofs stay near 0."""
     start = np.where(hand.closing < 0, hand.upper, hand.lower)
     end = np.where(hand.closing < 0, hand.lower, hand.upper)
@@ -123,7 +120,7 @@ def posture(hand: HandModel, share: float | Floats) -> Floats:
     return np.where(hand.closing == 0, rest, start + share * (end - start))
 
 
-def tips(hand: HandModel, q: Floats) -> Floats:
+def tip_positions(hand: HandModel, q: Floats) -> Floats:
     """Return the centres (..., T, 3) of the fingertip bodies in the root frame [m] for postures (..., D)."""
     many = q.reshape(-1, hand.dofs)
     poses = body_poses(hand, np.tile(IDENTITY_POSE, (len(many), 1)), hand.expand(many))

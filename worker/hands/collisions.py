@@ -9,7 +9,7 @@ import numpy as np
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
-from graspd.worker.objects.disk_cache import recalled
+from graspd.worker.objects.disk_cache import cached_step
 
 #: Pieces closer than this [m] at rest count as touching.
 TOUCH_M = 1e-4
@@ -48,7 +48,7 @@ def hull_distance(a: Floats, b: Floats) -> float:
     """Compute the distance [m] of the convex hulls of two point sets (N, 3) and (M, 3); 0 if they overlap.
     Least squares over convex weights x, y: min |a'x - b'y| with sum x = sum y = 1. The sums are rows of large
     weight."""
-    return float(recalled("distance", [a, b], lambda: [_hull_distance(a, b)])["0"])
+    return float(cached_step("distance", [a, b], lambda: [_hull_distance(a, b)])["0"])
 
 
 def _hull_distance(a: Floats, b: Floats) -> Floats:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, quat_rotate
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel, SurfacePoints
-from graspd.worker.hands.pinch_postures import Oppositions, climbed, opposed_finger, random_postures
+from graspd.worker.hands.pinch_postures import Oppositions, improve_postures, opposed_finger, random_postures
 from graspd.worker.hands.surface import farthest_points, sample_surface
 from graspd.worker.objects.memory_cache import cached_by_content
 
@@ -43,26 +43,26 @@ FACING: Final = 0.8
 SQUARE: Final = 0.7
 
 
-def pinches_of(hand: HandModel, height: float) -> Oppositions:
+def flat_pinches(hand: HandModel, height: float) -> Oppositions:
     """Return postures for an object of this height [m]; none if it reaches the pads or the hand has one finger.
     The palm's approach without its part along `axis` points at the plane. `middle` is half the height above it."""
     known = [h for h in HEIGHTS_M if h >= height]
-    return _kept(hand, known[0]) if known and len(hand.fingertips) > 1 else Oppositions.of_none(hand)
+    return _cached_pinches(hand, known[0]) if known and len(hand.fingertips) > 1 else Oppositions.empty(hand)
 
 
 @cached_by_content(32)
-def _kept(hand: HandModel, height: float) -> Oppositions:
+def _cached_pinches(hand: HandModel, height: float) -> Oppositions:
     key, code = (hand.content, str(height)), sys.modules[__name__]
-    return Oppositions.kept_or_made("pinches", key, lambda: _pinches(hand, height), code)
+    return Oppositions.cached("pinches", key, lambda: _pinches(hand, height), code)
 
 
 def _pinches(hand: HandModel, height: float) -> Oppositions:
-    one, look = opposed_finger(hand), _Look.of(hand, height)
+    one, look = opposed_finger(hand), _PinchSearch.of(hand, height)
     q = random_postures(hand, one, CROWD * POSTURES)
     wanted = np.linspace(*WIDTHS_M, POSTURES)
     cost = look.at(q, one).cost(np.repeat(wanted, CROWD))
     q = q[np.arange(POSTURES) * CROWD + cost.reshape(POSTURES, CROWD).argmin(axis=1)]
-    q = climbed(hand, one, q, lambda tried: look.at(tried, one).cost(wanted))
+    q = improve_postures(hand, one, q, lambda tried: look.at(tried, one).cost(wanted))
     seen = look.at(q, one)
     good = np.flatnonzero(
         (seen.short < 1.0)
@@ -75,7 +75,7 @@ def _pinches(hand: HandModel, height: float) -> Oppositions:
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _Evaluation:
     """Poses of the fingertips' ends in N postures."""
 
     axis: Floats
@@ -102,7 +102,7 @@ class _Seen:
 
 
 @dataclass(frozen=True)
-class _Look:
+class _PinchSearch:
     """Surface of a hand as points of its fingertips and of the rest."""
 
     hand: HandModel
@@ -117,7 +117,7 @@ class _Look:
     """(V,) bodies of the other points."""
 
     @classmethod
-    def of(cls, hand: HandModel, height: float) -> _Look:
+    def of(cls, hand: HandModel, height: float) -> _PinchSearch:
         points = sample_surface(hand, _DENSE)
         tips = [_spread(points, tip, _TIP_POINTS) for tip in hand.fingertips]
         mine = np.stack([np.resize(some, _TIP_POINTS) for some in tips])
@@ -132,7 +132,7 @@ class _Look:
             points.body[rest].astype(np.intp),
         )
 
-    def at(self, q: Floats, one: int) -> _Seen:
+    def at(self, q: Floats, one: int) -> _Evaluation:
         """Evaluate the pinch between the finger `one` and the others in postures (N, D)."""
         hand, others = self.hand, [f for f in range(len(self.tips)) if f != one]
         bodies = body_poses(hand, np.tile(IDENTITY_POSE, (len(q), 1)), hand.expand(q))
@@ -170,7 +170,7 @@ class _Look:
         )
         rest = bodies[:, self.body]
         lowest = np.einsum("nvi,ni->nv", quat_rotate(rest[..., 3:], self.others) + rest[..., :3], down).max(axis=1)
-        return _Seen(axis, middle, width, short, facing, np.abs(axis @ hand.palm.approach), plane - lowest)
+        return _Evaluation(axis, middle, width, short, facing, np.abs(axis @ hand.palm.approach), plane - lowest)
 
 
 def _spread(points: SurfacePoints, body: int, count: int) -> NDArray[np.intp]:

@@ -56,20 +56,22 @@ _NEXT_TO: Final = 1e-9
 
 
 @cached_by_content(32)
-def spans_of(hand: HandModel, size: Size) -> Oppositions:
+def postures_for_size(hand: HandModel, size: Size) -> Oppositions:
     """Return postures for small or wide objects, cached in memory and on this machine."""
-    return Oppositions.kept_or_made("spans", (hand.content, size), lambda: _spans(hand, size), sys.modules[__name__])
+    return Oppositions.cached(
+        "spans", (hand.content, size), lambda: _search_postures(hand, size), sys.modules[__name__]
+    )
 
 
-def widest_span(hand: HandModel) -> float:
-    """Return an upper bound of the widths in `spans_of` [m], without a search for postures."""
+def largest_width(hand: HandModel) -> float:
+    """Return an upper bound of the widths in `postures_for_size` [m], without a search for postures."""
     return WIDER * oppositions_of(hand).widest + GOOD_M
 
 
-def _spans(hand: HandModel, size: Size) -> Oppositions:
+def _search_postures(hand: HandModel, size: Size) -> Oppositions:
     widest = oppositions_of(hand).widest
     least, most = SMALL_M if size == "small" else (widest, WIDER * widest)
-    rng, look = np.random.default_rng(0), _Look(hand, size)
+    rng, look = np.random.default_rng(0), _PairSearch(hand, size)
     wanted = np.linspace(least, most, POSTURES)
     q = rng.uniform(hand.lower, hand.upper, (CROWD * POSTURES, hand.dofs))
     found = look.at(q, np.repeat(wanted, CROWD))
@@ -86,7 +88,7 @@ def _spans(hand: HandModel, size: Size) -> Oppositions:
 
 
 @dataclass
-class _Found:
+class _BestPairs:
     """Best pairs of N postures in the form of `Oppositions`, with their costs [m]."""
 
     axis: Floats
@@ -94,12 +96,12 @@ class _Found:
     width: Floats
     cost: Floats
 
-    def take(self, rows: NDArray[np.bool_], other: _Found) -> None:
+    def take(self, rows: NDArray[np.bool_], other: _BestPairs) -> None:
         for mine, its in zip(vars(self).values(), vars(other).values(), strict=True):
             mine[rows] = its[rows]
 
 
-class _Look:
+class _PairSearch:
     """Evaluates pairs of surface points of postures as grips."""
 
     def __init__(self, hand: HandModel, size: Size) -> None:
@@ -117,11 +119,11 @@ class _Look:
         pairs = [np.mgrid[mine, later].reshape(2, -1) for mine, later in self.blocks]
         self.one, self.other = np.concatenate(pairs, axis=1)
 
-    def at(self, q: Floats, wanted: Floats) -> _Found:
+    def at(self, q: Floats, wanted: Floats) -> _BestPairs:
         """Return the best pair of each posture (n, D) for the widths `wanted` (n,)."""
         rows = np.array_split(np.arange(len(q)), 1 + len(q) // AT_ONCE)
         parts = [self._at(q[some], wanted[some]) for some in rows]
-        return _Found(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+        return _BestPairs(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
     def _at(self, q: Floats, wanted: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         hand, points = self.hand, self.points
@@ -184,7 +186,7 @@ class _Look:
         ahead = self.hand.palm.approach
         up = ahead - np.einsum("nki,i->nk", axis, ahead)[..., None] * axis
         length = np.linalg.norm(up, axis=2, keepdims=True)
-        up = np.where(length > 0.1, up / np.maximum(length, 0.1), _any_across(axis))
+        up = np.where(length > 0.1, up / np.maximum(length, 0.1), _perpendicular(axis))
         half = 0.5 * width
         start = np.minimum(np.einsum("nki,nki->nk", one, up), np.einsum("nki,nki->nk", other, up))
         start = start - np.minimum(half, BEYOND_M)
@@ -213,7 +215,7 @@ def _flatness(hand: HandModel, points: SurfacePoints) -> Floats:
     return np.minimum(1.0, flat / (np.pi * FLAT_M**2))
 
 
-def _any_across(axis: Floats) -> Floats:
+def _perpendicular(axis: Floats) -> Floats:
     helper = np.eye(3)[np.argmin(np.abs(axis), axis=-1)]
     across = np.cross(axis, helper)
     unit: Floats = across / np.linalg.norm(across, axis=-1, keepdims=True)

@@ -10,13 +10,19 @@ import numpy as np
 
 from graspd.service.model.errors import HandError, did_you_mean
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, compose, quat_rotate
-from graspd.worker.hands.closing import carriers, closing_by_limits, closing_by_tips, posture, tips
-from graspd.worker.hands.jaws import MAX_DOFS, Jaws, closing_by_geometry, find_jaws, sign_of, slides
+from graspd.worker.hands.closing import (
+    closing_by_limits,
+    closing_by_tips,
+    closing_posture,
+    shared_bodies,
+    tip_positions,
+)
+from graspd.worker.hands.jaws import MAX_DOFS, Jaws, closing_by_geometry, find_jaws, prismatic_dofs, sign_of
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel, PalmFrame
 from graspd.worker.hands.options import HandOptions
 from graspd.worker.hands.tree import Tree
-from graspd.worker.objects.disk_cache import recalled
+from graspd.worker.objects.disk_cache import cached_step
 
 #: Share of the range from open to closed in the approach posture.
 PRESHAPE_SHARE = 0.25
@@ -41,14 +47,14 @@ _JOINTS = 64
 RIM_M = 0.02
 
 
-def complete(hand: HandModel, tree: Tree, options: HandOptions) -> HandModel:
+def complete_hand(hand: HandModel, tree: Tree, options: HandOptions) -> HandModel:
     """Fill in fingertips, closing, palm and preshape of the hand: as stated, else as guessed."""
     hand = replace(hand, fingertips=_fingertips(hand, tree, options))
     stated = dict(_by_dof(hand, tree, options.closing))
     hand = replace(hand, closing=closing_by_limits(hand))
-    slide = slides(hand)
+    slide = prismatic_dofs(hand)
     if hand.dofs <= MAX_DOFS or slide.any():
-        seen = replace(hand, closing=_closing_seen(hand, stated))
+        seen = replace(hand, closing=_gripper_closing(hand, stated))
         if (jaws := find_jaws(seen)) is not None:
             return _gripper(seen, jaws, tree, options)
         # Surfaces that come together identify sliding fingertips.
@@ -57,10 +63,10 @@ def complete(hand: HandModel, tree: Tree, options: HandOptions) -> HandModel:
         hand = _with_palm(hand, tree, options)
         hand = replace(hand, closing=np.where(slide, hand.closing, closing_by_tips(hand)))
     # A stated joint does not change the guess of another.
-    return _with_palm(replace(hand, closing=_with(hand.closing, stated)), tree, options)
+    return _with_palm(replace(hand, closing=_override(hand.closing, stated)), tree, options)
 
 
-def _with(closing: Floats, stated: Mapping[int, float]) -> Floats:
+def _override(closing: Floats, stated: Mapping[int, float]) -> Floats:
     closing = closing.copy()
     for dof, direction in stated.items():
         closing[dof] = np.sign(direction)
@@ -95,14 +101,14 @@ def _gripper(hand: HandModel, jaws: Jaws, tree: Tree, options: HandOptions) -> H
 
 def _approach_of_jaws(hand: HandModel, jaws: Jaws) -> Floats:
     """Return the approach of a gripper: perpendicular to the closing line and the axes of hinges."""
-    ahead, axis = _unit(_ahead(hand, jaws)), jaws.axis[len(jaws.q) // 2]
-    if (line := _line_of_joints(hand, ahead, ROUGH, 2, axis)) is not None:
+    ahead, axis = _unit(_pad_direction(hand, jaws)), jaws.axis[len(jaws.q) // 2]
+    if (line := _joint_direction(hand, ahead, ROUGH, 2, axis)) is not None:
         return line
     # A root frame that is not aligned with the closing line says nothing of the approach.
-    return _snapped(ahead) if _angle(axis, _root_axis(axis)) < GOOD else ahead
+    return _snap_to_axis(ahead) if _angle(axis, _root_axis(axis)) < GOOD else ahead
 
 
-def _ahead(hand: HandModel, jaws: Jaws) -> Floats:
+def _pad_direction(hand: HandModel, jaws: Jaws) -> Floats:
     """Return the direction from the palm to the point between the pads, perpendicular to the closing line."""
     half = len(jaws.q) // 2
     poses = body_poses(hand, IDENTITY_POSE, hand.expand(jaws.q[half]))[0]
@@ -112,16 +118,16 @@ def _ahead(hand: HandModel, jaws: Jaws) -> Floats:
     return np.asarray(way - (way @ jaws.axis[half]) * jaws.axis[half])
 
 
-def _closing_seen(hand: HandModel, stated: Mapping[int, float]) -> Floats:
+def _gripper_closing(hand: HandModel, stated: Mapping[int, float]) -> Floats:
     """Return closing of a possible gripper: as stated, else from facing surfaces, else from limits.
     Raises HandError: fingers slide, and nothing opposes them."""
     seen = closing_by_geometry(hand)
-    if not seen.any() and not stated and slides(hand).all():
+    if not seen.any() and not stated and prismatic_dofs(hand).all():
         raise HandError(
             f"no two surfaces of the hand come together when {', '.join(hand.dof_names[:4])} moves: its fingers are "
             "missing or have no collision shapes (add them), or do not move towards each other (correct axes or limits)"
         )
-    return _with(np.where((seen == 0) & ~slides(hand), hand.closing, seen), stated)
+    return _override(np.where((seen == 0) & ~prismatic_dofs(hand), hand.closing, seen), stated)
 
 
 def _fingertips(hand: HandModel, tree: Tree, options: HandOptions) -> tuple[int, ...]:
@@ -141,29 +147,31 @@ def guess_approach(hand: HandModel) -> tuple[Floats, bool]:
     position of the tips of the half-closed hand is ahead of a gripper's palm, but far along the fingers of a human-like
     hand. Their sum has the smallest error. If fingers oppose each other, the tip motions cancel to a sideways residual
     or rounding noise: see `_between_fingers`."""
-    ways, ahead = _ways(hand), _unit(_tips_ahead(hand))
-    if _cancelling(ways, ahead) < OPPOSED:
+    ways, ahead = _tip_motions(hand), _unit(_tips_ahead(hand))
+    if _residual_motion(ways, ahead) < OPPOSED:
         return _between_fingers(hand)
     mean = _unit(ways.sum(axis=0)) + ahead
     tied = bool(np.linalg.norm(mean) < CONTRADICTING)
     rough = ahead if tied else _unit(mean)
-    line = _line_of_joints(hand, rough, ROUGH, 3)
-    return (_snapped(rough) if line is None else line), tied
+    line = _joint_direction(hand, rough, ROUGH, 3)
+    return (_snap_to_axis(rough) if line is None else line), tied
 
 
-def _ways(hand: HandModel) -> Floats:
-    return tips(hand, posture(hand, 0.4)) - tips(hand, posture(hand, 0.05))
+def _tip_motions(hand: HandModel) -> Floats:
+    return tip_positions(hand, closing_posture(hand, 0.4)) - tip_positions(hand, closing_posture(hand, 0.05))
 
 
 def _tips_ahead(hand: HandModel) -> Floats:
     """Return the vector (3,) from the middle of the palm to the middle of the half-closed hand's tips."""
-    body = carriers(hand)[-1]
-    pose = body_poses(hand, IDENTITY_POSE, hand.expand(posture(hand, 0.6)))[0, body]
+    body = shared_bodies(hand)[-1]
+    pose = body_poses(hand, IDENTITY_POSE, hand.expand(closing_posture(hand, 0.6)))[0, body]
     palm = [apply(pose, piece.vertices.mean(axis=0)) for piece in hand.pieces if piece.body == body]
-    return np.asarray(tips(hand, posture(hand, 0.6)).mean(axis=0) - (np.mean(palm, axis=0) if palm else pose[:3]))
+    return np.asarray(
+        tip_positions(hand, closing_posture(hand, 0.6)).mean(axis=0) - (np.mean(palm, axis=0) if palm else pose[:3])
+    )
 
 
-def _cancelling(ways: Floats, ahead: Floats) -> float:
+def _residual_motion(ways: Floats, ahead: Floats) -> float:
     """Return the length of the sum of tip motions across `ahead`, over the sum of their lengths.
     The ratio is 0 if fingers close around an axis, 1 if all move the same way."""
     axis = _unit(ahead)
@@ -175,10 +183,10 @@ def _between_fingers(hand: HandModel) -> tuple[Floats, bool]:
     """Return the direction out of the palm of a hand with opposed fingers, and whether it is a tie.
     The direction runs from finger bases to half-closed tips, perpendicular to a common closing line. Coplanar points
     are a tie."""
-    body = carriers(hand)[-1]
-    q = posture(hand, 0.5)
+    body = shared_bodies(hand)[-1]
+    q = closing_posture(hand, 0.5)
     poses = body_poses(hand, IDENTITY_POSE, hand.expand(q))[0]
-    bases, ends = poses[hand.parent == body, :3], tips(hand, q)
+    bases, ends = poses[hand.parent == body, :3], tip_positions(hand, q)
     along = ends.mean(axis=0) - bases.mean(axis=0)
     spread = float(np.linalg.norm(bases - bases.mean(axis=0), axis=1).max())
     tied = bool(np.linalg.norm(along) < LEAST_AHEAD * max(spread, 1e-6))
@@ -187,17 +195,17 @@ def _between_fingers(hand: HandModel) -> tuple[Floats, bool]:
         normal = np.linalg.svd(np.vstack([bases, ends]) - bases.mean(axis=0))[2][-1]
         along = normal * sign_of(normal)
     else:
-        ways = _ways(hand)
+        ways = _tip_motions(hand)
         _, strength, lines = np.linalg.svd(ways - ways.mean(axis=0))
         if len(ways) > 1 and strength[1] < SIDEWAYS * strength[0]:
             # Unequal numbers of fingers on the two sides shift the mean of their tips.
             along = along - (along @ lines[0]) * lines[0]
     along = _unit(along)
-    line = _line_of_joints(hand, along, GOOD, 2)
-    return (_snapped(along, GOOD / 2) if line is None else line), tied
+    line = _joint_direction(hand, along, GOOD, 2)
+    return (_snap_to_axis(along, GOOD / 2) if line is None else line), tied
 
 
-def _line_of_joints(
+def _joint_direction(
     hand: HandModel, rough: Floats, within: float, least: int, beside: Floats | None = None
 ) -> Floats | None:
     """Return a direction that at least `least` lines of the joints share, within `within` degrees of a rough one."""
@@ -215,10 +223,10 @@ def _line_of_joints(
     if not len(lines) or alike.sum(axis=1).max() < least:
         return None
     mean = _unit(lines[alike[int(np.argmax(alike.sum(axis=1)))]].mean(axis=0))
-    return _snapped(mean, SAME_LINE)
+    return _snap_to_axis(mean, SAME_LINE)
 
 
-def _snapped(mean: Floats, within: float = ROUGH) -> Floats:
+def _snap_to_axis(mean: Floats, within: float = ROUGH) -> Floats:
     """Normalise a direction, and replace it by a root axis that is `within` so many degrees of it."""
     axis = _root_axis(mean)
     return axis if _angle(mean, axis) < within else _unit(mean)
@@ -279,19 +287,19 @@ def _palm(hand: HandModel, tree: Tree, options: HandOptions, approach: Floats) -
     centre = through + (height - through @ approach) * approach
     if len(bases):
         # Below the region that the half-closed fingers cover.
-        beneath = (bases.mean(axis=0) + tips(hand, posture(hand, 0.5)).mean(axis=0)) / 2
-        surface = _leaves(parts, beneath, approach)
+        beneath = (bases.mean(axis=0) + tip_positions(hand, closing_posture(hand, 0.5)).mean(axis=0)) / 2
+        surface = _exit_distance(parts, beneath, approach)
         if surface is not None and surface < height - RIM_M:
             return PalmFrame(beneath + (surface - beneath @ approach) * approach, approach)
     return PalmFrame(centre, approach)
 
 
-def _leaves(parts: Sequence[Floats], point: Floats, direction: Floats) -> float | None:
+def _exit_distance(parts: Sequence[Floats], point: Floats, direction: Floats) -> float | None:
     """Return the distance along `direction` at which a line through `point` leaves the last convex part.
     Parts are (V, 3); None if the line meets no part."""
     ends = []
     for corners in parts:
-        planes = recalled("planes", [corners], partial(_planes, corners))["0"]
+        planes = cached_step("planes", [corners], partial(_planes, corners))["0"]
         rate, room = planes[:, :3] @ direction, -(planes[:, :3] @ point + planes[:, 3])
         # Planes parallel to the line bound nothing. If such a plane excludes the point, the line does not meet its
         # part.
@@ -311,7 +319,7 @@ def _planes(corners: Floats) -> list[Floats]:
 
 
 def _preshape(hand: HandModel, tree: Tree, options: HandOptions, share: float = PRESHAPE_SHARE) -> Floats:
-    q = posture(hand, share)
+    q = closing_posture(hand, share)
     for dof, value in _by_dof(hand, tree, options.preshape):
         if not hand.lower[dof] - 1e-6 <= value <= hand.upper[dof] + 1e-6:
             raise HandError(

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, quat_conjugate, quat_rotate, spread_directions
-from graspd.worker.hands.closing import posture
+from graspd.worker.hands.closing import closing_posture
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel, JointType, SurfacePoints
 from graspd.worker.hands.surface import sample_surface
@@ -101,7 +101,7 @@ def closing_by_geometry(hand: HandModel) -> Floats:
         q = hand.lower + share * hand.span
         place, normal = posed_points(hand, points, q)
         motions = [_motion(hand, points, q, dof) for dof in range(hand.dofs)]
-        moved = np.max([_ahead(motion, normal) for motion in motions], axis=0) > _LEADING
+        moved = np.max([_normal_speed(motion, normal) for motion in motions], axis=0) > _LEADING
         first, second, _ = _facing(place, normal, points, np.flatnonzero(moved))
         for dof, motion in enumerate(motions):
             rate = np.einsum("ni,ni->n", motion[second] - motion[first], normal[first])
@@ -125,19 +125,19 @@ def find_jaws(hand: HandModel, approach: Floats | None = None) -> Jaws | None:
     if not 1 <= len(closing) <= MAX_DOFS or hand.dofs > MAX_DOFS:
         return None
     points = _points(hand)
-    path = posture(hand, np.linspace(0.0, 1.0, _STEPS)[:, None])
+    path = closing_posture(hand, np.linspace(0.0, 1.0, _STEPS)[:, None])
     if _is_centric(hand, points, path):
         return None
-    met = _meeting(hand, points, path)
+    met = _closed_posture(hand, points, path)
     if met is None:
         return None
     closed, first, second, faced = met
     place, normal = posed_points(hand, points, closed)
-    sides = _sides(place, normal, points, np.unique(np.concatenate([first, second])), faced)
+    sides = _pad_points(place, normal, points, np.unique(np.concatenate([first, second])), faced)
     if sides is None:
         return None
     share = float(np.max(np.abs(closed - path[0]) / np.maximum(np.abs(path[-1] - path[0]), 1e-12)))
-    return _measured(hand, points, sides, posture(hand, np.linspace(0.0, share, _STEPS)[:, None]), approach)
+    return _measure_jaws(hand, points, sides, closing_posture(hand, np.linspace(0.0, share, _STEPS)[:, None]), approach)
 
 
 def _points(hand: HandModel) -> SurfacePoints:
@@ -159,7 +159,7 @@ def _motion(hand: HandModel, points: SurfacePoints, q: Floats, dof: int) -> Floa
     return (posed_points(hand, points, q + step)[0] - posed_points(hand, points, q - step)[0]) / (2 * step[dof])
 
 
-def _ahead(motion: Floats, normal: Floats) -> Floats:
+def _normal_speed(motion: Floats, normal: Floats) -> Floats:
     """Return the speed (N,) of points along their normals, of either sign, over the speed of the fastest point."""
     return np.asarray(np.abs(np.einsum("ni,ni->n", motion, normal)) / np.abs(motion).max(initial=1e-12))
 
@@ -195,7 +195,7 @@ def _is_centric(hand: HandModel, points: SurfacePoints, path: Floats) -> bool:
     return bool(strength[2] > _IN_SPACE * strength[0])
 
 
-def _meeting(hand: HandModel, points: SurfacePoints, path: Floats) -> tuple[Floats, Ints, Ints, Floats] | None:
+def _closed_posture(hand: HandModel, points: SurfacePoints, path: Floats) -> tuple[Floats, Ints, Ints, Floats] | None:
     """Return the posture in which the pads meet, or the last of the path, and the first pairs in contact.
     Also return the area (L,) of each body that faced another body before contact, summed over postures."""
     best: tuple[Floats, Ints, Ints, Floats] | None = None
@@ -222,7 +222,7 @@ def _meeting(hand: HandModel, points: SurfacePoints, path: Floats) -> tuple[Floa
     return best
 
 
-def _sides(
+def _pad_points(
     place: Floats, normal: Floats, points: SurfacePoints, every: Ints, faced: Floats
 ) -> tuple[Ints, Ints] | None:
     """Return the points of the two pads, or None if they are not on different bodies."""
@@ -250,7 +250,7 @@ def _on_pads(side: Ints, points: SurfacePoints, faced: Floats) -> Ints:
     return side[faced[points.body[side]] >= _PAD_SHARE * most]
 
 
-def _measured(
+def _measure_jaws(
     hand: HandModel, points: SurfacePoints, sides: tuple[Ints, Ints], path: Floats, approach: Floats | None
 ) -> Jaws | None:
     """Measure widths, middles and axes of the pads on a path; None if they never face each other."""
@@ -290,7 +290,7 @@ def _measured(
     )
 
 
-def slides(hand: HandModel) -> NDArray[np.bool_]:
+def prismatic_dofs(hand: HandModel) -> NDArray[np.bool_]:
     """Return a mask (D,) of the dofs that drive prismatic joints: their unit is the metre."""
     return np.array([JointType.PRISMATIC in hand.joint_type[hand.dof == d] for d in range(hand.dofs)])
 
@@ -343,7 +343,7 @@ def fingertip_pad(hand: HandModel, tip: int) -> Pad:
     if not len(place) or not driven:
         return Pad(tip, np.zeros(3), np.array([0.0, 0, 1]), np.zeros((0, 3)))
     # A joint that turns the tip about itself moves no side forward; a joint nearer to the palm then decides.
-    chosen = next((part for body in driven if (part := _moved_ahead(hand, tip, body, place, normal)).any()), None)
+    chosen = next((part for body in driven if (part := _leading_points(hand, tip, body, place, normal)).any()), None)
     if chosen is None:
         # No joint decides, and the normals of a whole tip cancel: use the side that the palm faces.
         pose = body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0, tip]
@@ -364,7 +364,7 @@ def thinnest_fingertip(hand: HandModel) -> float:
     return min(tips, default=0.0)
 
 
-def _moved_ahead(hand: HandModel, tip: int, driven: int, place: Floats, normal: Floats) -> NDArray[np.bool_]:
+def _leading_points(hand: HandModel, tip: int, driven: int, place: Floats, normal: Floats) -> NDArray[np.bool_]:
     """Return a mask (P,) of the fastest points of a tip that a body's joint moves along their normals."""
     dof = int(hand.dof[driven])
     step = np.zeros(hand.dofs)

@@ -19,8 +19,8 @@ from graspd.service.store.hand_files import files_of_hand, hand_name, main_of
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.hands import collisions, guess, primitives, shapes
 from graspd.worker.hands.collisions import resting_neighbours
-from graspd.worker.hands.guess import complete
-from graspd.worker.hands.jaws import jaws_of, slides
+from graspd.worker.hands.guess import complete_hand
+from graspd.worker.hands.jaws import jaws_of, prismatic_dofs
 from graspd.worker.hands.model import ConvexPiece, Drag, HandModel, JointType, PalmFrame
 from graspd.worker.hands.mounting import mounting_tree
 from graspd.worker.hands.options import (
@@ -38,7 +38,7 @@ from graspd.worker.hands.tendons import tendons_of
 from graspd.worker.hands.tree import Tree, build_tree
 from graspd.worker.hands.visuals import PlacedShape, Visuals
 from graspd.worker.hands.xacro import read_robot
-from graspd.worker.objects.disk_cache import recalling
+from graspd.worker.objects.disk_cache import caching_steps
 
 log = logging.getLogger(__name__)
 
@@ -54,7 +54,7 @@ def load_hand(
     armature and dry friction in the files.
     Raises HandError: the files describe no usable hand; the message names the fault and the fix."""
     source = HandSource.read(files, options, name=name, digest=digest)
-    with recalling("hand_shapes", (digest_files(AssetKind.HAND, files),), (collisions, guess, primitives, shapes)):
+    with caching_steps("hand_shapes", (digest_files(AssetKind.HAND, files),), (collisions, guess, primitives, shapes)):
         hand = assemble(source)
     return replace(hand, drag=_drag(source.robot, hand)) if drag else hand
 
@@ -89,8 +89,8 @@ class HandSource:
 def assemble(source: HandSource) -> HandModel:
     """Build the model of a hand. Raises TaskCancelled if its run is cancelled."""
     tree = build_tree(source.robot, source.options)
-    hand = complete(body_model(source, tree), tree, source.options)
-    hand = with_drive(hand, stated_gains(source, tree.dof_names), assumed_efforts(source, tree.dof_names))
+    hand = complete_hand(body_model(source, tree), tree, source.options)
+    hand = with_default_drives(hand, stated_gains(source, tree.dof_names), assumed_efforts(source, tree.dof_names))
     mounting, fault = mounting_of(source, hand)
     if fault:
         log.warning("%s: %s", source.name, fault)
@@ -275,11 +275,11 @@ def files_from_path(path: str | Path) -> tuple[str, dict[str, bytes], dict[str, 
     return hand_name(path.resolve().name), files, {"file": main} if main else {}
 
 
-def with_drive(hand: HandModel, stated: Collection[str], assumed: Sequence[str]) -> HandModel:
+def with_default_drives(hand: HandModel, stated: Collection[str], assumed: Sequence[str]) -> HandModel:
     """Replace the defaults of revolute joints by those of sliding joints and jaws, unless stated.
     A dof that moves pads by v [m/rad or 1] along their line gets the limit f v. Its gain is k v^2, summed over the
     pads. Each pad thus has the gain k [N/m] and the limit f [N], independent of the gearing."""
-    slide, jaws = slides(hand), jaws_of(hand)
+    slide, jaws = prismatic_dofs(hand), jaws_of(hand)
     if jaws is None and not slide.any():
         return hand
     gain = np.where(slide, DEFAULT_LINEAR_STIFFNESS, hand.stiffness)

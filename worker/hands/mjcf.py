@@ -16,7 +16,7 @@ import numpy as np
 from graspd.service.model.errors import HandError
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, compose, invert
 from graspd.worker.hands.mjcf_drives import Couplings, chain_up, commanded, servos
-from graspd.worker.hands.mjcf_source import self_contained
+from graspd.worker.hands.mjcf_source import inline_model
 from graspd.worker.hands.primitives import hull
 from graspd.worker.hands.robot import UNLIMITED_M, Joint, Link, Robot, Shape, build_robot
 from graspd.worker.hands.tree import joint_motion
@@ -36,7 +36,7 @@ def read_mjcf(files: Mapping[str, bytes], main: str) -> Robot:
     """Read and check an MJCF model.
     Raises HandError: MuJoCo rejects it, or it is no hand; the message names the fault. LimitError: larger than a
     hand."""
-    text, assets, notes = self_contained(files, main)
+    text, assets, notes = inline_model(files, main)
     try:
         model = mujoco.MjModel.from_xml_string(text, assets)
     except (ValueError, RuntimeError, OSError, mujoco.FatalError) as error:

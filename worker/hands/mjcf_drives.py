@@ -79,7 +79,7 @@ class Couplings:
         if second < 0:
             self.follows[first] = self._rest(first) + float(polynomial[0])
             return
-        if first in self.follows or first == second or self._leads_to(second, first):
+        if first in self.follows or first == second or self._follows(second, first):
             self.notes.append(f"a second equality of {self.name(first)!r} was left out")
             return
         constant, slope = float(polynomial[0]), float(polynomial[1])
@@ -91,7 +91,7 @@ class Couplings:
         offset = self._rest(first) + constant - slope * self._rest(second)
         self.follows[first] = Mimic(self.name(second), slope, offset)
 
-    def _leads_to(self, joint: int, first: int) -> bool:
+    def _follows(self, joint: int, first: int) -> bool:
         """Check whether a joint follows another one through any chain."""
         number = {self.name(j): j for j in self.follows}
         while isinstance(follows := self.follows.get(joint), Mimic):
@@ -133,7 +133,7 @@ class Couplings:
             free = [(j, c) for j, c in pulled if j not in self.follows and j not in alone and abs(c) > 1e-9]
             if len(free) < 2:
                 continue
-            if self._in_a_row([joint for joint, _ in free]):
+            if self._form_chain([joint for joint, _ in free]):
                 self.tendons[str(self.model.actuator(actuator).name) or f"tendon_{actuator}"] = dict(free)
                 continue
             (driver, pull), *others = free
@@ -142,7 +142,7 @@ class Couplings:
             followers = ", ".join(self.name(joint) for joint, _ in others)
             self.notes.append(f"{followers} assumed to follow {self.name(driver)} on their tendon")
 
-    def _in_a_row(self, joints: list[int]) -> bool:
+    def _form_chain(self, joints: list[int]) -> bool:
         """Check whether the joints form one chain."""
         chains = sorted((set(chain_up(self.model, int(self.model.jnt_bodyid[joint]))) for joint in joints), key=len)
         return all(a <= b for a, b in itertools.pairwise(chains))
@@ -159,7 +159,7 @@ class Couplings:
     def _add_loops(self, loops: list[int]) -> None:
         """Add the joints that close the loops of the model."""
         for group in _groups(self.model, loops):
-            joints = sorted({j for e in group for j in _on_loop(self.model, e)})
+            joints = sorted({j for e in group for j in _loop_joints(self.model, e)})
             passive = [j for j in joints if j not in self._actuated and j not in self.follows]
             if not passive:
                 continue
@@ -220,7 +220,7 @@ class Couplings:
             behind = step - 1 if values[step] >= start else step + 1
             known = 0 <= behind < _STEPS and not np.isnan(solved[behind]).any()
             guess = solved[behind] if known else rest
-            solved[step], gap = _close(self.model, data, loops, driver, values[step], passive, guess)
+            solved[step], gap = _close_loops(self.model, data, loops, driver, values[step], passive, guess)
             if gap > _OPEN_M:
                 raise HandError(
                     f"the loop of {self.name(driver)!r} is open by {1e3 * gap:.1f} mm at {values[step]:.2f}; correct "
@@ -238,7 +238,7 @@ def _line(at: Floats, values: Floats) -> tuple[float, float, float]:
 def _groups(model: Any, loops: list[int]) -> list[list[int]]:
     groups: list[tuple[set[int], list[int]]] = []
     for loop in loops:
-        joints = set(_on_loop(model, loop))
+        joints = set(_loop_joints(model, loop))
         touching = [group for group in groups if group[0] & joints]
         merged = (joints.union(*(g[0] for g in touching)), [e for g in touching for e in g[1]] + [loop])
         groups = [group for group in groups if group not in touching] + [merged]
@@ -252,7 +252,7 @@ def _ends(model: Any, loop: int) -> tuple[int, int]:
     return first, max(second, 0)
 
 
-def _on_loop(model: Any, loop: int) -> list[int]:
+def _loop_joints(model: Any, loop: int) -> list[int]:
     """Return the joints between the ends and the body at which their chains branch."""
     chains = [chain_up(model, body) for body in _ends(model, loop)]
     common = set(chains[0]) & set(chains[1])
@@ -274,7 +274,7 @@ def chain_up(model: Any, body: int) -> list[int]:
     return found
 
 
-def _close(
+def _close_loops(
     model: Any, data: Any, loops: list[int], driver: int, value: float, passive: list[int], guess: Floats
 ) -> tuple[Floats, float]:
     """Solve for passive joint values at a driver value (Gauss-Newton); also return the loops' gap [m]."""

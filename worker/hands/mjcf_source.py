@@ -15,7 +15,7 @@ from typing import Final
 from graspd.service.model.errors import HandError, LimitError
 from graspd.service.store.mesh_files import match_name
 from graspd.worker.hands.urdf import parse_xml
-from graspd.worker.objects.stand_ins import refuse_stand_in
+from graspd.worker.objects.format_check import check_format
 
 MAX_BYTES: Final = 8 * 2**20
 _MAX_INCLUDES: Final = 64
@@ -36,12 +36,12 @@ _DROPPED: Final = frozenset(
 _MESHES: Final = (".stl", ".obj", ".msh")
 
 
-def self_contained(files: Mapping[str, bytes], main: str) -> tuple[str, dict[str, bytes], list[str]]:
+def inline_model(files: Mapping[str, bytes], main: str) -> tuple[str, dict[str, bytes], list[str]]:
     """Return the model as one text, the mesh files it names, and notes for the user.
     Raises HandError: no XML, no MJCF, an include or mesh that is missing or outside the upload, or an element that
     loads another model. LimitError: larger than the limits of this module."""
     root = parse_xml(files[main], main, "an MJCF model", "mujoco", limit_bytes=MAX_BYTES)
-    _put_in_includes(root, files, main, main, [0, 0])
+    _expand_includes(root, files, main, main, [0, 0])
     folder = _mesh_folder(root)
     assets: dict[str, bytes] = {}
     for section in list(root):
@@ -51,14 +51,14 @@ def self_contained(files: Mapping[str, bytes], main: str) -> tuple[str, dict[str
         if element.tag in _REFUSED:
             raise HandError(f"{main}: <{element.tag}> is not read; write its parts out, or give the hand's own file")
         if element.tag == "mesh" and (file := element.get("file")):
-            _take_mesh(element, file, files, main, folder, assets)
+            _add_mesh(element, file, files, main, folder, assets)
             continue
         for name in _DROPPED & element.attrib.keys():
             del element.attrib[name]
         if element.tag == "default":
             # MuJoCo refuses other attributes here, which other readers ignore.
             element.attrib = {name: value for name, value in element.attrib.items() if name == "class"}
-    notes = _passed_over(root)
+    notes = _ignored_elements(root)
     _prune(root)
     _prune_actuators(root)
     compiler = root.find("compiler")
@@ -67,7 +67,7 @@ def self_contained(files: Mapping[str, bytes], main: str) -> tuple[str, dict[str
     # Frames without mass are common in hands and make MuJoCo's reader fail.
     compiler.set("boundmass", compiler.get("boundmass", "1e-9"))
     compiler.set("boundinertia", compiler.get("boundinertia", "1e-12"))
-    if _means_radians(root):
+    if _uses_radians(root):
         compiler.set("angle", "radian")
         notes.append(
             'angles read as radians, since they are too small for degrees (if not: <compiler angle="degree"/>)'
@@ -75,12 +75,12 @@ def self_contained(files: Mapping[str, bytes], main: str) -> tuple[str, dict[str
     return ElementTree.tostring(root, encoding="unicode"), assets, notes
 
 
-def _passed_over(root: Element) -> list[str]:
+def _ignored_elements(root: Element) -> list[str]:
     """Return notes on drives and constraints that are left out; call it before their removal."""
     spatial = {tendon.get("name") for tendon in root.iter("spatial")}
     drives = list(root.iterfind("actuator/*"))
     pulled = [one for one in drives if one.get("tendon") in spatial]
-    others = [one for one in drives if one not in pulled and not _is_read(one)]
+    others = [one for one in drives if one not in pulled and not _is_supported(one)]
     held = [
         one
         for one in root.iterfind("equality/*")
@@ -92,19 +92,19 @@ def _passed_over(root: Element) -> list[str]:
         (others, "ignored: only motors and servos of joints and fixed tendons are read"),
         (held, "ignored: the bodies or tendons that it connects are planned as free"),
     )
-    return [f"{_shown(elements)} {note}" for elements, note in told if elements]
+    return [f"{_element_names(elements)} {note}" for elements, note in told if elements]
 
 
-def _shown(elements: list[Element]) -> str:
+def _element_names(elements: list[Element]) -> str:
     names = [one.get("name") or one.get("tendon") or one.tag for one in elements]
     return ", ".join(names[:4]) + (", ..." if len(names) > 4 else "")
 
 
-def _is_read(actuator: Element) -> bool:
+def _is_supported(actuator: Element) -> bool:
     return actuator.tag in _ACTUATORS and bool(actuator.attrib.keys() & {"joint", "jointinparent", "tendon"})
 
 
-def _means_radians(root: Element) -> bool:
+def _uses_radians(root: Element) -> bool:
     """Check whether angles of a model without an angle unit (MuJoCo: degrees) are meant as radians.
     This is assumed if no joint limit and no other angle exceeds 2 pi."""
     if any("angle" in compiler.attrib for compiler in root.findall("compiler")):
@@ -124,7 +124,7 @@ def _numbers(text: str) -> list[float]:
         return []
 
 
-def _put_in_includes(root: Element, files: Mapping[str, bytes], main: str, here: str, counts: list[int]) -> None:
+def _expand_includes(root: Element, files: Mapping[str, bytes], main: str, here: str, counts: list[int]) -> None:
     """Replace each include by the contents of its file; `counts` are the includes and elements so far."""
     counts[1] += sum(1 for _ in root.iter())
     if counts[1] > _MAX_ELEMENTS:
@@ -138,9 +138,9 @@ def _put_in_includes(root: Element, files: Mapping[str, bytes], main: str, here:
                 raise HandError(f"{main}: more than {_MAX_INCLUDES} includes, or a file that includes itself")
             wanted = child.get("file", "")
             name = _find(wanted, files, [posixpath.dirname(main), posixpath.dirname(here)], main, "includes")
-            refuse_stand_in(name, files[name], HandError)
+            check_format(name, files[name], HandError)
             part = parse_xml(files[name], name, limit_bytes=MAX_BYTES)
-            _put_in_includes(part, files, main, name, counts)
+            _expand_includes(part, files, main, name, counts)
             parent[at : at + 1] = list(part)
 
 
@@ -174,7 +174,7 @@ def _mesh_folder(root: Element) -> tuple[str, bool]:
     return folder, strip
 
 
-def _take_mesh(
+def _add_mesh(
     element: Element,
     file: str,
     files: Mapping[str, bytes],
@@ -191,7 +191,7 @@ def _take_mesh(
         raise HandError(f"{main}: the mesh {name!r} is no file of type {', '.join(_MESHES)}; convert it")
     # MuJoCo names a mesh after its file if the model does not name it.
     element.set("name", element.get("name", PurePosixPath(file.replace("\\", "/")).stem))
-    refuse_stand_in(name, files[name], HandError)
+    check_format(name, files[name], HandError)
     given = f"{len(assets)}{suffix}"
     assets[given] = files[name]
     element.set("file", given)
@@ -211,7 +211,7 @@ def _prune_actuators(root: Element) -> None:
     tendons = {tendon.get("name") for section in root.findall("tendon") for tendon in section.findall("fixed")}
     for section in root.findall("actuator"):
         for actuator in list(section):
-            if not _is_read(actuator) or actuator.get("tendon") not in {None, *tendons}:
+            if not _is_supported(actuator) or actuator.get("tendon") not in {None, *tendons}:
                 section.remove(actuator)
     for section in root.findall("equality"):
         for constraint in list(section):

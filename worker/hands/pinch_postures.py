@@ -18,12 +18,12 @@ from graspd.service.model import transforms
 from graspd.service.model.errors import HandError
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, quat_rotate
 from graspd.worker.hands import closing, guess, jaws, kinematics, primitives, surface
-from graspd.worker.hands.closing import posture
+from graspd.worker.hands.closing import closing_posture
 from graspd.worker.hands.jaws import Pad, fingertip_pad
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.surface import sample_surface
-from graspd.worker.objects.disk_cache import arrays_kept_or_made
+from graspd.worker.objects.disk_cache import cached_arrays
 from graspd.worker.objects.memory_cache import cached_by_content
 
 #: Number of postures, candidates per posture, and random steps that improve them.
@@ -75,7 +75,7 @@ class Oppositions:
         return float(self.width[-1]) if len(self) else 0.0
 
     @classmethod
-    def of_none(cls, hand: HandModel) -> Oppositions:
+    def empty(cls, hand: HandModel) -> Oppositions:
         return cls(np.zeros((0, hand.dofs)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
 
     @classmethod
@@ -85,17 +85,15 @@ class Oppositions:
         return cls(q[good], seen.axis[good], seen.middle[good], seen.width[good])
 
     @classmethod
-    def kept_or_made(
-        cls, kind: str, key: tuple[str, ...], make: Callable[[], Oppositions], *more: ModuleType
-    ) -> Oppositions:
+    def cached(cls, kind: str, key: tuple[str, ...], make: Callable[[], Oppositions], *more: ModuleType) -> Oppositions:
         """Load postures from this machine's cache; else compute them with this code and `more`, and cache them."""
-        return cls(**arrays_kept_or_made(kind, key, (*_code(), *more), lambda: vars(make())))
+        return cls(**cached_arrays(kind, key, (*_code(), *more), lambda: vars(make())))
 
 
 @cached_by_content(32)
 def oppositions_of(hand: HandModel) -> Oppositions:
     """Return the opposed postures of a hand, cached in memory and on this machine; one finger has none."""
-    return Oppositions.kept_or_made("oppositions", (hand.content,), lambda: _oppositions(hand))
+    return Oppositions.cached("oppositions", (hand.content,), lambda: _oppositions(hand))
 
 
 def _code() -> tuple[ModuleType, ...]:
@@ -104,17 +102,17 @@ def _code() -> tuple[ModuleType, ...]:
 
 def _oppositions(hand: HandModel) -> Oppositions:
     if len(hand.fingertips) < 2:
-        return Oppositions.of_none(hand)
+        return Oppositions.empty(hand)
     one = opposed_finger(hand)
     pads = [fingertip_pad(hand, body) for body in hand.fingertips]
     q = random_postures(hand, one, CROWD * POSTURES)
-    seen = _Seen.of(hand, pads, one, q)
+    seen = _PadGaps.of(hand, pads, one, q)
     # Select the best of postures with similar widths, then improve it.
     order = np.argsort(seen.width, kind="stable").reshape(POSTURES, CROWD)
     q = q[order[np.arange(POSTURES), seen.cost(seen.width)[order].argmin(axis=1)]]
     wanted = np.linspace(THINNEST_M, np.quantile(seen.width, 0.98), POSTURES)
-    q = climbed(hand, one, q, lambda tried: _Seen.of(hand, pads, one, tried).cost(wanted))
-    seen = _Seen.of(hand, pads, one, q)
+    q = improve_postures(hand, one, q, lambda tried: _PadGaps.of(hand, pads, one, tried).cost(wanted))
+    seen = _PadGaps.of(hand, pads, one, q)
     good = np.flatnonzero(
         (seen.facing > FACING) & (seen.square < SQUARE) & (seen.width > THINNEST_M) & (seen.ahead > AHEAD_M)
     )
@@ -126,13 +124,13 @@ def opposed_finger(hand: HandModel) -> int:
     pads = [fingertip_pad(hand, body) for body in hand.fingertips]
     tried = []
     for one in range(len(pads)):
-        seen = _Seen.of(hand, pads, one, random_postures(hand, one, POSTURES))
+        seen = _PadGaps.of(hand, pads, one, random_postures(hand, one, POSTURES))
         tried.append((float(np.sort(seen.cost(seen.width))[: POSTURES // 4].mean()), one))
     return min(tried)[1]
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _PadGaps:
     """Poses of the pads in N postures."""
 
     axis: Floats
@@ -146,7 +144,7 @@ class _Seen:
     """(N,) distance of the middle in front of the palm [m]."""
 
     @classmethod
-    def of(cls, hand: HandModel, pads: list[Pad], one: int, q: Floats) -> _Seen:
+    def of(cls, hand: HandModel, pads: list[Pad], one: int, q: Floats) -> _PadGaps:
         tips = body_poses(hand, np.tile(IDENTITY_POSE, (len(q), 1)), hand.expand(q))[:, list(hand.fingertips)]
         place = quat_rotate(tips[..., 3:], np.array([p.centre for p in pads])) + tips[..., :3]
         looks = quat_rotate(tips[..., 3:], np.array([p.normal for p in pads]))
@@ -172,7 +170,7 @@ class _Seen:
         return np.asarray(-3 * np.minimum(self.facing, 0.95) + np.abs(self.width - wanted) / WIDTH_M + near + aside)
 
 
-def climbed(hand: HandModel, one: int, q: Floats, cost: Callable[[Floats], Floats]) -> Floats:
+def improve_postures(hand: HandModel, one: int, q: Floats, cost: Callable[[Floats], Floats]) -> Floats:
     """Improve postures (N, D) by random steps of decreasing size with respect to their `cost` (N,)."""
     rng = np.random.default_rng(one)
     finger, rank = _ranks(hand)
@@ -235,7 +233,7 @@ def require_opposing(hand: HandModel) -> None:
 
 @cached_by_content(32)
 def _can_hold(hand: HandModel) -> bool:
-    made = arrays_kept_or_made("opposing", (hand.content,), _code(), lambda: {"opposes": np.array(opposes(hand))})
+    made = cached_arrays("opposing", (hand.content,), _code(), lambda: {"opposes": np.array(opposes(hand))})
     return bool(made["opposes"])
 
 
@@ -243,7 +241,7 @@ def opposes(hand: HandModel) -> bool:
     """Check whether points on different bodies face each other in some posture over an adjustable gap."""
     points = sample_surface(hand, _CHECKED_POINTS)
     rng = np.random.default_rng(0)
-    shares = [posture(hand, share) for share in np.linspace(0, 1, 5)]
+    shares = [closing_posture(hand, share) for share in np.linspace(0, 1, 5)]
     q = np.concatenate([shares, rng.uniform(hand.lower, hand.upper, (_CHECKED_AT_RANDOM, hand.dofs))])
     poses = body_poses(hand, np.tile(IDENTITY_POSE, (len(q), 1)), hand.expand(q))[:, points.body]
     position = quat_rotate(poses[..., 3:], points.position) + poses[..., :3]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from graspd.service.model.errors import HandError
 from graspd.service.model.transforms import Floats, quat_rotate
 from graspd.worker.hands.robot import Ints
-from graspd.worker.objects.disk_cache import recalled
+from graspd.worker.objects.disk_cache import cached_step
 from graspd.worker.objects.topology import directed_edges, face_areas, face_vectors, on_faces, outward_hull
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ SEGMENTS = 32
 def hull(points: Floats) -> tuple[Floats, Ints]:
     """Compute corners (V, 3) and outward triangles (F, 3) of the convex hull of points (N, 3).
     Raises HandError: the points lie in a plane."""
-    made = recalled("hull", [points], lambda: new_hull(points))
+    made = cached_step("hull", [points], lambda: new_hull(points))
     return made["0"], made["1"]
 
 

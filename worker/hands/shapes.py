@@ -20,9 +20,9 @@ from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, quat_t
 from graspd.worker.hands.model import ConvexPiece
 from graspd.worker.hands.primitives import hull, hull_planes, new_hull, signed_distance, tessellate, volume
 from graspd.worker.hands.robot import Ints, Shape
-from graspd.worker.hands.visuals import find_mesh, merged_and_thinned
-from graspd.worker.objects.convex import WorkLimitExceeded, coacd_parts, default_cache, keep_parts, load_parts
-from graspd.worker.objects.disk_cache import recalled
+from graspd.worker.hands.visuals import find_mesh, merge_and_thin
+from graspd.worker.objects.convex import WorkLimitExceeded, coacd_parts, default_cache, load_parts, save_parts
+from graspd.worker.objects.disk_cache import cached_step
 from graspd.worker.objects.formats import read_mesh
 from graspd.worker.objects.topology import face_areas, on_faces
 
@@ -78,7 +78,7 @@ def _mesh_hulls(name: str, scale: tuple[float, ...], data: bytes, link: str) -> 
 
 
 def _hulls(points: Floats, faces: Ints) -> list[tuple[Floats, Ints]]:
-    parts = parts_of(points, faces)
+    parts = convex_parts(points, faces)
     # Hulls use all points of a file, including points that no face uses.
     return [reduce_hull(part) for part in (parts if len(parts) > 1 else (points,))]
 
@@ -87,11 +87,11 @@ def reduce_hull(points: Floats, limit: int = MAX_HULL_VERTICES) -> tuple[Floats,
     """Compute a convex hull of points (N, 3) with at most `limit` corners and the volume of the full hull.
     Corners are added one by one at the largest distance to the full hull, then scaled about their centroid until the
     volumes agree. The surface error has both signs, with half the size of an inscribed hull's error."""
-    made = recalled("reduced hull", [points, np.array(limit)], lambda: _reduced(points, limit))
+    made = cached_step("reduced hull", [points, np.array(limit)], lambda: _reduce(points, limit))
     return made["0"], made["1"]
 
 
-def _reduced(points: Floats, limit: int) -> tuple[Floats, Ints]:
+def _reduce(points: Floats, limit: int) -> tuple[Floats, Ints]:
     vertices, faces = new_hull(points)
     if len(vertices) <= limit:
         return vertices, faces
@@ -99,7 +99,7 @@ def _reduced(points: Floats, limit: int) -> tuple[Floats, Ints]:
     directions = np.concatenate([np.eye(3), -np.eye(3)])
     chosen = list(dict.fromkeys(np.argmax(vertices @ directions.T, axis=0).tolist()))
     while len(chosen) < limit:
-        farthest = int(np.argmax(_outside(vertices, vertices[chosen])))
+        farthest = int(np.argmax(_excess_distance(vertices, vertices[chosen])))
         if farthest in chosen:
             break
         chosen.append(farthest)
@@ -109,7 +109,7 @@ def _reduced(points: Floats, limit: int) -> tuple[Floats, Ints]:
     return centre + (corners - centre) * growth, faces
 
 
-def _outside(points: Floats, corners: Floats) -> Floats:
+def _excess_distance(points: Floats, corners: Floats) -> Floats:
     """Return the distance (N,) of points (N, 3) outside a small hull; from its nearest corner if flat."""
     spread = np.linalg.svd(corners - corners.mean(axis=0), compute_uv=False)
     if len(corners) < 4 or spread[2] < 1e-6 * spread[0]:
@@ -149,7 +149,7 @@ _START_M: Final = 1e-5
 _MIN_EXTENT_M: Final = 1e-3
 
 
-def parts_of(vertices: Floats, faces: Ints) -> tuple[Floats, ...]:
+def convex_parts(vertices: Floats, faces: Ints) -> tuple[Floats, ...]:
     """Return corners of the convex pieces of a mesh, or all its corners if its hull is accurate.
     Raises HandError: the decomposition exceeds its CPU time limit."""
     whole: tuple[Floats, ...] = (vertices,)
@@ -161,15 +161,15 @@ def parts_of(vertices: Floats, faces: Ints) -> tuple[Floats, ...]:
     kept = load_parts(file) if file.is_file() else None
     if kept:
         return kept if len(kept) > 1 else whole
-    best, sure = _decomposed(vertices, faces)
+    best, sure = _decompose(vertices, faces)
     if sure:
-        keep_parts(file, best if len(best) > 1 else (np.zeros((1, 3)),))
+        save_parts(file, best if len(best) > 1 else (np.zeros((1, 3)),))
     return best
 
 
-def _decomposed(vertices: Floats, faces: Ints) -> tuple[tuple[Floats, ...], bool]:
+def _decompose(vertices: Floats, faces: Ints) -> tuple[tuple[Floats, ...], bool]:
     """Return the pieces, and whether CoACD finished; a failed run may succeed later."""
-    light = merged_and_thinned(vertices, faces, lambda count: 1 - _FACES / count)
+    light = merge_and_thin(vertices, faces, lambda count: 1 - _FACES / count)
     surface = _OpenSurface(*light)
     best: tuple[Floats, ...] = (vertices,)
     least, sure = surface.error(best), True
@@ -220,7 +220,7 @@ class _OpenSurface:
             return 0.0
         way = np.zeros((len(_DIRECTIONS), len(self._points)))
         for part in parts:
-            np.maximum(way, _ways_out(part, self._points), out=way)
+            np.maximum(way, _exit_distances(part, self._points), out=way)
         shortest = np.where(self._sees, way, np.inf).min(axis=0)
         return float(np.quantile(shortest[reached], _SHARE))
 
@@ -244,7 +244,7 @@ def _hits(points: Floats, direction: Floats, corners: Floats) -> NDArray[np.bool
     return hit
 
 
-def _ways_out(part: Floats, points: Floats) -> Floats:
+def _exit_distances(part: Floats, points: Floats) -> Floats:
     """Return the distance (D, P) from points along directions out of a part's hull; 0 outside of it."""
     normals, offsets = hull_planes(*hull(part))
     inside = offsets - points @ normals.T

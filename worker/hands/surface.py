@@ -16,7 +16,7 @@ from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, invert
 from graspd.worker.hands import kinematics, primitives
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import ConvexPiece, HandModel, SurfacePoints
-from graspd.worker.objects.disk_cache import arrays_kept_or_made, content_of
+from graspd.worker.objects.disk_cache import cached_arrays, content_of
 from graspd.worker.objects.memory_cache import cached_by_content
 
 #: Candidates per point. Thinning keeps one in five, evenly spread.
@@ -36,7 +36,9 @@ def sample_surface(hand: HandModel, count: int, *, seed: int = 0) -> SurfacePoin
     piece have no points. Equal arguments give the same points, bit for bit. Raises HandError: the hand has no outer
     surface."""
     # Shapes of a hand are known before its closing.
-    return _kept(_Shapes(hand.pieces, body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0]), count, seed)
+    return _cached_samples(
+        _Shapes(hand.pieces, body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0]), count, seed
+    )
 
 
 @dataclass(frozen=True)
@@ -51,12 +53,10 @@ class _Shapes:
 
 
 @cached_by_content(64)
-def _kept(shapes: _Shapes, count: int, seed: int) -> SurfacePoints:
+def _cached_samples(shapes: _Shapes, count: int, seed: int) -> SurfacePoints:
     code = (sys.modules[__name__], primitives, kinematics, transforms)
     make = partial(_sample, shapes, count, seed)
-    return SurfacePoints(
-        **arrays_kept_or_made("hand_samples", (shapes.content, count, seed), code, lambda: vars(make()))
-    )
+    return SurfacePoints(**cached_arrays("hand_samples", (shapes.content, count, seed), code, lambda: vars(make())))
 
 
 def _sample(shapes: _Shapes, count: int, seed: int) -> SurfacePoints:
@@ -104,7 +104,7 @@ def _candidates(hand: _Shapes, count: int, seed: int) -> SurfacePoints:
         )
         position = apply(piece.pose, local)
         normal = quat_rotate(piece.pose[3:], direction)
-        keep = ~_buried(hand, i, position, normal)
+        keep = ~_is_buried(hand, i, position, normal)
         bodies.append(np.full(int(keep.sum()), piece.body, dtype=np.int32))
         positions.append(position[keep])
         normals.append(normal[keep])
@@ -122,7 +122,7 @@ def piece_distance(piece: ConvexPiece, points: Floats) -> Floats:
     return primitives.signed_distance(piece.kind, piece.size, _local_vertices(piece), piece.faces, local)
 
 
-def _buried(hand: _Shapes, own: int, position: Floats, normal: Floats) -> NDArray[np.bool_]:
+def _is_buried(hand: _Shapes, own: int, position: Floats, normal: Floats) -> NDArray[np.bool_]:
     """Return a mask (N,) of points of piece `own` inside another piece or on a face of an earlier piece."""
     mine = hand.pieces[own]
     above = position + COINCIDENT_M * normal

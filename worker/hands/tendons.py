@@ -58,7 +58,7 @@ def tendons_of(
 ) -> tuple[Tendon, ...]:
     """Return the tendons of a hand: the stated ones, else the description's, else the known ones of a Shadow hand.
     Only joints that are degrees of freedom of the hand count; fewer than two make no tendon."""
-    said = stated if stated is not None else robot.tendons or known_tendons(robot)
+    said = stated if stated is not None else robot.tendons or shadow_tendons(robot)
     found = []
     for name, pulls in said.items():
         kept = {joint: float(c) for joint, c in pulls.items() if joint in dof_names and abs(c) > LEAST_PULL}
@@ -67,7 +67,7 @@ def tendons_of(
     return tuple(found)
 
 
-def known_tendons(robot: Robot) -> dict[str, dict[str, float]]:
+def shadow_tendons(robot: Robot) -> dict[str, dict[str, float]]:
     """Return the tendons of a Shadow hand by its joint names and their order: J1 + J2 of each finger but the thumb."""
     found: dict[str, dict[str, float]] = {}
     fingers = set()

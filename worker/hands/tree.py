@@ -67,7 +67,7 @@ def build_tree(robot: Robot, options: HandOptions) -> Tree:
     mimics = {name: None if name in pulled else joint.mimic for name, joint in robot.joints.items()}
     mimics |= {name: Mimic(c.of, c.multiplier, c.offset) for name, c in options.couplings.items()}
     root = pick_root(robot, options)
-    kept = _kept_joints(robot, root, set(options.drop))
+    kept = _hand_joints(robot, root, set(options.drop))
     for joint in kept:
         if joint.fault and joint.name not in options.fix:
             raise HandError(joint.fault)
@@ -105,7 +105,7 @@ def build_tree(robot: Robot, options: HandOptions) -> Tree:
     lower, upper = np.array([_fold_limits(dof, moving, robot, options) for dof in dofs]).T
     velocity = np.array([_fold_velocity(dof, moving, robot) for dof in dofs])
     known = frozenset(robot.joints) | frozenset(robot.links)
-    bodies, links = _walk(root, kept, frozen)
+    bodies, links = _collect_bodies(root, kept, frozen)
     return Tree(bodies, links, moving, names, dofs, lower, upper, velocity, tuple(still), known)
 
 
@@ -128,7 +128,7 @@ def _by_parent(joints: Iterable[Joint]) -> dict[str, list[Joint]]:
     return found
 
 
-def _kept_joints(robot: Robot, root: str, drop: set[str]) -> list[Joint]:
+def _hand_joints(robot: Robot, root: str, drop: set[str]) -> list[Joint]:
     """Return joints below the root and not below a dropped link, in the robot's order."""
     children = _by_parent(robot.joints.values())
     kept: set[str] = set()
@@ -161,14 +161,14 @@ def _resolve(name: str, mimics: Mapping[str, Mimic | None], fixed: Mapping[str, 
 
 
 def _fold_limits(dof: str, moving: dict[str, Mimic], robot: Robot, options: HandOptions) -> tuple[float, float]:
-    """Return the range of a dof in which all its followers stay within their own limits; see `_binds`."""
+    """Return the range of a dof in which all its followers stay within their own limits; see `_limits_bind`."""
     lower, upper = -math.inf, math.inf
     narrowest = dof
     for name, drive in moving.items():
         if drive.joint != dof:
             continue
         joint = robot.joints[name]
-        if not _binds(joint, drive, robot, options):
+        if not _limits_bind(joint, drive, robot, options):
             continue
         if joint.type == "prismatic" and joint.upper - joint.lower >= 2 * UNLIMITED_M:
             raise HandError.with_fixes(
@@ -200,17 +200,17 @@ def _check_travel(dof: str, lower: float, upper: float, moving: dict[str, Mimic]
             )
 
 
-def _binds(joint: Joint, drive: Mimic, robot: Robot, options: HandOptions) -> bool:
+def _limits_bind(joint: Joint, drive: Mimic, robot: Robot, options: HandOptions) -> bool:
     """Check whether a joint's own limits bind it. A URDF follower's limits do not, as in ROS: most are wrong."""
     return joint.name == drive.joint or robot.format != "URDF" or joint.name in options.couplings
 
 
-def passed_limits(robot: Robot, tree: Tree, options: HandOptions) -> list[str]:
+def exceeded_limits(robot: Robot, tree: Tree, options: HandOptions) -> list[str]:
     """Return notes on joints that follow another joint beyond their own limits, which do not bind them."""
     found = []
     for name in tree.joint_names:
         joint, drive = robot.joints[name], tree.drives[name]
-        if not _binds(joint, drive, robot, options):
+        if not _limits_bind(joint, drive, robot, options):
             at = tree.dof_names.index(drive.joint)
             ends = sorted(drive.multiplier * end + drive.offset for end in (tree.lower[at], tree.upper[at]))
             if ends[0] < joint.lower - LEAST_RANGE or ends[1] > joint.upper + LEAST_RANGE:
@@ -218,7 +218,7 @@ def passed_limits(robot: Robot, tree: Tree, options: HandOptions) -> list[str]:
     return found
 
 
-def cut_drives(robot: Robot, tree: Tree) -> list[str]:
+def reduced_ranges(robot: Robot, tree: Tree) -> list[str]:
     """Return notes on dofs whose range is reduced by their followers' limits."""
     found = []
     for dof, lower, upper in zip(tree.dof_names, tree.lower, tree.upper, strict=True):
@@ -238,7 +238,7 @@ def _fold_velocity(dof: str, moving: dict[str, Mimic], robot: Robot) -> float:
     return min(stated, default=0.0)
 
 
-def _walk(
+def _collect_bodies(
     root: str, kept: list[Joint], frozen: dict[str, float]
 ) -> tuple[tuple[Body, ...], dict[str, tuple[int, Floats]]]:
     """Collect bodies depth first; a link behind a fixed or frozen joint joins its parent's body."""
@@ -285,7 +285,7 @@ def pick_root(robot: Robot, options: HandOptions) -> str:
         if len(children) != 1:
             raise HandError(f"link {root!r} is dropped and has {len(children)} children; name the new root link")
         root = children[0]
-    tree = _Moving(robot, options)
+    tree = _JointTree(robot, options)
     root = _below_arm(tree, root, options)
     if options.palm or tree.reach[root] <= MAX_HAND_M:
         return root
@@ -304,7 +304,7 @@ def pick_root(robot: Robot, options: HandOptions) -> str:
     )
 
 
-def hand_links(tree: _Moving, root: str) -> list[str]:
+def hand_links(tree: _JointTree, root: str) -> list[str]:
     """Return the links, from the root down, at which a hand begins: two or more short fingers branch there."""
     found: list[str] = []
     queue = deque([root])
@@ -318,7 +318,7 @@ def hand_links(tree: _Moving, root: str) -> list[str]:
     return found
 
 
-class _Moving:
+class _JointTree:
     """The joints of a robot with moving joints at or below them."""
 
     def __init__(self, robot: Robot, options: HandOptions) -> None:
@@ -362,7 +362,7 @@ class _Moving:
         return any(self._has_shape(joint.child) for joint in self._children.get(link, []))
 
 
-def _below_arm(tree: _Moving, root: str, options: HandOptions) -> str:
+def _below_arm(tree: _JointTree, root: str, options: HandOptions) -> str:
     """Return the link at which a hand on an arm begins, below the last joint before the fingers; else the root."""
     start, at = root, root
     palm = options.palm.link if options.palm else None

@@ -113,13 +113,13 @@ def _read_joint(element: ElementTree.Element, notes: list[str]) -> Joint:
     if kind == "fixed":
         return still
     try:
-        return _moving(element, still, what, notes)
+        return _movable_joint(element, still, what, notes)
     except HandError as error:
         # The fault only matters if the hand moves by this joint.
         return replace(still, fault=str(error))
 
 
-def _moving(element: ElementTree.Element, still: Joint, what: str, notes: list[str]) -> Joint:
+def _movable_joint(element: ElementTree.Element, still: Joint, what: str, notes: list[str]) -> Joint:
     """Return the joint with its axis and limits; raise HandError if no hand can have it."""
     if still.type not in MOVING:
         raise HandError(
@@ -262,7 +262,7 @@ def parse_xml(data: bytes, name: str, what: str = "", root: str = "", *, limit_b
     if not text:
         raise HandError(f"{name} is empty; export it again")
     try:
-        tree = _with_prefixes(text)
+        tree = _parse_with_prefixes(text)
     except DefusedXmlException:
         raise HandError(f"{name}: XML entities are refused; write the text out") from None
     except (ParseError, ValueError, LookupError) as error:
@@ -276,7 +276,7 @@ def parse_xml(data: bytes, name: str, what: str = "", root: str = "", *, limit_b
     return tree
 
 
-def _with_prefixes(text: str) -> Element:
+def _parse_with_prefixes(text: str) -> Element:
     """Parse an XML text; undeclared prefixes of foreign elements (`drake:...`) are declared here."""
     try:
         tree: Element = SafeTree.fromstring(text)

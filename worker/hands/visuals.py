@@ -88,12 +88,12 @@ class Visuals:
 NO_VISUALS: Final = Visuals()
 
 
-def lighter(mesh: VisualMesh, times: float) -> VisualMesh:
-    vertices, faces = merged_and_thinned(mesh.vertices, mesh.faces, lambda _: 1 - 1 / times)
+def thin_mesh(mesh: VisualMesh, times: float) -> VisualMesh:
+    vertices, faces = merge_and_thin(mesh.vertices, mesh.faces, lambda _: 1 - 1 / times)
     return replace(mesh, vertices=vertices, faces=faces) if len(faces) else mesh
 
 
-def merged_and_thinned(vertices: Floats, faces: Ints, share: Callable[[int], float]) -> tuple[Floats, Ints]:
+def merge_and_thin(vertices: Floats, faces: Ints, share: Callable[[int], float]) -> tuple[Floats, Ints]:
     """Merge equal vertices, and drop the share of the faces that `share` gives for their number, if it is positive."""
     # Both are slow to load and not needed for cached results.
     import fast_simplification
@@ -118,7 +118,7 @@ def _meshes(item: PlacedShape, files: Mapping[str, bytes], base: str, soups: dic
         return []
     try:
         if name not in soups:
-            soups[name] = read_mesh(name, files[name], _nearby(name, files))
+            soups[name] = read_mesh(name, files[name], _mesh_files(name, files))
     except InputError:
         return []
     soup, scale = soups[name], np.asarray(shape.size)
@@ -131,7 +131,7 @@ def _meshes(item: PlacedShape, files: Mapping[str, bytes], base: str, soups: dic
     return found
 
 
-def _nearby(mesh: str, files: Mapping[str, bytes]) -> Nearby:
+def _mesh_files(mesh: str, files: Mapping[str, bytes]) -> Nearby:
     """Return the hand's files that a mesh and its libraries name, up to a limit."""
     naming = [mesh]
     asked = 0

@@ -18,7 +18,7 @@ from graspd.service.model.errors import HandError
 from graspd.service.store.hand_files import format_of, text_of
 from graspd.worker.hands.robot import Robot
 from graspd.worker.hands.urdf import MAX_BYTES, read_urdf
-from graspd.worker.objects.stand_ins import refuse_stand_in
+from graspd.worker.objects.format_check import check_format
 
 #: CPU time limit [s]; the largest hands on arms need a tenth of it.
 CPU_LIMIT_S: Final = 10
@@ -74,7 +74,7 @@ def expand(files: Mapping[str, bytes], main: str, arguments: Mapping[str, str]) 
 
 def read_robot(files: Mapping[str, bytes], main: str, arguments: Mapping[str, str] | None = None) -> Robot:
     """Read and check the description `main` among a hand's files; its root element determines the format."""
-    refuse_stand_in(main, files[main], HandError)
+    check_format(main, files[main], HandError)
     match format_of(main, files[main]):
         case "mjcf":
             from graspd.worker.hands.mjcf import read_mjcf

@@ -46,7 +46,7 @@ def main() -> None:
     try:
         answer = {"urdf": _expand(given), "error": ""}
     except Exception as error:
-        answer = {"urdf": "", "error": _told(error)}
+        answer = {"urdf": "", "error": _error_text(error)}
     data = memoryview(json.dumps(answer).encode())
     while data:
         data = data[os.write(answers, data) :]
@@ -116,7 +116,7 @@ def _expand(given: dict[str, Any]) -> str:
     substitution_args._eval_optenv = lambda name, default="": default
     xacro.verbosity = 0
     del encodings, yaml
-    _close_doors(given["cpu"], given["memory"])
+    _restrict_process(given["cpu"], given["memory"])
     document: minidom.Document = xacro.process_file(
         f"{_TOP}/{given['main']}", mappings=dict(given["arguments"]), verbosity=0
     )
@@ -168,7 +168,7 @@ def _package(package: str, names: list[str], texts: dict[str, str]) -> str | Non
     return "" if not manifests else None
 
 
-def _close_doors(cpu_s: int, memory_bytes: int) -> None:
+def _restrict_process(cpu_s: int, memory_bytes: int) -> None:
     """Restrict the process to computation from here on."""
     os.environ.clear()
     # The soft limit's signal differs from that of a machine out of memory.
@@ -184,7 +184,7 @@ def _refuse(event: str, _arguments: tuple[Any, ...]) -> None:
         raise Refused(f"it reaches out of its folder ({event}); expand it yourself and give the URDF")
 
 
-def _told(error: BaseException) -> str:
+def _error_text(error: BaseException) -> str:
     """Return a one-line message; for wrapped errors that of the inner refusal."""
     at: BaseException | None = error
     while at is not None:

@@ -69,7 +69,7 @@ def load_parts(file: Path) -> tuple[Floats, ...] | None:
         return None
 
 
-def keep_parts(file: Path, parts: tuple[Floats, ...]) -> None:
+def save_parts(file: Path, parts: tuple[Floats, ...]) -> None:
     """Save parts in a file; without a writable folder, they are computed again at the next use."""
     whole = io.BytesIO()
     arrays: dict[str, Any] = {f"{i:04}": part for i, part in enumerate(parts)}

@@ -31,7 +31,7 @@ Arrays = Mapping[str, NDArray[Any]]
 _recalled: ContextVar[dict[str, NDArray[Any]] | None] = ContextVar("recalled", default=None)
 
 
-def arrays_kept_or_made(
+def cached_arrays(
     kind: str,
     terms: tuple[str | int, ...],
     code: tuple[ModuleType, ...],
@@ -51,8 +51,8 @@ def arrays_kept_or_made(
 
 
 @contextmanager
-def recalling(kind: str, terms: tuple[str | int, ...], code: tuple[ModuleType, ...]) -> Iterator[None]:
-    """Cache the results of `recalled` inside this context in one entry, and load them the next time.
+def caching_steps(kind: str, terms: tuple[str | int, ...], code: tuple[ModuleType, ...]) -> Iterator[None]:
+    """Cache the results of `cached_step` inside this context in one entry, and load them the next time.
     Use it for small steps of a large computation whose library is slow to load. The terms only distinguish entries."""
     file = _file(kind, terms, code)
     known = _read(file) or {}
@@ -66,8 +66,8 @@ def recalling(kind: str, terms: tuple[str | int, ...], code: tuple[ModuleType, .
         _write(file, now)
 
 
-def recalled(what: str, given: Sequence[NDArray[Any]], make: Callable[[], Sequence[NDArray[Any]]]) -> Arrays:
-    """Return arrays that depend on `given` only, as "0", "1", ...: cached by `recalling`, or computed."""
+def cached_step(what: str, given: Sequence[NDArray[Any]], make: Callable[[], Sequence[NDArray[Any]]]) -> Arrays:
+    """Return arrays that depend on `given` only, as "0", "1", ...: cached by `caching_steps`, or computed."""
     known = _recalled.get()
     if known is None:
         return {str(number): array for number, array in enumerate(make())}
@@ -123,13 +123,13 @@ def content_of(model: Any) -> str:
     """Compute a digest of a dataclass without its name and its files' digest: arrays bit for bit.
     Raises TypeError: a field is no number, string, array, tuple or set of these, nor a dataclass."""
     whole = hashlib.sha256()
-    for part in _parts({name: value for name, value in _told(model).items() if name not in _NAMES}):
+    for part in _parts({name: value for name, value in _digest_fields(model).items() if name not in _NAMES}):
         whole.update(len(part).to_bytes(8, "little"))
         whole.update(part)
     return whole.hexdigest()[:32]
 
 
-def _told(model: Any) -> dict[str, Any]:
+def _digest_fields(model: Any) -> dict[str, Any]:
     """Return the fields of a dataclass that affect its digest."""
     values = {f: getattr(model, f.name) for f in fields(model)}
     return {
@@ -154,7 +154,7 @@ def _parts(value: Any) -> Iterator[bytes]:
     elif is_dataclass(value) and isinstance(told := getattr(value, "content", None), str):
         yield told.encode()
     elif is_dataclass(value) and not isinstance(value, type):
-        yield from _parts(_told(value))
+        yield from _parts(_digest_fields(value))
     elif isinstance(value, (str, int, float, np.generic)) or value is None:
         yield f"{type(value).__name__}{value!r}".encode()
     else:

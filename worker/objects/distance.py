@@ -42,7 +42,7 @@ class MeshDistance:
             todo, k = todo[open_], min(4 * k, len(self._face))
         return found
 
-    def furthest(self, points: Floats) -> float:
+    def largest(self, points: Floats) -> float:
         """Return the largest distance of any of the points (N, 3) to the surface [m].
         Only points whose first upper bound exceeds the largest proven distance need a proof."""
         bounds = self(points, np.inf)
@@ -86,7 +86,7 @@ def deviation(one: tuple[Floats, Indices], two: tuple[Floats, Indices], samples:
     furthest = 0.0
     for source, target in ((one, two), (two, one)):
         points = surface_points(*source, samples)
-        furthest = max(furthest, MeshDistance(*target).furthest(points))
+        furthest = max(furthest, MeshDistance(*target).largest(points))
     return furthest
 
 

@@ -52,7 +52,8 @@ def crossings(vertices: Floats, faces: Indices) -> Indices | None:
     near = near[apart]
     depth = DEPTH * float(np.ptp(vertices, axis=0).max())
     found = [
-        _pass(corners[part[:, 0]], corners[part[:, 1]], depth) | _pass(corners[part[:, 1]], corners[part[:, 0]], depth)
+        _edges_pass(corners[part[:, 0]], corners[part[:, 1]], depth)
+        | _edges_pass(corners[part[:, 1]], corners[part[:, 0]], depth)
         for part in np.array_split(near, max(1, len(near) // _CHUNK))
     ]
     return near[np.concatenate(found)]
@@ -75,7 +76,7 @@ def _boxes_meet(corners: Floats, pairs: Indices) -> NDArray[np.bool_]:
     return meet
 
 
-def _pass(edges_of: Floats, triangles: Floats, depth: float) -> NDArray[np.bool_]:
+def _edges_pass(edges_of: Floats, triangles: Floats, depth: float) -> NDArray[np.bool_]:
     """Return a mask (P,) of pairs in which an edge of one triangle (P, 3, 3) passes `depth` [m] deep through the
     other."""
     a, b, c = np.moveaxis(triangles, 1, 0)
@@ -101,7 +102,7 @@ def untangle(vertices: Floats, faces: Indices) -> Mesh | None:
     The mesh is halved until no piece intersects itself, and the pieces are united; no vertex moves. It is safe if the
     result is closed and free of crossings, and all of its surface lies on the old surface."""
     whole = mesh_geometry.to_manifold(vertices, faces)
-    pieces = None if whole is None else _halved(whole, _HALVINGS)
+    pieces = None if whole is None else _split_recursively(whole, _HALVINGS)
     if pieces is None:
         return None
     united = mesh_geometry.from_manifold(manifold3d.Manifold.batch_boolean(pieces, manifold3d.OpType.Add))
@@ -110,11 +111,11 @@ def untangle(vertices: Floats, faces: Indices) -> Mesh | None:
     left = crossings(*united) if topology.is_closed(united[1]) else None
     if left is None or len(left) or not 0 < signed_volume(*united) <= signed_volume(vertices, faces):
         return None
-    strayed = MeshDistance(vertices, faces).furthest(surface_points(*united, _SAMPLES))
+    strayed = MeshDistance(vertices, faces).largest(surface_points(*united, _SAMPLES))
     return united if strayed <= _SAME * extent else None
 
 
-def _halved(piece: Any, halvings: int) -> list[Any] | None:
+def _split_recursively(piece: Any, halvings: int) -> list[Any] | None:
     """Cut a solid into parts that do not intersect themselves; None if this takes too many cuts."""
     parts: list[Any] = []
     for part in piece.decompose():
@@ -130,7 +131,7 @@ def _halved(piece: Any, halvings: int) -> list[Any] | None:
         middles = mesh[0][mesh[1][crossed.reshape(-1)]].mean(axis=1)
         axis = np.eye(3)[int(np.argmax(np.ptp(mesh[0], axis=0)))]
         for half in part.split_by_plane(tuple(axis), float(np.median(middles @ axis))):
-            more = [] if half.is_empty() else _halved(half, halvings - 1)
+            more = [] if half.is_empty() else _split_recursively(half, halvings - 1)
             if more is None:
                 return None
             parts += more

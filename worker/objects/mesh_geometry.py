@@ -198,7 +198,7 @@ def centred(points: Floats) -> CentredMesh:
     return CentredMesh((2 * steps - ends) / (2 * scale), low + ends / (2 * scale), resolution)
 
 
-def carried(pose: ArrayLike, by: ArrayLike) -> Floats:
+def shift_frame(pose: ArrayLike, by: ArrayLike) -> Floats:
     """Return poses (..., 7) of a frame with its origin moved by a vector (3,) in that frame [m]."""
     pose, by = np.array(pose, float), np.asarray(by, float)
     if by.any():
@@ -209,9 +209,9 @@ def carried(pose: ArrayLike, by: ArrayLike) -> Floats:
 def to_centre(pose: ArrayLike, centre: ArrayLike) -> Floats:
     """Convert poses (..., 7) of the file's frame to the centred frame, at `centre` (3,) in it.
     The result is on a grid, so that the round trip gives the same bits."""
-    return moved(carried(pose, centre), np.zeros(3))
+    return moved(shift_frame(pose, centre), np.zeros(3))
 
 
 def to_file(pose: ArrayLike, centre: ArrayLike) -> Floats:
     """Convert poses (..., 7) of the centred frame to the file's frame."""
-    return carried(pose, -np.asarray(centre, float))
+    return shift_frame(pose, -np.asarray(centre, float))

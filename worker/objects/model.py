@@ -84,7 +84,7 @@ class ObjectModel:
             self, vertices=vertices, hull_vertices=hull, centre_of_mass=mass, centre=centre, about_centre=held
         )
 
-    def weighing(
+    def with_mass(
         self, *, mass: float | None = None, density: float | None = None, friction: float | None = None
     ) -> ObjectModel:
         """Return the object with another mass [kg], or density [kg/m^3], and friction; None: unchanged.
@@ -97,9 +97,9 @@ class ObjectModel:
         return self if (mass, friction) == (self.mass, self.friction) else replace(self, mass=mass, friction=friction)
 
     @property
-    def published(self) -> ObjectModel:
+    def for_dexgraspbench(self) -> ObjectModel:
         """Return the object with mass and friction of DexGraspBench's protocol, equal for all objects."""
-        return self.weighing(mass=MASS_KG, friction=FRICTION)
+        return self.with_mass(mass=MASS_KG, friction=FRICTION)
 
     @property
     def gyration_radius(self) -> float:

@@ -45,9 +45,9 @@ def stated_options(files: Mapping[str, bytes], error: type[AssetError]) -> dict[
     return stated
 
 
-def as_asked(obj: ObjectModel, request: JobOptions) -> ObjectModel:
+def for_request(obj: ObjectModel, request: JobOptions) -> ObjectModel:
     """Return the object with the job's mass and friction, else its own; at level dexgraspbench with the published ones.
     Raises MeshError: the mass would exceed 100 kg."""
     if request.validation == "dexgraspbench":
-        return obj.published
-    return obj.weighing(mass=request.mass, density=request.density, friction=request.object_friction)
+        return obj.for_dexgraspbench
+    return obj.with_mass(mass=request.mass, density=request.density, friction=request.object_friction)

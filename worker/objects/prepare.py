@@ -52,11 +52,11 @@ def load_object(
     main = main_file(files, settings)
     shape = settings.model_dump_json(exclude=set(OF_MATTER))
     model = replace(_prepared(main, files[main], shape, float(face_error_m)), name=name, digest=digest)
-    return weighed(model, settings)
+    return apply_options(model, settings)
 
 
-def weighed(model: ObjectModel, options: ObjectOptions) -> ObjectModel:
-    return model.weighing(mass=options.mass, density=options.density, friction=options.friction)
+def apply_options(model: ObjectModel, options: ObjectOptions) -> ObjectModel:
+    return model.with_mass(mass=options.mass, density=options.density, friction=options.friction)
 
 
 def main_file(files: Mapping[str, bytes], options: ObjectOptions) -> str:
@@ -216,21 +216,21 @@ def simplify(vertices: Floats, faces: Indices, error_m: float, *, closed: bool =
     if len(faces) > MANY_FACES:
         # A mesh within a fifth of the error is quick to compare with. By the triangle inequality the rest of the error
         # remains.
-        start = _rollout(original, MANY_FACES, limit / 5)
+        start = _simplified(original, MANY_FACES, limit / 5)
         if start is not None:
             original, limit = ReferenceMesh(*start, closed), limit * 4 / 5
     accepted: list[Mesh] = []
     low, high = float(FEW_FACES), float(len(original.faces))
     while high / low > STEP:
         target = round(math.sqrt(low * high))
-        rollout = _rollout(original, target, limit)
+        rollout = _simplified(original, target, limit)
         if rollout is None:
             low = target
         else:
             high = target
             accepted.append(rollout)
     if not accepted and closed:
-        accepted = _thinned(original, limit)
+        accepted = _thin_variants(original, limit)
     for mesh in reversed(accepted):
         error = deviation(mesh, (vertices, faces), DENSE_SAMPLES)
         if error <= error_m:
@@ -269,7 +269,7 @@ class ReferenceMesh:
         )
 
 
-def _rollout(original: ReferenceMesh, target: int, error_m: float) -> Mesh | None:
+def _simplified(original: ReferenceMesh, target: int, error_m: float) -> Mesh | None:
     """Return a mesh of about `target` faces if it is valid and within the bound.
     A collapse that breaks the surface at one number of faces often succeeds at the next, so a few numbers are used."""
     for count in (target, int(target * 1.02) + 2, int(target * 1.05) + 4):
@@ -302,7 +302,7 @@ def _collapse(vertices: Floats, faces: Indices, target: int) -> Mesh | None:
     return mesh
 
 
-def _thinned(original: ReferenceMesh, error_m: float) -> list[Mesh]:
+def _thin_variants(original: ReferenceMesh, error_m: float) -> list[Mesh]:
     whole = mesh_geometry.to_manifold(original.vertices, original.faces)
     if whole is None:
         return []

@@ -62,7 +62,7 @@ class RepairedMesh:
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """The middle in the file's frame [m]."""
 
-    def but(self, vertices: Floats, faces: Indices, repair: str) -> RepairedMesh:
+    def with_faces(self, vertices: Floats, faces: Indices, repair: str) -> RepairedMesh:
         return replace(self, vertices=vertices, faces=faces, repairs=(*self.repairs, repair))
 
 
@@ -76,17 +76,17 @@ def repair(soup: Soup, options: ObjectOptions) -> RepairedMesh:
         found, unit = centred(soup.vertices[np.unique(soup.faces)]), UNITS[options.units]
         if found.resolution * unit <= max(COARSE_M, 1e-3 * unit * float(np.ptp(found.points, axis=0).max())):
             raise
-        raise MeshError(f"{error}; {_coarse(found, unit)}", facts=error.facts) from None
+        raise MeshError(f"{error}; {_resolution_note(found, unit)}", facts=error.facts) from None
     if not mesh.repairs:
         return mesh
-    moved = MeshDistance(given.vertices, given.faces).furthest(surface_points(mesh.vertices, mesh.faces, _SAMPLES))
+    moved = MeshDistance(given.vertices, given.faces).largest(surface_points(mesh.vertices, mesh.faces, _SAMPLES))
     return replace(mesh, moved_m=moved)
 
 
 def _solid(mesh: RepairedMesh, options: ObjectOptions) -> RepairedMesh:
     mesh = _close(_clean(mesh))
     if not topology.is_closed(mesh.faces):
-        return _open(mesh, options)
+        return _accept_open(mesh, options)
     mesh = _resolve_self_intersections(_resolve_components(mesh, options))
     volume = signed_volume(mesh.vertices, mesh.faces)
     extent = float(np.ptp(mesh.vertices, axis=0).max())
@@ -119,12 +119,12 @@ def _to_metres(soup: Soup, options: ObjectOptions) -> RepairedMesh:
             units_suggested=list(fitting),
             lengths_m=fitting,
         )
-    notes = (_coarse(given, unit),) if given.resolution * unit > COARSE_M else ()
+    notes = (_resolution_note(given, unit),) if given.resolution * unit > COARSE_M else ()
     x, y, z = (float(value) for value in on_grid(given.centre * unit))
     return RepairedMesh(given.points * unit, faces, notes=notes, centre=(x, y, z))
 
 
-def _coarse(given: CentredMesh, unit: float) -> str:
+def _resolution_note(given: CentredMesh, unit: float) -> str:
     return (
         f"the mesh lies {float(np.linalg.norm(given.centre)) * unit:.4g} m from its origin, where the file's numbers "
         f"are {1e3 * given.resolution * unit:.2g} mm apart; move it nearer, or write 64-bit numbers (OBJ, PLY)"
@@ -162,7 +162,7 @@ def _clean(mesh: RepairedMesh) -> RepairedMesh:
         raise MeshError("the mesh encloses no volume: its faces have no area or cover each other; give it a thickness")
     mesh = replace(mesh, vertices=vertices, faces=faces)
     if dropped := int(collapsed.sum() + doubled.sum() + slivers.sum()):
-        mesh = mesh.but(*topology.compact(vertices, faces), f"dropped {dropped} degenerate or duplicate faces")
+        mesh = mesh.with_faces(*topology.compact(vertices, faces), f"dropped {dropped} degenerate or duplicate faces")
     return mesh
 
 
@@ -173,12 +173,12 @@ def _close(mesh: RepairedMesh) -> RepairedMesh:
     if not orientable:
         return mesh
     if turned := int((faces != mesh.faces).any(axis=1).sum()):
-        mesh = mesh.but(mesh.vertices, faces, f"winding of {turned} faces made consistent with their neighbours")
+        mesh = mesh.with_faces(mesh.vertices, faces, f"winding of {turned} faces made consistent with their neighbours")
     crowded = int((topology.edge_faces(mesh.faces)[1] > 2).sum())
     if crowded:
         split = topology.part_double_edges(*topology.split_edges(mesh.vertices, mesh.faces))
         if not topology.open_edges(split[1]) > topology.open_edges(mesh.faces):
-            mesh = mesh.but(*split, f"split {crowded} non-manifold edges")
+            mesh = mesh.with_faces(*split, f"split {crowded} non-manifold edges")
     if topology.open_edges(mesh.faces):
         mesh = _fill_pinholes(mesh)
     return mesh
@@ -197,7 +197,9 @@ def _weld(mesh: RepairedMesh) -> RepairedMesh:
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
     if not len(faces) or topology.open_edges(faces) >= topology.open_edges(mesh.faces):
         return mesh
-    return mesh.but(*topology.compact(mesh.vertices[first], faces), f"welded {len(pairs)} pairs of vertices at a seam")
+    return mesh.with_faces(
+        *topology.compact(mesh.vertices[first], faces), f"welded {len(pairs)} pairs of vertices at a seam"
+    )
 
 
 def _fill_pinholes(mesh: RepairedMesh) -> RepairedMesh:
@@ -208,7 +210,7 @@ def _fill_pinholes(mesh: RepairedMesh) -> RepairedMesh:
         return mesh
     fans = [[loop[0], loop[i + 1], loop[i]] for loop in loops for i in range(1, len(loop) - 1)]
     faces = np.concatenate([mesh.faces, np.array(fans, dtype=np.int64)])
-    return mesh.but(mesh.vertices, faces, f"filled {len(loops)} small holes")
+    return mesh.with_faces(mesh.vertices, faces, f"filled {len(loops)} small holes")
 
 
 def _rims(faces: Indices) -> list[list[int]] | None:
@@ -231,7 +233,7 @@ def _rims(faces: Indices) -> list[list[int]] | None:
     return loops
 
 
-def _open(mesh: RepairedMesh, options: ObjectOptions) -> RepairedMesh:
+def _accept_open(mesh: RepairedMesh, options: ObjectOptions) -> RepairedMesh:
     holes = topology.open_edges(mesh.faces)
     if options.allow_open:
         note = f"not watertight: {holes} open edges; volume, centre of mass and inertia are those of the convex hull"
@@ -258,12 +260,12 @@ def _resolve_components(mesh: RepairedMesh, options: ObjectOptions) -> RepairedM
         volumes = volumes[solid_parts]
         largest = int(np.argmax(np.abs(volumes)))
         dropped = int((~solid_parts).sum())
-        mesh = mesh.but(*_join(parts), f"dropped {dropped} components without volume")
+        mesh = mesh.with_faces(*_join(parts), f"dropped {dropped} components without volume")
     sign = np.sign(volumes[largest])
     outward = [part if v > 0 else (part[0], part[1][:, ::-1]) for part, v in zip(parts, volumes, strict=True)]
     if len(parts) == 1:
         if sign < 0:
-            mesh = mesh.but(*outward[0], "winding turned outward")
+            mesh = mesh.with_faces(*outward[0], "winding turned outward")
         return mesh
     return _unite(mesh, outward, np.sign(volumes) != sign, turned=bool(sign < 0), options=options)
 
@@ -278,7 +280,7 @@ def _unite(
 ) -> RepairedMesh:
     """Unite shells to one solid; shells wound against the largest one are cavities if they lie inside it."""
     if turned:
-        mesh = mesh.but(mesh.vertices, mesh.faces[:, ::-1], "winding turned outward")
+        mesh = mesh.with_faces(mesh.vertices, mesh.faces[:, ::-1], "winding turned outward")
     boxes = [(p[0].min(axis=0), p[0].max(axis=0)) for p in parts]
     main = int(np.argmax([signed_volume(*part) for part in parts]))
     hollow = [
@@ -309,14 +311,14 @@ def _unite(
                 {"compound": True},
             )
         best = united - mesh_geometry.union([piece for group in groups[1:] for piece in group])
-        return mesh.but(*mesh_geometry.from_manifold(best), f"kept the largest of {len(groups)} components")
+        return mesh.with_faces(*mesh_geometry.from_manifold(best), f"kept the largest of {len(groups)} components")
     if len(pieces) > 1:
         how = "lie apart" if len(groups) > 1 else f"touch or lie within {1e3 * JOINED_M:g} mm"
         mesh = replace(mesh, notes=(*mesh.notes, f"{len(pieces)} parts that {how} are one rigid body"))
     before = sum(signed_volume(*p) for p in positives) - sum(signed_volume(*p) for p in holes)
     # Parts that only share a face keep their volume when united, but their faces inside the solid are removed.
     if abs(united.volume() - before) > 1e-6 * before or len(pieces) < len(positives):
-        return mesh.but(
+        return mesh.with_faces(
             *mesh_geometry.from_manifold(united), f"united {len(parts)} touching or intersecting components"
         )
     vertices, faces = _join(positives + [(corners, cavity[:, ::-1]) for corners, cavity in holes])
@@ -332,7 +334,7 @@ def _resolve_self_intersections(mesh: RepairedMesh) -> RepairedMesh:
     if united is None:
         note = f"{len(found)} pairs of faces pass through each other; volume and mass may err there"
         return replace(mesh, self_intersections=len(found), notes=(*mesh.notes, note))
-    mesh = mesh.but(*united, f"united the mesh with itself where {len(found)} pairs of faces intersected")
+    mesh = mesh.with_faces(*united, f"united the mesh with itself where {len(found)} pairs of faces intersected")
     return replace(mesh, self_intersections=0)
 
 

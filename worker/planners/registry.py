@@ -32,7 +32,7 @@ PLANNERS: Final[dict[str, tuple[str, str]]] = {
 
 
 def method_names() -> list[str]:
-    return [*PLANNERS, *sorted(set(_offered()) - set(PLANNERS))]
+    return [*PLANNERS, *sorted(set(_entry_points()) - set(PLANNERS))]
 
 
 def method(name: str) -> Method:
@@ -43,7 +43,7 @@ def method(name: str) -> Method:
         with pause_garbage_collection():
             own: Method = getattr(import_module(module), attribute)
         return own
-    offered = _offered()
+    offered = _entry_points()
     if name not in offered:
         raise InputError(f"unknown method {name!r}{available_names(name, method_names())}")
     try:
@@ -82,14 +82,14 @@ def _options(name: str, options: Mapping[str, Any] | None) -> Options:
         raise InputError(f"option of {name}: {first_error(error)}; its options: {there_are}") from None
 
 
-def of_this_machine(name: str, options: Mapping[str, Any] | None) -> dict[str, Any]:
+def local_options(name: str, options: Mapping[str, Any] | None) -> dict[str, Any]:
     """Replace files in a local user's options by digests, and cache the files in this process.
     Raises InputError: unknown method, or a file that cannot be used."""
     files, given = method(name).files, dict(options or {})
     return given | {key: files[key](Path(str(value))) for key, value in given.items() if key in files}
 
 
-def _offered() -> dict[str, EntryPoint]:
+def _entry_points() -> dict[str, EntryPoint]:
     from importlib.metadata import entry_points
 
     return {point.name: point for point in entry_points(group=GROUP)}

@@ -39,7 +39,7 @@ class StepCounter:
             self._run.progress(min(self._done, self._total), self._total, message)
 
 
-def cut(count: int, run: ExecutionContext, *, least: int = 1) -> list[range]:
+def split_batch(count: int, run: ExecutionContext, *, least: int = 1) -> list[range]:
     """Cut a batch into contiguous, nearly equal parts: one on a GPU, at most one per thread on a CPU.
     Each part has at least `least` grasps."""
     if wp.get_device(run.device).is_cuda:
@@ -54,12 +54,12 @@ def run_parts(parts: list[range], work: Callable[[range], T]) -> list[T]:
     A part that exceeds a GPU's memory is halved, repeatedly if needed, down to single grasps. Halves run in sequence,
     so there may be more results than parts."""
     if len(parts) == 1:
-        return _fitted(parts[0], work)
+        return _run_halved(parts[0], work)
     with ThreadPoolExecutor(len(parts), thread_name_prefix="synthesize") as pool:
         return [future.result() for future in [pool.submit(work, part) for part in parts]]
 
 
-def _fitted(part: range, work: Callable[[range], T]) -> list[T]:
+def _run_halved(part: range, work: Callable[[range], T]) -> list[T]:
     try:
         return [work(part)]
     except RuntimeError as error:
@@ -71,4 +71,4 @@ def _fitted(part: range, work: Callable[[range], T]) -> list[T]:
     # The error is freed by now, and with it stack frames that held earlier allocations.
     gc.collect()
     middle = part.start + len(part) // 2
-    return [*_fitted(range(part.start, middle), work), *_fitted(range(middle, part.stop), work)]
+    return [*_run_halved(range(part.start, middle), work), *_run_halved(range(middle, part.stop), work)]

@@ -29,8 +29,8 @@ from graspd.service.model.libraries import mark_process
 from graspd.service.model.states import Stage
 from graspd.service.pipeline.identity import check_service
 from graspd.service.store.store import Store, open_store
+from graspd.worker.engines.batch_sizes import batches_at_once, processes_at_once
 from graspd.worker.engines.devices import Device
-from graspd.worker.engines.joins import batches_at_once, processes_at_once
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.pool.pool import MODULES, Pool
 from graspd.worker.process.fitness import Check, Fitness
@@ -76,19 +76,19 @@ class Engine:
                     word, about = self._orders.get()
                 self._surroundings.close()
             except (InputError, UnavailableError, BusyError) as error:
-                self._say("refused", error)
+                self._send("refused", error)
 
     def _carry_out(self, word: str, about: Any) -> None:
         if word == "service":
             check_service(self._surroundings.store, about)
-            self._say("service", True)
+            self._send("service", True)
         elif word == "check":
-            self._say("ready", self._admitted())
+            self._send("ready", self._admitted())
         else:
             self._do(about)
 
     def update(self, **facts: str | float) -> None:
-        self._say("facts", facts)
+        self._send("facts", facts)
 
     def _start(self) -> None:
         settings = self._setup.settings
@@ -99,11 +99,11 @@ class Engine:
             table, check = stage_table(), lambda some: check_engine(device.resolve, some, threads=settings.threads)
         self._fitness = Fitness(store, check)
         self._runner = Runner(
-            table, worker=self._setup.worker, publish=lambda event: self._say("event", event), fitness=self._fitness
+            table, worker=self._setup.worker, publish=lambda event: self._send("event", event), fitness=self._fitness
         )
         self._surroundings = TaskResources(settings, store, device)
         self.update(device_name=device.name)
-        device.find_out(lambda: self.update(device=device.resolve(), device_name=device.name))
+        device.start_resolving(lambda: self.update(device=device.resolve(), device_name=device.name))
 
     def _admitted(self) -> bool:
         """Check the engine before the first task; with `Setup.patient`, wait in quarantine until it passes."""
@@ -126,21 +126,21 @@ class Engine:
             if self._reason is not None:
                 context.stop(self._reason)
         try:
-            self._say("done", self._runner.run(raw, context))
+            self._send("done", self._runner.run(raw, context))
         except TaskRefused as error:
-            self._say("refused", error)
+            self._send("refused", error)
         finally:
             with self._changing:
                 self._context = None
-        self._say("idle", self._look_after_itself())
+        self._send("idle", self._check_condition())
 
-    def _look_after_itself(self) -> Condition:
+    def _check_condition(self) -> Condition:
         if self._runner.device_lost:
             log.error("this worker ends: %s", self._runner.device_lost)
             return "unfit"
         if self._fitness.reason and self._reason is None and not self._wait_in_quarantine(self._setup.stages):
             return "fit" if self._reason is StopReason.SHUTDOWN else "unfit"
-        if why := self._surroundings.outgrown():
+        if why := self._surroundings.memory_excess():
             log.info("this worker ends, so that a fresh one starts: %s", why)
             return "outgrown"
         return "fit"
@@ -164,7 +164,7 @@ class Engine:
             if word == "end":
                 return
 
-    def _say(self, word: str, about: Any) -> None:
+    def _send(self, word: str, about: Any) -> None:
         with self._speaking, suppress(OSError):  # the worker has ended
             self._connection.send((word, about))
 
@@ -178,7 +178,7 @@ class TaskResources:
         self._device = device
         self._memory_mb = settings.worker_max_memory_mb or available_memory() / 2 / 2**20
 
-    def outgrown(self) -> str:
+    def memory_excess(self) -> str:
         beside = sum(resident_mb(pid) for pid in pool.pids) if (pool := vars(self).get("_pool")) is not None else 0.0
         if (held := resident_mb() + beside) > self._memory_mb:
             return f"it uses {held:.0f} MiB, more than {self._memory_mb:.0f} (GRASPD_WORKER_MAX_MEMORY_MB)"

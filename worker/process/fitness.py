@@ -66,10 +66,10 @@ class Fitness:
         self.reason = ""
         return True
 
-    def passed(self) -> None:
+    def record_success(self) -> None:
         self._failed.clear()
 
-    def doubt(self, message: Message, error: Exception) -> str:
+    def diagnose(self, message: Message, error: Exception) -> str:
         """Return the reason why a failure is due to this worker and not to the task; "" if it is unknown."""
         if isinstance(error, _OF_THE_TASK):
             return ""

@@ -44,11 +44,11 @@ class Link:
         """`process` is None if the engine has no process of its own."""
         self._connection, self._process = connection, process
 
-    def say(self, word: str, about: Any = None) -> None:
+    def send(self, word: str, about: Any = None) -> None:
         with suppress(OSError):
             self._connection.send((word, about))
 
-    def hear(self, wait_s: float) -> tuple[str, Any] | None:
+    def receive(self, wait_s: float) -> tuple[str, Any] | None:
         """Receive a message; None after a timeout. Raises EngineLost."""
         try:
             return self._connection.recv() if self._connection.poll(wait_s) else None
@@ -66,7 +66,7 @@ class Link:
 
     def close(self) -> None:
         """End the engine, gracefully if it responds in time."""
-        self.say("end", StopReason.SHUTDOWN)
+        self.send("end", StopReason.SHUTDOWN)
         self._end()
         self._connection.close()
 

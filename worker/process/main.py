@@ -77,12 +77,12 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
 
     def check_service(self) -> None:
         """Raise BusyError if Redis belongs to another service, InputError if the device is unknown."""
-        self._engine.say("service", self._queue.service())
+        self._engine.send("service", self._queue.service())
         self._await("service")
 
     def admit(self) -> bool:
         """Wait for the engine's check before the first task; False if it must end. Raises EngineLost."""
-        self._engine.say("check")
+        self._engine.send("check")
         return bool(self._await("ready"))
 
     def execute_job(self, job: Any, queue: Any) -> None:
@@ -91,7 +91,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         self.prepare_job_execution(job)
         self._heartbeat.update(task_id=job.id.rpartition("-")[0], state="busy", done=0.0, total=0.0, message="")
         outcome: Event | None = None
-        self._engine.say("task", job.args[0])
+        self._engine.send("task", job.args[0])
         try:
             outcome = self._await("done", partial(self._keep_lease, job))
         except GraspdError as error:
@@ -100,7 +100,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
             # As after a kill of this process, the lease remains, and the controller detects its expiry.
             log.error("this worker ends: %s", error)
             os._exit(1)
-        self._give_back(job)
+        self._return_task(job)
         self._heartbeat.update(task_id="", state="stopping" if self.told_to_stop else "idle")
         self.tasks_done += 1
         if outcome is not None:
@@ -117,16 +117,16 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         due = began + self._heartbeat.interval_s
         told: StopReason | None = None
         while True:
-            if (news := self._engine.hear(_LOOK_S)) is not None:
+            if (news := self._engine.receive(_LOOK_S)) is not None:
                 if news[0] == word:
                     return news[1]
-                self._pass_on(*news)
+                self._forward(*news)
             elapsed = time.monotonic() - began
             reason = (
                 StopReason.TIMEOUT if elapsed > self._limit_s else StopReason.SHUTDOWN if self.told_to_stop else None
             )
             if reason is not told:
-                self._engine.say("stop", reason)
+                self._engine.send("stop", reason)
                 told = reason
             if elapsed > self._limit_s + STUCK_AFTER_S:
                 log.error("the engine does not stop, and is ended")
@@ -135,7 +135,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
                 beat()
                 due = time.monotonic() + self._heartbeat.interval_s
 
-    def _pass_on(self, word: str, about: Any) -> None:
+    def _forward(self, word: str, about: Any) -> None:
         if word == "refused":
             raise about
         if word == "facts":
@@ -164,9 +164,9 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
             log.warning("the lease of a task could not be renewed: %s", error)
             return
         if is_cancelled or not is_held:
-            self._engine.say("stop", StopReason.CANCELLED if is_cancelled else StopReason.LEASE_LOST)
+            self._engine.send("stop", StopReason.CANCELLED if is_cancelled else StopReason.LEASE_LOST)
 
-    def _give_back(self, job: Any) -> None:
+    def _return_task(self, job: Any) -> None:
         """Remove the task from Redis; wait while Redis refuses writes because its disk is full."""
         if not job.exists(job.id, self.connection):
             log.info("task %s was taken from this worker, which was too slow", job.id.rpartition("-")[0])

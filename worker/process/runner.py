@@ -88,7 +88,7 @@ class Runner:
             if (why := self._loss(error, context)) and first_loss(message.task_id):
                 log.error("the task is returned to the queue: %s", why, exc_info=True)
                 return self._event(EventKind.RETURNED, message, message=why)
-            if not why and self._fitness is not None and (why := self._fitness.doubt(message, error)):
+            if not why and self._fitness is not None and (why := self._fitness.diagnose(message, error)):
                 log.warning("the task is returned to the queue; it failed because of this worker", exc_info=True)
                 return self._event(EventKind.RETURNED, message, message=why)
             return self._failed(message, error, context, started)
@@ -104,7 +104,7 @@ class Runner:
             raise TaskRefused(f"this worker does no {message.stage} tasks")
         self._publish(self._event(EventKind.STARTED, message))
         clock = time.perf_counter()
-        lost = self._lost(message, context)
+        lost = self._lost_manifest(message, context)
         made = self._stages[message.stage](message, context)
         self._check_device(context.device)
         seconds = time.perf_counter() - clock
@@ -120,7 +120,7 @@ class Runner:
                 )
             publish_shard(context.store, manifest, data)
         if self._fitness is not None:
-            self._fitness.passed()
+            self._fitness.record_success()
         return self._event(EventKind.FINISHED, message, output=output, seconds=seconds)
 
     def _loss(self, error: Exception, context: TaskContext) -> str:
@@ -139,7 +139,7 @@ class Runner:
         is_there = shard_exists(context.store, message.stage, message.output)
         return is_there and context.store.exists(names.shard_file(message.stage, message.output))
 
-    def _lost(self, message: Message, context: TaskContext) -> ShardManifest | None:
+    def _lost_manifest(self, message: Message, context: TaskContext) -> ShardManifest | None:
         """Return the manifest of a shard that was made before but has lost its file."""
         if isinstance(message, IngestMessage) or not shard_exists(context.store, message.stage, message.output):
             return None

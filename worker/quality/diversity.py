@@ -53,7 +53,7 @@ def distances(points: Floats, one: NDArray[np.intp], other: NDArray[np.intp]) ->
     return np.concatenate([np.zeros(0), *found])
 
 
-def nearest(points: Floats) -> float | None:
+def least_distance(points: Floats) -> float | None:
     """Return the least distance between two of N grasps (N, P, 3) [m]; None for fewer than two."""
     if len(points) < 2:
         return None

@@ -15,7 +15,7 @@ from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.quality.contact import LINK_CONTACT_M, contact_links, finger_of_body
 from graspd.worker.quality.probe import Probe, probe_of
-from graspd.worker.simulation.device import chain_of, posed_bodies, room_for_bodies, to_xyzw
+from graspd.worker.simulation.device import allocate_bodies, chain_of, posed_bodies, to_xyzw
 from graspd.worker.simulation.kernels import balance, jamming, opening, optimizers, touching
 from graspd.worker.simulation.launches import launch
 
@@ -49,7 +49,7 @@ class PostureData:
 
     def bodies(self, count: int) -> Any:
         with wp.ScopedDevice(self.device):
-            return room_for_bodies(self.hand, count)
+            return allocate_bodies(self.hand, count)
 
     def roots(self, hand_pose: Floats) -> tuple[Any, Any]:
         """Return positions about the object's centre of mass, and rotations, of hands' roots (n, 7)."""

@@ -18,7 +18,7 @@ from graspd.worker.grasps import Posture
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel, SurfacePoints
 from graspd.worker.hands.surface import sample_surface
-from graspd.worker.objects.disk_cache import arrays_kept_or_made
+from graspd.worker.objects.disk_cache import cached_arrays
 from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.topology import face_areas
@@ -124,7 +124,7 @@ class Probe:
             if wp.get_device().is_cpu:
                 # Cached on disk: every process needs the grid at its start, and it depends on the object alone.
                 terms = (obj.content, binary_name(kernels))
-                kept = arrays_kept_or_made(
+                kept = cached_arrays(
                     "coarse_grids", terms, (sys.modules[__name__],), make, fits=lambda kept: _is_grid(kept, counts)
                 )
             else:

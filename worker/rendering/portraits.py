@@ -14,7 +14,7 @@ from PIL import Image, ImageDraw
 from graspd.service.model.colours import hexadecimal
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, compose, quat_from_matrix
-from graspd.worker.hands.closing import posture
+from graspd.worker.hands.closing import closing_posture
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.mesh_geometry import corner_normals, from_manifold
@@ -51,7 +51,11 @@ _OBJECT_AZIMUTHS: Final = tuple(np.radians([-50.0, 40.0, 130.0]).tolist())
 def hand_portrait(hand: HandModel) -> Image.Image:
     """Draw the hand open, in its pre-shape and closing, from two sides; an arrow on the palm shows the approach."""
     parts, upright = hand_parts(hand), _upright(hand)
-    named = {"open": posture(hand, 0.0), "pre-shape": hand.preshape, "closing": posture(hand, _CLOSING_SHARE)}
+    named = {
+        "open": closing_posture(hand, 0.0),
+        "pre-shape": hand.preshape,
+        "closing": closing_posture(hand, _CLOSING_SHARE),
+    }
     joints = hand.expand(np.array(list(named.values())))
     bodies = np.array(body_poses(hand, np.tile(upright, (len(named), 1)), joints))
     corners = [apply(bodies[:, piece.body, None], piece.vertices) for piece in hand.pieces]
@@ -111,7 +115,7 @@ def _page(pictures: NDArray[np.uint8], captions: Sequence[str]) -> Image.Image:
 
 def _upright(hand: HandModel) -> Floats:
     """Return the root pose with the approach along +y, right of a camera on +x, and fingertips up."""
-    poses = body_poses(hand, IDENTITY_POSE, hand.expand(posture(hand, 0.0)))[0]
+    poses = body_poses(hand, IDENTITY_POSE, hand.expand(closing_posture(hand, 0.0)))[0]
     centres = {piece.body: apply(poses[piece.body], piece.vertices).mean(axis=0) for piece in hand.pieces}
     tips = np.mean([centres.get(body, poses[body, :3]) for body in hand.fingertips], axis=0)
     forward, up = hand.palm.approach, tips - hand.palm.centre

@@ -37,9 +37,9 @@ from graspd.worker.rendering.scenery import (
     Pictures,
     Solid,
     Supports,
-    seen_share,
     slab_poses,
     slabs,
+    visible_share,
 )
 from graspd.worker.rendering.tracer import Tracer
 
@@ -93,7 +93,7 @@ class CameraPlan:
             middles = list(self.given.extrinsics)
         else:
             cone = narrow_field(self.intrinsics, self.width, self.height)
-            middles = _unhidden(
+            middles = _unobstructed_cameras(
                 lambda: sample_hemisphere(centre, radius, views=self.views, field_of_view=cone, rng=rng),
                 supports,
                 points,
@@ -150,7 +150,7 @@ class Setting:
 
     def shoot_with(self, drawn: DrawnHand, run: ExecutionContext) -> Pictures:
         key = (*self._key(), drawn.hand.content, drawn.wrist is not None, run.device)
-        stage = _kept(key, lambda: [*self._solids(), *(part.solid for part in drawn.parts)], run.device)
+        stage = _cached_tracer(key, lambda: [*self._solids(), *(part.solid for part in drawn.parts)], run.device)
         shown = [part.look for part in drawn.parts]
         stage.place(
             np.concatenate([self._poses, drawn.body_poses()], axis=1), [[*looks, *shown] for looks in self.looks]
@@ -158,7 +158,7 @@ class Setting:
         return self._named(stage.shoot(self.shot, run))
 
     def stage(self, device: str, poses: Floats | None = None) -> Tracer:
-        stage = _kept((*self._key(), device), self._solids, device)
+        stage = _cached_tracer((*self._key(), device), self._solids, device)
         stage.place(self._poses if poses is None else poses, self.looks)
         return stage
 
@@ -201,14 +201,14 @@ class _Scene:
         ]
 
 
-def _unhidden(draw: Callable[[], Sequence[Floats]], supports: Supports, points: Floats) -> Sequence[Floats]:
+def _unobstructed_cameras(draw: Callable[[], Sequence[Floats]], supports: Supports, points: Floats) -> Sequence[Floats]:
     """Draw cameras that see the points past boxes; a camera without a free view is drawn again."""
     drawn = list(draw())
     if not any(isinstance(s, BoxSupport) for s in supports):
         return drawn
 
     def seen(camera: Floats) -> float:
-        return seen_share(supports, -camera[:3, :3].T @ camera[:3, 3], points)
+        return visible_share(supports, -camera[:3, :3].T @ camera[:3, 3], points)
 
     share = [seen(camera) for camera in drawn]
     for _ in range(_DRAWS):
@@ -220,7 +220,7 @@ def _unhidden(draw: Callable[[], Sequence[Floats]], supports: Supports, points: 
     return drawn
 
 
-def _kept(key: tuple[object, ...], solids: Callable[[], Sequence[Solid | Box]], device: str) -> Tracer:
+def _cached_tracer(key: tuple[object, ...], solids: Callable[[], Sequence[Solid | Box]], device: str) -> Tracer:
     if key not in _stages:
         _stages[key] = Tracer(solids(), device)
     return _stages[key]

@@ -121,7 +121,7 @@ def _slab_pose(plane: HalfSpace, middle: Floats, yaw: float) -> Floats:
     return compose(up, np.array([0, 0, -0.5 * TABLE_SIZE[2], np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]))
 
 
-def seen_share(supports: Supports, eye: Floats, points: Floats) -> float:
+def visible_share(supports: Supports, eye: Floats, points: Floats) -> float:
     """Return the share of points (P, 3) that no support hides from an eye (3,)."""
     hidden = np.zeros(len(points), bool)
     for support in supports:

@@ -34,18 +34,20 @@ Arrays = Mapping[str, NDArray[np.generic]]
 def best(quality: Arrays, count: int, among: NDArray[np.bool_]) -> NDArray[np.intp]:
     """Return the `count` best rows by epsilon among those of a mask (N,)."""
     rows = np.flatnonzero(among)
-    return rows[np.argsort(-quoted(quality, "quality/epsilon")[rows], kind="stable")][:count]
+    return rows[np.argsort(-metric_at_threshold(quality, "quality/epsilon")[rows], kind="stable")][:count]
 
 
 def best_kept(scene: Arrays, base: Arrays) -> NDArray[np.int32]:
     """Return the row (S,) of each scene's valid grasp with the largest epsilon; -1: none."""
-    epsilon = quoted(base, "quality/epsilon")[np.asarray(scene["grasp/base_index"])]
+    epsilon = metric_at_threshold(base, "quality/epsilon")[np.asarray(scene["grasp/base_index"])]
     return _best_of_scenes(scene, np.where(np.asarray(scene["grasp/valid"], bool), epsilon, -np.inf))
 
 
 def best_in_scenes(base: Arrays, among: NDArray[np.bool_]) -> NDArray[np.int32]:
     """Return the row (S,) with the largest epsilon planned in each scene, among a mask (N,); -1: none."""
-    return _best_of_scenes(base, np.where(among, np.nan_to_num(quoted(base, "quality/epsilon"), nan=-1.0), -np.inf))
+    return _best_of_scenes(
+        base, np.where(among, np.nan_to_num(metric_at_threshold(base, "quality/epsilon"), nan=-1.0), -np.inf)
+    )
 
 
 def _best_of_scenes(columns: Arrays, score: Floats) -> NDArray[np.int32]:
@@ -59,7 +61,10 @@ def _best_of_scenes(columns: Arrays, score: Floats) -> NDArray[np.int32]:
 
 def figures(quality: Arrays, rows: NDArray[np.intp]) -> list[list[tuple[str, str]]]:
     """Return caption entries, label and value, for each row of a base shard."""
-    epsilon, area = quoted(quality, "quality/epsilon"), quoted(quality, "quality/contact_area_cm2")
+    epsilon, area = (
+        metric_at_threshold(quality, "quality/epsilon"),
+        metric_at_threshold(quality, "quality/contact_area_cm2"),
+    )
     depth = np.asarray(quality["quality/penetration_depth_mm"], float)
     return [
         [("epsilon", f"{epsilon[r]:.3f}"), ("contact", f"{area[r]:.1f} cm^2"), ("depth", f"{depth[r]:.2f} mm")]
@@ -67,7 +72,7 @@ def figures(quality: Arrays, rows: NDArray[np.intp]) -> list[list[tuple[str, str
     ]
 
 
-def quoted(quality: Arrays, path: str) -> Floats:
+def metric_at_threshold(quality: Arrays, path: str) -> Floats:
     """Return a metric (N,) at the contact threshold of the index."""
     thresholds = np.asarray(quality["quality/thresholds_m"], float)
     return np.asarray(quality[path], float)[:, int(np.argmin(np.abs(thresholds - INDEX_THRESHOLD_M)))]

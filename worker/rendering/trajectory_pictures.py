@@ -38,7 +38,7 @@ from graspd.worker.rendering.pictures import (
     side_of,
     studio_shot,
 )
-from graspd.worker.rendering.scenery import Appearance, Box, Solid, Supports, seen_share, slab_poses, slabs
+from graspd.worker.rendering.scenery import Appearance, Box, Solid, Supports, slab_poses, slabs, visible_share
 from graspd.worker.rendering.tracer import Tracer
 from graspd.worker.scenes.neighbours import Neighbours
 
@@ -79,7 +79,7 @@ class PictureScenes:
         return 0 if self.index is None else int(self.index[number])
 
 
-def way_pictures(
+def trajectory_pictures(
     hand: HandModel,
     obj: ObjectModel,
     frames: Sequence[Sequence[Waypoint]],
@@ -142,7 +142,7 @@ class _Stage:
         near = points[np.linalg.norm(points - middles[:, None], axis=2) < reach]
         self._place(scene, things, drawn, floor_pose(points), middles[0])
         above = middles[0] + np.array([0, 0, _HIGH_M])
-        covered = seen_share(self.around.supports, above, middles[:1]) < 1
+        covered = visible_share(self.around.supports, above, middles[:1]) < 1
         lamp = _UNDER_A_BOARD if covered else TOWARD_LAMP
         grasp = next((k for k, point in enumerate(way) if point.name == "grasp"), 0)
         k = intrinsics(*size, FIELD_OF_VIEW)

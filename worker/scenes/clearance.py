@@ -15,7 +15,7 @@ from graspd.worker.grasps import Posture
 from graspd.worker.hands.model import HandModel
 from graspd.worker.scenes.neighbours import Neighbours, neighbour_clearance
 from graspd.worker.simulation.environment import CLEAR_M, UP, Environment, Obstacle
-from graspd.worker.simulation.mounting import mounting_room, wrist_room
+from graspd.worker.simulation.mounting import choose_wrist, wrist_clearance
 from graspd.worker.simulation.obstacles import PosedFeatures
 
 #: Least clearance of the hand above the table [m].
@@ -66,7 +66,7 @@ def transfer(
     rejection[at_contact < MARGIN_M] = Rejection.TABLE_AT_CONTACT
     result: dict[str, NDArray[np.generic]] = {}
     if neighbours is not None:
-        beside = _beside(hand, grasp, pregrasp, poses, neighbours, wrist).reshape(-1, 2)
+        beside = _neighbour_clearance(hand, grasp, pregrasp, poses, neighbours, wrist).reshape(-1, 2)
         rejection[(rejection == Rejection.NONE) & (beside[:, 1] < MARGIN_M)] = Rejection.NEIGHBOUR_ON_APPROACH
         rejection[(rejection >= Rejection.NEIGHBOUR_AT_CONTACT) & (beside[:, 0] < MARGIN_M)] = (
             Rejection.NEIGHBOUR_AT_CONTACT
@@ -102,7 +102,7 @@ def approach(grasp: Posture, pregrasp: Posture, postures: int = PATH_POSTURES) -
     return Posture(pose.reshape(-1, 7), joints.reshape(-1, joints.shape[-1]))
 
 
-def _beside(
+def _neighbour_clearance(
     hand: HandModel, grasp: Posture, pregrasp: Posture, poses: Floats, neighbours: Neighbours, wrist: Floats
 ) -> Floats:
     """Return clearances (S, N, 2) of hands and mountings from neighbours: at contact and on the approach.
@@ -122,7 +122,7 @@ def _beside(
 def _clearance(hand: HandModel, grasp: Posture, pregrasp: Posture, object_pose: Floats) -> Floats:
     """Return the height (S, N, 2) of the hand's lowest point at contact, and on its approach, table frame [m]."""
     features = PosedFeatures.of(hand, approach(grasp, pregrasp))
-    on_path = np.array([features.distance(_TABLE.seen_from(pose)).min(axis=1) for pose in object_pose])
+    on_path = np.array([features.distance(_TABLE.in_frame(pose)).min(axis=1) for pose in object_pose])
     on_path = on_path.reshape(len(object_pose), len(grasp), -1)
     return np.stack([on_path[..., -1], on_path.min(axis=2)], axis=-1)
 
@@ -135,10 +135,12 @@ def _mounting_clearance(
     path = approach(grasp, pregrasp).hand_pose.reshape(len(grasp), PATH_POSTURES, 7)
     angles, heights = [], []
     for pose in object_pose:
-        table = [Environment((_TABLE.seen_from(pose),), UP)]
-        wrist, on_path = mounting_room(hand, path, table)
+        table = [Environment((_TABLE.in_frame(pose),), UP)]
+        wrist, on_path = choose_wrist(hand, path, table)
         only = np.zeros(len(grasp), np.intp)
-        at_contact = on_path if hand.mounting is None else wrist_room(hand.mounting, path[:, -1:], wrist, table, only)
+        at_contact = (
+            on_path if hand.mounting is None else wrist_clearance(hand.mounting, path[:, -1:], wrist, table, only)
+        )
         angles.append(wrist)
         heights.append(np.stack([at_contact, on_path], axis=-1))
     return np.array(angles), np.array(heights)

@@ -33,7 +33,7 @@ def supports_of(spec: SceneSpec) -> tuple[Obstacle, ...]:
     return tuple(found) if spec.touch >= MOST_TOUCH else tuple(replace(o, tips_m=1e-3 * spec.touch) for o in found)
 
 
-def room_in(spec: SceneSpec) -> tuple[float, float] | None:
+def walled_area(spec: SceneSpec) -> tuple[float, float] | None:
     """Return the sides x and y of the rectangle about the origin, inside walls or on the board [m]; None: no walls."""
     return {"bin": BIN_SIZE, "shelf": (SHELF_SIZE[1], SHELF_SIZE[0])}.get(spec.kind)
 
@@ -56,8 +56,10 @@ def rest_poses(spec: SceneSpec, obj: ObjectModel, *, count: int, seed: int) -> d
         found = drop(obj, count=count, seed=seed)
     poses = found["scene/object_pose"]
     supports = supports_of(spec)
-    if (size := room_in(spec)) is not None:
-        poses = np.array([inside(obj, pose, size, np.random.default_rng([seed, i])) for i, pose in enumerate(poses)])
+    if (size := walled_area(spec)) is not None:
+        poses = np.array(
+            [move_inside(obj, pose, size, np.random.default_rng([seed, i])) for i, pose in enumerate(poses)]
+        )
     poses = poses if spec.target is not None else moved(poses, np.zeros(3))
     check_free(obj, poses, supports)
     return {**found, "scene/object_pose": poses}
@@ -76,7 +78,7 @@ def _each_face(obj: ObjectModel, seed: int) -> dict[str, Floats]:
     poses = []
     for number, face in enumerate(chosen):
         turn = np.random.default_rng([seed, number]).uniform(0, 2 * np.pi)
-        pose = turned(lay_flat(faces, face, np.array([0.0, 0, 0, 1, 0, 0, 0])), turn)
+        pose = rotate_about_vertical(lay_flat(faces, face, np.array([0.0, 0, 0, 1, 0, 0, 0])), turn)
         pose[:2] -= (pose[:3] + quat_rotate(pose[3:], obj.centre_of_mass))[:2]
         poses.append(pose)
     return {
@@ -86,13 +88,13 @@ def _each_face(obj: ObjectModel, seed: int) -> dict[str, Floats]:
     }
 
 
-def turned(pose: Floats, angle: float) -> Floats:
+def rotate_about_vertical(pose: Floats, angle: float) -> Floats:
     """Return the pose rotated about the vertical axis through the origin."""
     about = np.concatenate([np.zeros(3), quat_from_axis_angle(np.array([0.0, 0, 1]), np.asarray(angle))])
     return compose(about, pose)
 
 
-def inside(obj: ObjectModel, pose: Floats, size: tuple[float, float], rng: np.random.Generator) -> Floats:
+def move_inside(obj: ObjectModel, pose: Floats, size: tuple[float, float], rng: np.random.Generator) -> Floats:
     """Move the pose to a random place in a rectangle x by y [m] about the origin. Raises SceneError: it does not
     fit."""
     corners = quat_rotate(pose[3:], obj.hull_vertices)[:, :2]

@@ -16,13 +16,13 @@ import numpy as np
 
 from graspd.service.model.errors import InputError, MeshError, SceneError
 from graspd.service.model.transforms import Floats, compose, quat_rotate
-from graspd.worker.engines.mujoco_warnings import void
+from graspd.worker.engines.mujoco_warnings import is_invalid
 from graspd.worker.grasps import Posture, moved
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import ConvexPiece, HandModel
 from graspd.worker.objects.mesh_geometry import to_centre, to_file
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.scenes.kinds import GAP, SUNK, turned
+from graspd.worker.scenes.kinds import GAP, SUNK, rotate_about_vertical
 from graspd.worker.scenes.rest import lay_flat, resting_faces, settle
 from graspd.worker.scenes.simulate import (
     DROP_HEIGHT,
@@ -36,7 +36,7 @@ from graspd.worker.scenes.simulate import (
     drop,
     model_above_table,
     rest_probability,
-    steadied,
+    settle_on_face,
 )
 from graspd.worker.simulation.environment import Obstacle
 from graspd.worker.validation.model import add_shape
@@ -114,7 +114,7 @@ class _Heap:
             return None
         self.data.qpos[:] = start.ravel()
         seconds = self._run()
-        return None if seconds is None or void(self.data) else self._at_rest(seconds, rng)
+        return None if seconds is None or is_invalid(self.data) else self._at_rest(seconds, rng)
 
     def _sample(self, rng: np.random.Generator) -> Floats | None:
         """Draw release poses (1 + M, 7) with disjoint bounding balls; None if a neighbour does not fit."""
@@ -163,7 +163,7 @@ class _Heap:
             away = np.hypot(*middle[:2]) > (NEIGHBOUR_REACH if k else REACH)
             if away or angle > MAX_SETTLE_ANGLE or lift > MAX_LIFT or self.faces[k].topples(face):
                 return None
-            face, laid = steadied(obj, self.faces[k], face, laid, rng)
+            face, laid = settle_on_face(obj, self.faces[k], face, laid, rng)
             flat.append(laid)
             first = face if k == 0 else first
         self.data.qpos[:] = np.concatenate(flat)
@@ -219,7 +219,7 @@ _REACH: Final = 1.25
 _FARTHER: Final = 0.1
 
 
-def lay_beside(
+def place_neighbours(
     obj: ObjectModel,
     again: Callable[[int, int], Floats],
     others: Sequence[ObjectModel],
@@ -243,7 +243,7 @@ def lay_beside(
         rest = [one[scene] for one in resting]
         for k in range(_DRAWS):
             target, rng = again(scene, k), np.random.default_rng([seed, scene, k, len(others)])
-            if (found := _drawn(hulls, target, rest, _REACH + _FARTHER * k, rng)) is not None:
+            if (found := _draw_poses(hulls, target, rest, _REACH + _FARTHER * k, rng)) is not None:
                 poses[scene] = found
                 break
         else:
@@ -255,7 +255,7 @@ def lay_beside(
     return poses[:, 0], poses[:, 1:]
 
 
-def _drawn(
+def _draw_poses(
     hulls: _Hulls, target: Floats, resting: Sequence[Floats], reach: float, rng: np.random.Generator
 ) -> Floats | None:
     """Draw poses (1 + M, 7) of one scene; None if a neighbour does not fit."""
@@ -264,7 +264,7 @@ def _drawn(
     for number, rest in enumerate(resting, start=1):
         far = reach * (hulls.objects[0].radius + hulls.objects[number].radius)
         for _ in range(_PLACES):
-            pose = turned(rest, rng.uniform(0, 2 * np.pi))
+            pose = rotate_about_vertical(rest, rng.uniform(0, 2 * np.pi))
             low, high = hulls.room(number, pose)
             centre = hulls.middle(number, pose)
             low, high = np.maximum(low, middle - far - centre), np.minimum(high, middle + far - centre)
@@ -303,7 +303,7 @@ class _Hulls:
     def clear(self, number: int, pose: Floats) -> bool:
         """Check whether an object is `GAP` away from every support except the one it stands on."""
         corners = self._corners(number, pose)
-        return all(_beyond(support, corners) for support in self._supports)
+        return all(_is_separated(support, corners) for support in self._supports)
 
     def _corners(self, number: int, pose: Floats) -> Floats:
         return quat_rotate(pose[3:], self.objects[number].hull_vertices) + pose[:3]
@@ -318,7 +318,7 @@ class _Hulls:
         return all(gap >= BETWEEN for gap in gaps)
 
 
-def _beyond(support: Obstacle, corners: Floats) -> bool:
+def _is_separated(support: Obstacle, corners: Floats) -> bool:
     """Check whether one plane of a support separates it from a hull: upward planes at no gap, other planes at `GAP`.
     Two convex bodies may be apart although none of these planes separates them: then the result is False."""
     room = (corners @ support.planes[:, :3].T - support.planes[:, 3]).min(axis=0)

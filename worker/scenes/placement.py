@@ -20,8 +20,8 @@ from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.objects.mesh_geometry import to_centre, to_file
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.topology import outward_hull
-from graspd.worker.scenes.kinds import SUNK, check_free, inside, rest_poses, room_in, supports_of
-from graspd.worker.scenes.neighbours import drop_together, lay_beside
+from graspd.worker.scenes.kinds import SUNK, check_free, move_inside, rest_poses, supports_of, walled_area
+from graspd.worker.scenes.neighbours import drop_together, place_neighbours
 from graspd.worker.simulation.environment import Neighbour, Obstacle, Scenes
 from graspd.worker.validation.decomposition import decompose
 from graspd.worker.validation.model import add_mesh
@@ -48,7 +48,7 @@ def _neighbour(obj: ObjectModel) -> Neighbour:
     except MeshError:
         pieces = (obj.hull_vertices,)  # an obstacle may be larger than the object
     pieces = joined_pieces(pieces)
-    solids = [outer_solid(piece) for piece in pieces]
+    solids = [enclosing_solid(piece) for piece in pieces]
     return Neighbour(obj, pieces, tuple(solid for solid, _ in solids), max(error for _, error in solids))
 
 
@@ -119,15 +119,15 @@ def _scenes_of(
         poses = rest_poses(spec, obj, count=count, seed=seed)
         stand = np.asarray(given, float)
         poses["scene/neighbour_pose"] = np.tile(stand, (len(poses["scene/object_pose"]), 1, 1))
-    elif spec.faces == "drawn" and room_in(spec) is None:
+    elif spec.faces == "drawn" and walled_area(spec) is None:
         try:
             poses = drop_together(obj, others, count=count, seed=seed)
         except MeshError:
             # Too many objects never come to rest without touching.
-            poses = _laid(SceneSpec(kind="table"), obj, others, supports, count=count, seed=seed)
+            poses = _place_objects(SceneSpec(kind="table"), obj, others, supports, count=count, seed=seed)
         check_free(obj, poses["scene/object_pose"], supports)
     else:
-        poses = _laid(spec, obj, others, supports, count=count, seed=seed)
+        poses = _place_objects(spec, obj, others, supports, count=count, seed=seed)
     beside = tuple(neighbour_of(other) for other in others)
     for number, other in enumerate(others):
         check_free(other, poses["scene/neighbour_pose"][:, number], supports)
@@ -137,7 +137,7 @@ def _scenes_of(
     return Scenes(supports, poses["scene/object_pose"], beside, poses["scene/neighbour_pose"]), poses
 
 
-def _laid(
+def _place_objects(
     spec: SceneSpec,
     obj: ObjectModel,
     others: Sequence[ObjectModel],
@@ -148,14 +148,14 @@ def _laid(
 ) -> dict[str, Floats]:
     """Place the object in its own rest pose and the neighbours beside it; move the object if they do not fit."""
     poses = rest_poses(spec, obj, count=count, seed=seed)
-    alone, size = poses["scene/object_pose"], room_in(spec)
+    alone, size = poses["scene/object_pose"], walled_area(spec)
 
     def again(scene: int, draw: int) -> Floats:
         if size is None or not draw:
             return alone[scene]
-        return inside(obj, alone[scene], size, np.random.default_rng([seed, scene, draw]))
+        return move_inside(obj, alone[scene], size, np.random.default_rng([seed, scene, draw]))
 
-    found, beside = lay_beside(obj, again, others, supports, within=size, count=len(alone), seed=seed)
+    found, beside = place_neighbours(obj, again, others, supports, within=size, count=len(alone), seed=seed)
     return {**poses, "scene/object_pose": found, "scene/neighbour_pose": beside}
 
 
@@ -198,7 +198,7 @@ ENOUGH_M: Final = 1e-3
 _SAME_M: Final = 1e-7
 
 
-def outer_solid(corners: Floats) -> tuple[Obstacle, float]:
+def enclosing_solid(corners: Floats) -> tuple[Obstacle, float]:
     """Return a convex solid of at most `MOST_PLANES` faces around points (V, 3), and its largest excess over their hull
     [m].
     The solid begins as the bounding box of the points. While it exceeds their hull by more than `ENOUGH_M`, its
@@ -225,7 +225,7 @@ def outer_solid(corners: Floats) -> tuple[Obstacle, float]:
         found.close()
     except QhullError:
         raise MeshError("a convex piece of this object is flat; an object needs some thickness") from None
-    return solid, _stands_out(solid.corners, corners, hull)
+    return solid, _protrusion(solid.corners, corners, hull)
 
 
 def _as_qhull(planes: Floats) -> Floats:
@@ -242,7 +242,7 @@ def _corners_and_edges(points: Floats) -> tuple[Floats, NDArray[np.intp]]:
     return corners, convex_edges(corners, triangles)
 
 
-def _stands_out(points: Floats, corners: Floats, hull: Any) -> float:
+def _protrusion(points: Floats, corners: Floats, hull: Any) -> float:
     """Return the largest distance of `points` from the hull of `corners` [m], attained at a corner."""
     import trimesh  # slow to load, seldom needed
 

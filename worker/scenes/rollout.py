@@ -16,13 +16,13 @@ from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.scenes.trajectory import plan_way
+from graspd.worker.scenes.trajectory import plan_trajectory
 from graspd.worker.simulation.environment import PlacedGrasps, Scenes
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.key import Level
 from graspd.worker.validation.lift import LiftOutcome
 from graspd.worker.validation.lifting import KnownLifts, LiftLevel, validate_lifts
-from graspd.worker.validation.prescreening import SLIPS, LiftRollouts, push_rollout
+from graspd.worker.validation.prescreening import SLIPS, ShortTests
 from graspd.worker.validation.validator import KnownRollouts, validate
 
 #: Added to the score of a candidate that would lift but whose approach is blocked. The sum is worse than the score of
@@ -69,12 +69,12 @@ def hold_rollout(
 ) -> Callable[[GraspSet, PlacedGrasps | None, Floats], Floats]:
     """Return a `worker.planners.Rollout` that scores free grasps (N,) by short pushes.
     Scores are below 2 for grasps that also hold against the six pushes, if they are better than the score to beat."""
-    short, run = push_rollout(hand, obj, pieces), ExecutionContext(threads=1)
+    shorts, run = ShortTests(hand, obj, pieces), ExecutionContext(threads=1)
 
     def rollout(grasps: GraspSet, placed: PlacedGrasps | None, beat: Floats | None = None) -> Floats:
         grasps = grasps.moved(np.zeros(3))
         beat = np.full(len(grasps), np.inf) if beat is None else beat
-        score = short(grasps, placed, beat)
+        score = shorts.scores(grasps, None, beat)
         # Skip candidates that cannot beat the previous score.
         held = np.flatnonzero((score < SLIPS + 1.0) & (score < beat))
         if len(held):
@@ -99,7 +99,7 @@ def lift_rollout(
     Scores are below 1 for grasps with a clear trajectory that lift at half friction, below 2 at full friction.
     Candidates that hold the hanging object briefly are validated by the whole lift test, because a squeeze may turn
     an object out of the hand slowly at first. `threads` are per call; on the CPU, planners already use all threads."""
-    shorts, run = LiftRollouts(hand, obj, pieces, threads=threads), ExecutionContext(threads=threads)
+    shorts, run = ShortTests(hand, obj, pieces, threads=threads), ExecutionContext(threads=threads)
 
     def rollout(grasps: GraspSet, placed: PlacedGrasps | None, beat: Floats | None = None) -> Floats:
         assert placed is not None, "a lift needs a scene"
@@ -111,7 +111,7 @@ def lift_rollout(
         if not len(held):
             return score
         mine, where = grasps.take(held), placed.take(held)
-        way = plan_way(hand, obj, mine, where)
+        way = plan_trajectory(hand, obj, mine, where)
         score[held[~way.clear]] += BLOCKED
         free = np.flatnonzero(way.clear)
         coming = replace(mine, approach=way.approach, coming=way.open).take(free)
@@ -168,7 +168,7 @@ def scene_verdicts(
         verdict in `quality/success` (-1: not clear)."""
     assert grasps.scene is not None
     placed = scenes.placed(grasps.scene)
-    way = plan_way(hand, obj, grasps, placed)
+    way = plan_trajectory(hand, obj, grasps, placed)
     wrist = way.wrist if way.wrist.shape[1] else None
     grasps = replace(grasps, approach=way.approach, coming=way.open, lift=way.lift, wrist=wrist)
     count, clear = len(grasps), np.flatnonzero(way.clear)

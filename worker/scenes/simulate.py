@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from graspd.service.model.errors import InputError, MeshError
 from graspd.service.model.libraries import version_of
 from graspd.service.model.transforms import Floats, quat_rotate
-from graspd.worker.engines.mujoco_warnings import void
+from graspd.worker.engines.mujoco_warnings import is_invalid
 from graspd.worker.grasps import moved
-from graspd.worker.objects.disk_cache import arrays_kept_or_made
+from graspd.worker.objects.disk_cache import cached_arrays
 from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.objects.mesh_geometry import to_file
 from graspd.worker.objects.model import ObjectModel
@@ -67,7 +67,7 @@ def drop(obj: ObjectModel, *, count: int, seed: int) -> dict[str, Floats]:
     """Drop an object onto a table until it rests, `count` times.
     A drop is repeated with a new sample if it times out, or if the object rolls away. It is also repeated if no resting
     face stays stable under a change of the surface by one millimetre. An object that rolls is laid on a steady face,
-    see `steadied`. Scene i depends only on the object, the seed and i. Return `scene/object_pose` (S, 7) with the
+    see `settle_on_face`. Scene i depends only on the object, the seed and i. Return `scene/object_pose` (S, 7) with the
     lowest point of the object at z = 0, and `scene/drop_seconds` (S,). `scene/rest_probability` (S,) is the share of
     `REFERENCE_DROPS` reference drops (plus this one) on the same face. Raises InputError: count or seed is negative.
     MeshError: the hull is flat, or the object never comes to rest."""
@@ -77,7 +77,7 @@ def drop(obj: ObjectModel, *, count: int, seed: int) -> dict[str, Floats]:
     rests = []
     for scene in range(count):
         rest, rng = _redo_until_rest(table, (seed, scene)), np.random.default_rng([seed, scene, MAX_ATTEMPTS])
-        face, pose = steadied(obj.centred, table.faces, rest.face, rest.pose, rng)
+        face, pose = settle_on_face(obj.centred, table.faces, rest.face, rest.pose, rng)
         rests.append(RestPose(pose, face, rest.seconds))
     poses = moved(np.array([rest.pose for rest in rests]).reshape(count, 7), np.zeros(3))
     return {
@@ -87,7 +87,7 @@ def drop(obj: ObjectModel, *, count: int, seed: int) -> dict[str, Floats]:
     }
 
 
-def steadied(
+def settle_on_face(
     obj: ObjectModel, faces: RestingFaces, face: int, pose: Floats, rng: np.random.Generator
 ) -> tuple[int, Floats]:
     """Return the face on which a centred object stays after coming to rest on `face`, and its pose (7,).
@@ -128,7 +128,7 @@ def _reference_faces(obj: ObjectModel) -> tuple[int, ...]:
         known = face.shape == (REFERENCE_DROPS,) and face.dtype == np.int64
         return known and bool(np.isin(face, np.arange(len(resting_faces(obj).offset))).all())
 
-    kept = arrays_kept_or_made("drops", (obj.content, version_of("mujoco")), code, drops, fits=fits)
+    kept = cached_arrays("drops", (obj.content, version_of("mujoco")), code, drops, fits=fits)
     return tuple(kept["face"].tolist())
 
 
@@ -195,7 +195,7 @@ def _drop_once(table: _Table, rng: np.random.Generator) -> RestPose | None:
     mujoco.mj_resetData(table.model, data)
     data.qpos[:] = np.concatenate([position, quaternion])
     seconds = _run(table)
-    if seconds is None or void(data):
+    if seconds is None or is_invalid(data):
         return None
     quaternion = data.qpos[3:] / np.linalg.norm(data.qpos[3:])
     face, angle = settle(table.faces, quaternion)

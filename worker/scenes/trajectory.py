@@ -26,8 +26,8 @@ from graspd.worker.quality.contact import finger_of_body
 from graspd.worker.quality.probe import Probe, probe_of
 from graspd.worker.scenes.clearance import MARGIN_M, PATH_POSTURES, approach
 from graspd.worker.simulation.environment import RISE_M, STANDOFF_M, Environment, PlacedGrasps
-from graspd.worker.simulation.mounting import mounting_room, wrist_room
-from graspd.worker.simulation.obstacles import obstacle_room
+from graspd.worker.simulation.mounting import choose_wrist, wrist_clearance
+from graspd.worker.simulation.obstacles import obstacle_clearance
 
 _POINTS: Final = 600
 #: Around a free object: tilts of the retreat from the palm's own direction [rad], and number of sides of each tilt.
@@ -75,7 +75,7 @@ class Trajectory:
         return np.asarray((self.least >= MARGIN_M) & ~self.touching)
 
 
-def plan_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet, placed: PlacedGrasps) -> Trajectory:
+def plan_trajectory(hand: HandModel, obj: ObjectModel, grasps: GraspSet, placed: PlacedGrasps) -> Trajectory:
     """Plan each grasp's trajectory in its scene: the first free direction of retreat, else the one with most
     clearance."""
     probe = probe_of(hand, obj, hand_points=_POINTS, object_points=64)
@@ -84,15 +84,15 @@ def plan_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet, placed: Placed
     wide = wide_open(hand, obj, grasps.pregrasp, placed)
 
     def room(postures: Posture, steps: int = PATH_POSTURES) -> Floats:
-        return obstacle_room(hand, postures, scenes, np.repeat(which, steps)).reshape(count, steps)
+        return obstacle_clearance(hand, postures, scenes, np.repeat(which, steps)).reshape(count, steps)
 
     closing_hand = approach(grasps.grasp, grasps.pregrasp)
     between = room(closing_hand)
     lifted = np.repeat(grasps.grasp.hand_pose[:, None], WAYPOINTS, axis=1)
     lifted[..., :3] += np.linspace(0, 1, WAYPOINTS)[:, None] * rise[:, None]
     taken = np.concatenate([closing_hand.hand_pose.reshape(count, PATH_POSTURES, 7)[:, ::4], lifted], axis=1)
-    wrist, mounting = mounting_room(hand, taken, scenes, which)
-    path, came, coming, touching = come_open(probe, grasps.pregrasp, wide, wrist, placed)
+    wrist, mounting = choose_wrist(hand, taken, scenes, which)
+    path, came, coming, touching = open_approach(probe, grasps.pregrasp, wide, wrist, placed)
     before = room(approach(grasps.pregrasp, Posture(grasps.pregrasp.hand_pose, came)))
     joints = np.repeat(grasps.grasp.joint_positions, WAYPOINTS, axis=0)
     lifting = room(Posture(lifted.reshape(-1, 7), joints), WAYPOINTS).min(axis=1)
@@ -105,26 +105,26 @@ def plan_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet, placed: Placed
     )
 
 
-def plan_free_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet) -> Trajectory:
+def plan_free_trajectory(hand: HandModel, obj: ObjectModel, grasps: GraspSet) -> Trajectory:
     """Plan trajectories around a free object: a retreat of `STANDOFF_M` without contact with the object.
     The palm's own direction of retreat is tested first, then directions with increasing tilt. `lift` is the squeeze
     posture after this retreat, with the object in hand. Without obstacles all clearances are infinite."""
     hand_points, object_points = _FREE_POINTS
     probe = probe_of(hand, obj, hand_points=hand_points, object_points=object_points)
     nowhere = PlacedGrasps((), IDENTITY_POSE[None], np.zeros(len(grasps), np.intp))
-    wide = _opened(probe, grasps.pregrasp, wide_open(hand, obj, grasps.pregrasp, nowhere))
+    wide = _open_pregrasps(probe, grasps.pregrasp, wide_open(hand, obj, grasps.pregrasp, nowhere))
     pointing = quat_rotate(wide.hand_pose[:, 3:], hand.palm.approach)
     ways = [-pointing, *(_tilted(-pointing, tilt, side) for tilt in TILTS for side in range(SIDES))]
-    path, _, touching, chosen = _coming(probe, wide, nowhere.scenes[0], ways)
+    path, _, touching, chosen = _plan_approach(probe, wide, nowhere.scenes[0], ways)
     raised = np.array(grasps.squeeze.hand_pose, float)
     raised[:, :3] += STANDOFF_M * chosen
     lift = Posture(raised, np.array(grasps.squeeze.joint_positions, float))
     endless = np.full(len(grasps), np.inf)
-    still, _ = mounting_room(hand, path[:, -1:], nowhere.scenes)
+    still, _ = choose_wrist(hand, path[:, -1:], nowhere.scenes)
     return Trajectory(path, wide.joint_positions, lift, endless, endless, endless, endless, touching, still, endless)
 
 
-def _opened(probe: Probe, pregrasp: Posture, joints: Floats) -> Posture:
+def _open_pregrasps(probe: Probe, pregrasp: Posture, joints: Floats) -> Posture:
     """Return pregrasps opened to `joints` (n, J), unless that moves the fingers closer to the object."""
     start = np.asarray(pregrasp.joint_positions, float)
     room = np.minimum(OBJECT_MARGIN_M, _gaps(probe, pregrasp)) - 5e-4
@@ -155,7 +155,7 @@ def _retreat(hand_pose: Floats, way: Floats, steps: int) -> Floats:
     return poses
 
 
-def _coming(
+def _plan_approach(
     probe: Probe, pregrasp: Posture, scene: Environment, ways: Sequence[Floats]
 ) -> tuple[Floats, Floats, NDArray[np.bool_], Floats]:
     """Return approaches along the first free direction of `ways`, (n, 3) each, or else the one with most clearance.
@@ -172,7 +172,7 @@ def _coming(
         poses = _retreat(pregrasp.hand_pose[open_], way, looks)
         joints = np.repeat(pregrasp.joint_positions[open_], looks, axis=0)
         postures = Posture(poses.reshape(-1, 7), joints)
-        room = obstacle_room(probe.hand, postures, [scene]).reshape(len(open_), looks).min(axis=1)
+        room = obstacle_clearance(probe.hand, postures, [scene]).reshape(len(open_), looks).min(axis=1)
         gap = _gaps(probe, postures).reshape(len(open_), looks)
         # The pregrasp itself may be closer than the margin; the approach may then be as close, but not closer.
         hits = gap[:, :-1].min(axis=1) < np.minimum(OBJECT_MARGIN_M, gap[:, -1]) - 5e-4
@@ -209,7 +209,7 @@ SHARES_UP: Final = (0.0, 0.25, 0.5, 0.75, 1.0)
 OPENNESS: Final = (1.0, 0.5, 0.0)
 
 
-def come_open(
+def open_approach(
     probe: Probe, pregrasp: Posture, wide: Floats, wrist: Floats, placed: PlacedGrasps
 ) -> tuple[Floats, Floats, Floats, NDArray[np.bool_]]:
     """Return approaches with the hand as wide open as possible, its fingers away from the object.
@@ -225,7 +225,7 @@ def come_open(
         way = _unit((1 - share) * back[open_] + share * up[open_], up[open_])
         start = pregrasp.joint_positions[open_]
         opened = start + openness * (wide[open_] - start)
-        room, gap = _seen(probe, pregrasp.take(open_), opened, wrist[open_], way, placed.take(open_))
+        room, gap = _retreat_clearance(probe, pregrasp.take(open_), opened, wrist[open_], way, placed.take(open_))
         score = np.minimum(room, MARGIN_M) + 0.1 * np.minimum(gap, OBJECT_WANTED_M) - (gap < OBJECT_MARGIN_M)
         better = score > best[open_]
         rows = open_[better]
@@ -237,7 +237,7 @@ def come_open(
     return _retreat(pregrasp.hand_pose, chosen, WAYPOINTS), joints, least, touching
 
 
-def _seen(
+def _retreat_clearance(
     probe: Probe, pregrasp: Posture, opened: Floats, wrist: Floats, way: Floats, placed: PlacedGrasps
 ) -> tuple[Floats, Floats]:
     """Return least clearances (n,) of open hands and mountings that retreat along `way` (n, 3).
@@ -250,13 +250,13 @@ def _seen(
     postures = Posture(poses.reshape(-1, 7), joints.reshape(len(share) * count, -1))
     coming = np.tile(share == 0, count)
     scenes, which = placed.scenes, np.asarray(placed.index, np.intp)
-    room = obstacle_room(probe.hand, postures.take(np.flatnonzero(coming)), scenes, np.repeat(which, looks))
+    room = obstacle_clearance(probe.hand, postures.take(np.flatnonzero(coming)), scenes, np.repeat(which, looks))
     free = room.reshape(count, looks).min(axis=1)
     rows = np.flatnonzero(free >= MARGIN_M)
     if (mounting := probe.hand.mounting) is not None and len(rows):
         # A mounting is thicker than a finger, so half as many checks suffice; it is checked only if the hand itself is
         # clear.
-        mounted = wrist_room(mounting, poses[rows, :looks:2], wrist[rows], scenes, which[rows])
+        mounted = wrist_clearance(mounting, poses[rows, :looks:2], wrist[rows], scenes, which[rows])
         free[rows] = np.minimum(free[rows], mounted)
     # Larger distances count equally.
     reach = OBJECT_WANTED_M + 2 * NEARER_M

@@ -114,7 +114,7 @@ class Data:
         self.best.fill_(1e9)
         self.waited.zero_()
 
-    def switch_off(self, hands: NDArray[np.bool_]) -> None:
+    def deactivate(self, hands: NDArray[np.bool_]) -> None:
         """Switch off hands (n,) from the next iteration on; they cost nothing more."""
         active = self.active.numpy()
         active[: len(hands)][hands] = 0

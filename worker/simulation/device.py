@@ -10,7 +10,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from graspd.service.model.transforms import Floats
-from graspd.worker.hands.jaws import slides
+from graspd.worker.hands.jaws import prismatic_dofs
 from graspd.worker.hands.model import ConvexPiece, HandModel, JointType
 from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.objects.model import ObjectModel
@@ -36,7 +36,7 @@ def to_wxyz(quaternion: Floats) -> Floats:
 
 def joint_units(hand: HandModel) -> Floats:
     """Return the step of each dof (D,) relative to a revolute joint: 1, or `SLIDE_M` for a sliding one."""
-    return np.where(slides(hand), SLIDE_M, 1.0)
+    return np.where(prismatic_dofs(hand), SLIDE_M, 1.0)
 
 
 @dataclass(frozen=True)
@@ -196,12 +196,12 @@ def posed_bodies(hand: HandModel, hand_pose: Floats, joint_positions: Floats, de
             wp.array(np.ascontiguousarray(given, float), dtype=wp.float64, ndim=2)
             for given in (hand_pose, joint_positions)
         )
-        bodies = room_for_bodies(hand, count)
+        bodies = allocate_bodies(hand, count)
         wp.launch(kernels.pose, count, inputs=[chain, root, joints], outputs=[bodies])
     return bodies
 
 
-def room_for_bodies(hand: HandModel, count: int) -> Any:
+def allocate_bodies(hand: HandModel, count: int) -> Any:
     """Allocate poses of `count` hands on the current device, uninitialised."""
     out = kernels.Bodies()
     out.position = wp.empty((count, hand.bodies), dtype=wp.vec3d)

@@ -74,7 +74,7 @@ class Obstacle:
         planes = np.column_stack([normals, self.planes[:, 3] + normals @ pose[:3]])
         return replace(self, planes=planes, corners=quat_rotate(pose[3:], self.corners) + pose[:3])
 
-    def seen_from(self, pose: Floats) -> Obstacle:
+    def in_frame(self, pose: Floats) -> Obstacle:
         """Return an obstacle given in an outer frame, in the frame at `pose` (7,) of the outer frame."""
         return self.moved(invert(pose))
 
@@ -142,7 +142,7 @@ class PlacedGrasps:
         """The S scenes in the object frame."""
         return tuple(
             Environment(
-                tuple(o.seen_from(pose) for o in self.supports) + self._beside(number),
+                tuple(o.in_frame(pose) for o in self.supports) + self._neighbour_obstacles(number),
                 quat_rotate(quat_conjugate(pose[3:]), UP),
             )
             for number, pose in enumerate(np.asarray(self.object_pose, float))
@@ -173,7 +173,7 @@ class PlacedGrasps:
             return np.zeros((0, 7))
         return np.asarray(compose(invert(self.object_pose[scene]), np.asarray(self.neighbour_pose[scene], float)))
 
-    def _beside(self, scene: int) -> tuple[Obstacle, ...]:
+    def _neighbour_obstacles(self, scene: int) -> tuple[Obstacle, ...]:
         poses = self.neighbours_of(scene)
         return tuple(
             solid.moved(pose) for one, pose in zip(self.neighbours, poses, strict=True) for solid in one.solids
@@ -185,19 +185,19 @@ class PlacedGrasps:
         return taken
 
 
-def placed_together(parts: Sequence[PlacedGrasps]) -> PlacedGrasps:
+def join_placed(parts: Sequence[PlacedGrasps]) -> PlacedGrasps:
     """Join grasps of several sets, each in its own scenes; supports and neighbours are common."""
     first = parts[0]
     if len(parts) == 1:
         return first
     before = np.cumsum([0, *(len(part.object_pose) for part in parts)])
     index = np.concatenate([part.index + start for part, start in zip(parts, before, strict=False)])
-    whole = scenes_together([part.everywhere for part in parts]).placed(index)
+    whole = join_scenes([part.everywhere for part in parts]).placed(index)
     vars(whole)["scenes"] = tuple(scene for part in parts for scene in part.scenes)  # not recomputed
     return whole
 
 
-def scenes_together(parts: Sequence[Scenes]) -> Scenes:
+def join_scenes(parts: Sequence[Scenes]) -> Scenes:
     """Join the scenes of several sets; supports and neighbours are common."""
     first = parts[0]
     beside = np.concatenate([part.neighbour_pose for part in parts]) if first.neighbours else first.neighbour_pose

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from graspd.service.model.transforms import Floats
 from graspd.worker.engines.backend import binary_name
-from graspd.worker.objects.disk_cache import arrays_kept_or_made
+from graspd.worker.objects.disk_cache import cached_arrays
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.kernels import nearest, surface
 
@@ -55,7 +55,7 @@ def add_grid(skin: Any, obj: ObjectModel, mesh: Any, cell: float) -> None:
 
     terms = (obj.content, repr(cell), repr(float(skin.alpha)), *map(binary_name, (surface, nearest)))
     fits = partial(_fits, shape=shape, faces=len(obj.faces))
-    kept = arrays_kept_or_made("object_grids", terms, (sys.modules[__name__],), make, fits=fits)
+    kept = cached_arrays("object_grids", terms, (sys.modules[__name__],), make, fits=fits)
     skin.field = wp.array(kept["field"], dtype=wp.float32)
     for name, kind in _LISTS.items():
         setattr(skin.cells, name, wp.array(kept[name], dtype=kind))

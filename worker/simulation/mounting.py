@@ -17,7 +17,7 @@ from graspd.worker.hands.mounting import wrist_positions
 from graspd.worker.hands.surface import farthest_points
 from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.simulation.environment import CLEAR_M, Environment
-from graspd.worker.simulation.obstacles import MARGIN_M, obstacle_room
+from graspd.worker.simulation.obstacles import MARGIN_M, obstacle_clearance
 
 #: Numbers of points of a mounting: outermost points in so many directions, then corners spread over it.
 OUTERMOST: Final = 20
@@ -25,7 +25,7 @@ SPREAD: Final = 40
 TRIES: Final = 4  # wrist positions of a hand whose exact clearances are computed
 
 
-def mounting_room(
+def choose_wrist(
     hand: HandModel, poses: Floats, scenes: Sequence[Environment], which: NDArray[np.integer[Any]] | None = None
 ) -> tuple[Floats, Floats]:
     """Choose wrist angles that stay constant while the hand moves; return the mounting's clearance.
@@ -37,10 +37,10 @@ def mounting_room(
     if mounting is None:
         return np.zeros((count, 0)), np.full(count, np.inf)
     scene_of = np.zeros(count, np.intp) if which is None else which.astype(np.intp)
-    return _solved(mounting, poses, scenes, scene_of, point_room(mounting, poses, scenes, scene_of), CLEAR_M)
+    return _solve_wrist(mounting, poses, scenes, scene_of, point_clearance(mounting, poses, scenes, scene_of), CLEAR_M)
 
 
-def mounting_lack(
+def missing_mounting_clearance(
     hand: HandModel,
     poses: Floats,
     scenes: Sequence[Environment],
@@ -56,15 +56,15 @@ def mounting_lack(
     if mounting is None or not len(poses):
         return np.zeros(len(poses))
     poses, scene_of = poses[:, None], which.astype(np.intp)
-    points = point_room(mounting, poses, scenes, scene_of)
+    points = point_clearance(mounting, poses, scenes, scene_of)
     most = points.max(axis=1)
     rows = np.flatnonzero(exact & (most >= wanted))
     if len(rows):
-        _, most[rows] = _solved(mounting, poses[rows], scenes, scene_of[rows], points[rows], wanted)
+        _, most[rows] = _solve_wrist(mounting, poses[rows], scenes, scene_of[rows], points[rows], wanted)
     return np.asarray(np.maximum(0.0, wanted - most))
 
 
-def _solved(
+def _solve_wrist(
     mounting: HandModel,
     poses: Floats,
     scenes: Sequence[Environment],
@@ -72,13 +72,13 @@ def _solved(
     points: Floats,
     enough: float,
 ) -> tuple[Floats, Floats]:
-    """Return angles and clearance as `mounting_room`; the clearance of points (N, W) is consumed."""
+    """Return angles and clearance as `choose_wrist`; the clearance of points (N, W) is consumed."""
     wrists, count = wrist_positions(mounting), len(poses)
     number, room, rows = np.zeros(count, np.intp), np.full(count, -np.inf), np.arange(count)
     for _ in range(min(TRIES, len(wrists))):
         hopeful = points[rows] >= enough
         tried = np.where(hopeful.any(axis=1), hopeful.argmax(axis=1), points[rows].argmax(axis=1))
-        found = wrist_room(mounting, poses[rows], wrists[tried], scenes, which[rows])
+        found = wrist_clearance(mounting, poses[rows], wrists[tried], scenes, which[rows])
         better = found > room[rows]
         number[rows[better]], room[rows[better]] = tried[better], found[better]
         points[rows, tried] = -np.inf
@@ -88,7 +88,9 @@ def _solved(
     return wrists[number], room
 
 
-def point_room(mounting: HandModel, poses: Floats, scenes: Sequence[Environment], which: NDArray[np.intp]) -> Floats:
+def point_clearance(
+    mounting: HandModel, poses: Floats, scenes: Sequence[Environment], which: NDArray[np.intp]
+) -> Floats:
     """Return the least clearance (N, W) of a mounting's points over root poses (N, P, 7), at W wrist positions [m].
     Scenes are `which` (N,). The mounting itself has no more clearance, except near edges and corners of solids."""
     points = points_of(mounting)
@@ -116,7 +118,7 @@ def points_of(mounting: HandModel) -> Floats:
     return np.concatenate([np.take_along_axis(every, far[..., None], axis=1), spread], axis=1)
 
 
-def wrist_room(
+def wrist_clearance(
     mounting: HandModel, poses: Floats, wrist: Floats, scenes: Sequence[Environment], which: NDArray[np.integer[Any]]
 ) -> Floats:
     """Return the least clearance (N,) of mountings at root poses (N, P, 7) and wrist angles (N, K) [m].
@@ -124,4 +126,6 @@ def wrist_room(
     steps = poses.shape[1]
     joints = np.repeat(mounting.expand(wrist), steps, axis=0)
     postures = Posture(poses.reshape(-1, 7), joints)
-    return obstacle_room(mounting, postures, scenes, np.repeat(which, steps)).reshape(len(poses), steps).min(axis=1)
+    return (
+        obstacle_clearance(mounting, postures, scenes, np.repeat(which, steps)).reshape(len(poses), steps).min(axis=1)
+    )

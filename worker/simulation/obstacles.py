@@ -54,7 +54,7 @@ class PosedFeatures:
 
 
 def _solid_distances(hand: HandModel, postures: Posture, scene: Environment) -> Floats:
-    """Return `body_room` (P, L) without the tolerance of fingertips, in float32 (3e-8 at 0.3 m)."""
+    """Return `body_clearance` (P, L) without the tolerance of fingertips, in float32 (3e-8 at 0.3 m)."""
     bodies = body_poses(hand, postures.hand_pose, postures.joint_positions)
     device = _device_hand(hand)
     obstacles = DeviceObstacles.create(hand, [scene], np.zeros(3), "cpu")
@@ -74,7 +74,7 @@ def _device_hand(hand: HandModel) -> DeviceHand:
     return DeviceHand.create(hand, "cpu")
 
 
-def body_room(
+def body_clearance(
     hand: HandModel, postures: Posture, scenes: Sequence[Environment], which: NDArray[np.integer[Any]] | None = None
 ) -> Floats:
     """Return signed distances (P, L) of the hand's bodies from the nearest obstacle [m]; inf: no obstacle.
@@ -83,22 +83,22 @@ def body_room(
     below `CLEAR_M`. Distances are exact from half-spaces, and from solids that the hand does not penetrate. Near edges
     and corners of solids, distances of links with hulls are lower bounds. Distances from solids are at most `FAR_M`."""
     which = np.zeros(len(postures), np.int32) if which is None else np.asarray(which, np.int32)
-    out = _half_space_room(hand, postures, scenes, which)
+    out = _half_space_clearance(hand, postures, scenes, which)
     tips = np.isin(np.arange(hand.bodies), hand.fingertips)
     for number, scene in enumerate(scenes):
         solids = [o for o in scene.obstacles if len(o.corners)]
         rows = np.flatnonzero(which == number) if solids else np.zeros(0, np.intp)
-        for more in sorted({_more(o) for o in solids} if len(rows) else ()):
-            alike = Environment(tuple(o for o in solids if _more(o) == more), scene.up)
+        for more in sorted({_extra_margin(o) for o in solids} if len(rows) else ()):
+            alike = Environment(tuple(o for o in solids if _extra_margin(o) == more), scene.up)
             out[rows] = np.minimum(out[rows], _solid_distances(hand, postures.take(rows), alike) + more * tips)
     return out
 
 
-def _more(obstacle: Obstacle) -> float:
+def _extra_margin(obstacle: Obstacle) -> float:
     return 0.0 if obstacle.tips_m is None else CLEAR_M - obstacle.tips_m
 
 
-def _half_space_room(
+def _half_space_clearance(
     hand: HandModel, postures: Posture, scenes: Sequence[Environment], which: NDArray[np.integer[Any]]
 ) -> Floats:
     every = [[o for o in scene.obstacles if not len(o.corners)] for scene in scenes]
@@ -107,18 +107,18 @@ def _half_space_room(
     with wp.ScopedDevice("cpu"):
         spaces.first = wp.array(_starts([len(one) for one in every]), dtype=wp.int32)
         spaces.planes = wp.array(np.concatenate([np.zeros((0, 4)), *(o.planes for o in flat)]), dtype=wp.vec4d)
-        spaces.more = wp.array([_more(o) for o in flat], dtype=wp.float64)
+        spaces.more = wp.array([_extra_margin(o) for o in flat], dtype=wp.float64)
         room = wp.full((count, hand.bodies), np.inf, dtype=wp.float64)
         inputs = [chain_of(hand, "cpu"), spaces, wp.array(which, dtype=wp.int32), bodies.position, bodies.rotation]
-        launch(chain_kernels.rooms, (count, hand.bodies), inputs=inputs, outputs=[room], device="cpu")
+        launch(chain_kernels.half_space_clearance, (count, hand.bodies), inputs=inputs, outputs=[room], device="cpu")
     return np.asarray(room.numpy())
 
 
-def obstacle_room(
+def obstacle_clearance(
     hand: HandModel, postures: Posture, scenes: Sequence[Environment], which: NDArray[np.integer[Any]] | None = None
 ) -> Floats:
-    """Return the least of the `body_room` of each posture (P,) [m]."""
-    return np.asarray(body_room(hand, postures, scenes, which).min(axis=1))
+    """Return the least of the `body_clearance` of each posture (P,) [m]."""
+    return np.asarray(body_clearance(hand, postures, scenes, which).min(axis=1))
 
 
 @dataclass(frozen=True)

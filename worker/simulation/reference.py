@@ -74,9 +74,9 @@ def gauss_seidel(contacts: Contacts, s0: Floats, world: World) -> tuple[Floats, 
     s = s0
     impulses = []
     for i, (p, n) in enumerate(zip(contacts.points, contacts.normals, strict=True)):
-        impulse, change = _pushed(p, n, contacts.distances[..., i], s, world)
+        impulse, change = _push_out(p, n, contacts.distances[..., i], s, world)
         s = s + change
-        slip, change = _slipped(p, n, impulse, s, world)
+        slip, change = _apply_friction(p, n, impulse, s, world)
         s = s + change
         impulses.append(np.stack([impulse, slip], axis=-1))
     return s, np.stack(impulses, axis=-2)
@@ -87,14 +87,14 @@ def jacobi(contacts: Contacts, s0: Floats, world: World, passes: int) -> Floats:
     p, n = contacts.points, contacts.normals
     s = s0
     for _ in range(passes):
-        impulse, push = _pushed(p, n, contacts.distances, s[..., None, :], world)
-        _, slide = _slipped(p, n, impulse, s[..., None, :], world)
+        impulse, push = _push_out(p, n, contacts.distances, s[..., None, :], world)
+        _, slide = _apply_friction(p, n, impulse, s[..., None, :], world)
         active = np.sum(impulse > 0, axis=-1, keepdims=True)
         s = s + (push + slide).sum(axis=-2) / np.maximum(active, 1)
     return s
 
 
-def _pushed(p: Floats, n: Floats, rho: Floats, s: Floats, world: World) -> tuple[Floats, Floats]:
+def _push_out(p: Floats, n: Floats, rho: Floats, s: Floats, world: World) -> tuple[Floats, Floats]:
     """Return normal impulses (...) that end penetration at points (..., 3) moved by s, and their effect."""
     j = row(n, p)
     back = j @ np.linalg.inv(world.mass)
@@ -102,7 +102,7 @@ def _pushed(p: Floats, n: Floats, rho: Floats, s: Floats, world: World) -> tuple
     return impulse, -impulse[..., None] * back
 
 
-def _slipped(p: Floats, n: Floats, impulse: Floats, s: Floats, world: World) -> tuple[Floats, Floats]:
+def _apply_friction(p: Floats, n: Floats, impulse: Floats, s: Floats, world: World) -> tuple[Floats, Floats]:
     """Return tangential impulses (...) within the friction cone, and the motion they cause (..., 6)."""
     u = s[..., :3] + np.cross(s[..., 3:], p)
     tangent = u - np.sum(n * u, axis=-1, keepdims=True) * n

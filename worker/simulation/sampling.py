@@ -10,7 +10,7 @@ from graspd.service.model.transforms import Floats
 from graspd.worker.hands import surface
 from graspd.worker.hands.surface import farthest_points
 from graspd.worker.objects import mesh_geometry
-from graspd.worker.objects.disk_cache import arrays_kept_or_made
+from graspd.worker.objects.disk_cache import cached_arrays
 from graspd.worker.objects.model import ObjectModel
 
 #: Edges between faces that turn by more than this have their own samples: they enter links between surface samples.
@@ -23,7 +23,7 @@ CANDIDATES, FEWER_CANDIDATES, MANY = 6, 3, 8_000
 def object_samples(obj: ObjectModel, count: int, *, seed: int = 0) -> Floats:
     """Return evenly spread points (count, 3) of the surface, its sharp edges included [m]; deterministic."""
     code = (sys.modules[__name__], mesh_geometry, surface)
-    kept = arrays_kept_or_made(
+    kept = cached_arrays(
         "object_samples", (obj.content, count, seed), code, lambda: {"points": _sampled(obj, count, seed)}
     )
     return kept["points"]

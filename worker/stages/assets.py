@@ -34,9 +34,9 @@ from graspd.worker.hands.options import parse_options
 from graspd.worker.hands.xacro import expand
 from graspd.worker.objects import prepare
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.objects.options import as_asked
+from graspd.worker.objects.options import for_request
 from graspd.worker.objects.prepare import load_object
-from graspd.worker.planners.known_networks import keep
+from graspd.worker.planners.network_cache import store_network
 from graspd.worker.stages.context import TaskContext
 from graspd.worker.stages.models import SHOWN_ERROR_M, publish_model
 from graspd.worker.validation.decomposition import ConvexPieces, decompose, piece_file
@@ -69,7 +69,7 @@ def object_of(store: Store, message: TaskMessage) -> ObjectModel:
             # The model does not depend on which fidelity comes first.
             shown = prepared_object(store, digest, name=name, face_error_m=SHOWN_ERROR_M)
             publish_model(store, AssetKind.OBJECT, shown)
-        return as_asked(obj, request)
+        return for_request(obj, request)
 
     return _cached((store.url, AssetKind.OBJECT, name, digest, *terms), load)
 
@@ -90,7 +90,7 @@ def _neighbour(store: Store, name: str, digest: str) -> ObjectModel:
     return _cached((store.url, "neighbour", name, digest), load)
 
 
-def keep_network(store: Store, message: TaskMessage) -> None:
+def cache_network(store: Store, message: TaskMessage) -> None:
     """Cache the network that a task's method takes, if any, under the digest in the method's options.
     Raises NotFoundError, InputError: it is not in the store, or does not match its digest."""
     if not (digest := message.request.network):
@@ -100,10 +100,10 @@ def keep_network(store: Store, message: TaskMessage) -> None:
         files = load_asset_files(store, AssetKind.NETWORK, digest)
         return from_bytes(network_bytes(files, f"network {digest[:12]}"), f"network {digest[:12]}")
 
-    keep(digest, _cached((store.url, AssetKind.NETWORK, digest), load))
+    store_network(digest, _cached((store.url, AssetKind.NETWORK, digest), load))
 
 
-def beside_attributes(message: TaskMessage) -> dict[str, Attribute]:
+def neighbour_attributes(message: TaskMessage) -> dict[str, Attribute]:
     """Return a shard's attributes for the objects beside its own; empty if there are none."""
     beside = message.request.beside
     if not beside:
@@ -169,7 +169,7 @@ def _fetch(store: Store, key: str, file: Path) -> None:
         write_atomically(file, [data])
 
 
-def input_of(message: TaskMessage, context: TaskContext, stage: Stage) -> Shard:
+def load_input(message: TaskMessage, context: TaskContext, stage: Stage) -> Shard:
     """Load the shard that `stage` made for a task; raises the errors of `load_shard`."""
     return load_shard(context.store, stage, message.inputs[0])
 

@@ -104,22 +104,22 @@ class SelfTest:
         return shares | {"width_m": self.width_m, "by_object": self.by_object, "says": self.line, "limit": limit}
 
 
-def failed(reason: str, says: str = "suspicious") -> dict[str, Any]:
+def failed_facts(reason: str, says: str = "suspicious") -> dict[str, Any]:
     """Return the facts of a hand that could not be tested."""
     shares = {"gsr": 0.0, "n": 0, "table": 0.0, "table_n": 0}
     return shares | {"width_m": 0.0, "by_object": {}, "says": f"{says}: {reason}", "limit": None}
 
 
-def tried_softly(hand: Callable[[], HandModel], run: ExecutionContext = DEFAULT_CONTEXT) -> dict[str, Any]:
+def self_test_facts(hand: Callable[[], HandModel], run: ExecutionContext = DEFAULT_CONTEXT) -> dict[str, Any]:
     """Return the facts of a self-test; a test without a grasp, or with an error, is reported and not raised.
     Raises TaskCancelled: `run.cancelled()` returned True."""
     try:
         return self_test(hand(), run).facts()
     except InputError as error:
-        return failed(str(error))
+        return failed_facts(str(error))
     except (ArithmeticError, LookupError, MemoryError, ValueError) as error:
         log.warning("a self-test ended with an error", exc_info=True)
-        return failed(f"the test itself failed ({type(error).__name__})", "not tried")
+        return failed_facts(f"the test itself failed ({type(error).__name__})", "not tried")
 
 
 def self_test(
@@ -138,9 +138,9 @@ def self_test(
         part = run.part(number / len(objects), (number + 1) / len(objects))
         free, standing = (count // 3 + (number < count % 3) for count in (grasps, on_table))
         found = _batches(hand, obj, free, part.part(0.0, 0.7))
-        lifted += [_lifted(hand, obj, standing, part.part(0.7, 1.0))]
+        lifted += [_test_lifts(hand, obj, standing, part.part(0.7, 1.0))]
         held[name] = [bool(value == 1) for batch in found for value in batch.columns["quality/success"]]
-        lost += [bool(one) for batch in found for one in _lost(batch)]
+        lost += [bool(one) for batch in found for one in _lost_in_closing(batch)]
         better = [_best(obj, batch) for batch in found]
         best = max((one for one in (best, *better) if one), key=lambda one: one.rank, default=None)
     every = [value for values in held.values() for value in values]
@@ -148,25 +148,27 @@ def self_test(
     slack = float(np.mean(lost)) if lost else 0.0
     tried = sum(planned for planned, _, _ in lifted)
     table = sum(planned * share for planned, share, _ in lifted) / max(tried, 1)
-    limit = _joined([limit for _, _, limit in lifted if limit is not None])
-    return SelfTest(float(np.mean(every)), len(every), width, by_object, table, tried, best, slack, _give(hand), limit)
+    limit = _join_limits([limit for _, _, limit in lifted if limit is not None])
+    return SelfTest(
+        float(np.mean(every)), len(every), width, by_object, table, tried, best, slack, _drive_compliance(hand), limit
+    )
 
 
-def _joined(limits: list[Limit]) -> Limit | None:
+def _join_limits(limits: list[Limit]) -> Limit | None:
     if not limits:
         return None
     lifts, bound = (max(getattr(one, name) for one in limits) for name in ("lifts_kg", "bound_kg"))
     return replace(limits[0], grasps=sum(one.grasps for one in limits), lifts_kg=lifts, bound_kg=bound)
 
 
-def _lost(batch: ValidatedBatch) -> NDArray[np.bool_]:
+def _lost_in_closing(batch: ValidatedBatch) -> NDArray[np.bool_]:
     """Return a mask of the grasps that do not hold because the object was lost during closing."""
     failed = batch.columns["quality/success"] != 1
     outcome = batch.columns["quality/verdict_outcome"][failed]
     return np.asarray((outcome == Outcome.LOST_WHILE_CLOSING).any(axis=1))
 
 
-def _give(hand: HandModel) -> float:
+def _drive_compliance(hand: HandModel) -> float:
     """Return the least fingertip motion [m] over which a closing dof goes from zero torque to its limit."""
     if jaws_of(hand) is not None:
         return math.inf
@@ -191,7 +193,9 @@ def _request(count: int) -> JobOptions:
     return JobOptions(want="candidates", grasps=count, validation="standard")
 
 
-def _lifted(hand: HandModel, obj: ObjectModel, count: int, run: ExecutionContext) -> tuple[int, float, Limit | None]:
+def _test_lifts(
+    hand: HandModel, obj: ObjectModel, count: int, run: ExecutionContext
+) -> tuple[int, float, Limit | None]:
     """Test grasps of an object on a table.
     Return the number of planned grasps, the share that lifts, and the payload at full actuator force."""
     scenes, _ = scenes_of(TABLE, obj, count=TABLE_SCENES, seed=0)

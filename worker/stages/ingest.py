@@ -46,11 +46,11 @@ def run(message: IngestMessage, context: TaskContext) -> None:
     found, model = check_in_child(message.kind, message.name, files, context)
     if found["verdict"] != "refuse" and load_asset(context.store, message.kind, message.digest).self_test:
         from graspd.worker.hands.load import load_hand
-        from graspd.worker.stages.hand_self_test import tried_softly
+        from graspd.worker.stages.hand_self_test import self_test_facts
 
         # A hand that holds no grasp of a plain object is a result, not an error.
         load = partial(load_hand, files, name=message.name, digest=message.digest)
-        found["facts"]["self_test"] = tried_softly(load, context.run)
+        found["facts"]["self_test"] = self_test_facts(load, context.run)
     if model:
         put_sealed(context.store, names.asset_model(message.kind, message.digest), model)
     put_document(context.store, names.asset_check(message.kind, message.digest), found)

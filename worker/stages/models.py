@@ -28,7 +28,7 @@ from graspd.worker.hands.load import load_hand
 from graspd.worker.hands.model import HandModel, JointType
 from graspd.worker.hands.robot import Ints
 from graspd.worker.hands.surface import sample_surface
-from graspd.worker.hands.visuals import VisualMesh, lighter
+from graspd.worker.hands.visuals import VisualMesh, thin_mesh
 from graspd.worker.objects.glb_document import Document, plain
 from graspd.worker.objects.mesh_geometry import corner_normals
 from graspd.worker.objects.model import ObjectModel
@@ -157,7 +157,7 @@ def _joined(document: Document, meshes: list[tuple[Floats, Ints, Colour | None]]
 def _light_visuals(hand: HandModel) -> tuple[VisualMesh, ...]:
     meshes = hand.visuals.meshes
     excess = sum(len(mesh.faces) for mesh in meshes) / MAX_FACES
-    return meshes if excess <= 1 else tuple(lighter(mesh, excess) for mesh in meshes)
+    return meshes if excess <= 1 else tuple(thin_mesh(mesh, excess) for mesh in meshes)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from graspd.worker.rendering import Extras, render
 from graspd.worker.rendering.hands import DrawnHand
 from graspd.worker.rendering.sheets import best_in_scenes
 from graspd.worker.scenes.neighbours import Neighbours
-from graspd.worker.stages.assets import beside_attributes, hand_of, input_of, neighbours_of, object_of
+from graspd.worker.stages.assets import hand_of, load_input, neighbour_attributes, neighbours_of, object_of
 from graspd.worker.stages.context import Output, TaskContext, batch_seed
 
 
@@ -26,7 +26,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
     """Render `request.views` camera placements of each scene, with the hand for grasps planned in scenes."""
     request = message.request
     stage = Stage.SYNTHESIZE if request.in_scene else Stage.SCENE
-    shard = input_of(message, context, stage)
+    shard = load_input(message, context, stage)
     obj = object_of(context.store, message)
     said: dict[str, Attribute] = {"scene_shard": message.inputs[0]}
     extras = Extras(channels=request.channels)
@@ -36,7 +36,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
         drawn = _drawn(shard, message, context)
         extras = replace(extras, supports=supports_in(request.place), drawn=drawn, neighbours=beside)
         said = {"base_shard": message.inputs[0], "scene": json_attribute(request.place.told())}
-        said |= beside_attributes(message)
+        said |= neighbour_attributes(message)
     context.check()
     pictures = render(
         obj,

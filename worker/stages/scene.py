@@ -17,7 +17,7 @@ from graspd.worker.grasps import Posture
 from graspd.worker.scenes import drop, transfer
 from graspd.worker.scenes.clearance import count_rejections
 from graspd.worker.scenes.placement import scenes_of
-from graspd.worker.stages.assets import beside_attributes, hand_of, input_of, neighbours_of, object_of
+from graspd.worker.stages.assets import hand_of, load_input, neighbour_attributes, neighbours_of, object_of
 from graspd.worker.stages.context import Output, TaskContext, batch_seed
 from graspd.worker.stages.ranges import base_rows, batches_of, joined
 
@@ -42,7 +42,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
 
     if message.request.in_scene:
         return joined(message, [_before_grasps(part, told(number)) for number, part in enumerate(parts)])
-    base = input_of(message, context, Stage.SYNTHESIZE)
+    base = load_input(message, context, Stage.SYNTHESIZE)
     rows = base_rows(base, message)
     made = [_after_grasps(part, told(number), base, rows[number]) for number, part in enumerate(parts)]
     return joined(message, made, base_rows=rows)
@@ -64,7 +64,7 @@ def _before_grasps(message: TaskMessage, context: TaskContext) -> Output:
     said: dict[str, Attribute] = {
         "scene": json_attribute(place.told()),
         "root_link": hand.root_link,
-        **beside_attributes(message),
+        **neighbour_attributes(message),
     }
     return Output({**scenes, **_NO_GRASPS}, said)
 

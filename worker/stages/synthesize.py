@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
@@ -11,11 +10,13 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from graspd.service.model.base import json_value
 from graspd.service.model.errors import InputError, LoadError, SceneError
 from graspd.service.model.messages import TaskMessage
 from graspd.service.model.planning import format_outcomes, sum_outcomes
 from graspd.service.model.states import Stage
 from graspd.service.store.columns import Attribute
+from graspd.worker.batched_generation import validated_batches
 from graspd.worker.files.provenance import base_attributes
 from graspd.worker.generation import ValidatedBatch
 from graspd.worker.planners import NoStartFound, planner
@@ -23,17 +24,16 @@ from graspd.worker.scenes.kinds import supports_of
 from graspd.worker.scenes.placement import neighbour_of
 from graspd.worker.simulation.environment import Scenes
 from graspd.worker.stages.assets import (
-    beside_attributes,
+    cache_network,
     hand_of,
-    input_of,
-    keep_network,
+    load_input,
+    neighbour_attributes,
     neighbours_of,
     object_of,
     pieces_of,
 )
 from graspd.worker.stages.context import Output, TaskContext
 from graspd.worker.stages.ranges import joined, sizes_of
-from graspd.worker.together import validated_batches
 
 #: Columns of the scene shard that the base shard repeats, so that it can be used alone.
 _OF_SCENES: Final = ("scene/object_pose", "scene/rest_probability", "scene/neighbour_pose")
@@ -44,7 +44,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
     Raises SceneError: no hand reaches into the scenes, the first batch finds no grasp, or the method cannot plan in
     them. LoadError: a job's first batch finds none because the payload is far too small."""
     hand, obj = hand_of(context.store, message), object_of(context.store, message)
-    keep_network(context.store, message)
+    cache_network(context.store, message)
     columns = _scene_columns(message, context)
     scenes = [_scenes(message, part, context) for part in columns]
     context.check()
@@ -59,7 +59,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
             scenes=scenes or None,
             pieces=lambda prepared: pieces_of(context.store, prepared),
             run=context.run,
-            checked=partial(_check_hope, message, in_scenes=bool(scenes)),
+            checked=partial(_stop_if_empty, message, in_scenes=bool(scenes)),
             empty_on=(NoStartFound,) if scenes else (),
         )
     except InputError as error:
@@ -78,14 +78,14 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
     )
     of_scenes: dict[str, Attribute] = {"scene_shard": message.inputs[0]} if scenes else {}
     whole = joined(message, made)
-    return replace(whole, attributes={**whole.attributes, **said, **of_scenes, **beside_attributes(message)})
+    return replace(whole, attributes={**whole.attributes, **said, **of_scenes, **neighbour_attributes(message)})
 
 
 def _output(found: ValidatedBatch, columns: Mapping[str, NDArray[Any]]) -> Output:
     info: dict[str, Any] = {f"{name}_seconds": round(value, 4) for name, value in found.seconds.items()}
     info |= {name: round(value, 4) for name, value in found.shares.items()}
     info |= {"rejected": found.rejected, "outcomes": found.outcomes, "planned": found.planned}
-    info |= _plain(found.grasps.info)
+    info |= json_value(found.grasps.info)
     return Output({**found.grasps.to_columns(), **found.columns, **columns}, info=info)
 
 
@@ -97,7 +97,7 @@ def _scene_columns(message: TaskMessage, context: TaskContext) -> list[dict[str,
         planner(request.method, request.options, in_scenes=True)
     except InputError as error:
         raise SceneError(str(error)) from None
-    shard = input_of(message, context, Stage.SCENE)
+    shard = load_input(message, context, Stage.SCENE)
     there = {name: np.asarray(shard[name], float) for name in _OF_SCENES if name in shard.arrays}
     count = len(sizes_of(message))
     parts = {name: np.split(column, count) for name, column in there.items()}
@@ -112,13 +112,13 @@ def _scenes(message: TaskMessage, columns: dict[str, NDArray[Any]], context: Tas
     return replace(scenes, neighbours=beside, neighbour_pose=columns["scene/neighbour_pose"])
 
 
-def _check_hope(message: TaskMessage, batch: int, found: ValidatedBatch, *, in_scenes: bool) -> None:
+def _stop_if_empty(message: TaskMessage, batch: int, found: ValidatedBatch, *, in_scenes: bool) -> None:
     """Stop a job whose first batch finds nothing, since the other batches would find nothing either."""
     request, limit = message.request, found.limit
     if batch or request.want == "candidates" or len(found.grasps):
         return
     none = f"none of {found.planned} candidates is {request.counted}"
-    if limit is not None and limit.hopeless:
+    if limit is not None and limit.is_unreachable:
         raise LoadError(f"{none}: {limit.line}")
     if in_scenes:
         reasons = [format_outcomes(found.outcomes), found.narrow, limit.line if limit is not None else ""]
@@ -127,12 +127,3 @@ def _check_hope(message: TaskMessage, batch: int, found: ValidatedBatch, *, in_s
             f"{none} in its scene ({request.place.kind}): {lost}; give "
             f"a larger budget than {request.budget:g} candidates for each grasp, or another pose, scene, hand or seed"
         )
-
-
-def _plain(value: Any) -> Any:
-    """Convert the planner's records for JSON, with None for nan and infinity."""
-    if isinstance(value, dict):
-        return {str(key): _plain(part) for key, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(part) for part in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -25,8 +25,8 @@ from graspd.worker.objects.convex import (
     WorkLimitExceeded,
     coacd_parts,
     default_cache,
-    keep_parts,
     load_parts,
+    save_parts,
     union_volume,
 )
 from graspd.worker.objects.model import ObjectModel
@@ -111,7 +111,7 @@ def _load_or_make(obj: ObjectModel, file: Path) -> ConvexPieces:
     parts = load_parts(file) if file.is_file() else None
     if parts is None:
         parts = _make(obj)
-        keep_parts(file, parts)
+        save_parts(file, parts)
     volume = union_volume(parts)
     digest = digest_json([hashlib.sha256(np.round(part, 9).tobytes()).hexdigest() for part in parts])
     return ConvexPieces(parts, volume / obj.volume, _excess(volume, obj), digest)

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from graspd.service.model.transforms import Floats
-from graspd.worker.engines.mujoco_warnings import ARENA, void
+from graspd.worker.engines.mujoco_warnings import ARENA, is_invalid
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.grasps import Posture
 from graspd.worker.hands.kinematics import body_poses
@@ -49,7 +49,7 @@ def simulated_displacement_cm(
         data.mocap_pos[:] = poses[:, :3]
         data.mocap_quat[:] = poses[:, 3:]
         mujoco.mj_step(model, data, nstep=STEPS)
-        return math.nan if void(data) else float(np.linalg.norm(data.qpos[:3] - centre))
+        return math.nan if is_invalid(data) else float(np.linalg.norm(data.qpos[:3] - centre))
 
     with ThreadPoolExecutor(run.cores, thread_name_prefix="displacement") as pool:
         return 100.0 * np.array(list(pool.map(work, bodies)), float)

@@ -14,8 +14,8 @@ import numpy as np
 from graspd.service.model.transforms import compose
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.grasps import GraspSet, Posture
+from graspd.worker.hands.hand_matching import HandMatch
 from graspd.worker.hands.model import HandModel
-from graspd.worker.hands.same_hand import SameHand
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.key import Level
@@ -29,7 +29,7 @@ class ForeignVerdicts:
 
     nominal: Verdicts
     foreign: Verdicts
-    same: SameHand
+    same: HandMatch
 
     def facts(self) -> dict[str, Any]:
         """Return the facts of both validations, with `share_counts`.
@@ -69,7 +69,7 @@ def share_counts(held: Mapping[str, int]) -> dict[str, Any]:
 
 
 def foreign_verdicts(
-    same: SameHand,
+    same: HandMatch,
     obj: ObjectModel,
     grasps: GraspSet,
     nominal: Verdicts,
@@ -79,12 +79,12 @@ def foreign_verdicts(
 ) -> ForeignVerdicts:
     """Validate grasps of `same.ours` in the other model, with the settings of their nominal verdicts."""
     level = cast(Level, nominal.level)
-    moved = in_other_model(same, grasps)
-    found = validate(driven_as(same), obj, moved, level=level, hard=nominal.hard, pieces=pieces, run=run)
+    moved = transfer_grasps(same, grasps)
+    found = validate(with_drives_of(same), obj, moved, level=level, hard=nominal.hard, pieces=pieces, run=run)
     return ForeignVerdicts(nominal, found, same)
 
 
-def driven_as(same: SameHand) -> HandModel:
+def with_drives_of(same: HandMatch) -> HandModel:
     """Return the other model with the gains and limits of `same.ours`.
     Let a dof with gain k and limit e move n joints by m_i. Each joint then gets the gain k / (n m_i^2) and the limit e
     / (n |m_i|). Conversely, a dof's gain and limit are sum(m_i^2 k_i) and sum(|m_i| e_i) of its joints. The drive along
@@ -101,7 +101,7 @@ def driven_as(same: SameHand) -> HandModel:
     return replace(theirs, stiffness=stiffness, effort=effort)
 
 
-def in_other_model(same: SameHand, grasps: GraspSet) -> GraspSet:
+def transfer_grasps(same: HandMatch, grasps: GraspSet) -> GraspSet:
     """Return the grasps as postures of the other model: base transformed, joints matched by name.
     Joints that only the other model couples take the nearest feasible values."""
 

@@ -89,7 +89,7 @@ def verdict_key(
             "physics": asdict(model.MujocoOptions().hardened() if hard else model.MujocoOptions()),
             "constants": [_values(MOVES), _values(LEVEL_MOVES[level])],
             # Only for grippers, so that the keys of other hands stay unchanged.
-            **({"several_contacts": flag} if (flag := model.several_contacts(hand)) else {}),
+            **({"several_contacts": flag} if (flag := model.multi_contact_flags(hand)) else {}),
             # Only for hands with tendons, for the same reason.
             **({"tendons": [[*t.dofs, *t.coefficients] for t in hand.tendons]} if hand.tendons else {}),
             **({"drag": [hand.drag.armature.tolist(), hand.drag.dry_friction.tolist()]} if hand.drag else {}),

@@ -19,7 +19,7 @@ import numpy as np
 
 from graspd.service.model.matter import ACCELERATION
 from graspd.service.model.transforms import Floats, invert, quat_conjugate, quat_multiply, quat_rotate, slerp
-from graspd.worker.engines.mujoco_warnings import void
+from graspd.worker.engines.mujoco_warnings import is_invalid
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.simulation.environment import RISE_M, PlacedGrasps
 from graspd.worker.validation.model import Scene, blend
@@ -84,7 +84,7 @@ class Lift(Test):
             return rollout
         self._close(grasps, row)
         self._rise(grasps, row, np.arange(1, STAGES + 1) / STAGES, STAGE_S)
-        return self._ended(rollout, self._validate(Rollout()))
+        return self._result(rollout, self._validate(Rollout()))
 
     def lift(self, grasps: GraspSet, row: int) -> LiftTest:
         """Run the test from the standoff to the end of the hold, along `grasps.approach`."""
@@ -95,7 +95,7 @@ class Lift(Test):
             rollout.outcome = LiftOutcome.TOUCHED_ON_THE_WAY
             return rollout
         if not self._close(grasps, row, give_up=True):
-            rollout.outcome = LiftOutcome.DIVERGED if void(self.data) else LiftOutcome.LOST_WHILE_CLOSING
+            rollout.outcome = LiftOutcome.DIVERGED if is_invalid(self.data) else LiftOutcome.LOST_WHILE_CLOSING
             rollout.steps = self._steps
             return rollout
         self._rise(grasps, row)
@@ -103,7 +103,7 @@ class Lift(Test):
         outcome = self._validate(inner)
         if outcome is Outcome.HELD:
             outcome = self._hold(inner)
-        rollout = self._ended(rollout, outcome)
+        rollout = self._result(rollout, outcome)
         if rollout.success and self._neighbours_moved():
             rollout.outcome = LiftOutcome.NEIGHBOUR_MOVED
         return rollout
@@ -149,12 +149,12 @@ class Lift(Test):
         for a, b in pairwise(path):
             for share in shares:
                 pose = np.concatenate([(1 - share) * a[:3] + share * b[:3], slerp(a[3:], b[3:], float(share))])
-                if self._in_touch(pose, joints):
+                if self._in_contact(pose, joints):
                     return True
         wide, closed = Posture(path[-1:], joints[None]), grasps.pregrasp.take(slice(row, row + 1))
-        return any(self._in_touch(*blend(wide, closed, 0, float(share))) for share in shares)
+        return any(self._in_contact(*blend(wide, closed, 0, float(share))) for share in shares)
 
-    def _in_touch(self, hand_pose: Floats, joints: Floats) -> bool:
+    def _in_contact(self, hand_pose: Floats, joints: Floats) -> bool:
         self._put(hand_pose, joints)
         mujoco.mj_kinematics(self.scene.model, self.data)
         mujoco.mj_collision(self.scene.model, self.data)
@@ -177,22 +177,22 @@ class Lift(Test):
             self._goal = share * RISE_M * self._up
             self.data.mocap_pos[0] = root[:3] + self._goal
             self._run(step_s)
-            if self._in_hand and number % LOSSES == 0 and self._lost():
+            if self._in_hand and number % LOSSES == 0 and self._is_lost():
                 break
 
     def _offset(self) -> Floats:
         """Return the displacement (3,) of the object's frame from its commanded position [m]."""
-        at, yielded = super()._offset(), self._yielded()
+        at, yielded = super()._offset(), self._root_yield()
         if yielded is not None:
             root, turn = yielded
             at = self.data.mocap_pos[0] + quat_rotate(quat_conjugate(turn), at - root)
         return np.asarray(at - self._goal)
 
     def _turned(self) -> Floats:
-        turned, yielded = super()._turned(), self._yielded()
+        turned, yielded = super()._turned(), self._root_yield()
         return turned if yielded is None else quat_multiply(quat_conjugate(yielded[1]), turned)
 
-    def _yielded(self) -> tuple[Floats, Floats] | None:
+    def _root_yield(self) -> tuple[Floats, Floats] | None:
         """Return the root's position (3,) and its rotation (4,) relative to the command.
         None: the root is fixed, or the object is not in the hand. Unlike an arm, the protocol's weld yields by 10
         degrees under the weight of a hammer. An object that only follows this deviation has not moved in the hand."""
@@ -202,7 +202,7 @@ class Lift(Test):
         root = self.data.qpos[at : at + 7]
         return root[:3], quat_multiply(root[3:], quat_conjugate(self.data.mocap_quat[0]))
 
-    def _ended(self, rollout: LiftTest, outcome: Outcome) -> LiftTest:
+    def _result(self, rollout: LiftTest, outcome: Outcome) -> LiftTest:
         rollout.steps, rollout.margin = self._steps, self._excess()
         rollout.outcome = _OUTCOMES[outcome]
         return rollout

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from graspd.service.model.digests import digest_bytes, digest_json
 from graspd.service.model.errors import InputError
 from graspd.worker.control import postures
-from graspd.worker.execution_context import DEFAULT_CONTEXT, Count, ExecutionContext, answers
+from graspd.worker.execution_context import DEFAULT_CONTEXT, Count, ExecutionContext, evaluate_rows
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
@@ -25,7 +25,7 @@ from graspd.worker.validation.lift import Lift, LiftOutcome, LiftTest
 from graspd.worker.validation.model import TOUCH_ROUNDING_M, MujocoOptions, scene_of
 
 LiftLevel = Literal["dexgraspbench", "lift"]
-#: Finished lifts, by `lift_of`.
+#: Finished lifts, by `lift_digest`.
 KnownLifts = dict[str, LiftTest]
 LEVELS: Final[tuple[LiftLevel, ...]] = get_args(LiftLevel)
 #: Increase after changes of verdicts by the lift test's code, other than its constants.
@@ -78,7 +78,7 @@ def validate_lifts(
         pieces: convex pieces of the object; by default its CoACD pieces.
         known: finished lifts of this hand, object and level, which are reused; new ones are added to it.
         run: receives the number of finished grasps; polled for cancellation between grasps."""
-    require_ways(grasps, placed, level)
+    require_approaches(grasps, placed, level)
     began = time.perf_counter()
     pieces = pieces or decompose(obj)
     physics = MujocoOptions().hardened() if hard else MujocoOptions()
@@ -87,7 +87,7 @@ def validate_lifts(
 
     def ask(test: Lift, row: int) -> LiftTest:
         run.check("the validator")
-        key = lift_of(grasps, row, placed, hard=hard) if known is not None else ""
+        key = lift_digest(grasps, row, placed, hard=hard) if known is not None else ""
         rollout = known.get(key) if known is not None else None
         if rollout is None:
             rollout = test.dexgraspbench(grasps, row) if level == "dexgraspbench" else test.lift(grasps, row)
@@ -96,7 +96,7 @@ def validate_lifts(
         done.add(1)
         return rollout
 
-    rollouts = answers(range(len(grasps)), lambda: Lift(scene, placed), ask, threads=run.cores, name="lift")
+    rollouts = evaluate_rows(range(len(grasps)), lambda: Lift(scene, placed), ask, threads=run.cores, name="lift")
     return LiftVerdicts(
         success=np.array([t.success for t in rollouts], np.int8),
         outcome=np.array([t.outcome for t in rollouts], np.uint8),
@@ -108,7 +108,7 @@ def validate_lifts(
     )
 
 
-def lift_of(grasps: GraspSet, row: int, placed: PlacedGrasps, *, hard: bool) -> str:
+def lift_digest(grasps: GraspSet, row: int, placed: PlacedGrasps, *, hard: bool) -> str:
     """Return the digest of everything that determines a lift besides hand, object, level and fixed obstacles."""
     number = int(placed.index[row])
     around = [array[row] for array in (grasps.approach, grasps.coming) if array is not None]
@@ -117,7 +117,7 @@ def lift_of(grasps: GraspSet, row: int, placed: PlacedGrasps, *, hard: bool) -> 
     return postures_key(terms, grasps.take(slice(row, row + 1)))
 
 
-def require_ways(grasps: GraspSet, placed: PlacedGrasps, level: LiftLevel) -> None:
+def require_approaches(grasps: GraspSet, placed: PlacedGrasps, level: LiftLevel) -> None:
     """Raise InputError for an unknown level, or if a grasp has no scene or approach."""
     if level not in LEVELS:
         raise InputError(f"unknown level {level!r} of the lift test; choose one of {', '.join(LEVELS)}")

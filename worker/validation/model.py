@@ -209,7 +209,7 @@ def scene_spec(
     option.impratio = 10.0
     option.noslip_iterations = physics.noslip_iterations
     spec.memory = ARENA
-    option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_GRAVITY) | (NOT_IN_3_3_2 & ~several_contacts(hand))
+    option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_GRAVITY) | (NOT_IN_3_3_2 & ~multi_contact_flags(hand))
     slide, twist = (coefficient * obj.friction / SLIDING for coefficient in physics.friction)
     friction = [slide, twist, 1e-4]
     _add_hand(spec, hand, friction, physics.root)
@@ -221,7 +221,7 @@ def scene_spec(
     return spec
 
 
-def several_contacts(hand: HandModel) -> int:
+def multi_contact_flags(hand: HandModel) -> int:
     """Return the flags of `NOT_IN_3_3_2` that a gripper needs: its flat pads touch flat sides over an area.
     With a single contact point the object would rotate unrealistically. The protocol was made for rounded fingers."""
     return int(mujoco.mjtDisableBit.mjDSBL_MULTICCD) if jaws_of(hand) is not None else 0
@@ -339,7 +339,7 @@ def _add_actuators(spec: Any, hand: HandModel) -> None:
         m = float(hand.multiplier[lead])
         actuator = spec.add_actuator(name=f"dof{d}", target=f"joint{lead}", trntype=mujoco.mjtTrn.mjTRN_JOINT)
         actuator.set_to_position(kp=float(hand.stiffness[d]) / m**2)
-        _limit(actuator, float(hand.effort[d]) / abs(m))
+        _limit_effort(actuator, float(hand.effort[d]) / abs(m))
         for b in np.flatnonzero(hand.dof == d):
             if b == lead:
                 continue
@@ -402,10 +402,10 @@ def _add_tendon(spec: Any, hand: HandModel, tendon: Tendon, name: str, leading: 
         cord.wrap_joint(f"joint{leading[d]}", pull)
     actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_TENDON)
     actuator.set_to_position(kp=tendon.gain(hand.stiffness))
-    _limit(actuator, tendon.limit(hand.effort))
+    _limit_effort(actuator, tendon.limit(hand.effort))
 
 
-def _limit(actuator: Any, effort: float) -> None:
+def _limit_effort(actuator: Any, effort: float) -> None:
     actuator.forcerange = [-effort, effort]
     actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
 

@@ -28,8 +28,8 @@ from numpy.typing import NDArray
 from graspd.service.model.matter import ACCELERATION, MASS_KG, MOST_KG
 from graspd.service.model.planning import limit_text
 from graspd.service.model.transforms import Floats, cross, quat_rotate
-from graspd.worker.engines.mujoco_warnings import void
-from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext, measured
+from graspd.worker.engines.mujoco_warnings import is_invalid
+from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext, measure_rows
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.kinematics import generalized_forces
 from graspd.worker.hands.model import HandModel
@@ -52,7 +52,7 @@ STEP: Final = math.sqrt(2)
 WATCHED: Final = 10
 
 
-class _Weighed(Test):
+class _WeightTest(Test):
     """A test with a variable mass of the object. Not thread-safe: it owns its model."""
 
     def __init__(self, scene: Scene, *rest: Any) -> None:
@@ -103,7 +103,7 @@ class _Weighed(Test):
                 step **= 2
 
 
-class LiftPayload(_Weighed, FixedRootScene):
+class LiftPayload(_WeightTest, FixedRootScene):
     """Payloads of grasps in one scene."""
 
     def payload(self, grasps: GraspSet, row: int) -> float:
@@ -119,7 +119,7 @@ class LiftPayload(_Weighed, FixedRootScene):
             self._weigh(mass)
             self._restore()
             self._hang(borne, mass)
-            if self._ahead(WATCHED) >= 1.0:
+            if self._extrapolate(WATCHED) >= 1.0:
                 return False
             self._save()
             borne = mass
@@ -128,7 +128,7 @@ class LiftPayload(_Weighed, FixedRootScene):
         return self._heaviest(bears, FIRST * self._bound(self._up))
 
 
-class PushPayload(_Weighed):
+class PushPayload(_WeightTest):
     """Payloads of grasps of a free object."""
 
     __test__ = False
@@ -138,7 +138,7 @@ class PushPayload(_Weighed):
         self._weigh(self._own)
         if self._start(grasps, row).outcomes[0] is Outcome.PENETRATION:
             return math.nan
-        if not self._close(grasps, row, give_up=True, stages=HANGING_CLOSING) or void(self.data):
+        if not self._close(grasps, row, give_up=True, stages=HANGING_CLOSING) or is_invalid(self.data):
             return math.nan
         self._save()
         bounds = [self._bound(-np.array(direction, float)) for direction in DIRECTIONS]
@@ -149,7 +149,7 @@ class PushPayload(_Weighed):
             for direction in weakest_first:
                 self._restore()
                 self._push(direction)
-                if self._ahead(WATCHED) >= 1.0:
+                if self._extrapolate(WATCHED) >= 1.0:
                     # The next masses start with this direction.
                     weakest_first.remove(direction)
                     weakest_first.insert(0, direction)
@@ -177,7 +177,7 @@ def payloads(
         scene = scene_of(hand, obj, pieces, LIFTING, *around)
         return PushPayload(scene) if placed is None else LiftPayload(scene, placed)
 
-    return measured(len(grasps), held, make, lambda test, row: test.payload(grasps, row), run=run, name="payload")
+    return measure_rows(len(grasps), held, make, lambda test, row: test.payload(grasps, row), run=run, name="payload")
 
 
 #: Fewest grasps that must lift a light object before their payload counts as the hand's limit; otherwise the grasps'
@@ -204,7 +204,7 @@ class Limit:
     wanted_kg: float | None = None
 
     @property
-    def hopeless(self) -> bool:
+    def is_unreachable(self) -> bool:
         """Whether the wanted payload is so far above the limit that no more grasps are tested."""
         return self.grasps >= ENOUGH and self.wanted_kg is not None and self.wanted_kg > HOPELESS * self.lifts_kg
 
@@ -233,7 +233,7 @@ def limit_of(
     lift a light object."""
     if len(grasps) < least:
         return None
-    light = obj.weighing(mass=MASS_KG if wanted is None else min(MASS_KG, LIGHT * wanted))
+    light = obj.with_mass(mass=MASS_KG if wanted is None else min(MASS_KG, LIGHT * wanted))
     found = payloads(hand, light, grasps, pieces=pieces, placed=placed, run=run)
     if np.isfinite(found).sum() < least:
         return None
@@ -272,7 +272,7 @@ class Shake(FixedRootScene):
                 force = -self.scene.mass * (ACCELERATION * self._up + jerked)
                 self.data.xfrc_applied[self.scene.object_body, :3] = force
                 self._run(STEP_S)
-                worst = max(worst, LOST if void(self.data) else self._excess())
+                worst = max(worst, LOST if is_invalid(self.data) else self._excess())
                 if worst >= 1.0:
                     return worst
         return worst
@@ -294,7 +294,7 @@ def shake_margins(
     def make() -> Shake:
         return Shake(scene_of(hand, obj, pieces, LIFTING, placed.supports, placed.neighbours), placed)
 
-    return measured(len(grasps), held, make, lambda test, row: test.margin(grasps, row), run=run, name="shake")
+    return measure_rows(len(grasps), held, make, lambda test, row: test.margin(grasps, row), run=run, name="shake")
 
 
 _POINTS: Final = 600
@@ -329,14 +329,14 @@ def capacities(hand: HandModel, obj: ObjectModel, grasp: Posture, against: Float
         bounds = (np.where(stop, np.inf, hand.effort) for stop in (rest > hand.upper - near, rest < hand.lower + near))
         efforts = np.concatenate([*bounds])
         loads = [
-            _load(forces.reshape(-1, 3), moments.reshape(-1, 3), torques.reshape(-1, hand.dofs), efforts, along)
+            _largest_load(forces.reshape(-1, 3), moments.reshape(-1, 3), torques.reshape(-1, hand.dofs), efforts, along)
             for along in against[row]
         ]
         out[row] = min(loads) / ACCELERATION
     return out
 
 
-def _load(forces: Floats, moments: Floats, torques: Floats, efforts: Floats, along: Floats) -> float:
+def _largest_load(forces: Floats, moments: Floats, torques: Floats, efforts: Floats, along: Floats) -> float:
     """Return the largest weight [N] balanced by pyramid edges: forces, moments (E, 3), torques (E, D)."""
     from scipy.optimize import linprog
 

@@ -11,15 +11,14 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from functools import partial
 from typing import Final, TypeVar
 
 import numpy as np
 
 from graspd.service.model.matter import ACCELERATION
 from graspd.service.model.transforms import Floats
-from graspd.worker.engines.mujoco_warnings import void
-from graspd.worker.execution_context import answers
+from graspd.worker.engines.mujoco_warnings import is_invalid
+from graspd.worker.execution_context import evaluate_rows
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
@@ -80,24 +79,24 @@ class LiftRollout(Lift):
         self.scene = self._half
         if self._begin(grasps, row).outcome is not LiftOutcome.NOT_TRIED:
             return DEEP
-        if not self._close(grasps, row, give_up=True, stages=CLOSING) or void(self.data):
+        if not self._close(grasps, row, give_up=True, stages=CLOSING) or is_invalid(self.data):
             return LOST
         self._save()
-        hung = self._hung(HANGS, enough=1.0)
+        hung = self._hang_score(HANGS, enough=1.0)
         if hung < 1.0:
             return hung
         if beat < SLIPS + 1.0:
             return beat
         self.scene = self._whole
         self._restore()
-        return SLIPS + self._hung(HANGS_WHOLE)
+        return SLIPS + self._hang_score(HANGS_WHOLE)
 
-    def _hung(self, weights: float, enough: float = GONE) -> float:
+    def _hang_score(self, weights: float, enough: float = GONE) -> float:
         """Return displacement or rotation over its limit, extrapolated to `HOLD_S` after support removal.
         As soon as the present value reaches `enough`, return it without extrapolation."""
         self.data.mocap_pos[1] = self._scene_pose[:3] - AWAY_M * self._up
         self.data.xfrc_applied[self.scene.object_body, :3] = -weights * self.scene.push * self._up
-        return self._ahead(HANGING, enough)
+        return self._extrapolate(HANGING, enough)
 
 
 class PushRollout(Test):
@@ -114,31 +113,31 @@ class PushRollout(Test):
         self.scene = self._half
         if self._start(grasps, row).outcomes[0] is Outcome.PENETRATION:
             return DEEP
-        if not self._close(grasps, row, give_up=True, stages=FREE_CLOSING) or void(self.data):
+        if not self._close(grasps, row, give_up=True, stages=FREE_CLOSING) or is_invalid(self.data):
             return LOST
         self._save()
-        pushed = self._pushed(min(beat, 1.0))
+        pushed = self._push_score(min(beat, 1.0))
         if pushed < min(beat, 1.0):
             return pushed
         if beat < SLIPS + 1.0:
             return np.inf
         self.scene = self._whole
-        return SLIPS + self._pushed()
+        return SLIPS + self._push_score()
 
-    def _pushed(self, enough: float = 1.0) -> float:
+    def _push_score(self, enough: float = 1.0) -> float:
         """Return the worst displacement or rotation over its limit; stop at the first push that reaches `enough`."""
         worst = 0.0
         for corner in CORNERS:
             self._restore()
             self.data.xfrc_applied[self.scene.object_body, :3] = PULL * self.scene.push * corner
             self._run(PUSHED * STAGE_S)
-            worst = max(worst, LOST if void(self.data) else self._excess())
+            worst = max(worst, LOST if is_invalid(self.data) else self._excess())
             if worst >= enough:
                 break
         return worst
 
 
-class _Shorts:
+class ShortTests:
     """Short tests of one hand and one object; thread-safe. Scenes are compiled on first use.
     All grasps must have the same supports and neighbours."""
 
@@ -149,10 +148,10 @@ class _Shorts:
         self._scenes: Frictions | None = None
         self._lock = threading.Lock()
 
-    def scored(
-        self, count: int, placed: PlacedGrasps | None, make: Callable[[Frictions], T], score: Callable[[T, int], float]
-    ) -> Floats:
-        """Return scores (count,) of grasps by tests that `make` creates."""
+    def scores(self, grasps: GraspSet, placed: PlacedGrasps | None, beat: Floats | None = None) -> Floats:
+        """Return scores (N,) of grasps, see `worker.planners.Rollout`: by pushes if free, else by lifts.
+        Scores are below 1 for grasps that hold at half the friction, and below 2 at full friction. Each call uses
+        `threads`; planners on the CPU already call from all their threads."""
         with self._lock:
             if self._scenes is None:
                 around = (placed.supports, placed.neighbours) if placed is not None else ()
@@ -161,37 +160,15 @@ class _Shorts:
                     scene_of(self.hand, self.obj, pieces, physics, *around) for physics in (whole.hardened(), whole)
                 )
                 self._scenes = half, full
-        scenes = self._scenes
-        found = answers(range(count), lambda: make(scenes), score, threads=self.threads, name="short-test")
-        return np.array(found, float)
+        scenes, least = self._scenes, np.full(len(grasps), np.inf) if beat is None else beat
 
+        def make() -> LiftRollout | PushRollout:
+            return PushRollout(scenes) if placed is None else LiftRollout(scenes, placed)
 
-class LiftRollouts(_Shorts):
-    def scores(self, grasps: GraspSet, placed: PlacedGrasps, beat: Floats | None = None) -> Floats:
-        least = np.full(len(grasps), np.inf) if beat is None else beat
-        return self.scored(
-            len(grasps),
-            placed,
-            partial(LiftRollout, placed=placed),
-            lambda test, row: test.score(grasps, row, float(least[row])),
-        )
+        def score(test: LiftRollout | PushRollout, row: int) -> float:
+            return test.score(grasps, row, float(least[row]))
 
-
-def push_rollout(
-    hand: HandModel, obj: ObjectModel, pieces: Callable[[], ConvexPieces]
-) -> Callable[[GraspSet, PlacedGrasps | None, Floats], Floats]:
-    """Return a `worker.planners.Rollout` that scores free grasps (N,) by short pushes.
-    Scores are below 1 for grasps that hold at half the friction, and below 2 at full friction.
-    Each call uses one thread: planners on the CPU already call from all their threads."""
-    shorts = _Shorts(hand, obj, pieces)
-
-    def rollout(grasps: GraspSet, placed: PlacedGrasps | None, beat: Floats | None = None) -> Floats:
-        least = np.full(len(grasps), np.inf) if beat is None else beat
-        return shorts.scored(
-            len(grasps), None, PushRollout, lambda test, row: test.score(grasps, row, float(least[row]))
-        )
-
-    return rollout
+        return np.array(evaluate_rows(range(len(grasps)), make, score, threads=self.threads, name="short-test"), float)
 
 
 #: Number of stages of closing and of squeezing.
@@ -210,7 +187,7 @@ class FixedRootScene(Lift):
         """Close the hand around the object; return whether it holds on to it."""
         if self._begin(grasps, row).outcome is not LiftOutcome.NOT_TRIED:
             return False
-        return self._close(grasps, row, give_up=True, stages=HANGING_CLOSING) and not void(self.data)
+        return self._close(grasps, row, give_up=True, stages=HANGING_CLOSING) and not is_invalid(self.data)
 
     def _hang(self, before: float, mass: float) -> None:
         """Let the object hang while its weight changes from the mass `before` to `mass` [kg]."""

@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 
 from graspd.service.model.transforms import Floats
-from graspd.worker.engines.mujoco_warnings import void
+from graspd.worker.engines.mujoco_warnings import is_invalid
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.validation.model import Scene, blend
 
@@ -130,7 +130,7 @@ class Test:
             # The result is wrong only if a push brings the object back inside the limits. None of 690 grasps did so.
             rollout.margin = max(rollout.margin, self._excess())
             rollout.steps = self._steps
-            return rollout.fail(Outcome.DIVERGED if void(self.data) else Outcome.LOST_WHILE_CLOSING)
+            return rollout.fail(Outcome.DIVERGED if is_invalid(self.data) else Outcome.LOST_WHILE_CLOSING)
         self._save()
         for direction in range(len(DIRECTIONS)):
             self._restore()
@@ -178,11 +178,11 @@ class Test:
         for hand_pose, joints in self._way(grasps, row, stages):
             self.scene.command(self.data, hand_pose, joints)
             self._run(STAGE_S)
-            if give_up and self._lost():
+            if give_up and self._is_lost():
                 return False
         return True
 
-    def _lost(self) -> bool:
+    def _is_lost(self) -> bool:
         moved, turned = self._motion()
         return moved > MAX_DISPLACEMENT_M or turned > LOST_ROTATION
 
@@ -223,13 +223,13 @@ class Test:
             before, turned_before = now, turned
         return Outcome.HELD
 
-    def _ahead(self, stages: int, enough: float = 1.0) -> float:
+    def _extrapolate(self, stages: int, enough: float = 1.0) -> float:
         """Return displacement or rotation over its limit, extrapolated from now to `HOLD_S`.
         Simulate at most `stages` stages; as soon as the present value reaches `enough`, return it."""
         before = self._excess()
         for stage in range(1, stages + 1):
             self._run(STAGE_S)
-            excess = LOST if void(self.data) else self._excess()
+            excess = LOST if is_invalid(self.data) else self._excess()
             ahead = excess + max(0.0, excess - before) * (HOLD_S / STAGE_S - stage)
             if excess >= enough or (stage > 1 and ahead < STILL):
                 return excess
@@ -262,7 +262,7 @@ class Test:
         return max(moved / MAX_DISPLACEMENT_M, turned / MAX_ROTATION)
 
     def _validate(self, rollout: Rollout) -> Outcome:
-        if void(self.data):
+        if is_invalid(self.data):
             return Outcome.DIVERGED
         moved, turned = self._motion()
         rollout.margin = max(rollout.margin, moved / MAX_DISPLACEMENT_M, turned / MAX_ROTATION)

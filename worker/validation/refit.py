@@ -29,16 +29,16 @@ _SHORTEST: Final = 1e-3
 _PRIMITIVES: Final = ("box", "cylinder", "capsule")
 
 
-def refitted(hand: HandModel, fit: Fit, grown_m: float = 0.0) -> HandModel:
+def refit_hand(hand: HandModel, fit: Fit, grown_m: float = 0.0) -> HandModel:
     """Return the hand with its collision shapes replaced, then grown by `grown_m` [m] (negative: shrunk).
     Contacts between bodies whose new shapes touch at rest are ignored, as in the original hand."""
     pieces = hand.pieces
     if fit == "hull":
         pieces = _hulls(hand)
     elif fit != "own":
-        pieces = tuple(_fitted(piece, fit) for piece in pieces)
+        pieces = tuple(_fit_piece(piece, fit) for piece in pieces)
     if grown_m:
-        pieces = tuple(grown(piece, grown_m) for piece in pieces)
+        pieces = tuple(offset_piece(piece, grown_m) for piece in pieces)
     if len(pieces) == len(hand.pieces) and all(a is b for a, b in zip(pieces, hand.pieces, strict=True)):
         return hand
     other = replace(hand, pieces=pieces)
@@ -57,7 +57,7 @@ def fits_of(hand: HandModel) -> frozenset[Fit]:
     return frozenset(found)
 
 
-def grown(piece: ConvexPiece, by_m: float) -> ConvexPiece:
+def offset_piece(piece: ConvexPiece, by_m: float) -> ConvexPiece:
     """Return a piece with its surface offset by `by_m` [m] along all face normals (negative: inwards).
     Boxes and cylinders keep their edges; capsules and spheres are exact. Corners of a hull are cut at the offset
     surface of the Minkowski sum with a ball. A piece too thin to shrink by this much keeps half of its thickness."""
@@ -95,13 +95,13 @@ def _hulls(hand: HandModel) -> tuple[ConvexPiece, ...]:
     return tuple(out)
 
 
-def _fitted(piece: ConvexPiece, fit: Fit) -> ConvexPiece:
+def _fit_piece(piece: ConvexPiece, fit: Fit) -> ConvexPiece:
     if fit == "primitive":
         if piece.kind != "hull":
             return piece
-        found = [_like(piece, kind) for kind in _PRIMITIVES]
+        found = [_primitive_like(piece, kind) for kind in _PRIMITIVES]
         return min(found, key=lambda one: _distance(one, piece))
-    return piece if piece.kind in ("capsule", "sphere") or not _is_round(piece) else _like(piece, "capsule")
+    return piece if piece.kind in ("capsule", "sphere") or not _is_round(piece) else _primitive_like(piece, "capsule")
 
 
 def _moments(piece: ConvexPiece) -> tuple[float, Floats, Floats, Floats]:
@@ -122,7 +122,7 @@ def _is_round(piece: ConvexPiece) -> bool:
     return bool(middle <= WIDE * low)
 
 
-def _like(piece: ConvexPiece, kind: str) -> ConvexPiece:
+def _primitive_like(piece: ConvexPiece, kind: str) -> ConvexPiece:
     """Return a primitive with a piece's centre, principal axes and volume, proportioned by second moments."""
     solid, centre, spread, axes = _moments(piece)
     long = 2

@@ -24,9 +24,9 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.environment import PlacedGrasps
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
-from graspd.worker.validation.lifting import LiftLevel, require_ways
+from graspd.worker.validation.lifting import LiftLevel, require_approaches
 from graspd.worker.validation.model import MujocoOptions
-from graspd.worker.validation.variant import Models, Variant, dealt, draw
+from graspd.worker.validation.variant import Models, Variant, draw, first_axes
 
 NOT_VALIDATED: Final = -1
 #: Numerical tolerance of wanted shares: 0.9 of 10 models is exactly 9.
@@ -111,7 +111,7 @@ def robust(
         pieces: convex pieces of the object; by default its CoACD pieces.
         run: receives the number of finished grasps; polled for cancellation between models."""
     if placed is not None:
-        require_ways(grasps, placed, level)
+        require_approaches(grasps, placed, level)
     began = time.perf_counter()
     verdicts = np.full((len(grasps), models), NOT_VALIDATED, np.int8)
     axes = np.zeros((len(grasps), models), np.uint8)
@@ -144,12 +144,12 @@ def robust(
 
 
 def models_of(hand: HandModel, grasps: GraspSet, row: int, models: int, seed: int) -> list[tuple[Axis, Variant]]:
-    words = (seed, *_words(grasps, row))
-    axes = dealt(hand, models, words)
+    words = (seed, *_digest_words(grasps, row))
+    axes = first_axes(hand, models, words)
     return [(axis, draw(axis, hand, np.random.default_rng((*words, k)))) for k, axis in enumerate(axes)]
 
 
-def _words(grasps: GraspSet, row: int) -> tuple[int, ...]:
+def _digest_words(grasps: GraspSet, row: int) -> tuple[int, ...]:
     whole = hashlib.sha256()
     for part in (grasps.pregrasp, grasps.grasp, grasps.squeeze):
         for array in (part.hand_pose, part.joint_positions):

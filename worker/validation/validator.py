@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import Floats
-from graspd.worker.execution_context import DEFAULT_CONTEXT, Count, ExecutionContext, answers
+from graspd.worker.execution_context import DEFAULT_CONTEXT, Count, ExecutionContext, evaluate_rows
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.disk_cache import content_of
@@ -21,7 +21,7 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.key import Level, postures_key, verdict_key
 from graspd.worker.validation.model import COARSE, MujocoOptions, Scene, scene_of
-from graspd.worker.validation.prefilter.prefilter import PrefilterVerdicts, first_terms, screened
+from graspd.worker.validation.prefilter.prefilter import PrefilterVerdicts, prefilter_key_terms, run_prefilter
 from graspd.worker.validation.protocol import DIRECTIONS, FAST_BAND, Outcome, Rollout, Test
 
 log = logging.getLogger(__name__)
@@ -108,26 +108,26 @@ def validate(
         raise InputError(f"unknown level {level!r}; choose one of {', '.join(LEVELS)}")
     began = time.perf_counter()
     pieces = pieces or decompose(obj)
-    prefilter_terms = first_terms(hand, level, run)
+    prefilter_terms = prefilter_key_terms(hand, level, run)
     # The prefilter leaves only cases near a limit. For such cases, coarse physics would defer to level standard anyway.
     of_the_cpu: Level = "standard" if prefilter_terms else level
     case = _Case(hand, obj, pieces, of_the_cpu, hard)
     terms = verdict_key(hand, obj, level, hard, pieces=pieces, prefilter=prefilter_terms)
-    first = prefilter or _screened(case, terms, grasps, level, run if prefilter_terms else None)
+    first = prefilter or _run_prefilter(case, terms, grasps, level, run if prefilter_terms else None)
     rollouts = dict(first.stands)
     left = [row for row in range(len(grasps)) if row not in rollouts]
     keys = {} if known is None else {row: postures_key(terms, grasps.take(slice(row, row + 1))) for row in left}
     if known is not None:
         rollouts |= {row: known[key] for row, key in keys.items() if key in known}
-    _try(case, grasps, [row for row in left if row not in rollouts], rollouts, run)
+    _run_tests(case, grasps, [row for row in left if row not in rollouts], rollouts, run)
     if known is not None:
         known |= {key: rollouts[row] for row, key in keys.items()}
     contradicted = first.contradicted(rollouts)
-    if not first.believed(contradicted):
+    if not first.is_trusted(contradicted):
         log.warning(
             "%d of %d rechecked verdicts are contradicted: the CPU validates all", contradicted, len(first.rechecked)
         )
-        _try(case, grasps, list(first.stands), rollouts, run)
+        _run_tests(case, grasps, list(first.stands), rollouts, run)
     ordered = [rollouts[row] for row in range(len(grasps))]
     return Verdicts(
         success=np.array([t.success for t in ordered], np.int8),
@@ -154,16 +154,16 @@ def prefiltered(
     hand: HandModel, obj: ObjectModel, grasps: GraspSet, *, level: Level, pieces: ConvexPieces, run: ExecutionContext
 ) -> PrefilterVerdicts:
     """Run the GPU prefilter for `validate` beforehand, in the thread that has the device."""
-    prefilter_terms = first_terms(hand, level, run)
+    prefilter_terms = prefilter_key_terms(hand, level, run)
     terms = verdict_key(hand, obj, level, False, pieces=pieces, prefilter=prefilter_terms)
     case = _Case(hand, obj, pieces, "standard", False)
-    return _screened(case, terms, grasps, level, run if prefilter_terms else None)
+    return _run_prefilter(case, terms, grasps, level, run if prefilter_terms else None)
 
 
-def _screened(
+def _run_prefilter(
     case: _Case, terms: str, grasps: GraspSet, level: Level, run: ExecutionContext | None
 ) -> PrefilterVerdicts:
-    return PrefilterVerdicts({}, {}) if run is None else screened(case.scene, terms, grasps, level=level, run=run)
+    return PrefilterVerdicts({}, {}) if run is None else run_prefilter(case.scene, terms, grasps, level=level, run=run)
 
 
 @dataclass(frozen=True)
@@ -190,7 +190,9 @@ class _Case:
         return _Tests(self)
 
 
-def _try(case: _Case, grasps: GraspSet, rows: list[int], rollouts: dict[int, Rollout], run: ExecutionContext) -> None:
+def _run_tests(
+    case: _Case, grasps: GraspSet, rows: list[int], rollouts: dict[int, Rollout], run: ExecutionContext
+) -> None:
     done = Count(len(grasps), run, "validation", len(grasps) - len(rows))
     if run.pool is None:
 
@@ -200,7 +202,7 @@ def _try(case: _Case, grasps: GraspSet, rows: list[int], rollouts: dict[int, Rol
             done.add(1)
             return rollout
 
-        found = answers(rows, lambda: _Tests(case), ask, threads=run.cores, name="validation")
+        found = evaluate_rows(rows, lambda: _Tests(case), ask, threads=run.cores, name="validation")
         rollouts.update(zip(rows, found, strict=True))
         return
     bare = GraspSet(grasps.grasp, grasps.pregrasp, grasps.squeeze, grasps.stability_loss)

@@ -25,7 +25,7 @@ from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.lift import Lift, LiftTest
 from graspd.worker.validation.model import MujocoOptions, Scene, blend, build, scene_of
 from graspd.worker.validation.protocol import STAGES, Rollout, Test
-from graspd.worker.validation.refit import Fit, fits_of, refitted
+from graspd.worker.validation.refit import Fit, fits_of, refit_hand
 
 Vector = tuple[float, float, float]
 
@@ -62,7 +62,7 @@ class Variant:
     gain: float = 1.0
     """Factor on the position gain; torque limits are unchanged."""
     coupling: Coupling = "own"
-    """compliant: couplings yield under load; separate, ratio: other interpretations of tendons, see `recoupled`."""
+    """compliant: couplings yield under load; separate, ratio: see `replace_coupling`."""
     friction: float = 1.0
     mass: float = 1.0
     """Factor on the object's mass; pushes equal its weight and grow with it."""
@@ -93,7 +93,7 @@ def couplings_of(hand: HandModel) -> tuple[Coupling, ...]:
     return (*rigid, "separate", "ratio") if hand.tendons else rigid
 
 
-def dealt(hand: HandModel, models: int, seed: tuple[int, ...]) -> list[Axis]:
+def first_axes(hand: HandModel, models: int, seed: tuple[int, ...]) -> list[Axis]:
     """Return the axes of a grasp's first models: all axes of the hand in random order, then a repetition."""
     axes = axes_of(hand)
     rounds = range(-(-models // len(axes)))
@@ -154,7 +154,7 @@ def _vector(rng: np.random.Generator, most: float) -> Vector:
     return x, y, z
 
 
-def recoupled(hand: HandModel, coupling: Coupling) -> HandModel:
+def replace_coupling(hand: HandModel, coupling: Coupling) -> HandModel:
     """Return the hand with another interpretation of its tendons; unchanged without tendons, or for other couplings.
     separate: each joint of a tendon gets the drive it would have without the tendon. ratio: joints of a tendon turn
     together, by equal angles with their coefficients' signs. Gain and limit are then the sums over their drives."""
@@ -233,7 +233,7 @@ class Models:
         """Return the verdict of level standard on one grasp in a variant.
         For the nominal variant it equals the verdict of `validate` bit for bit."""
         test = VariantTest(self.scene(variant), variant, self._lags(variant))
-        return test.standard(self._taken(test.scene, seen(self.obj, grasps, row, variant)), 0)
+        return test.standard(self._projected(test.scene, displaced_grasp(self.obj, grasps, row, variant)), 0)
 
     def lift(
         self, grasps: GraspSet, row: int, placed: PlacedGrasps, variant: Variant, *, dexgraspbench: bool = False
@@ -242,17 +242,17 @@ class Models:
         `grasps` have their approach except at level dexgraspbench. `placed` has the scenes of all grasps, with the
         supports and neighbours of these models. `dexgraspbench`: run the published test instead of the full one."""
         number = int(placed.index[row])
-        variant = upright(variant, placed.scenes[number].up)
-        one, where = seen(self.obj, grasps, row, variant), placed.take(slice(row, row + 1))
+        variant = restrict_to_support(variant, placed.scenes[number].up)
+        one, where = displaced_grasp(self.obj, grasps, row, variant), placed.take(slice(row, row + 1))
         if moves_object(variant):
             pose = compose(placed.object_pose[number], motion_of(self.obj, variant))
             beside = placed.neighbour_pose[number : number + 1]
             where = replace(placed, object_pose=pose[None], index=np.zeros(1, np.intp), neighbour_pose=beside)
         test = VariantLift(self.scene(variant), where, variant, self._lags(variant))
-        one = self._taken(test.scene, one)
+        one = self._projected(test.scene, one)
         return test.dexgraspbench(one, 0) if dexgraspbench else test.lift(one, 0)
 
-    def _taken(self, scene: Scene, one: GraspSet) -> GraspSet:
+    def _projected(self, scene: Scene, one: GraspSet) -> GraspSet:
         """Project the grasp onto the postures of a hand with fewer dofs."""
         if scene.hand.dofs < self.hand.dofs:
             for part in (one.grasp, one.pregrasp, one.squeeze):
@@ -266,14 +266,14 @@ class Models:
         built: _Build = (variant.fit, variant.grown_m, "own" if variant.coupling == "compliant" else variant.coupling)
         with self._lock:
             if built not in self._scenes:
-                self._hands[built] = recoupled(refitted(self.hand, *built[:2]), built[2])
+                self._hands[built] = replace_coupling(refit_hand(self.hand, *built[:2]), built[2])
                 self._scenes[built] = build(self._hands[built], self.obj, self._pieces, self._physics, *self._around)
             scene = self._scenes[built]
         if any(variant.centre_m):
             # The body's frame is at the centre of mass.
             obj = replace(self.obj, centre_of_mass=self.obj.centre_of_mass + variant.centre_m)
             scene = build(self._hands[built], obj, self._pieces, self._physics, *self._around)
-        return _with_numbers(scene, variant)
+        return _perturbed_scene(scene, variant)
 
     def _lags(self, variant: Variant) -> Floats | None:
         """Return delays (J,) of joints, as shares of the closing time; None: all start at once."""
@@ -330,7 +330,7 @@ class VariantLift(_OneByOne, Lift):
         self.data.xfrc_applied[self.scene.object_body, :3] *= self._weight
 
 
-def _with_numbers(scene: Scene, variant: Variant) -> Scene:
+def _perturbed_scene(scene: Scene, variant: Variant) -> Scene:
     """Return the scene with a variant's numbers in a copy of its model; the same scene if nothing changes."""
     compiled = "own" if variant.coupling == "compliant" else variant.coupling
     plain = replace(
@@ -358,7 +358,7 @@ def _with_numbers(scene: Scene, variant: Variant) -> Scene:
     return replace(scene, model=model)
 
 
-def seen(obj: ObjectModel, grasps: GraspSet, row: int, variant: Variant) -> GraspSet:
+def displaced_grasp(obj: ObjectModel, grasps: GraspSet, row: int, variant: Variant) -> GraspSet:
     """Return one grasp relative to the object, for a variant that displaces object or hand."""
     one = grasps.take(np.array([row]))
     if not (moves_object(variant) or any(variant.hand_shift_m)):
@@ -387,7 +387,7 @@ def motion_of(obj: ObjectModel, variant: Variant) -> Floats:
     return compose(about, np.concatenate([-obj.centre_of_mass, [1.0, 0, 0, 0]]))
 
 
-def upright(variant: Variant, up: Floats) -> Variant:
+def restrict_to_support(variant: Variant, up: Floats) -> Variant:
     """Restrict a variant to an object on a support: shifts along the support, rotations about the vertical.
     `up` (3,) is the direction against gravity, in the object frame."""
     if not moves_object(variant):

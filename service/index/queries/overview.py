@@ -188,7 +188,9 @@ class Usage(IndexPart):
                 found["tasks"] += int(tasks)
                 found["gpu_seconds" if device.startswith("cuda") else "cpu_seconds"] += float(seconds)
         views = []
-        for (when, project), found in sorted(days.items(), key=lambda item: (-_number(item[0][0]), item[0][1])):
+        for (when, project), found in sorted(
+            days.items(), key=lambda item: (-int(item[0][0].replace("-", "")), item[0][1])
+        ):
             seconds = {name: round(float(found[name]), 3) for name in ("gpu_seconds", "cpu_seconds")}
             views.append(UsageDay(project=project, day=when, **{**found, **seconds}))
         return views
@@ -200,10 +202,6 @@ class Usage(IndexPart):
 
 def _base(column: ColumnElement[Any]) -> ColumnElement[Any]:
     return func.sum(case((shards.c.kind == "base", column), else_=0))
-
-
-def _number(day: str) -> int:
-    return int(day.replace("-", ""))
 
 
 _USED: Final = ("grasps", "valid", "tasks", "gpu_seconds", "cpu_seconds")

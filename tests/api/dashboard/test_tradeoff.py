@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from starlette.testclient import TestClient
 
-from graspd.api.dashboard.tradeoff import HEIGHT, WIDTH, Measured, draw, pareto
+from graspd.api.dashboard.tradeoff import HEIGHT, WIDTH, Measured, draw
 from graspd.service.model.scene_spec import SceneSpec
-from graspd.service.model.studies import FILTERED, IN_SCENE
+from graspd.service.model.studies import FILTERED, IN_SCENE, pareto
 from graspd.service.pipeline.backends import Services
 from graspd.service.store.records import publish
 

@@ -24,10 +24,10 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import BatchRequest, PlanRequest, method, planner, synthesize
 from graspd.worker.planners.fast_graspd.pairs import Pair, pair_of
-from graspd.worker.planners.fast_graspd.scene_starts import ROOM, free_ways
+from graspd.worker.planners.fast_graspd.scene_starts import ROOM, free_directions
 from graspd.worker.planners.fast_graspd.starts import CLEAR, Probe, start_generator
-from graspd.worker.planners.known_networks import keep_file
-from graspd.worker.planners.registry import of_this_machine
+from graspd.worker.planners.network_cache import cache_file
+from graspd.worker.planners.registry import local_options
 from graspd.worker.simulation.data import HandState
 from graspd.worker.simulation.environment import Obstacle, PlacedGrasps
 from graspd.worker.simulation.obstacles import DeviceObstacles
@@ -60,7 +60,7 @@ def keep(network: ProposalNetwork) -> str:
     """A network's digest, its file read by this process."""
     with tempfile.TemporaryDirectory() as folder:
         save(network, Path(folder) / "net.npz")
-        return keep_file(Path(folder) / "net.npz")
+        return cache_file(Path(folder) / "net.npz")
 
 
 def made(hand: HandModel, obj: ObjectModel, network: ProposalNetwork, count: int, **given: Any) -> GraspSet:
@@ -109,7 +109,7 @@ def started(pair: Pair, network: ProposalNetwork, height: float, placed: PlacedG
     obstacles = DeviceObstacles.create(hand, placed.scenes, obj.centre_of_mass, "cpu")
     model = pair.model(pair.coarse, obstacles)
     generators = [start_generator(0, 0, i, k) for i in range(len(placed.index)) for k in range(each)]
-    ways = [free_ways(scene, obj) for scene in placed.scenes]
+    ways = [free_directions(scene, obj) for scene in placed.scenes]
     state, depth = seeds(model, generators, each=each, placed=placed, ways=ways)
     probe = Probe(model, len(generators), room=ROOM)
     probe.data.set_scenes(np.repeat(placed.index, each))
@@ -175,10 +175,10 @@ def test_what_it_cannot_do_is_said_in_a_line(hand, network, tmp_path: Path) -> N
     save(network, tmp_path / "net.npz")
     with pytest.raises(InputError, match="option of learned: network"):
         planner("learned", {"network": str(tmp_path / "net.npz")}, in_scenes=True)
-    assert of_this_machine("learned", {"network": str(tmp_path / "net.npz")}) == {"network": keep(network)}
-    assert of_this_machine("graspit", {"steps": "3"}) == {"steps": "3"}
+    assert local_options("learned", {"network": str(tmp_path / "net.npz")}) == {"network": keep(network)}
+    assert local_options("graspit", {"steps": "3"}) == {"steps": "3"}
     with pytest.raises(InputError, match="cannot be read"):
-        of_this_machine("learned", {"network": str(tmp_path / "none.npz")})
+        local_options("learned", {"network": str(tmp_path / "none.npz")})
 
 
 def test_points_lie_on_the_surface_and_are_seen_by_the_camera() -> None:

@@ -10,7 +10,7 @@ import trimesh
 
 from graspd.exchange.inputs import load_case
 from graspd.exchange.robots import execution
-from graspd.exchange.robots.execution import POSTURES, Executions, executions, straight_paths, timed, tool_frame
+from graspd.exchange.robots.execution import POSTURES, Executions, executions, straight_paths, time_motions, tool_frame
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import IDENTITY_POSE, apply, compose, invert, slerp
 from graspd.service.store.shards import read_shard
@@ -116,7 +116,7 @@ def test_a_tool_frame_that_is_none_is_refused_in_a_line(text: str, said: str) ->
 def test_trajectories_stay_within_limits_and_reach_every_posture(free: Executions, speed: float) -> None:
     velocity = np.linspace(0.3, 2.0, len(free.hand.joint_names))
     for row in range(len(free)):
-        found = timed(straight_paths(free, row), free.hand.joint_names, velocity, speed=speed)
+        found = time_motions(straight_paths(free, row), free.hand.joint_names, velocity, speed=speed)
         step = np.diff(found.time)
         assert (step > 0).all()
         # Secants of a motion are no steeper than its steepest tangent; 1e-9: rounding.

@@ -17,9 +17,9 @@ from graspd.service.model.transforms import Floats, apply, quat_rotate
 from graspd.worker.control import opening, postures
 from graspd.worker.control import squeeze as squeezing
 from graspd.worker.control.postures import hold_forces, normal_force, pregrasp, squeeze
-from graspd.worker.control.squeeze import SPREAD, SUM, TORQUE, solved
+from graspd.worker.control.squeeze import SPREAD, SUM, TORQUE, solve_nonnegative
 from graspd.worker.grasps import Posture
-from graspd.worker.hands.jaws import slides
+from graspd.worker.hands.jaws import prismatic_dofs
 from graspd.worker.hands.kinematics import body_poses, generalized_forces
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
@@ -94,7 +94,7 @@ def _leaving(probe: Probe, found: NearestPoints, finger: NDArray[np.int32]) -> F
 def _openings(hand: HandModel, q: Floats, direction: Floats) -> Floats:
     """(B, K, D) dof values on the way along `direction` (B, D), the grasp first, all within the limits."""
     step = opening.OPENING_STEP * np.arange(opening.OPENING_STEPS + 1)
-    direction = direction * np.where(slides(hand), opening.SLIDING_STEP_M / opening.OPENING_STEP, 1.0)
+    direction = direction * np.where(prismatic_dofs(hand), opening.SLIDING_STEP_M / opening.OPENING_STEP, 1.0)
     path = q[:, None] + step[None, :, None] * direction[:, None]
     # A grasp may stand a hair outside its limits: opening must not make a jump of that.
     return np.clip(path, np.minimum(hand.lower, q)[:, None], np.maximum(hand.upper, q)[:, None])
@@ -327,7 +327,7 @@ def test_a_finger_stands_off_that_is_near_and_does_not_touch() -> None:
     near, far = postures.STANDS_OFF_M
     rights = np.array([0.0, near - 1e-3, near + 1e-3, far - 1e-3, far + 1e-3])
     grasps = posture(*(((0, 0, 0), (0.065, 0.065 - right)) for right in rights))
-    assert postures.standing_off(PLATES, BOX, grasps).tolist() == [False, False, True, True, False]
+    assert postures.fingers_off_object(PLATES, BOX, grasps).tolist() == [False, False, True, True, False]
 
 
 def around(hand: HandModel, count: int) -> Posture:
@@ -426,7 +426,7 @@ def test_gripper_opens_for_way_in_and_squeezes_within_its_stroke() -> None:
 def nonnegative_weights(matrix: np.ndarray, count: np.ndarray) -> np.ndarray:
     """`solved` of systems (B, K, 23) for `TARGET` with a ridge of 0.1."""
     given = [wp.array(a, dtype=kind, device="cpu") for a, kind in ((matrix, wp.float64), (count, wp.int32))]
-    return np.array(solved(given[0], TARGET, 0.1, given[1]).numpy())
+    return np.array(solve_nonnegative(given[0], TARGET, 0.1, given[1]).numpy())
 
 
 def systems(count: int, columns: int, seed: int) -> np.ndarray:
@@ -445,13 +445,13 @@ def test_weights_are_scipy_s(columns: int, seed: int) -> None:
     made = systems(16, columns, seed)
     count = np.random.default_rng(seed).integers(1, columns + 1, 16)
     found = nonnegative_weights(made, count)
-    wanted = [squeezing._plain(made[b], TARGET, 0.1, int(count[b])) for b in range(16)]
+    wanted = [squeezing._solve_by_scipy(made[b], TARGET, 0.1, int(count[b])) for b in range(16)]
     # Both are exact but for rounding; the normal equations square the condition, some 1e5 here.
     np.testing.assert_allclose(found, wanted, atol=1e-9)
 
 
 def test_the_kernel_needs_no_second_way(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(squeezing, "_plain", None)
+    monkeypatch.setattr(squeezing, "_solve_by_scipy", None)
     nonnegative_weights(systems(64, 96, 9), np.full(64, 96))
 
 

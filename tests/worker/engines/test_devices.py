@@ -14,7 +14,7 @@ import warp as wp
 
 from graspd.service.model.errors import InputError
 from graspd.worker.engines import devices
-from graspd.worker.engines.devices import Device, DeviceLost, Gpu, check_device, is_out_of_memory, take
+from graspd.worker.engines.devices import Device, DeviceLost, Gpu, check_device, is_out_of_memory, select_gpu
 from graspd.worker.planners.threads import run_parts
 
 #: As Warp 1.19 says it.
@@ -105,35 +105,35 @@ def own_locks(tmp_path, monkeypatch: pytest.MonkeyPatch):
 
 
 def test_each_process_takes_its_own_gpu_then_they_share_evenly(tmp_path) -> None:
-    taken = [take(FOUR, tmp_path).name for _ in range(10)]
+    taken = [select_gpu(FOUR, tmp_path).name for _ in range(10)]
     assert taken[:4] == [gpu.name for gpu in FOUR]
     assert sorted(Counter(taken).values()) == [2, 2, 3, 3]
     # Names count what a process sees, as CUDA_VISIBLE_DEVICES has it; ids are the machine's.
     seen = [Gpu("cuda:0", "GPU-0001"), Gpu("cuda:1", "GPU-0002")]
-    assert take(seen, tmp_path).id == "GPU-0002"
+    assert select_gpu(seen, tmp_path).id == "GPU-0002"
 
 
 def test_the_gpu_of_a_killed_process_is_free_again(tmp_path) -> None:
     script = (
         "import sys, time, pathlib\n"
-        "from graspd.worker.engines.devices import Gpu, take\n"
+        "from graspd.worker.engines.devices import Gpu, select_gpu\n"
         "two = [Gpu('cuda:0', 'a'), Gpu('cuda:1', 'b')]\n"
-        "print(take(two, pathlib.Path(sys.argv[1])).name, flush=True)\n"
+        "print(select_gpu(two, pathlib.Path(sys.argv[1])).name, flush=True)\n"
         "time.sleep(600)\n"
     )
     two = [Gpu("cuda:0", "a"), Gpu("cuda:1", "b")]
     with subprocess.Popen([sys.executable, "-c", script, str(tmp_path)], stdout=subprocess.PIPE, text=True) as other:
         assert other.stdout is not None and other.stdout.readline().strip() == "cuda:0"
-        assert take(two, tmp_path).name == "cuda:1"
+        assert select_gpu(two, tmp_path).name == "cuda:1"
         other.kill()
         other.wait()
-    assert take(two, tmp_path).name == "cuda:0"
+    assert select_gpu(two, tmp_path).name == "cuda:0"
 
 
 def test_without_a_place_for_locks_it_is_the_first(tmp_path, caplog: pytest.LogCaptureFixture) -> None:
     (tmp_path / "file").write_text("")
     with caplog.at_level(logging.WARNING):
-        assert take(FOUR, tmp_path / "file" / "gpus").name == "cuda:0"
+        assert select_gpu(FOUR, tmp_path / "file" / "gpus").name == "cuda:0"
     assert "processes per GPU are not counted" in caplog.text
 
 

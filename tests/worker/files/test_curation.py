@@ -13,8 +13,8 @@ from graspd.service.model.errors import InputError
 from graspd.service.readers import Grasps, Pictures, open_shards
 from graspd.service.readers.clouds import OF_GRASPS
 from graspd.service.store.shards import Shard, read_shard, write_shard
-from graspd.worker.files.curation import Balance, faces
-from graspd.worker.files.subsets import choose
+from graspd.worker.files.curation import Balance, face_numbers
+from graspd.worker.files.subsets import select_grasps
 from tests.service.readers import box_scenes
 from tests.worker.models import quality_columns
 
@@ -96,7 +96,13 @@ def test_faces_are_told_by_what_lies_below() -> None:
         with pytest.raises(InputError, match="type, direction, face"):
             Balance(by)
     tilted = [np.sin(0.1), 0.0, -np.cos(0.1)]
-    assert faces(np.array([[0, 0, -1.0], [0, 1.0, 0], tilted, [0.0, 0, 0], [0, 0, 1.0]])).tolist() == [0, 1, 0, -1, 2]
+    assert face_numbers(np.array([[0, 0, -1.0], [0, 1.0, 0], tilted, [0.0, 0, 0], [0, 0, 1.0]])).tolist() == [
+        0,
+        1,
+        0,
+        -1,
+        2,
+    ]
 
 
 def base_of(valid: list[int], feasible: list[int], success: list[int] | None) -> Shard:
@@ -109,9 +115,15 @@ UNVALIDATED = base_of([0, 0], [1, 0], None)
 
 
 def test_valid_grasps_are_taken_unless_others_are_asked_for() -> None:
-    assert choose(VALIDATED)[0].tolist() == [True, False, False] and choose(VALIDATED, every=True)[0].all()
-    assert choose(UNVALIDATED, unvalidated=True)[0].tolist() == [True, False]
-    words = [choose(VALIDATED)[1], choose(UNVALIDATED, unvalidated=True)[1], choose(VALIDATED, every=True)[1]]
+    assert (
+        select_grasps(VALIDATED)[0].tolist() == [True, False, False] and select_grasps(VALIDATED, every=True)[0].all()
+    )
+    assert select_grasps(UNVALIDATED, unvalidated=True)[0].tolist() == [True, False]
+    words = [
+        select_grasps(VALIDATED)[1],
+        select_grasps(UNVALIDATED, unvalidated=True)[1],
+        select_grasps(VALIDATED, every=True)[1],
+    ]
     assert words == ["valid grasps", "feasible grasps that are not validated", "grasps of any kind"]
 
 
@@ -127,7 +139,7 @@ def test_valid_grasps_are_taken_unless_others_are_asked_for() -> None:
 )
 def test_none_of_that_kind_is_told_with_the_mend(base: Shard, wish: dict[str, bool], fix: str) -> None:
     with pytest.raises(InputError, match=fix):
-        choose(base, **wish)
+        select_grasps(base, **wish)
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from graspd.service.model.scene_spec import SceneSpec, parse_scene
 from graspd.service.model.transforms import apply
 from graspd.service.store.shards import read_shard, write_shard
 from graspd.studies.evaluation import evaluate
-from graspd.worker.files.synthesis import SynthesisResult, synthesized
+from graspd.worker.files.synthesis import SynthesisResult, synthesize_grasps
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.rendering.pictures import grasp_pictures
 from graspd.worker.scenes.placement import scenes_of
@@ -42,7 +42,7 @@ def boxes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 def made(boxes: dict[str, Path]) -> dict[tuple[str, str], SynthesisResult]:
     def one(place: str, scene: str) -> SynthesisResult:
         where = SceneSpec() if scene == "free" else parse_scene(scene, faces="drawn", touch=None, beside=[])
-        return synthesized("barrett", str(boxes[place]), REQUEST, place=where, scenes=1, device="cpu", threads=1)
+        return synthesize_grasps("barrett", str(boxes[place]), REQUEST, place=where, scenes=1, device="cpu", threads=1)
 
     return {(place, scene): one(place, scene) for place in PLACES for scene in ("free", "table")}
 

@@ -395,7 +395,7 @@ def test_an_expansion_that_the_machine_ended_refuses_no_hand(code: str, monkeypa
 def test_code_that_climbs_out_of_expression_finds_doors_closed(attempt: str) -> None:
     code = (
         "import os, socket; from importlib import import_module; from graspd.worker.hands import xacro_child as child;"
-        f"child._close_doors(5, 2**30)\ntry:\n    {attempt}\nexcept BaseException as error:\n"
+        f"child._restrict_process(5, 2**30)\ntry:\n    {attempt}\nexcept BaseException as error:\n"
         "    os.write(1, type(error).__name__.encode())\nos._exit(0)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)

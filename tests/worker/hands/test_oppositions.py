@@ -15,8 +15,8 @@ from graspd.service.model.transforms import IDENTITY_POSE, apply, quat_rotate
 from graspd.studies.stability.assets import ring_hand
 from graspd.worker.generation import validated_grasps
 from graspd.worker.hands import pinch_postures as oppositions
-from graspd.worker.hands.flat_pinches import HEIGHTS_M, OVER_M, pinches_of
-from graspd.worker.hands.grasp_widths import Size, spans_of
+from graspd.worker.hands.flat_pinches import HEIGHTS_M, OVER_M, flat_pinches
+from graspd.worker.hands.grasp_widths import Size, postures_for_size
 from graspd.worker.hands.jaws import jaws_of
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path, load_hand
@@ -60,7 +60,7 @@ def test_a_wide_hand_opposes_over_a_range_one_finger_nothing() -> None:
 
 @pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
 def test_opposed_fingertips_end_on_one_plane_and_none_is_as_low(name: str) -> None:
-    hand, found = hand_from_path(name), pinches_of(hand_from_path(name), HEIGHT_M)
+    hand, found = hand_from_path(name), flat_pinches(hand_from_path(name), HEIGHT_M)
     assert len(found) >= 20 and (np.diff(found.width) >= 0).all()
     down = hand.palm.approach - (found.axis @ hand.palm.approach)[:, None] * found.axis
     down /= np.linalg.norm(down, axis=1, keepdims=True)
@@ -79,14 +79,14 @@ def test_opposed_fingertips_end_on_one_plane_and_none_is_as_low(name: str) -> No
 
 def test_what_reaches_the_pads_has_no_such_postures() -> None:
     hand = hand_from_path("barrett")
-    assert len(pinches_of(hand, HEIGHTS_M[-1] + 1e-4)) == 0
-    assert len(pinches_of(replace(hand, name="alone", fingertips=hand.fingertips[:1]), HEIGHT_M)) == 0
+    assert len(flat_pinches(hand, HEIGHTS_M[-1] + 1e-4)) == 0
+    assert len(flat_pinches(replace(hand, name="alone", fingertips=hand.fingertips[:1]), HEIGHT_M)) == 0
 
 
 @pytest.mark.parametrize("size", ["small", "wide"])
 def test_hand_looks_at_thing_from_both_sides_and_leaves_it_room(size: Size) -> None:
     hand = hand_from_path("allegro")
-    found, points = spans_of(hand, size), sample_surface(hand, 3000)
+    found, points = postures_for_size(hand, size), sample_surface(hand, 3000)
     assert len(found) >= 10 and ((found.q >= hand.lower) & (found.q <= hand.upper)).all()
     pose = body_poses(hand, np.tile(IDENTITY_POSE, (len(found), 1)), hand.expand(found.q))[:, points.body]
     place = quat_rotate(pose[..., 3:], points.position) + pose[..., :3]
@@ -108,8 +108,8 @@ def test_hand_looks_at_thing_from_both_sides_and_leaves_it_room(size: Size) -> N
 def test_spans_begin_where_pads_end() -> None:
     hand = hand_from_path("allegro")
     pads = oppositions_of(hand).width
-    assert spans_of(hand, "small").width[0] < pads[0] - 0.005
-    assert spans_of(hand, "wide").width[-1] > pads[-1] + 0.005
+    assert postures_for_size(hand, "small").width[0] < pads[0] - 0.005
+    assert postures_for_size(hand, "wide").width[-1] > pads[-1] + 0.005
 
 
 def pointer() -> HandModel:

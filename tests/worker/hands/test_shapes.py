@@ -14,7 +14,7 @@ from graspd.worker.hands.collisions import hull_distance
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path, load_hand
 from graspd.worker.hands.model import HandModel
-from graspd.worker.hands.shapes import MAX_HULL_VERTICES, parts_of, reduce_hull
+from graspd.worker.hands.shapes import MAX_HULL_VERTICES, convex_parts, reduce_hull
 from graspd.worker.hands.surface import piece_distance, sample_surface
 from graspd.worker.objects.convex import union_volume
 from tests.worker.hands.urdfs import joint, link, load, robot
@@ -122,7 +122,7 @@ def fork(gap: float) -> trimesh.Trimesh:
 
 
 def measured(mesh: trimesh.Trimesh) -> tuple[int, float]:
-    parts = parts_of(np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int32))
+    parts = convex_parts(np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int32))
     return len(parts), union_volume(parts) / mesh.volume
 
 
@@ -136,7 +136,7 @@ def test_a_fork_is_taken_apart_and_its_gap_is_empty() -> None:
 @pytest.mark.parametrize("mesh", FILLED)
 def test_what_its_hull_shows_well_enough_stays_one_hull(mesh: trimesh.Trimesh) -> None:
     vertices = np.asarray(mesh.vertices, float)
-    (part,) = parts_of(vertices, np.asarray(mesh.faces, np.int32))
+    (part,) = convex_parts(vertices, np.asarray(mesh.faces, np.int32))
     assert part is vertices
 
 

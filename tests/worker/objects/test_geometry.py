@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from manifold3d import Manifold
 
-from graspd.exchange.training_export import families, signature
+from graspd.exchange.training_export import object_families, shape_signature
 from graspd.service.model.errors import MeshError
 from graspd.service.model.states import AssetKind
 from graspd.service.store.assets import builtin_files, builtin_names
@@ -251,24 +251,24 @@ def test_copies_turned_scaled_or_meshed_anew_are_of_one_family(flask: trimesh.Tr
     ball = named(trimesh.creation.icosphere(3, 0.05), "a")
     others = {"box": named(trimesh.creation.box((0.05, 0.07, 0.18)), "b"), "ball": ball}
     copies = {"bottle": flask, "turned": turned, "finer": finer, "larger": larger}
-    found = families(others | {name: named(mesh, f"c{k}") for k, (name, mesh) in enumerate(copies.items())})
+    found = object_families(others | {name: named(mesh, f"c{k}") for k, (name, mesh) in enumerate(copies.items())})
     assert {found[name] for name in copies} == {"c0"} and (found["box"], found["ball"]) == ("b", "a")
-    assert families({"jar": named(flask, "x"), "bottle": named(flask, "x")}) == {"jar": "x", "bottle": "x"}
-    assert families({}) == {}
+    assert object_families({"jar": named(flask, "x"), "bottle": named(flask, "x")}) == {"jar": "x", "bottle": "x"}
+    assert object_families({}) == {}
 
 
 def test_whoever_is_like_two_families_makes_them_one(monkeypatch: pytest.MonkeyPatch, flask: trimesh.Trimesh) -> None:
     at = {"a": 0.0, "b": 0.009, "c": 0.0045, "d": 1.0}
-    monkeypatch.setattr("graspd.exchange.training_export.signature", lambda obj: np.full(50, at[obj.digest]))
+    monkeypatch.setattr("graspd.exchange.training_export.shape_signature", lambda obj: np.full(50, at[obj.digest]))
     one = object_from_mesh(flask)
-    assert families({name: replace(one, digest=name) for name in at}) == {"a": "a", "b": "a", "c": "a", "d": "d"}
+    assert object_families({name: replace(one, digest=name) for name in at}) == {"a": "a", "b": "a", "c": "a", "d": "d"}
 
 
 def test_the_signature_of_a_ball_is_that_of_chords() -> None:
     # Of two random points of a sphere of radius R the chord l has the density l / (2 R^2): F(l) = (l / 2R)^2, and its
     # root mean square is R sqrt 2. 40,000 draws are off by 0.005 at most, the icosphere's chords by less.
     share = np.linspace(0.01, 0.99, 50)
-    found = signature(object_from_mesh(trimesh.creation.icosphere(4, 0.04)))
+    found = shape_signature(object_from_mesh(trimesh.creation.icosphere(4, 0.04)))
     np.testing.assert_allclose(found, np.sqrt(2.0 * share), atol=0.01)
 
 

@@ -27,7 +27,7 @@ from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.surface import sample_surface
 from graspd.worker.objects import disk_cache, prepare
-from graspd.worker.objects.disk_cache import arrays_kept_or_made, content_of, recalled, recalling
+from graspd.worker.objects.disk_cache import cached_arrays, cached_step, caching_steps, content_of
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import load_object, object_from_path
 from graspd.worker.quality.probe import probe_of
@@ -63,19 +63,19 @@ def made(number: float) -> dict[str, np.ndarray]:
 
 
 def test_what_was_made_is_read_bit_for_bit(own_cache: Path) -> None:
-    first = arrays_kept_or_made("things", ("x", 1), (disk_cache,), lambda: made(1 / 3))
-    again = arrays_kept_or_made("things", ("x", 1), (disk_cache,), lambda: pytest.fail("it is there already"))
+    first = cached_arrays("things", ("x", 1), (disk_cache,), lambda: made(1 / 3))
+    again = cached_arrays("things", ("x", 1), (disk_cache,), lambda: pytest.fail("it is there already"))
     assert all(np.array_equal(first[name], again[name]) and first[name].dtype == again[name].dtype for name in first)
     assert [file.suffix for file in (own_cache / "things").iterdir()] == [".npz"]
 
 
 def test_entries_differ_with_terms_and_code_bad_ones_are_remade(own_cache: Path) -> None:
-    arrays_kept_or_made("things", ("x", 1), (disk_cache,), lambda: made(1))
-    assert arrays_kept_or_made("things", ("x", 2), (disk_cache,), lambda: made(2))["a"][0, 0] == 2
-    assert arrays_kept_or_made("things", ("x", 1), (surface,), lambda: made(3))["a"][0, 0] == 3
+    cached_arrays("things", ("x", 1), (disk_cache,), lambda: made(1))
+    assert cached_arrays("things", ("x", 2), (disk_cache,), lambda: made(2))["a"][0, 0] == 2
+    assert cached_arrays("things", ("x", 1), (surface,), lambda: made(3))["a"][0, 0] == 3
     for file in (own_cache / "things").iterdir():
         user_cache.store(file, b"no arrays")
-    assert arrays_kept_or_made("things", ("x", 1), (disk_cache,), lambda: made(4))["a"][0, 0] == 4
+    assert cached_arrays("things", ("x", 1), (disk_cache,), lambda: made(4))["a"][0, 0] == 4
 
 
 def test_samples_are_those_of_a_process_without_a_cache(own_cache: Path) -> None:
@@ -83,22 +83,22 @@ def test_samples_are_those_of_a_process_without_a_cache(own_cache: Path) -> None
     ball = load_object(stl(sphere(segments=24)), name="ball", digest="", face_error_m=0.0)
     shapes = surface._Shapes(hand.pieces, body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0])
     for _ in range(2):
-        found, fresh = surface._kept.__wrapped__(shapes, 120, 2), surface._sample(shapes, 120, 2)
+        found, fresh = surface._cached_samples.__wrapped__(shapes, 120, 2), surface._sample(shapes, 120, 2)
         assert all(np.array_equal(getattr(found, name), array) for name, array in vars(fresh).items())
         assert np.array_equal(sampling.object_samples(ball, 90, seed=1), sampling._sampled(ball, 90, 1))
 
 
 def test_small_steps_are_kept_together_each_by_what_it_is_given(own_cache: Path) -> None:
     def halves(array: np.ndarray) -> np.ndarray:
-        return recalled("half", [array], lambda: [array / 2])["0"]
+        return cached_step("half", [array], lambda: [array / 2])["0"]
 
     for _ in range(2):
-        with recalling("steps", ("one thing",), (disk_cache,)):
+        with caching_steps("steps", ("one thing",), (disk_cache,)):
             assert halves(np.arange(3.0)).tolist() == [0, 0.5, 1]
             assert halves(np.arange(2.0)).tolist() == [0, 0.5]
     assert len(list((own_cache / "steps").iterdir())) == 1
-    with recalling("steps", ("one thing",), (disk_cache,)):
-        step = recalled("half", [np.arange(3.0)], lambda: pytest.fail("it is cached"))["0"]
+    with caching_steps("steps", ("one thing",), (disk_cache,)):
+        step = cached_step("half", [np.arange(3.0)], lambda: pytest.fail("it is cached"))["0"]
         step += 1
         assert halves(np.arange(3.0)).tolist() == [0, 0.5, 1], "nobody writes into what is kept"
         assert halves(np.arange(3)).dtype == float, "another type is another step"

@@ -20,7 +20,7 @@ from graspd.worker.scenes.rollout import lift_rollout
 from graspd.worker.simulation.data import Data, HandState
 from graspd.worker.simulation.environment import Obstacle, PlacedGrasps
 from graspd.worker.validation.decomposition import ConvexPieces
-from graspd.worker.validation.prescreening import SLIPS, push_rollout
+from graspd.worker.validation.prescreening import SLIPS, ShortTests
 from tests.worker.models import on_tables, two_finger_hand
 from tests.worker.quality.helpers import grasp_set, posture
 from tests.worker.simulation.rigs import ball
@@ -38,7 +38,7 @@ def plain(hand, obj, state: HandState, losses: np.ndarray, placed: PlacedGrasps,
 
 def taken(scores, monkeypatch, merit=None, infeasible=()) -> tuple[list[int], list[int], list[int]]:
     """Hands that are taken where hand k of grasp n scores `scores[n][k]` and is the k-th most promising; those that
-    were tried, and those that were seated. Some are infeasible."""
+    were tried, and those that were refined. Some are infeasible."""
     monkeypatch.setattr(candidates, "with_postures", plain)
     n, each = np.shape(scores)
     flat, worth = np.ravel(scores), np.ravel(merit if merit is not None else np.tile(0.01 * np.arange(each), (n, 1)))
@@ -59,7 +59,9 @@ def taken(scores, monkeypatch, merit=None, infeasible=()) -> tuple[list[int], li
         return Refinements(state, each_row, worth[rows.ravel()].astype(float), np.isin(each_row, infeasible))
 
     placed = PlacedGrasps(TABLE, np.tile([0, 0, 0, 1.0, 0, 0, 0], (n, 1)), np.arange(n))
-    found = candidates.tried(two_finger_hand(), ball(), np.arange(n * each).reshape(n, each), seat, placed, rollout)
+    found = candidates.select_by_rollout(
+        two_finger_hand(), ball(), np.arange(n * each).reshape(n, each), seat, placed, rollout
+    )
     rows = found.joined().stability_loss.astype(int).tolist()
     assert found.state.pivot[:, 0].tolist() == found.losses.tolist() == rows
     return rows, sorted(tries), sorted(seats)
@@ -70,7 +72,7 @@ def taken(scores, monkeypatch, merit=None, infeasible=()) -> tuple[list[int], li
     [
         # The first that is good enough is taken, and nobody after it is tried.
         ([[0.5, 0.1, 0.1], [3.0, 0.9, 0.1]], {}, [0, 4], [0, 3, 4]),
-        # Of the seated the one of better merit is tried first.
+        # Of the refined the one of better merit is tried first.
         ([[0.5, 0.5, 0.5]], {"merit": [[0.2, 0.1, 0.0]]}, [1], [1]),
         # What balances too badly is tried only where there is nothing else.
         (
@@ -93,7 +95,7 @@ def test_which_candidate_is_taken_and_which_are_tried(scores, given, rows, tries
     assert took == rows and tries in (None, tried)
 
 
-def test_the_others_are_seated_only_where_the_first_two_fail(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_others_are_refined_only_where_the_first_two_fail(monkeypatch: pytest.MonkeyPatch) -> None:
     rows, _, seats = taken([[0.5, 3.0, 3.0, 3.0], [3.0, 3.0, 3.0, 0.5]], monkeypatch)
     assert (rows, seats) == ([0, 7], [0, 1, 4, 5, 6, 7])
 
@@ -136,13 +138,13 @@ def always(score: float):
 @pytest.fixture
 def attempts(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     made: list[int] = []
-    set_out = planner._set_out
+    set_out = planner._draw_starts
 
     def counted(launch, rows, attempt):
         made.extend(attempt.tolist())
         return set_out(launch, rows, attempt)
 
-    monkeypatch.setattr(planner, "_set_out", counted)
+    monkeypatch.setattr(planner, "_draw_starts", counted)
     return made
 
 
@@ -192,7 +194,7 @@ def test_hand_that_nearly_lifts_squeezes_gently_where_that_helps(pair, in_scenes
 @pytest.fixture(scope="module")
 def free(pair):
     """Six grasps of a free object, chosen by their trial, but for what is changed of the request."""
-    rollout = push_rollout(*pair, lambda: ConvexPieces((pair[1].hull_vertices,), 1.0, 0.0, "block"))
+    rollout = ShortTests(*pair, lambda: ConvexPieces((pair[1].hull_vertices,), 1.0, 0.0, "block")).scores
     wanted = PlanRequest(6, QUICK, seed=4, rollout=rollout)
 
     def made(threads: int = 1, **changes: object) -> GraspSet:
@@ -203,7 +205,7 @@ def free(pair):
 
 def test_the_hand_around_more_of_an_object_is_tried_first(free, monkeypatch: pytest.MonkeyPatch) -> None:
     shares, orders = [], []
-    near_share, tried = Data.near_share, planner.tried
+    near_share, tried = Data.near_share, planner.select_by_rollout
 
     def told(data: Data, reach: float, n: int) -> np.ndarray:
         shares.append(near_share(data, reach, n))
@@ -214,7 +216,7 @@ def test_the_hand_around_more_of_an_object_is_tried_first(free, monkeypatch: pyt
         return tried(hand, obj, order, *rest, **named)
 
     monkeypatch.setattr(Data, "near_share", told)
-    monkeypatch.setattr(planner, "tried", seen)
+    monkeypatch.setattr(planner, "select_by_rollout", seen)
     monkeypatch.setattr(planner, "NEARNESS", 1e6)
     free(count=4, fidelity=QUICK.model_copy(update={"starts": 4}))
     in_order = shares[0][orders[0]]
@@ -248,7 +250,7 @@ def test_a_grasp_nobody_holds_sets_out_as_often_as_it_may(free, attempts: list[i
 )
 def test_grasps_that_slip_or_stand_off_have_retries(free, attempts, monkeypatch, score, off: bool, made: int) -> None:
     if off:
-        monkeypatch.setattr(planner, "standing_off", lambda hand, obj, grasp, **_: np.ones(len(grasp), bool))
+        monkeypatch.setattr(planner, "fingers_off_object", lambda hand, obj, grasp, **_: np.ones(len(grasp), bool))
     free(count=1, rollout=always(score))
     assert attempts == list(range(made))
 
@@ -265,19 +267,19 @@ def test_of_grasps_that_hold_one_whose_fingers_touch_is_chosen(free, monkeypatch
     first = free(count=1, rollout=rollout)
     seen.clear()
     monkeypatch.setattr(planner, "FREE", (STANDS,))
-    monkeypatch.setattr(planner, "standing_off", off_at_first)
+    monkeypatch.setattr(planner, "fingers_off_object", off_at_first)
     assert (free(count=1, rollout=rollout).grasp.hand_pose != first.grasp.hand_pose).any()
 
 
 def test_hands_are_drawn_to_an_object_at_their_first_start_alone(free, monkeypatch: pytest.MonkeyPatch) -> None:
     pulls: list[tuple[float, float]] = []
-    work = planner._work
+    work = planner._optimise_part
 
     def watched(launch, begun, *rest):
         pulls.append((launch.coarse.options.pull, launch.fine.options.pull))
         return work(launch, begun, *rest)
 
-    monkeypatch.setattr(planner, "_work", watched)
+    monkeypatch.setattr(planner, "_optimise_part", watched)
     monkeypatch.setattr(planner, "FREE", (FAILED, FAILED))
     free(count=1, rollout=always(9.0))
     assert pulls[0] == (PULL, PULL) and len(pulls) > 1 and set(pulls[1:]) == {(0.0, 0.0)}

@@ -14,9 +14,9 @@ from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.transforms import apply, quat_from_matrix, quat_rotate
 from graspd.studies.stability.assets import ring_hand
 from graspd.worker.execution_context import ExecutionContext
-from graspd.worker.files.synthesis import synthesized
+from graspd.worker.files.synthesis import synthesize_grasps
 from graspd.worker.grasps import Posture
-from graspd.worker.hands.flat_pinches import pinches_of
+from graspd.worker.hands.flat_pinches import flat_pinches
 from graspd.worker.hands.jaws import fingertip_pad, pads_of, thinnest_fingertip
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
@@ -26,15 +26,21 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import PlanRequest, synthesize
 from graspd.worker.planners.fast_graspd import antipodal_starts, starts
-from graspd.worker.planners.fast_graspd.antipodal_starts import Openings, across, crossings_of, promising, why_narrow
+from graspd.worker.planners.fast_graspd.antipodal_starts import (
+    Openings,
+    crossings_of,
+    narrow_reason,
+    place_across,
+    select_draws,
+)
 from graspd.worker.planners.fast_graspd.candidates import posture_of
 from graspd.worker.planners.fast_graspd.pairs import pair_of
-from graspd.worker.planners.fast_graspd.scene_starts import REACHING, clear_scene_starts, free_ways, hindrance
+from graspd.worker.planners.fast_graspd.scene_starts import REACHING, clear_scene_starts, free_directions, obstruction
 from graspd.worker.planners.fast_graspd.starts import CLEAR, NO_PLACE, RETREATS, clear_starts, start_generator
 from graspd.worker.simulation.data import HandState
 from graspd.worker.simulation.environment import Environment, Obstacle, Scenes
 from graspd.worker.simulation.model import Model
-from graspd.worker.simulation.obstacles import MARGIN_M, DeviceObstacles, body_room
+from graspd.worker.simulation.obstacles import MARGIN_M, DeviceObstacles, body_clearance
 from tests.worker.models import object_from_mesh
 from tests.worker.simulation.rigs import ball, object_of
 
@@ -208,9 +214,9 @@ def test_hands_reach_across_what_lies_flat_from_above(barrett) -> None:
     flat = object_from_mesh(trimesh.creation.box([0.06, 0.06, 0.01]))
     scene, standing = lying(flat), Environment((Obstacle.half_space([1.0, 0, 0], -0.03),), np.array([1.0, 0, 0]))
     opening = Openings.in_scene(barrett, flat, scene)
-    assert len(opening.known) == len(pinches_of(barrett, 0.01)) > 0
+    assert len(opening.known) == len(flat_pinches(barrett, 0.01)) > 0
     assert len(Openings.in_scene(barrett, flat, standing).known) == len(oppositions_of(barrett))
-    found = across(barrett, flat, opening, np.random.default_rng(1).random((60, 6)), free_ways(scene, flat))
+    found = place_across(barrett, flat, opening, np.random.default_rng(1).random((60, 6)), free_directions(scene, flat))
     line = np.einsum("nij,nj->ni", found.turn, opening.known.axis[found.posture])
     assert np.abs(line @ UP).max() < 1e-6 and (found.away @ UP).min() > 0.6
 
@@ -220,7 +226,7 @@ def test_hands_hold_the_middle_and_come_from_a_free_way(barrett) -> None:
     opening, known = Openings.of(oppositions_of(barrett), BLOCK, lying(BLOCK)), oppositions_of(barrett)
     uniform = rng.random((40, 6))
     uniform[:, 5] = 0.0
-    found = across(barrett, BLOCK, opening, uniform, np.array([[0.0, 0, 1]]))
+    found = place_across(barrett, BLOCK, opening, uniform, np.array([[0.0, 0, 1]]))
     # Without noise the dofs are those of one of the known postures, whose middle lies in that of a pair.
     assert np.array_equal(found.q(barrett, np.zeros((40, barrett.dofs))), known.q[found.posture])
     rotation = quat_from_matrix(found.turn)
@@ -240,7 +246,7 @@ def hindered(hand, obj, scenes: Scenes, height: float, share: float) -> float:
     at = np.array([[0, 0, float(obj.vertices[:, 2].max()) - obj.centre_of_mass[2] + height]])
     q = np.where(hand.closing > 0, hand.lower + share * hand.span, hand.upper - share * hand.span)
     # The palm looks along its z axis: turned about x it looks down.
-    return float(hindrance(model, HandState(at, np.array([[0.0, 1.0, 0.0, 0.0]]), q[None]), placed)[0])
+    return float(obstruction(model, HandState(at, np.array([[0.0, 1.0, 0.0, 0.0]]), q[None]), placed)[0])
 
 
 def test_a_hand_around_an_edge_or_below_a_board_is_hindered(barrett) -> None:
@@ -258,16 +264,16 @@ def test_a_hand_around_an_edge_or_below_a_board_is_hindered(barrett) -> None:
 def test_how_far_pair_is_beside_pads_of_a_hand_that_was_moved(barrett) -> None:
     opening = Openings.of(oppositions_of(barrett), BLOCK, lying(BLOCK))
     uniform, ways = np.random.default_rng(0).random((30, 6)), np.array([[0.0, 0, 1]])
-    found = across(barrett, BLOCK, opening, uniform, ways)
+    found = place_across(barrett, BLOCK, opening, uniform, ways)
     assert found.deep.min() >= 0.0 and found.deep.max() > 0.02
     # Back by as much as it is deep, or less: what lies between palm and pads lies between the fingers.
     for share in (0.0, 0.5, 1.0):
-        assert found.beside(share * found.deep[:, None] * found.away) == pytest.approx(0.0, abs=1e-12)
-    assert found.beside((found.deep + 0.03)[:, None] * found.away) == pytest.approx(0.03)
+        assert found.pad_distance(share * found.deep[:, None] * found.away) == pytest.approx(0.0, abs=1e-12)
+    assert found.pad_distance((found.deep + 0.03)[:, None] * found.away) == pytest.approx(0.03)
     aside = np.cross(found.away, [1.0, 0, 0])
     aside *= 0.02 / np.linalg.norm(aside, axis=1, keepdims=True)
-    assert found.beside(aside) == pytest.approx(0.02)
-    several = found.beside(np.stack([aside, 2 * aside], axis=1))
+    assert found.pad_distance(aside) == pytest.approx(0.02)
+    several = found.pad_distance(np.stack([aside, 2 * aside], axis=1))
     assert several == pytest.approx(np.tile([0.02, 0.04], (30, 1)))
 
 
@@ -277,16 +283,16 @@ def test_outlines_tell_how_far_a_hand_must_rise(barrett, tips_m) -> None:
     uniform, ways = np.random.default_rng(0).random((60, 6)), np.array([[0.0, 0, 1], [0.6, 0, 0.8]])
     table = replace(lying(BLOCK).obstacles[0], tips_m=tips_m)
     scene = Environment((table,), UP)
-    found = across(barrett, BLOCK, opening, uniform, ways)
+    found = place_across(barrett, BLOCK, opening, uniform, ways)
     centre = found.pivot + BLOCK.centre_of_mass
     known = oppositions_of(barrett).q
-    outlines, again, few = (antipodal_starts.outlines_of(barrett, q) for q in (known, known.copy(), known[:3]))
+    outlines, again, few = (antipodal_starts.posture_outlines(barrett, q) for q in (known, known.copy(), known[:3]))
     assert outlines is again and len(few.points) == 3
-    told = outlines.lacks(found.posture, found.turn, centre, scene, room=0.006)
+    told = outlines.missing_clearance(found.posture, found.turn, centre, scene, room=0.006)
     root = centre - np.einsum("nij,j->ni", found.turn, barrett.palm.centre)
     q = found.q(barrett, np.zeros((60, barrett.dofs)))
     posture = Posture(np.concatenate([root, quat_from_matrix(found.turn)], axis=1), barrett.expand(q))
-    room = body_room(barrett, posture, [Environment((replace(table, tips_m=None),), UP)])
+    room = body_clearance(barrett, posture, [Environment((replace(table, tips_m=None),), UP)])
     tip = np.isin(np.arange(barrett.bodies), barrett.fingertips)
     wanted = np.where(tip & (tips_m is not None), 0.0, MARGIN_M) + 0.006
     lack = np.maximum(0.0, (wanted - room).max(axis=1))
@@ -299,15 +305,15 @@ def test_outlines_tell_how_far_a_hand_must_rise(barrett, tips_m) -> None:
 def test_draws_that_need_not_rise_come_first_in_their_order(barrett) -> None:
     scene = lying(BLOCK)
     opening = Openings.of(oppositions_of(barrett), BLOCK, scene)
-    uniform, ways = np.random.default_rng(1).random((5, 40, 6)), free_ways(scene, BLOCK)
-    order, off = promising(barrett, BLOCK, opening, uniform, ways, scene, room=0.006, keep=40)
+    uniform, ways = np.random.default_rng(1).random((5, 40, 6)), free_directions(scene, BLOCK)
+    order, off = select_draws(barrett, BLOCK, opening, uniform, ways, scene, room=0.006, keep=40)
     assert np.array_equal(np.sort(order, axis=1), np.tile(np.arange(40), (5, 1)))
     near = off <= antipodal_starts.NEAR_M
     assert near.any() and not near.all()
     for places, offs, alike in zip(order, off, near, strict=True):
         assert (np.diff(places[alike]) > 0).all()
         assert (np.diff(offs[~alike]) >= 0).all() and alike[: alike.sum()].all()
-    few, least = promising(barrett, BLOCK, opening, uniform[3:4], ways, scene, room=0.006, keep=7)
+    few, least = select_draws(barrett, BLOCK, opening, uniform[3:4], ways, scene, room=0.006, keep=7)
     assert np.array_equal(few[0], order[3, :7]) and np.array_equal(least[0], off[3, :7])
 
 
@@ -318,7 +324,7 @@ def test_what_lies_flat_is_between_the_fingers_at_the_start(barrett) -> None:
     (table,) = lying(thin).obstacles
     placed = Scenes((replace(table, tips_m=0.0),), on_its_table(thin).object_pose).placed(np.zeros(4, int))
     model = draft_model(barrett, thin, placed.scenes)
-    ways = [free_ways(placed.scenes[0], thin)]
+    ways = [free_directions(placed.scenes[0], thin)]
     generators = [start_generator(0, 0, i, k) for i in range(4) for k in range(REACHING)]
     state, depth = clear_scene_starts(model, generators, each=REACHING, placed=placed, ways=ways)
     assert (depth <= CLEAR).mean() > 0.9
@@ -344,18 +350,18 @@ def beside_walls(gap: float, axes: tuple[int, ...]) -> Environment:
 
 
 def test_a_gap_is_named_with_the_fingertip_that_does_not_fit(barrett) -> None:
-    told = why_narrow(barrett, BOX, [beside_walls(0.008, (0, 1))])
+    told = narrow_reason(barrett, BOX, [beside_walls(0.008, (0, 1))])
     assert "about 8 mm" in told and f"{1e3 * thinnest_fingertip(barrett):.0f} mm" in told
     # One of several scenes that has room is enough, and so is one axis that is free.
-    assert why_narrow(barrett, BOX, [beside_walls(0.008, (0, 1)), beside_walls(0.03, (0, 1))]) is None
-    assert why_narrow(barrett, BOX, [beside_walls(0.008, (0,))]) is None
-    assert why_narrow(barrett, BOX, [beside_walls(0.008, ())]) is None
+    assert narrow_reason(barrett, BOX, [beside_walls(0.008, (0, 1)), beside_walls(0.03, (0, 1))]) is None
+    assert narrow_reason(barrett, BOX, [beside_walls(0.008, (0,))]) is None
+    assert narrow_reason(barrett, BOX, [beside_walls(0.008, ())]) is None
 
 
 def test_what_is_too_wide_is_told(barrett) -> None:
     large = object_from_mesh(trimesh.creation.box([0.4, 0.4, 0.4]))
     table = Environment((Obstacle.half_space(UP, -0.2),), UP)
-    assert f"opens to {1e3 * oppositions_of(barrett).widest:.0f} mm" in str(why_narrow(barrett, large, [table]))
+    assert f"opens to {1e3 * oppositions_of(barrett).widest:.0f} mm" in str(narrow_reason(barrett, large, [table]))
 
 
 def test_a_ball_beside_a_pair_keeps_its_distance_from_a_wall() -> None:
@@ -363,9 +369,9 @@ def test_a_ball_beside_a_pair_keeps_its_distance_from_a_wall() -> None:
     right = pairs.ends()[1][:, 0] > 0.5 * SIZE[0] - 1e-6
     across = right & (pairs.axis[:, 0] > 0.999)
     assert across.any()
-    room = antipodal_starts.room_beside(pairs, beside_walls(gap, (0,)), width)
+    room = antipodal_starts.end_clearance(pairs, beside_walls(gap, (0,)), width)
     assert room[across] == pytest.approx(gap - width, abs=1e-4)
-    assert np.isinf(antipodal_starts.room_beside(pairs, beside_walls(gap, ()), width)).all()
+    assert np.isinf(antipodal_starts.end_clearance(pairs, beside_walls(gap, ()), width)).all()
 
 
 def test_pairs_with_room_for_fingertips_are_drawn_more_often(barrett) -> None:
@@ -383,6 +389,6 @@ def test_candidate_grasps_none_of_which_is_valid_come_with_the_reason(tmp_path) 
     sheet = tmp_path / "sheet.stl"
     trimesh.creation.box([0.08, 0.08, 0.004]).export(sheet)
     place, request = SceneSpec(kind="table"), JobOptions(want="candidates", grasps=1, fidelity="draft", scene="table")
-    found = synthesized("allegro", str(sheet), request, place=place, scenes=1).summary()
+    found = synthesize_grasps("allegro", str(sheet), request, place=place, scenes=1).summary()
     assert (found["grasps"], found["valid"], found["reason"]) == (1, 0, None)
     assert "is 4 mm high" in found["narrow"] and _format_summary({"file": "g.h5", **found}).endswith(found["narrow"])

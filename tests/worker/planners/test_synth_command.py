@@ -164,7 +164,7 @@ def test_fewer_grasps_than_asked_are_told_with_the_reason_and_exit_code_3(folder
 
 @pytest.mark.parametrize("asked", [signal.SIGINT, signal.SIGTERM])
 def test_who_stops_it_keeps_what_was_validated(folder: Path, monkeypatch, asked: signal.Signals) -> None:
-    real, out = synthesis.synthesized, folder / f"stopped-{asked}.h5"
+    real, out = synthesis.synthesize_grasps, folder / f"stopped-{asked}.h5"
 
     def stopped(*given, progress, **named):
         def tell(done: float, total: float, message: str) -> None:
@@ -174,7 +174,7 @@ def test_who_stops_it_keeps_what_was_validated(folder: Path, monkeypatch, asked:
         return real(*given, progress=tell, **named)
 
     before = signal.getsignal(asked)
-    monkeypatch.setattr(synthesis, "synthesized", stopped)
+    monkeypatch.setattr(synthesis, "synthesize_grasps", stopped)
     words = f"synth --hand barrett --object block -n 64 --budget 1 --validation none --json {DRAFT} -o"
     done = CliRunner().invoke(build(), [*words.split(), str(out)])
     shard = read_shard(out, kind="base")

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from graspd.service.model.errors import TaskCancelled
-from graspd.worker.engines.joins import BYTES_PER_PROCESS, PROCESS_SHARE, processes_at_once
+from graspd.worker.engines.batch_sizes import BYTES_PER_PROCESS, PROCESS_SHARE, processes_at_once
 from graspd.worker.pool.pool import KEPT, Pool, ProcessLost
 from tests.service.model.test_cores import system
 from tests.waiting import until

@@ -171,10 +171,10 @@ class Deaf(Link):
         self.told = []
         self.killed = False
 
-    def say(self, word: str, about=None) -> None:
+    def send(self, word: str, about=None) -> None:
         self.told.append(about)
 
-    def hear(self, wait_s: float) -> None:
+    def receive(self, wait_s: float) -> None:
         if self.killed:
             raise EngineLost("killed")
 

@@ -23,7 +23,7 @@ from graspd.worker.objects import disk_cache
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.quality import diversity, probe
 from graspd.worker.quality.contact import contact_distance_consistency_mm, finger_of_body, spread_contacts
-from graspd.worker.quality.diversity import cells_of, distances, distinct, hand_points, nearest
+from graspd.worker.quality.diversity import cells_of, distances, distinct, hand_points, least_distance
 from graspd.worker.quality.gate import MAX_PENETRATION_MM, MAX_SELF_PENETRATION_MM, MIN_CONTACT_LINKS, passes
 from graspd.worker.quality.intervals import wilson, wilson_of_mean
 from graspd.worker.quality.probe import HAND_POINTS, REACH_M, Probe
@@ -344,8 +344,8 @@ def test_distinct_grasps_keep_the_given_nearest_sees_all_pairs() -> None:
     # Turned about their middles too, so that near middles are no near grasps.
     points = rng.normal(0, 0.05, (60, 1, 3)) + rng.normal(0, 0.03, (60, 8, 3))
     rows, others = np.triu_indices(len(points), 1)
-    assert nearest(points) == pytest.approx(distances(points, rows, others).min(), rel=1e-12)
-    assert nearest(points[:1]) is None and nearest(np.zeros((3, 8, 3))) == 0
+    assert least_distance(points) == pytest.approx(distances(points, rows, others).min(), rel=1e-12)
+    assert least_distance(points[:1]) is None and least_distance(np.zeros((3, 8, 3))) == 0
 
 
 def test_entropy_of_even_kinds_is_the_logarithm_of_their_number() -> None:

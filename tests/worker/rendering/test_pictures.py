@@ -9,7 +9,7 @@ import trimesh
 from PIL import Image, ImageSequence, features
 
 from graspd.commands.grasp_sheet import waypoints
-from graspd.exchange.robots.execution import POSTURES, Executions, ToolFrame, straight_paths, timed
+from graspd.exchange.robots.execution import POSTURES, Executions, ToolFrame, straight_paths, time_motions
 from graspd.service.model.errors import InputError
 from graspd.service.model.scene_spec import Box, HalfSpace, SceneSpec, supports_in
 from graspd.service.model.transforms import apply, compose, invert, quat_rotate
@@ -21,8 +21,8 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.rendering import Extras, render, sheets
 from graspd.worker.rendering.hands import DrawnHand, drawn_bodies, hand_parts, without_visuals
 from graspd.worker.rendering.pictures import THREE_SIDES, grasp_pictures
-from graspd.worker.rendering.scenery import TABLE, TABLE_SIZE, seen_share, slab_poses, slabs
-from graspd.worker.rendering.trajectory_pictures import KINDS, PictureScenes, animation, way_pictures
+from graspd.worker.rendering.scenery import TABLE, TABLE_SIZE, slab_poses, slabs, visible_share
+from graspd.worker.rendering.trajectory_pictures import KINDS, PictureScenes, animation, trajectory_pictures
 from graspd.worker.stages.models import hand_glb
 from tests.worker.commands_run import refused
 from tests.worker.hands.urdfs import joint, link, robot
@@ -128,26 +128,26 @@ def at(name: str, height: float = 0.0) -> Waypoint:
 
 
 def grasped(scenes: PictureScenes, hand: HandModel = HAND, **options) -> np.ndarray:
-    return way_pictures(hand, BLOCK, [[at("grasp")]], scenes, (48, 48), samples=2, **options)[0, 0, 0]
+    return trajectory_pictures(hand, BLOCK, [[at("grasp")]], scenes, (48, 48), samples=2, **options)[0, 0, 0]
 
 
 def test_every_posture_of_every_grasp_is_drawn_from_every_side():
     frames = [[at("grasp"), at("lift", 0.1)]] * 2
-    drawn = way_pictures(HAND, BLOCK, frames, TABLE_SCENE, (48, 36), sides=3, samples=2)
+    drawn = trajectory_pictures(HAND, BLOCK, frames, TABLE_SCENE, (48, 36), sides=3, samples=2)
     assert drawn.shape == (2, 3, 2, 36, 48, 3)
     assert all(orange(picture).sum() > 10 for picture in drawn.reshape(-1, 36, 48, 3))
 
 
 def test_the_lifted_object_is_higher_in_the_picture():
     frames = [[at("grasp"), at("lift", 0.1)]]
-    (low, high) = way_pictures(HAND, BLOCK, frames, TABLE_SCENE, (64, 64), samples=2)[0, 0]
+    (low, high) = trajectory_pictures(HAND, BLOCK, frames, TABLE_SCENE, (64, 64), samples=2)[0, 0]
     assert np.argwhere(orange(high))[:, 0].mean() < np.argwhere(orange(low))[:, 0].mean() - 10
     assert orange(grasped(PictureScenes())).sum() > 20, "a free grasp floats over a floor"
 
 
 def test_whole_hand_is_in_the_picture_where_that_is_asked_for():
     frames = [[replace(at("", 0.5), carried=np.zeros(3)), at("grasp")]]
-    both = (way_pictures(HAND, BLOCK, frames, TABLE_SCENE, (48, 48), whole=w, samples=2) for w in (False, True))
+    both = (trajectory_pictures(HAND, BLOCK, frames, TABLE_SCENE, (48, 48), whole=w, samples=2) for w in (False, True))
     near, whole = (seen[0, 0] for seen in both)
     # The camera steps back for the hand that is far above: the block is smaller, and what is drawn ends above the rim.
     assert 0 < orange(whole[1]).sum() < 0.5 * orange(near[1]).sum()
@@ -165,7 +165,7 @@ def test_no_wall_stands_between_the_object_and_the_camera(side):
 def test_each_grasp_stands_in_its_own_scene():
     turned = np.array([[0, 0, 0.02, np.sqrt(0.5), np.sqrt(0.5), 0, 0]])
     around = PictureScenes((HalfSpace(),), np.concatenate([REST, turned]), np.array([0, 1]))
-    first, second = way_pictures(HAND, BLOCK, [[at("grasp")]] * 2, around, (48, 48), samples=2)[:, 0, 0]
+    first, second = trajectory_pictures(HAND, BLOCK, [[at("grasp")]] * 2, around, (48, 48), samples=2)[:, 0, 0]
     np.testing.assert_array_equal(second, grasped(PictureScenes((HalfSpace(),), turned)))
     assert (first != second).any()
 
@@ -217,7 +217,7 @@ def test_the_object_is_carried_with_the_hand_from_where_it_rests():
     postures = {name: Posture(poses[name], np.full((1, 1), closing[name])) for name in POSTURES}
     tool, rows = ToolFrame("palm", rest[0]), np.zeros(1, np.intp)
     found = Executions(None, None, tool, "scene", rows, rest, postures, None, {})
-    way = timed(straight_paths(found, 0), ["joint"], np.ones(1), speed=1.0)
+    way = time_motions(straight_paths(found, 0), ["joint"], np.ones(1), speed=1.0)
     points = waypoints(found, way)
     assert len(points) == len(way.time)
     (closed,) = [k for k, point in enumerate(points) if point.name == "grasp"]
@@ -248,11 +248,11 @@ def test_a_box_keeps_its_size_and_hides_what_is_behind_it() -> None:
     assert slabs(wall)[0].size == (0.02, 0.4, 0.2)
     np.testing.assert_array_equal(slab_poses(wall, np.zeros(3), 0.7)[0], wall[0].pose)
     points = np.array([[0, 0, 0.05], [0, 0, 0.5]])
-    assert seen_share(wall, np.array([0.5, 0, 0.1]), points) == 0.5
-    assert seen_share(wall, np.array([-0.5, 0, 0.1]), points) == 1.0
-    assert seen_share(TABLE, np.array([0.5, 0, -0.1]), points) == 0.0
+    assert visible_share(wall, np.array([0.5, 0, 0.1]), points) == 0.5
+    assert visible_share(wall, np.array([-0.5, 0, 0.1]), points) == 1.0
+    assert visible_share(TABLE, np.array([0.5, 0, -0.1]), points) == 0.0
     board = [Box(size=(0.4, 0.4, 0.02), pose=(0, 0, -0.01, 1, 0, 0, 0))]
-    assert seen_share(board, np.array([0.5, 0, 0.4]), np.zeros((1, 3))) == 1.0
+    assert visible_share(board, np.array([0.5, 0, 0.4]), np.zeros((1, 3))) == 1.0
 
 
 @pytest.mark.parametrize("kind", ["bin", "shelf"])

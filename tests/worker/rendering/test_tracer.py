@@ -95,7 +95,7 @@ def _in_the_way(
     shadowed_out: wp.array[wp.int32],
 ):
     i = wp.tid()
-    shadowed_out[i] = wp.int32(rays.in_the_way(placed_in, world_in[i], point_in[i], toward))
+    shadowed_out[i] = wp.int32(rays.is_occluded(placed_in, world_in[i], point_in[i], toward))
 
 
 def by_newton(poses: np.ndarray, what: CameraShot) -> dict[str, np.ndarray]:

@@ -24,16 +24,16 @@ from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import synthesize
 from graspd.worker.planners.fast_graspd.candidates import posture_of
 from graspd.worker.planners.fast_graspd.pairs import pair_of
-from graspd.worker.planners.fast_graspd.scene_starts import clear_scene_starts, free_ways
+from graspd.worker.planners.fast_graspd.scene_starts import clear_scene_starts, free_directions
 from graspd.worker.planners.fast_graspd.starts import CLEAR, start_generator
 from graspd.worker.planners.port import PlanRequest
 from graspd.worker.scenes.clearance import MARGIN_M, approach, transfer
 from graspd.worker.scenes.kinds import supports_of
 from graspd.worker.scenes.placement import joined_pieces, scenes_of
 from graspd.worker.scenes.rollout import scene_verdicts
-from graspd.worker.scenes.trajectory import plan_way
+from graspd.worker.scenes.trajectory import plan_trajectory
 from graspd.worker.simulation.environment import STANDOFF_M, PlacedGrasps, Scenes
-from graspd.worker.simulation.mounting import mounting_room
+from graspd.worker.simulation.mounting import choose_wrist
 from graspd.worker.simulation.obstacles import DeviceObstacles
 from tests.worker.commands_run import graspd, refused
 from tests.worker.hands.urdfs import gripper
@@ -96,7 +96,7 @@ def least_room(hand, way, grasps, row: int, scene) -> float:
 @pytest.mark.parametrize("case", ["planned", "planned_beside"])
 def test_the_whole_way_is_as_clear_as_it_says(case: str, request: pytest.FixtureRequest) -> None:
     hand, obj, placed, grasps = request.getfixturevalue(case)
-    way = plan_way(hand, obj, grasps, placed)
+    way = plan_trajectory(hand, obj, grasps, placed)
     assert way.clear.any()
     for row in np.flatnonzero(way.clear)[:4]:
         # Postures between those that were looked at may be nearer by what a finger's arc deviates from its chord.
@@ -254,12 +254,12 @@ def test_starts_keep_the_forearm_off_the_table(shared_data, table: Scenes) -> No
     model = pair_of(shadow, BLOCK, QUICK, "cpu", in_scenes=True)
     coarse = model.model(model.coarse, obstacles)
     generators = [start_generator(3, 0, i, k) for i in range(16) for k in range(each)]
-    ways = [free_ways(scene, BLOCK) for scene in placed.scenes]
+    ways = [free_directions(scene, BLOCK) for scene in placed.scenes]
     state, depth = clear_scene_starts(coarse, generators, each=each, placed=placed, ways=ways)
     clear = np.flatnonzero(depth <= CLEAR)
     assert len(clear) > 40
     poses = posture_of(shadow, BLOCK, state).hand_pose[clear][:, None]
-    _, room = mounting_room(shadow, poses, placed.scenes, np.repeat(placed.index, each)[clear])
+    _, room = choose_wrist(shadow, poses, placed.scenes, np.repeat(placed.index, each)[clear])
     assert room.min() >= MARGIN_M
 
 
@@ -271,7 +271,7 @@ def test_the_wrist_is_bent_no_farther_than_the_table_asks(shadow: HandModel, tab
     level = np.array([0.0, 0, 0.04, 0.7071067811865476, 0.7071067811865476, 0, 0])
     scene = replace(table.placed(np.zeros(1, int)).scenes[0], obstacles=table.supports, up=np.array([0.0, 0, 1]))
     high = np.array([*level[:2], 0.24, *level[3:]])
-    wrist, room = mounting_room(shadow, np.stack([upright, level, high])[:, None], [scene])
+    wrist, room = choose_wrist(shadow, np.stack([upright, level, high])[:, None], [scene])
     assert room[0] < 0 < MARGIN_M <= room[1] < room[2]
     assert not wrist[2].any() and wrist[1] == pytest.approx([0.5 * shadow.mounting.lower[0], 0.0])
     assert lowest(shadow.mounting, level[None], wrist[1]) == pytest.approx(room[1], abs=1e-3)
@@ -294,7 +294,7 @@ def test_valid_grasps_have_their_forearm_above_the_table(shadow: HandModel, tabl
 
 def test_a_grasp_with_its_mounting_in_the_table_is_not_clear(shadow: HandModel, table, mounted) -> None:
     assert mounted.scene is not None and shadow.mounting is not None
-    bare = plan_way(replace(shadow, mounting=None), BLOCK, mounted, table.placed(mounted.scene))
+    bare = plan_trajectory(replace(shadow, mounting=None), BLOCK, mounted, table.placed(mounted.scene))
     assert bare.clear.any() and bare.wrist.shape == (8, 0)
     # A mounting as large as this reaches down to the table from anywhere.
     vertices, faces = tessellate("sphere", (1.0,))

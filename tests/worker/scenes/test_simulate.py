@@ -14,7 +14,7 @@ from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.transforms import apply, quat_conjugate, quat_rotate
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.scenes import drop, simulate
-from graspd.worker.scenes.kinds import GAP, rest_poses, room_in, supports_of
+from graspd.worker.scenes.kinds import GAP, rest_poses, supports_of, walled_area
 from graspd.worker.scenes.neighbours import BETWEEN, drop_together
 from graspd.worker.scenes.placement import gaps_between, neighbour_of, scenes_of
 from graspd.worker.scenes.rest import RestingFaces, resting_faces, rolling_note, rolling_poses
@@ -266,7 +266,7 @@ def together(poses: dict[str, np.ndarray], things: list[ObjectModel]) -> tuple[n
 def test_neighbours_stand_within_walls_apart_and_on_the_floor(kind: str) -> None:
     others = [LOW, TALL, LOW]
     spec, scenes, poses = laid(kind, others, count=4)
-    room = np.asarray(room_in(spec) or (np.inf, np.inf)) / 2 - GAP
+    room = np.asarray(walled_area(spec) or (np.inf, np.inf)) / 2 - GAP
     places, gap = together(poses, [THING, *others])
     for number, one in enumerate([THING, *others]):
         found = apply(places[:, number, None], one.hull_vertices)

@@ -16,7 +16,7 @@ from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import ConvexPiece, HandModel
 from graspd.worker.hands.surface import piece_distance, sample_surface
-from graspd.worker.scenes.placement import outer_solid
+from graspd.worker.scenes.placement import enclosing_solid
 from graspd.worker.simulation.data import HandState, Schedule
 from graspd.worker.simulation.environment import Environment, Obstacle
 from graspd.worker.simulation.kernels import kinematics, wrenches
@@ -351,7 +351,7 @@ SCENES = {
         Obstacle.box([0.30, 0.02, 0.02, 0.9, 0.1, 0.2, 0.3], [0.012, 0.3, 0.011]),
         Obstacle.box([0.33, 0.03, 0.05, 0.6, 0.5, -0.2, 0.3], [0.4, 0.5, 0.006]),
     ),
-    "a round neighbour": (outer_solid(BALL)[0],),
+    "a round neighbour": (enclosing_solid(BALL)[0],),
 }
 
 

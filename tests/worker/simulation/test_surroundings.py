@@ -13,9 +13,9 @@ from graspd.worker.grasps import Posture
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
-from graspd.worker.scenes.placement import MOST_PLANES, outer_solid
+from graspd.worker.scenes.placement import MOST_PLANES, enclosing_solid
 from graspd.worker.simulation.environment import CLEAR_M, Environment, Obstacle, PlacedGrasps
-from graspd.worker.simulation.obstacles import FAR_M, PosedFeatures, body_room, obstacle_room
+from graspd.worker.simulation.obstacles import FAR_M, PosedFeatures, body_clearance, obstacle_clearance
 from tests.worker.models import piece, two_finger_hand
 
 TILTED = np.array([0.1, -0.2, 0.3, 0.8, 0.2, -0.4, 0.4])
@@ -44,7 +44,7 @@ def test_distances_are_closed_forms_and_a_bound_beyond_edges() -> None:
 def test_frames_keep_distances_and_up_is_against_gravity() -> None:
     points = np.random.default_rng(1).normal(size=(50, 3))
     for obstacle in (Obstacle.half_space([1, 2, 3], 0.4), Obstacle.box(TILTED, [0.3, 0.5, 0.7])):
-        found = obstacle.seen_from(TILTED).distance(points)
+        found = obstacle.in_frame(TILTED).distance(points)
         np.testing.assert_allclose(found, obstacle.distance(apply(TILTED, points)), atol=1e-12)
     placed = PlacedGrasps((Obstacle.half_space([0, 0, 1], 0),), TILTED[None], np.zeros(1, int))
     np.testing.assert_allclose(quat_rotate(TILTED[3:], placed.scenes[0].up), [0, 0, 1], atol=1e-12)
@@ -77,7 +77,7 @@ def test_the_distance_of_a_hand_from_a_plane_is_mujocos(name: str) -> None:
     hand = hand_from_path(name)
     postures = random_postures(hand, 8, np.random.default_rng(3))
     plane = Obstacle.half_space([0.3, -0.5, 0.8], -0.2)
-    found = obstacle_room(hand, postures, [Environment((plane,), plane.planes[0, :3])])
+    found = obstacle_clearance(hand, postures, [Environment((plane,), plane.planes[0, :3])])
     np.testing.assert_allclose(found, mujoco_distances(hand, postures, plane), atol=1e-5)
 
 
@@ -87,13 +87,13 @@ def test_only_fingertips_have_more_room_over_what_they_may_touch() -> None:
     table, wall = Obstacle.half_space([0, 0, 1], -0.3), Obstacle.half_space([1, 0, 0], -0.4)
     up = np.array([0.0, 0, 1])
     tips = np.isin(np.arange(hand.bodies), hand.fingertips)
-    alone, beside = (body_room(hand, posture, [Environment((one,), up)])[0] for one in (table, wall))
+    alone, beside = (body_clearance(hand, posture, [Environment((one,), up)])[0] for one in (table, wall))
     to_touch = replace(table, tips_m=-0.0005)
-    found = body_room(hand, posture, [Environment((to_touch, wall), up)])[0]
+    found = body_clearance(hand, posture, [Environment((to_touch, wall), up)])[0]
     np.testing.assert_array_equal(found, np.minimum(alone + np.where(tips, 0.0025, 0.0), beside))
-    assert obstacle_room(hand, posture, [Environment((to_touch, wall), up)])[0] == found.min()
+    assert obstacle_clearance(hand, posture, [Environment((to_touch, wall), up)])[0] == found.min()
     pose = np.array([0.1, 0, 0, 0.6, 0, 0.8, 0])
-    assert to_touch.seen_from(pose).tips_m == -0.0005, "a support keeps what it says wherever it is seen from"
+    assert to_touch.in_frame(pose).tips_m == -0.0005, "a support keeps what it says wherever it is seen from"
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
@@ -109,7 +109,7 @@ def test_many_hands_have_the_room_of_each_ones_scene(name: str) -> None:
     for number, around in enumerate([[one], [one, other], []]):
         for obstacle in around:
             wanted[which == number] = np.minimum(wanted, posed.distance(obstacle).min(axis=1))[which == number]
-    np.testing.assert_allclose(obstacle_room(hand, postures, scenes, which), wanted, atol=1e-12)
+    np.testing.assert_allclose(obstacle_clearance(hand, postures, scenes, which), wanted, atol=1e-12)
 
 
 def parted(hand: HandModel) -> tuple[HandModel, HandModel]:
@@ -173,7 +173,7 @@ def link(kind: str) -> HandModel:
 def distance(kind: str, at: tuple[float, ...], obstacle: Obstacle, turn: tuple[float, ...] = (1, 0, 0, 0)) -> float:
     quaternion = np.array(turn, float) / np.linalg.norm(turn)
     posture = Posture(np.array([[*at, *quaternion]]), np.zeros((1, 2)))
-    return float(obstacle_room(link(kind), posture, [Environment((obstacle,), UP)])[0])
+    return float(obstacle_clearance(link(kind), posture, [Environment((obstacle,), UP)])[0])
 
 
 @pytest.mark.parametrize(
@@ -215,9 +215,9 @@ def test_no_hand_is_nearer_to_a_solid_than_it_says_by_mujoco(name: str) -> None:
     """Exact for links that are boxes or round (1e-5 m: MuJoCo's meshes are float32 and converge to 1e-6); for hulls a
     lower bound."""
     hand, rng = hand_from_path(name), np.random.default_rng(2)
-    solid, _ = outer_solid(rng.normal(size=(40, 3)) * [0.03, 0.05, 0.04])
+    solid, _ = enclosing_solid(rng.normal(size=(40, 3)) * [0.03, 0.05, 0.04])
     postures = random_postures(hand, 60, rng)
-    found = obstacle_room(hand, postures, [Environment((solid,), UP)])
+    found = obstacle_clearance(hand, postures, [Environment((solid,), UP)])
     true = mujoco_distances(hand, postures, solid)
     apart = true > 0
     assert (found[apart] <= true[apart] + 1e-5).all() and (found[~apart] < 1e-5).all()
@@ -229,13 +229,13 @@ def test_no_hand_is_nearer_to_a_solid_than_it_says_by_mujoco(name: str) -> None:
 def test_an_outer_solid_holds_its_points_and_is_a_box_of_a_box() -> None:
     points = np.random.default_rng(0).normal(size=(400, 3))
     points *= 0.03 / np.linalg.norm(points, axis=1, keepdims=True)
-    solid, error = outer_solid(points)
+    solid, error = enclosing_solid(points)
     assert len(solid.planes) <= MOST_PLANES and solid.distance(points).max() <= 1e-9
     radius = np.linalg.norm(solid.corners, axis=1).max()
     assert radius - 0.03 <= error < radius - 0.03 + 5e-4, "the ball's points are up to half a millimetre apart from it"
     # Euler: every edge of the solid is there.
     faces = sum((np.abs(solid.corners @ p[:3] - p[3]) < 1e-6).sum() >= 3 for p in solid.planes)
     assert len(solid.corners) - len(solid.edges) + faces == 2
-    solid, error = outer_solid(np.asarray(trimesh.creation.box((0.1, 0.2, 0.3)).vertices))
+    solid, error = enclosing_solid(np.asarray(trimesh.creation.box((0.1, 0.2, 0.3)).vertices))
     assert (len(solid.planes), len(solid.corners), len(solid.edges)) == (6, 8, 12)
     assert error == pytest.approx(0, abs=1e-9)

@@ -40,7 +40,7 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.process.runner import Runner
 from graspd.worker.stages import hand_self_test, ingest
 from graspd.worker.stages.context import StopReason, TaskContext
-from graspd.worker.stages.hand_self_test import SelfTest, fitting_width, plain_objects, self_test, tried_softly
+from graspd.worker.stages.hand_self_test import SelfTest, fitting_width, plain_objects, self_test, self_test_facts
 from graspd.worker.validation.payload import Limit
 from tests.api.factories import zipped
 from tests.worker.hands.urdfs import OPENING, gripper, gripper_urdf, joint, link, robot
@@ -393,8 +393,8 @@ def test_a_busy_machine_leaves_nothing_out(monkeypatch: pytest.MonkeyPatch) -> N
         return [held(count)]
 
     monkeypatch.setattr(hand_self_test, "_batches", batches)
-    monkeypatch.setattr(hand_self_test, "_lifted", lambda hand, obj, count, run: (count, 0.5, None))
-    found = tried_softly(gripper)
+    monkeypatch.setattr(hand_self_test, "_test_lifts", lambda hand, obj, count, run: (count, 0.5, None))
+    found = self_test_facts(gripper)
     assert (found["table_n"], found["table"]) == (16, 0.5)
     assert (found["n"], sorted(found["by_object"])) == (64, ["box", "cylinder", "sphere"])
 
@@ -402,7 +402,10 @@ def test_a_busy_machine_leaves_nothing_out(monkeypatch: pytest.MonkeyPatch) -> N
 def test_a_servo_that_is_stiff_for_its_limit_gives_little() -> None:
     """0.1 N m at 20 N m/rad are 5 mrad, and the pad lies 50 to 100 mm from its joint."""
     hand = three_fingers(effort=0.1, stiffness=20.0)
-    assert 0.005 * 0.05 < hand_self_test._give(hand) < 0.005 * 0.1 and hand_self_test._give(gripper()) == np.inf
+    assert (
+        0.005 * 0.05 < hand_self_test._drive_compliance(hand) < 0.005 * 0.1
+        and hand_self_test._drive_compliance(gripper()) == np.inf
+    )
 
 
 @pytest.mark.parametrize(
@@ -417,10 +420,10 @@ def test_a_test_that_ends_badly_is_told_and_stops_nothing(error: Exception, says
         raise error
 
     monkeypatch.setattr(hand_self_test, "self_test", breaks)
-    assert tried_softly(gripper)["says"] == says
+    assert self_test_facts(gripper)["says"] == says
     monkeypatch.undo()
     with pytest.raises(TaskCancelled):
-        tried_softly(gripper, ExecutionContext(cancelled=lambda: True))
+        self_test_facts(gripper, ExecutionContext(cancelled=lambda: True))
 
 
 @pytest.mark.slow

@@ -29,12 +29,12 @@ from graspd.service.store.shards import Shard
 from graspd.service.store.store import Store, open_store
 from graspd.worker import generation
 from graspd.worker.execution_context import ExecutionContext
-from graspd.worker.files.provenance import placed_of_shard
-from graspd.worker.files.synthesis import synthesized
+from graspd.worker.files.provenance import scenes_of_shard
+from graspd.worker.files.synthesis import synthesize_grasps
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.planners import NoStartFound
-from graspd.worker.planners import known_networks as known
-from graspd.worker.planners.registry import of_this_machine
+from graspd.worker.planners import network_cache as known
+from graspd.worker.planners.registry import local_options
 from graspd.worker.process.runner import Runner
 from graspd.worker.rendering import Extras
 from graspd.worker.rendering import render as pictures
@@ -152,7 +152,7 @@ def test_neighbours_in_a_bin_stand_in_scenes_grasps_and_pictures(table: Bench) -
     first, base, views = shards
     assert base["scene/neighbour_pose"].shape == (1, 2, 7)
     np.testing.assert_array_equal(base["scene/neighbour_pose"], first["scene/neighbour_pose"])
-    assert len(placed_of_shard(base).neighbours) == 2
+    assert len(scenes_of_shard(base).neighbours) == 2
     assert table.store.exists(names.asset_model(AssetKind.OBJECT, beside[0]["digest"])), "viewers show it"
     alone = render_alone(bench, base)
     assert (views["image/depth"] != alone["image/depth"]).any(), "they are in the picture"
@@ -295,7 +295,7 @@ def test_a_batch_without_a_place_has_no_grasps_but_for_the_first(monkeypatch, re
             raise NoStartFound("no hand finds a way in")
         return whole(*given, batch=batch, **options)
 
-    monkeypatch.setattr("graspd.worker.together.validated_grasps", some)
+    monkeypatch.setattr("graspd.worker.batched_generation.validated_grasps", some)
     asked = {"grasps": 2 * SIZE + 1, "scene": "table", "scenes": 2, "budget": 20}
     if not rows:
         with pytest.raises(AssertionError, match="no hand finds a way in"):
@@ -332,15 +332,15 @@ def test_the_grasps_of_a_job_are_those_of_synth_with_the_file(store: Store, netw
     assert end.kind is EventKind.FINISHED, end
     made = load_shard(store, Stage.SYNTHESIZE, list(plan(job))[-1].output)
     (tmp_path / "net.npz").write_bytes(files[NETWORK_FILE])
-    own = of_this_machine("learned", {"network": str(tmp_path / "net.npz"), "starts": 2})
+    own = local_options("learned", {"network": str(tmp_path / "net.npz"), "starts": 2})
     assert own["network"] == digest_bytes(files[NETWORK_FILE]) != network.digest
     request = JobOptions(**LEARNED, options=own)
-    alone = synthesized("barrett", "block", request, place=request.place, scenes=2, device="cpu", threads=2)
+    alone = synthesize_grasps("barrett", "block", request, place=request.place, scenes=2, device="cpu", threads=2)
     assert set(made.arrays) == set(alone.arrays) and len(made["grasp/hand_pose"]) == 3
     for name, values in alone.arrays.items():
         np.testing.assert_array_equal(made[name], values, err_msg=name)
     without = JobOptions(**{**LEARNED, "method": "fast_graspd"})
-    other = synthesized("barrett", "block", without, place=without.place, scenes=2, device="cpu", threads=2)
+    other = synthesize_grasps("barrett", "block", without, place=without.place, scenes=2, device="cpu", threads=2)
     assert (made["grasp/hand_pose"] != other.arrays["grasp/hand_pose"]).any(), "the network is followed"
 
 
@@ -356,10 +356,10 @@ def test_files_that_are_not_what_their_digest_says_fail_the_job(store: Store, ne
 def test_a_worker_reads_a_network_once(store: Store, network: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
     job = job_of(store, **LEARNED, options={"network": network.digest})
     message = message_of(job, next(plan(job)), attempt=1, max_attempt=3)
-    assets.keep_network(store, message)
+    assets.cache_network(store, message)
     monkeypatch.setattr(assets, "load_asset_files", None)
-    assets.keep_network(store, message)
-    assert known.kept(network.digest).hand == "barrett"
+    assets.cache_network(store, message)
+    assert known.load_network(network.digest).hand == "barrett"
 
 
 def test_a_network_whose_finding_was_lost_is_checked_by_a_worker(store: Store, network: Asset, files) -> None:

@@ -19,17 +19,25 @@ from graspd.worker.grasps import GraspSet, Posture, joined
 from graspd.worker.scenes import rollout as rollouts
 from graspd.worker.scenes.rollout import BEST, FALLS, TOUCHES, hold_rollout, lift_rollout, scene_verdicts
 from graspd.worker.simulation.environment import Neighbour, Obstacle, PlacedGrasps
-from graspd.worker.simulation.obstacles import obstacle_room
+from graspd.worker.simulation.obstacles import obstacle_clearance
 from graspd.worker.validation import prescreening
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.lift import RISING, RISING_S, Lift, LiftOutcome
 from graspd.worker.validation.lifting import KnownLifts, LiftLevel, lift_key, validate_lifts
 from graspd.worker.validation.model import FRICTION, HARD, MujocoOptions, build
-from graspd.worker.validation.prescreening import PHYSICS, SLIPS, LiftRollouts, push_rollout
+from graspd.worker.validation.prescreening import PHYSICS, SLIPS, ShortTests
 from graspd.worker.validation.protocol import MAX_DISPLACEMENT_M, STAGE_S, Test
 from graspd.worker.validation.robust import robust
 from graspd.worker.validation.validator import KnownRollouts, validate
-from graspd.worker.validation.variant import NOMINAL, Models, Variant, VariantLift, motion_of, seen, upright
+from graspd.worker.validation.variant import (
+    NOMINAL,
+    Models,
+    Variant,
+    VariantLift,
+    displaced_grasp,
+    motion_of,
+    restrict_to_support,
+)
 from tests.worker.models import object_from_mesh
 from tests.worker.quality.helpers import pad_hand, posture
 
@@ -100,7 +108,7 @@ def test_fingertips_press_into_the_table_as_deep_as_it_says(tips_m: float | None
     """A way that ends with the pads 0.8 mm in the table."""
     placed = dataclasses.replace(PLACED, supports=(dataclasses.replace(PLACED.supports[0], tips_m=tips_m),))
     given = grasp(0.05)
-    down = obstacle_room(HAND, given.grasp, PLACED.scenes)[0] + 0.0008
+    down = obstacle_clearance(HAND, given.grasp, PLACED.scenes)[0] + 0.0008
     for part in (given.grasp.hand_pose, given.pregrasp.hand_pose, given.squeeze.hand_pose, given.approach[0]):
         part[:, 2] += down
     found = Lift(build(HAND, BOX, WHOLE, MujocoOptions(), placed.supports), placed).lift(given, 0)
@@ -130,7 +138,7 @@ def test_a_box_with_its_origin_elsewhere_is_lifted_alike() -> None:
 
 
 def beside(place: tuple[float, float], size: tuple[float, float, float], mass: float = 0.1) -> Lift:
-    other = object_from_mesh(trimesh.creation.box(size)).weighing(mass=mass)
+    other = object_from_mesh(trimesh.creation.box(size)).with_mass(mass=mass)
     neighbour = Neighbour(other, (other.hull_vertices,), (), 0.0)
     pose = np.array([[[*place, size[2] / 2, 1.0, 0, 0, 0]]])
     placed = dataclasses.replace(PLACED, neighbours=(neighbour,), neighbour_pose=pose)
@@ -175,7 +183,7 @@ def test_a_neighbour_that_leans_or_slides_has_moved() -> None:
 
 def scores(*squeezes: float, threads: int = 1) -> np.ndarray:
     grasps = joined([grasp(squeeze) for squeeze in squeezes])
-    return LiftRollouts(HAND, BOX, lambda: WHOLE, threads=threads).scores(grasps, placed(len(squeezes)))
+    return ShortTests(HAND, BOX, lambda: WHOLE, threads=threads).scores(grasps, placed(len(squeezes)))
 
 
 def test_the_box_falls_by_what_friction_does_not_carry() -> None:
@@ -189,15 +197,15 @@ def test_the_box_falls_by_what_friction_does_not_carry() -> None:
 
 def test_half_friction_needs_twice_the_squeeze_unless_beaten() -> None:
     grasps = joined([grasp(share * LEAST_AT_HALF) for share in (0.9, 1.1, 0.9)])
-    found = LiftRollouts(HAND, BOX, lambda: WHOLE).scores(grasps, placed(3), np.array([1.5, 1.5, np.inf]))
+    found = ShortTests(HAND, BOX, lambda: WHOLE).scores(grasps, placed(3), np.array([1.5, 1.5, np.inf]))
     assert found[0] == 1.5 and found[1] < 0.05 and SLIPS <= found[2] < SLIPS + 0.05
 
 
 def test_pads_that_start_in_the_box_are_no_candidates() -> None:
     deep = grasp(0.05)
     deep.pregrasp.joint_positions[:] += 0.02
-    assert LiftRollouts(HAND, BOX, lambda: WHOLE).scores(deep, PLACED) == [prescreening.DEEP]
-    assert push_rollout(HAND, BOX, lambda: WHOLE)(deep, None) == [prescreening.DEEP]
+    assert ShortTests(HAND, BOX, lambda: WHOLE).scores(deep, PLACED) == [prescreening.DEEP]
+    assert ShortTests(HAND, BOX, lambda: WHOLE).scores(deep, None) == [prescreening.DEEP]
 
 
 def test_threads_and_the_other_grasps_change_no_score() -> None:
@@ -208,7 +216,7 @@ def test_threads_and_the_other_grasps_change_no_score() -> None:
 
 
 def pushed(*squeezes: float) -> np.ndarray:
-    return push_rollout(HAND, BOX, lambda: WHOLE)(joined([grasp(squeeze) for squeeze in squeezes]), None)
+    return ShortTests(HAND, BOX, lambda: WHOLE).scores(joined([grasp(squeeze) for squeeze in squeezes]), None)
 
 
 def test_free_box_is_pushed_away_the_less_the_firmer_it_is_held() -> None:
@@ -222,7 +230,7 @@ def test_free_box_is_pushed_away_the_less_the_firmer_it_is_held() -> None:
 
 
 def test_pushes_that_cannot_beat_a_score_end_early() -> None:
-    rollout, squeeze = push_rollout(HAND, BOX, lambda: WHOLE), ACROSS * LEAST_PUSHED
+    rollout, squeeze = ShortTests(HAND, BOX, lambda: WHOLE).scores, ACROSS * LEAST_PUSHED
     hands = joined([grasp(0.8 * squeeze), grasp(2.4 * squeeze)])
     slips, holds = rollout(hands, None)
     assert holds < 1.0 < SLIPS + 1.0 < slips
@@ -281,12 +289,12 @@ def test_a_heavier_object_weighs_more_and_takes_more_to_lift() -> None:
 
 def test_an_object_that_stands_off_slides_and_the_hand_stays() -> None:
     up = WHERE.scenes[0].up
-    variant = upright(Variant(object_shift_m=(0.001, -0.0015, 0.0005), object_turn=(0.01, 0.0, 0.02)), up)
+    variant = restrict_to_support(Variant(object_shift_m=(0.001, -0.0015, 0.0005), object_turn=(0.01, 0.0, 0.02)), up)
     assert np.array(variant.object_shift_m) @ up == pytest.approx(0.0, abs=1e-12)
     assert variant.object_shift_m[:2] == (0.001, -0.0015)
     assert np.cross(variant.object_turn, up) == pytest.approx([0, 0, 0], abs=1e-12)
     assert np.linalg.norm(variant.object_turn) == pytest.approx(0.02)
-    one, motion = seen(BOX, MANY, 5, variant), motion_of(BOX, variant)
+    one, motion = displaced_grasp(BOX, MANY, 5, variant), motion_of(BOX, variant)
     # Hand, seen from where the object stands, and from where it was thought to be: the same place in the world.
     pregrasps = one.pregrasp.hand_pose[0], MANY.pregrasp.hand_pose[5]
     for now, thought in (pregrasps, (one.approach[0, 0], MANY.approach[5, 0])):
@@ -377,13 +385,13 @@ def lift_tests(monkeypatch: pytest.MonkeyPatch, outcomes: dict[bool, list[int]])
         return SimpleNamespace(clear=clear, **seen)
 
     monkeypatch.setattr(rollouts, "validate_lifts", validated)
-    monkeypatch.setattr(rollouts, "plan_way", way)
+    monkeypatch.setattr(rollouts, "plan_trajectory", way)
     return done
 
 
 def rollout_of(monkeypatch, scores: list[float], outcomes, beat=None, level: LiftLevel = "lift"):
     lift_tests(monkeypatch, outcomes)
-    monkeypatch.setattr(LiftRollouts, "scores", lambda *_: np.array(scores))
+    monkeypatch.setattr(ShortTests, "scores", lambda *_: np.array(scores))
     where = THREE_PLACES.take(np.zeros(len(scores), int))
     rollout = lift_rollout(HAND, BOX, lambda: WHOLE, level=level)
     return rollout(numbered(len(scores)), where, np.full(len(scores), np.inf) if beat is None else beat)
@@ -427,13 +435,13 @@ def test_no_grasp_is_lifted_that_another_lift_decides(monkeypatch, level: LiftLe
 
 @pytest.mark.parametrize(("verdict", "score"), [(1, 0.2), (0, SLIPS + 1.0 + FALLS * 0.2)])
 def test_free_grasp_that_the_validator_drops_is_no_good_candidate(monkeypatch, verdict: int, score: float) -> None:
-    monkeypatch.setattr(rollouts, "push_rollout", lambda *_: lambda grasps, *_: np.array([0.2, 4.0, 4.0]))
+    monkeypatch.setattr(ShortTests, "scores", lambda *_: np.array([0.2, 4.0, 4.0]))
     monkeypatch.setattr(rollouts, "validate", lambda *_, **__: SimpleNamespace(success=np.array([verdict])))
     assert hold_rollout(HAND, BOX, lambda: WHOLE)(THREE, None).tolist() == pytest.approx([score, 4.0, 4.0])
 
 
 def test_a_free_grasp_that_cannot_beat_another_is_not_validated(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rollouts, "push_rollout", lambda *_: lambda grasps, *_: np.array([0.6, 0.7, 0.8]))
+    monkeypatch.setattr(ShortTests, "scores", lambda *_: np.array([0.6, 0.7, 0.8]))
     validated: list[int] = []
     held = SimpleNamespace(success=np.ones(1))
     monkeypatch.setattr(rollouts, "validate", lambda hand, obj, grasps, **_: validated.append(len(grasps)) or held)

@@ -12,7 +12,7 @@ from graspd.service.model.errors import MeshError
 from graspd.service.model.matter import ACCELERATION, FRICTION, MASS_KG
 from graspd.service.store.shards import read_shard
 from graspd.worker.grasps import GraspSet, Posture
-from graspd.worker.objects.options import as_asked
+from graspd.worker.objects.options import for_request
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.quality.wrench_space import EDGES
 from graspd.worker.simulation.environment import Obstacle, PlacedGrasps
@@ -55,7 +55,7 @@ def bears(friction: float) -> float:
 
 
 def payload(friction: float) -> float:
-    (found,) = payloads(HAND, BOX.weighing(mass=0.02, friction=friction), pinch(), pieces=PIECES, placed=TABLE)
+    (found,) = payloads(HAND, BOX.with_mass(mass=0.02, friction=friction), pinch(), pieces=PIECES, placed=TABLE)
     return float(found)
 
 
@@ -78,7 +78,7 @@ def test_what_friction_bears_of_the_shake_survives_it(friction: float) -> None:
     accelerated = heaviest.AMPLITUDE_M * (2 * np.pi * heaviest.FREQUENCY_HZ) ** 2
     borne = 2 * friction * TORQUE / LEVER_M / (ACCELERATION + friction * accelerated)
     survives, lost = (
-        shake_margins(HAND, BOX.weighing(mass=share * borne, friction=friction), pinch(), TABLE, pieces=PIECES)[0]
+        shake_margins(HAND, BOX.with_mass(mass=share * borne, friction=friction), pinch(), TABLE, pieces=PIECES)[0]
         for share in (0.92, 1.15)
     )
     assert survives < 0.2 and lost >= 1
@@ -88,22 +88,22 @@ def test_what_friction_bears_of_the_shake_survives_it(friction: float) -> None:
 
 def test_a_lift_has_the_mass_and_the_friction_of_the_object() -> None:
     for share, friction, lifted in ((0.8, FRICTION, 1), (1.2, FRICTION, 0), (1.2, 1.5 * FRICTION, 1)):
-        obj = BOX.weighing(mass=share * bears(FRICTION), friction=friction)
+        obj = BOX.with_mass(mass=share * bears(FRICTION), friction=friction)
         assert validate_lifts(HAND, obj, pinch(), TABLE, pieces=PIECES).success.tolist() == [lifted], (share, friction)
 
 
 def test_verdicts_of_other_masses_have_other_keys() -> None:
-    objects = [BOX, BOX.weighing(mass=0.5), BOX.weighing(friction=0.5), BOX.weighing(mass=0.5).published]
+    objects = [BOX, BOX.with_mass(mass=0.5), BOX.with_mass(friction=0.5), BOX.with_mass(mass=0.5).for_dexgraspbench]
     keys = [verdict_key(HAND, obj, "standard", False, pieces=PIECES) for obj in objects]
     assert len(set(keys)) == 3 and keys[0] == keys[3]
 
 
 def test_the_letter_has_the_mass_of_the_protocol() -> None:
-    obj = BOX.weighing(mass=0.7, friction=0.4)
-    published = as_asked(obj, JobOptions(validation="dexgraspbench"))
+    obj = BOX.with_mass(mass=0.7, friction=0.4)
+    published = for_request(obj, JobOptions(validation="dexgraspbench"))
     assert (published.mass, published.friction) == (MASS_KG, FRICTION)
-    assert as_asked(obj, JobOptions()).mass == 0.7
-    asked = as_asked(obj, JobOptions(density=500.0, object_friction=0.8))
+    assert for_request(obj, JobOptions()).mass == 0.7
+    asked = for_request(obj, JobOptions(density=500.0, object_friction=0.8))
     assert (asked.mass, asked.friction) == (pytest.approx(500 * BOX.volume), 0.8)
     with pytest.raises(ValueError, match="dexgraspbench gives all objects"):
         JobOptions(validation="dexgraspbench", mass=0.5)
@@ -115,7 +115,7 @@ def test_what_is_said_with_a_job_goes_over_what_the_file_says() -> None:
     with pytest.raises(MeshError, match="exclude each other"):
         object_from_path("block", options={"mass": 0.4, "density": 3.0})
     with pytest.raises(MeshError, match="100 kg"):
-        BOX.weighing(density=1e7)
+        BOX.with_mass(density=1e7)
 
 
 def test_whoever_says_the_weight_is_told_what_the_grasps_lift(tmp_path) -> None:
@@ -140,7 +140,7 @@ def test_a_job_counts_grasps_that_lift_the_wanted_payload(tmp_path, least, kept:
 
 @pytest.mark.parametrize("friction", [0.01, 0.3, FRICTION, 1.0])
 def test_pinch_could_bear_what_pyramids_around_its_cones_bear(friction: float) -> None:
-    found = capacities(HAND, BOX.weighing(friction=friction), pinch().grasp, UP)
+    found = capacities(HAND, BOX.with_mass(friction=friction), pinch().grasp, UP)
     assert found == pytest.approx(bears(friction) / math.cos(math.pi / EDGES), rel=2e-3)
 
 
@@ -157,14 +157,14 @@ def test_what_is_wanted_is_told_with_what_the_best_grasp_lifts() -> None:
 
     lifts = bears(FRICTION)
     found = limit(3 * lifts)
-    assert found.hopeless and 0.95 * lifts < found.lifts_kg < lifts < found.bound_kg < 1.1 * lifts
+    assert found.is_unreachable and 0.95 * lifts < found.lifts_kg < lifts < found.bound_kg < 1.1 * lifts
     assert found.line == (
         "two_finger lifts 0.34 kg at friction 0.6 in the best of 8 grasps, and at most 0.38 kg by actuator effort; "
         "1.06 kg are wanted"
     )
-    assert not limit(0.9 * heaviest.HOPELESS * lifts).hopeless
+    assert not limit(0.9 * heaviest.HOPELESS * lifts).is_unreachable
     assert limit(0.9 * lifts) is None, "they lift it"
-    assert not limit(3 * lifts, ENOUGH - 1).hopeless, "it may be their shape"
+    assert not limit(3 * lifts, ENOUGH - 1).is_unreachable, "it may be their shape"
     assert limit(3 * lifts, heaviest.LEAST - 1) is None, "too few to tell"
 
 

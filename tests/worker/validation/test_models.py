@@ -17,22 +17,31 @@ from graspd.service.model.transforms import IDENTITY_POSE, apply
 from graspd.studies.evaluation import combine, evaluate
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet
+from graspd.worker.hands.hand_matching import match_hands
 from graspd.worker.hands.model import Drag, HandModel
 from graspd.worker.hands.primitives import tessellate, volume
-from graspd.worker.hands.same_hand import same_hand
 from graspd.worker.hands.tendons import Tendon
 from graspd.worker.validation import model
 from graspd.worker.validation import robust as robustness
 from graspd.worker.validation import variant as variants
-from graspd.worker.validation.foreign import driven_as, in_other_model
+from graspd.worker.validation.foreign import transfer_grasps, with_drives_of
 from graspd.worker.validation.key import verdict_key
 from graspd.worker.validation.model import MujocoOptions, Scene, build
-from graspd.worker.validation.prefilter.prefilter import first_terms
+from graspd.worker.validation.prefilter.prefilter import prefilter_key_terms
 from graspd.worker.validation.protocol import STAGES, Outcome, Rollout, Test
-from graspd.worker.validation.refit import fits_of, grown, refitted
+from graspd.worker.validation.refit import fits_of, offset_piece, refit_hand
 from graspd.worker.validation.robust import Robustness, models_of, needed, robust
 from graspd.worker.validation.validator import validate
-from graspd.worker.validation.variant import NOMINAL, Models, Variant, VariantTest, axes_of, draw, recoupled, seen
+from graspd.worker.validation.variant import (
+    NOMINAL,
+    Models,
+    Variant,
+    VariantTest,
+    axes_of,
+    displaced_grasp,
+    draw,
+    replace_coupling,
+)
 from tests.studies.test_evaluation import HAND as PADS_HAND
 from tests.studies.test_evaluation import plates_case
 from tests.worker.hands.mjcfs import CLAW
@@ -165,7 +174,7 @@ def test_shapes_grow_by_a_millimetre_in_the_engine(kind: str, monkeypatch: pytes
 @pytest.mark.parametrize("by", [2e-3, -1e-3])
 def test_a_hull_grows_like_its_sum_with_a_ball_along_its_normals(by: float) -> None:
     solid = trimesh.convex.convex_hull(RNG.normal(size=(40, 3)) * 0.02)
-    other = grown(piece(0, solid, "hull", (), (0, 0, 0)), by)
+    other = offset_piece(piece(0, solid, "hull", (), (0, 0, 0)), by)
     reach = (other.vertices @ solid.face_normals.T).max(axis=0) - (solid.vertices @ solid.face_normals.T).max(axis=0)
     # A small side may be swallowed by its neighbours where the solid shrinks: then it lies farther back.
     assert (reach.max(), np.median(reach)) == pytest.approx((by, by), abs=1e-9)
@@ -182,7 +191,7 @@ def test_a_thin_shape_does_not_vanish_when_it_shrinks() -> None:
         vertices, faces = tessellate("box" if kind == "hull" else kind, size or (0.02, 0.02, 0.001))
         thin = piece(0, trimesh.Trimesh(vertices, faces, process=False), kind, size, (0, 0, 0))
         # Half of its thickness stays.
-        assert np.ptp(grown(thin, -1e-3).vertices, axis=0)[2] == pytest.approx(5e-4, rel=1e-3)
+        assert np.ptp(offset_piece(thin, -1e-3).vertices, axis=0)[2] == pytest.approx(5e-4, rel=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -193,7 +202,7 @@ def test_the_primitive_nearest_to_the_hull_of_one_is_that_one(kind: str, size: t
     vertices, faces = tessellate(kind, size)
     turned = apply(np.array([0.01, 0.02, 0.03, *(np.array([1, 2, 3, 4]) / np.sqrt(30))]), vertices)
     hulls = piece(0, trimesh.Trimesh(turned, faces, process=False), "hull", (), (0, 0, 0))
-    found = refitted(dataclasses.replace(two_finger_hand(), pieces=(hulls,)), "primitive").pieces[0]
+    found = refit_hand(dataclasses.replace(two_finger_hand(), pieces=(hulls,)), "primitive").pieces[0]
     assert found.kind == kind
     # Tessellations lie inside the round ones: 32 corners lose 0.6 % of a circle's area.
     assert sorted(found.size) == pytest.approx(sorted(size), rel=0.01)
@@ -206,7 +215,7 @@ def test_fits_that_change_nothing_are_not_offered() -> None:
     ball = dataclasses.replace(hand, pieces=tuple(p for p in hand.pieces if p.kind == "sphere"))
     assert fits_of(ball) == frozenset()
     assert "hull" in fits_of(hand), "a finger has a shaft and a tip"
-    assert len(refitted(hand, "hull").pieces) == 3 and refitted(ball, "capsule") is ball
+    assert len(refit_hand(hand, "hull").pieces) == 3 and refit_hand(ball, "capsule") is ball
 
 
 def test_nominal_variant_has_verdicts_of_the_judge_bit_for_bit() -> None:
@@ -271,9 +280,9 @@ def test_the_centre_of_mass_moves_and_the_object_stays() -> None:
 def test_object_or_a_hand_that_is_off_is_met_the_other_way_round() -> None:
     grasps = many_grasps()
     shift, turn = (0.001, -0.002, 0.0005), (0.0, 0.0, 0.03)
-    moved = seen(BOX, grasps, 3, Variant(object_shift_m=shift))
+    moved = displaced_grasp(BOX, grasps, 3, Variant(object_shift_m=shift))
     assert moved.pregrasp.hand_pose[0, :3] == pytest.approx(grasps.pregrasp.hand_pose[3, :3] - shift)
-    turned = seen(BOX, grasps, 3, Variant(object_turn=turn)).grasp.hand_pose[0]
+    turned = displaced_grasp(BOX, grasps, 3, Variant(object_turn=turn)).grasp.hand_pose[0]
     arm = grasps.grasp.hand_pose[3, :3] - BOX.centre_of_mass
     back = np.array([[np.cos(0.03), np.sin(0.03), 0], [-np.sin(0.03), np.cos(0.03), 0], [0, 0, 1]])
     assert turned[:3] == pytest.approx(BOX.centre_of_mass + back @ arm, abs=1e-12)
@@ -282,7 +291,7 @@ def test_object_or_a_hand_that_is_off_is_met_the_other_way_round() -> None:
     quarter = np.array([np.sqrt(0.5), 0, 0, np.sqrt(0.5)])
     for part in (grasps.grasp, grasps.pregrasp, grasps.squeeze):
         part.hand_pose[:, 3:] = quarter
-    off = seen(BOX, grasps, 2, Variant(hand_shift_m=(0.002, 0, 0)))
+    off = displaced_grasp(BOX, grasps, 2, Variant(hand_shift_m=(0.002, 0, 0)))
     assert off.grasp.hand_pose[0, :3] - grasps.grasp.hand_pose[2, :3] == pytest.approx([0, 0.002, 0], abs=1e-12)
 
 
@@ -357,15 +366,15 @@ def test_each_reading_moves_as_it_says() -> None:
 
 
 def test_a_ratio_keeps_what_both_can_do() -> None:
-    hand = recoupled(tied(), "ratio")
+    hand = replace_coupling(tied(), "ratio")
     assert (hand.dofs, hand.tendons) == (1, ()) and (hand.lower[0], hand.upper[0]) == (-0.2, 1.1)
     assert hand.expand(np.array([0.4])) == pytest.approx([0.4, 0.4])
     assert variants.nearest(hand, np.array([[0.1, 0.5]]))[0] == pytest.approx([0.3, 0.3])
-    turned = recoupled(tied(-1.0), "ratio")
+    turned = replace_coupling(tied(-1.0), "ratio")
     assert turned.expand(np.array([0.15])) == pytest.approx([0.15, -0.15])
     assert (turned.lower[0], turned.upper[0]) == (-0.3, 0.2), "the second joint turns the other way"
     hand = two_finger_hand()
-    assert recoupled(hand, "ratio") is hand is recoupled(hand, "separate")
+    assert replace_coupling(hand, "ratio") is hand is replace_coupling(hand, "separate")
     assert variants.couplings_of(hand) == ()
 
 
@@ -417,7 +426,7 @@ def test_the_first_judge_and_the_key_know_of_tendons() -> None:
     dragged = dataclasses.replace(separate, drag=Drag(np.zeros(hand.bodies), np.zeros(hand.bodies)))
     keys = {verdict_key(one, BOX, "standard", False, pieces=WHOLE) for one in (hand, separate, dragged)}
     assert len(keys) == 3
-    assert first_terms(load(root="palm"), "standard", ExecutionContext(prefilter="on")) == []
+    assert prefilter_key_terms(load(root="palm"), "standard", ExecutionContext(prefilter="on")) == []
 
 
 def test_a_drive_stays_what_it_is_with_followers_or_on_a_tendon() -> None:
@@ -426,7 +435,7 @@ def test_a_drive_stays_what_it_is_with_followers_or_on_a_tendon() -> None:
     ratio = load(text, root="palm", tendons={}, couplings={"left_curl": {"of": "left_bend"}})
     (cord,), dof = tendon.tendons, ratio.dof_names.index("left_bend")
     # Both joints by the same angle q change the tendon's length by 2 q: its gain K is 4 K to q, its limit F is 2 F.
-    forth, back = driven_as(same_hand(tendon, ratio)), driven_as(same_hand(ratio, tendon))
+    forth, back = with_drives_of(match_hands(tendon, ratio)), with_drives_of(match_hands(ratio, tendon))
     assert forth.stiffness[dof] == pytest.approx(4 * cord.gain(tendon.stiffness))
     assert forth.effort[dof] == pytest.approx(2 * cord.limit(tendon.effort))
     assert 4 * cord.gain(back.stiffness) == pytest.approx(ratio.stiffness[dof])
@@ -434,7 +443,7 @@ def test_a_drive_stays_what_it_is_with_followers_or_on_a_tendon() -> None:
 
 
 def test_the_same_model_gives_the_same_verdicts(tmp_path) -> None:
-    row = evaluate(plates_case(), validation_hand=same_hand(PADS_HAND, PADS_HAND), cache=tmp_path)
+    row = evaluate(plates_case(), validation_hand=match_hands(PADS_HAND, PADS_HAND), cache=tmp_path)
     assert row["foreign_held"] == {"both": 2, "nominal": 0, "foreign": 0, "neither": 1}
     assert (row["agreement"], row["foreign_share"], row["fingertips_mm"]) == (1.0, 1.0, pytest.approx(0.0, abs=1e-6))
     assert [one["held_foreign"] for one in row["verdicts"]] == [True, True, False]
@@ -445,7 +454,7 @@ def test_a_model_with_other_pads_says_otherwise(tmp_path) -> None:
     # The other model's pads do not reach the object: they are 40 mm nearer to their joints.
     back, (foot, *pads) = np.array([0, 0, -0.04, 0, 0, 0, 0]), PADS_HAND.pieces
     moved = (dataclasses.replace(p, vertices=p.vertices + back[:3], pose=p.pose + back) for p in pads)
-    same = same_hand(PADS_HAND, dataclasses.replace(PADS_HAND, name="shorter", pieces=(foot, *moved)))
+    same = match_hands(PADS_HAND, dataclasses.replace(PADS_HAND, name="shorter", pieces=(foot, *moved)))
     row = evaluate(plates_case(), validation_hand=same, cache=tmp_path)
     assert row["foreign_held"] == {"both": 0, "nominal": 2, "foreign": 0, "neither": 1}
     assert (row["foreign_share"], row["agreement"]) == (0.0, pytest.approx(1 / 3))
@@ -456,7 +465,7 @@ def test_a_model_with_other_pads_says_otherwise(tmp_path) -> None:
 
 
 def test_rows_add_up_by_their_grasps(tmp_path) -> None:
-    row = evaluate(plates_case(), validation_hand=same_hand(PADS_HAND, PADS_HAND), cache=tmp_path)
+    row = evaluate(plates_case(), validation_hand=match_hands(PADS_HAND, PADS_HAND), cache=tmp_path)
     lost = {**row, "foreign_held": {"both": 0, "nominal": 1, "foreign": 1, "neither": 0}, "fingertips_mm": 0.4}
     whole = combine([row, lost])
     assert whole["foreign_held"] == {"both": 2, "nominal": 1, "foreign": 1, "neither": 1}
@@ -469,6 +478,6 @@ def test_joints_take_order_and_the_couplings_of_the_other_model() -> None:
     other = dataclasses.replace(
         PADS_HAND, joint_names=PADS_HAND.joint_names[::-1], joint_body=PADS_HAND.joint_body[::-1].copy()
     )
-    moved = in_other_model(same_hand(PADS_HAND, other), grasps)
+    moved = transfer_grasps(match_hands(PADS_HAND, other), grasps)
     assert moved.grasp.joint_positions == pytest.approx(grasps.grasp.joint_positions[:, ::-1])
     assert moved.grasp.hand_pose == pytest.approx(np.asarray(grasps.grasp.hand_pose), abs=1e-6)

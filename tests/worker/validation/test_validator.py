@@ -18,8 +18,8 @@ from graspd.exchange.inputs import load_case
 from graspd.service.model.errors import InputError, MeshError, TaskCancelled
 from graspd.service.model.matter import MASS_KG
 from graspd.worker.control import postures
-from graspd.worker.engines.mujoco_warnings import void
-from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext, measured
+from graspd.worker.engines.mujoco_warnings import is_invalid
+from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext, measure_rows
 from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.objects.convex import union_volume
@@ -294,9 +294,9 @@ def test_a_blown_up_push_is_not_held_and_spoils_no_other_grasp(level: str, tmp_p
     rollout = getattr(test, level)(grasp_of(), 0)
     assert rollout.outcomes[0] is Outcome.DIVERGED and not rollout.success
     # What the guard is for: after MuJoCo's reset the object stands where it began.
-    assert test._motion()[0] < 0.05 and void(test.data)
+    assert test._motion()[0] < 0.05 and is_invalid(test.data)
     test._start(grasp_of(), 0)
-    assert not void(test.data)
+    assert not is_invalid(test.data)
     assert list(tmp_path.iterdir()) == [], "MuJoCo's warnings go to no file"
 
 
@@ -418,8 +418,8 @@ def test_a_published_grasp_without_its_thumb_is_refused(shared_data) -> None:
 
 def test_measured_tests_held_grasps_by_row_and_may_be_stopped() -> None:
     held = np.array([False, True, False, True])
-    found = measured(4, held, lambda: 10.0, lambda test, row: test + row, run=DEFAULT_CONTEXT, name="test")
+    found = measure_rows(4, held, lambda: 10.0, lambda test, row: test + row, run=DEFAULT_CONTEXT, name="test")
     np.testing.assert_array_equal(found, [np.nan, 11.0, np.nan, 13.0])
     run = ExecutionContext(threads=1, cancelled=lambda: True)
     with pytest.raises(TaskCancelled):
-        measured(2, None, lambda: None, lambda *_: 0.0, run=run, name="test")
+        measure_rows(2, None, lambda: None, lambda *_: 0.0, run=run, name="test")

@@ -18,7 +18,7 @@ from graspd.service.model.errors import InputError, TaskCancelled
 from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.store.columns import SCHEMAS
 from graspd.worker.execution_context import ExecutionContext
-from graspd.worker.generation import scored
+from graspd.worker.generation import score_grasps
 from graspd.worker.grasps import GraspSet, joined
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
@@ -236,7 +236,7 @@ def test_the_letter_and_grippers_are_the_cpus(monkeypatch: pytest.MonkeyPatch) -
     assert (found.validated_by == ValidatedBy.MUJOCO).all()
     assert found.terms == verdicts(ExecutionContext(), "dexgraspbench", grasp_of()).terms
     monkeypatch.setattr(screening, "jaws_of", lambda hand: object())
-    assert screening.first_terms(PADS, "standard", ON) == []
+    assert screening.prefilter_key_terms(PADS, "standard", ON) == []
 
 
 def test_the_key_says_who_judges() -> None:
@@ -292,16 +292,16 @@ def test_grasps_that_overflow_the_first_judge_are_the_cpus(stand_in: Stand, monk
 def test_an_audit_follows_the_grasp_and_not_its_batch(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(screening, "RECHECK_ONE_IN", 2)
     grasps = every_kind()
-    drawn = screening._drawn(grasps)
+    drawn = screening._recheck_sample(grasps)
     assert 0 < drawn.sum() < len(grasps)
-    np.testing.assert_array_equal(screening._drawn(grasps.take(np.arange(3, 9))), drawn[3:9])
+    np.testing.assert_array_equal(screening._recheck_sample(grasps.take(np.arange(3, 9))), drawn[3:9])
 
 
 @pytest.mark.parametrize("mode", ["on", "off"])
 def test_a_shard_tells_of_each_grasp_who_validated_it(mode) -> None:
     request = JobOptions(grasps=1, validation="fast", want="candidates", rechecks=0)
     run = ExecutionContext(prefilter=mode, threads=1)
-    found = scored(PADS, BOX, every_kind(), request, pieces=lambda obj: WHOLE, run=run)
+    found = score_grasps(PADS, BOX, every_kind(), request, pieces=lambda obj: WHOLE, run=run)
     columns = found.columns
     assert ("quality/validated_by" in columns) == (mode == "on")
     assert found.verdict_key == verdicts(run, "fast").terms and columns.keys() <= SCHEMAS["base"].keys()

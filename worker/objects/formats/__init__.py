@@ -12,10 +12,10 @@ from typing import Final
 import numpy as np
 
 from graspd.service.model.errors import GraspdError, MeshError
+from graspd.worker.objects.format_check import check_format, true_format
 from graspd.worker.objects.formats import bare, dae, glb, obj
-from graspd.worker.objects.formats.obj import Nearby, nothing_nearby
+from graspd.worker.objects.formats.obj import Nearby, no_files
 from graspd.worker.objects.formats.soup import MAX_FACES, Soup, check_soup
-from graspd.worker.objects.stand_ins import other_format, refuse_stand_in
 
 __all__ = ["MAX_FACES", "READERS", "Nearby", "Soup", "read_mesh"]
 
@@ -35,7 +35,7 @@ _NO_NUMBER: Final = re.compile(r": (?:np\.bytes_\()?b?'(.{1,40}?)'")
 _WITH_LOOKS: Final = (".obj", ".dae")
 
 
-def read_mesh(filename: str, data: bytes, nearby: Nearby = nothing_nearby) -> Soup:
+def read_mesh(filename: str, data: bytes, nearby: Nearby = no_files) -> Soup:
     """Read vertices and triangles of a mesh file; the extension determines the format.
     `nearby` returns material libraries and pictures by their names in the file. Raises MeshError: unknown format,
     unreadable, no faces, a bad index or a coordinate that is not finite. LimitError: more than `MAX_FACES` faces."""
@@ -47,13 +47,13 @@ def read_mesh(filename: str, data: bytes, nearby: Nearby = nothing_nearby) -> So
     if not data:
         raise MeshError(f"{filename}: the file is empty; export the mesh again")
     text = _marked_text(data)
-    refuse_stand_in(filename, text, MeshError)
+    check_format(filename, text, MeshError)
     try:
         # The check below finds invalid numbers, so NumPy's warnings are not needed.
         with np.errstate(all="ignore"):
             return check_soup(reader(text, nearby) if suffix in _WITH_LOOKS else reader(text))
     except GraspdError as error:
-        raise type(error)(f"{filename}: {other_format(filename, text) or error}") from None
+        raise type(error)(f"{filename}: {true_format(filename, text) or error}") from None
     except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError, struct.error) as error:
         # Readers rely on NumPy and json for malformed input: any of their errors is due to the file.
         kind = suffix[1:].upper()

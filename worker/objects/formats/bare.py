@@ -178,8 +178,8 @@ _VERTEX = re.compile(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
 
 
 def read_stl(data: bytes) -> Soup:
-    if len(data) >= _HEADER and len(data) == _HEADER + _RECORD.itemsize * _promised(data):
-        return _binary(data, _promised(data))
+    if len(data) >= _HEADER and len(data) == _HEADER + _RECORD.itemsize * _declared_count(data):
+        return _binary(data, _declared_count(data))
     if b"\0" not in data[:1024] and (_FACET.search(data) or b"endsolid" in data[-1024:].lower()):
         return _ascii(data)
     if len(data) < _HEADER:
@@ -187,13 +187,13 @@ def read_stl(data: bytes) -> Soup:
     if b"\0" not in data[:1024]:
         raise MeshError("neither binary STL nor text with facets; export the mesh again")
     held = (len(data) - _HEADER) / _RECORD.itemsize
-    if _promised(data) > held:
-        raise MeshError(f"truncated: the header states {_promised(data)} faces, the file has {int(held)}")
+    if _declared_count(data) > held:
+        raise MeshError(f"truncated: the header states {_declared_count(data)} faces, the file has {int(held)}")
     # Some exporters append their own data; all faces stated in the header are present.
-    return _binary(data, _promised(data))
+    return _binary(data, _declared_count(data))
 
 
-def _promised(data: bytes) -> int:
+def _declared_count(data: bytes) -> int:
     return int.from_bytes(data[80:84], "little")
 
 

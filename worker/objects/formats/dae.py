@@ -15,7 +15,7 @@ from defusedxml import ElementTree as SafeTree
 from defusedxml.common import DefusedXmlException
 
 from graspd.service.model.errors import MeshError
-from graspd.worker.objects.formats.obj import Nearby, colour_of, nothing_nearby
+from graspd.worker.objects.formats.obj import Nearby, colour_of, no_files
 from graspd.worker.objects.formats.soup import Soup, soup_of, triangulate, walk
 
 Element = ElementTree.Element
@@ -23,7 +23,7 @@ Element = ElementTree.Element
 _Primitive = tuple[np.ndarray, np.ndarray, str]
 
 
-def read(data: bytes, nearby: Nearby = nothing_nearby) -> Soup:
+def read(data: bytes, nearby: Nearby = no_files) -> Soup:
     """Read vertices and triangles; every instance of a mesh in the node tree is its own copy."""
     root = _parse(data)
     library = _Library(root, nearby)

@@ -18,12 +18,12 @@ _SHADES = 8
 _NO_COLOUR = [b"nan", b"nan", b"nan"]
 
 
-def nothing_nearby(reference: str) -> bytes | None:
+def no_files(reference: str) -> bytes | None:
     """Return None: resolver for a mesh without other files."""
     return None
 
 
-def read(data: bytes, nearby: Nearby = nothing_nearby) -> Soup:
+def read(data: bytes, nearby: Nearby = no_files) -> Soup:
     """Read triangles of the polygons; negative indices count from the latest vertex.
     The colour of a face is its corners' mean colour, or else that of its material."""
     vertices: list[list[bytes]] = []

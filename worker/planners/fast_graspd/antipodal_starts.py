@@ -30,8 +30,8 @@ from graspd.service.model.transforms import (
     quat_rotate,
     spread_directions,
 )
-from graspd.worker.hands.flat_pinches import HEIGHTS_M, pinches_of
-from graspd.worker.hands.grasp_widths import Size, spans_of, widest_span
+from graspd.worker.hands.flat_pinches import HEIGHTS_M, flat_pinches
+from graspd.worker.hands.grasp_widths import Size, largest_width, postures_for_size
 from graspd.worker.hands.jaws import thinnest_fingertip
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
@@ -144,7 +144,7 @@ class Openings:
         for obstacle in scene.obstacles:
             for end in pairs.ends():
                 room = np.minimum(room, obstacle.distance(end))
-        easy = (room >= MARGIN_M) & (room_beside(pairs, scene, tip) >= 0.0)
+        easy = (room >= MARGIN_M) & (end_clearance(pairs, scene, tip) >= 0.0)
         chance *= np.where(level, 1.0, SELDOM) * np.where(easy, 1.0, SELDOM) * fits
         within_reach = bool((fits & easy & level).any())
         return cls(pairs, np.cumsum(chance) / chance.sum(), known, scene.up, upright, within_reach)
@@ -152,13 +152,13 @@ class Openings:
     @classmethod
     def in_scene(cls, hand: HandModel, obj: ObjectModel, scene: Environment) -> Openings:
         """Select pairs for fingertips that rest next to a flat object, or else for the pads."""
-        ends = pinches_of(hand, float(np.ptp(obj.hull_vertices @ scene.up)))
+        ends = flat_pinches(hand, float(np.ptp(obj.hull_vertices @ scene.up)))
         tip = thinnest_fingertip(hand)
         flat = cls.of(ends, obj, scene, tip=tip, upright=True)
         return flat if len(flat.sums) else cls.of(oppositions_of(hand), obj, scene, tip=tip)
 
 
-def room_beside(pairs: Crossings, scene: Environment, width: float) -> Floats:
+def end_clearance(pairs: Crossings, scene: Environment, width: float) -> Floats:
     """Return the least clearance (P,) of balls of diameter `width` at the ends of pairs [m].
     Walls and neighbours count; the object's own support is ignored."""
     out = np.full(len(pairs), np.inf)
@@ -188,7 +188,7 @@ class AntipodalHands:
         known = self.known.q[self.posture]
         return np.clip(known + NOISE * hand.span * normal, hand.lower, hand.upper)
 
-    def beside(self, moved: Floats) -> Floats:
+    def pad_distance(self, moved: Floats) -> Floats:
         """Return the distance (n, ...) of the pair from pads that have moved by (n, ..., 3), sideways or ahead [m].
         A pair nearer to the palm is also between the fingers."""
         away = self.away.reshape(len(self.deep), *(1,) * (moved.ndim - 2), 3)
@@ -197,7 +197,7 @@ class AntipodalHands:
         return np.linalg.norm(off - np.minimum(along, 0.0)[..., None] * away, axis=-1)
 
 
-def across(hand: HandModel, obj: ObjectModel, opening: Openings, uniform: Floats, ways: Floats) -> AntipodalHands:
+def place_across(hand: HandModel, obj: ObjectModel, opening: Openings, uniform: Floats, ways: Floats) -> AntipodalHands:
     """Place hands across pairs by random numbers (n, 6); `ways` (K, 3) are free directions away from the object."""
     known = opening.known
     if opening.upright and (upright := ways @ opening.up > UPRIGHT).any():
@@ -222,7 +222,7 @@ def across(hand: HandModel, obj: ObjectModel, opening: Openings, uniform: Floats
     return AntipodalHands(known, posture, pivot - obj.centre_of_mass, turn, away, deep)
 
 
-def promising(
+def select_draws(
     hand: HandModel,
     obj: ObjectModel,
     opening: Openings,
@@ -235,13 +235,13 @@ def promising(
 ) -> tuple[NDArray[np.intp], Floats]:
     """Select the `keep` of C draws per hand that need the least rise to clear the obstacles, (n, keep).
     Also return the distance of the pair from the middle of the pads (n, keep) [m]. Draws below `NEAR_M` keep their
-    order. For `uniform` (n, C, 6) and `ways` see `across`; `room` is clearance in addition to the margin [m]."""
+    order. For `uniform` (n, C, 6) and `ways` see `place_across`; `room` is clearance in addition to the margin [m]."""
     count, draws, _ = uniform.shape
-    outlines, off = outlines_of(hand, opening.known.q), np.zeros((count, draws))
+    outlines, off = posture_outlines(hand, opening.known.q), np.zeros((count, draws))
     for rows in np.array_split(np.arange(count), 1 + count // AT_ONCE):
-        found = across(hand, obj, opening, uniform[rows].reshape(-1, 6), ways)
-        lack = outlines.lacks(found.posture, found.turn, found.pivot + obj.centre_of_mass, scene, room=room)
-        off[rows] = found.beside(lack[:, None] * scene.up).reshape(-1, draws)
+        found = place_across(hand, obj, opening, uniform[rows].reshape(-1, 6), ways)
+        lack = outlines.missing_clearance(found.posture, found.turn, found.pivot + obj.centre_of_mass, scene, room=room)
+        off[rows] = found.pad_distance(lack[:, None] * scene.up).reshape(-1, draws)
     order = np.argsort(np.maximum(off, NEAR_M), axis=1, kind="stable")[:, :keep]
     return order, np.take_along_axis(off, order, axis=1)
 
@@ -271,7 +271,7 @@ class PostureOutlines:
     """(W, M, 3) outermost points of the mounting at each wrist position, from the palm's centre [m].
     W is 0 without a mounting."""
 
-    def lacks(
+    def missing_clearance(
         self, posture: NDArray[np.intp], turn: Floats, centre: Floats, scene: Environment, *, room: float
     ) -> Floats:
         """Return the clearance (n,) missing at hands and mountings, relative to the margin plus `room` [m]; at least 0.
@@ -281,9 +281,9 @@ class PostureOutlines:
         for obstacle in scene.obstacles:
             wanted = np.where(self.tips, MARGIN_M if obstacle.tips_m is None else obstacle.tips_m, MARGIN_M) + room
             lack = np.maximum(lack, (wanted - obstacle.distance(place)).max(axis=1))
-        return np.maximum(lack, self._mounting_lacks(turn, centre, scene, MARGIN_M + room))
+        return np.maximum(lack, self._missing_mounting_clearance(turn, centre, scene, MARGIN_M + room))
 
-    def _mounting_lacks(self, turn: Floats, centre: Floats, scene: Environment, wanted: float) -> Floats:
+    def _missing_mounting_clearance(self, turn: Floats, centre: Floats, scene: Environment, wanted: float) -> Floats:
         """Return the clearance (n,) missing at mountings relative to `wanted`, at their best wrist position [m]."""
         least = np.full(len(turn), np.inf if len(self.mounting) else 0.0)
         for points in self.mounting:
@@ -295,7 +295,7 @@ class PostureOutlines:
 
 
 @cached_by_content(16)
-def outlines_of(hand: HandModel, q: Floats) -> PostureOutlines:
+def posture_outlines(hand: HandModel, q: Floats) -> PostureOutlines:
     bodies = body_poses(hand, np.tile(IDENTITY_POSE, (len(q), 1)), hand.expand(q))
     points, tips = [], []
     for tip in (True, False):
@@ -316,7 +316,7 @@ WIDEST_M: Final = 0.064
 EXACT_M: Final = 0.0005
 
 
-def why_narrow(hand: HandModel, obj: ObjectModel, scenes: Sequence[Environment]) -> str | None:
+def narrow_reason(hand: HandModel, obj: ObjectModel, scenes: Sequence[Environment]) -> str | None:
     """Explain why fingertips of a hand cannot hold an object in any scene; None if no reason is found."""
     known, pairs = oppositions_of(hand), crossings_of(obj)
     if not len(known) or not len(pairs):
@@ -328,7 +328,7 @@ def why_narrow(hand: HandModel, obj: ObjectModel, scenes: Sequence[Environment])
             f"to {1e3 * known.widest:.0f} mm"
         )
     height = max(float(np.ptp(obj.hull_vertices @ scene.up)) for scene in scenes)
-    if height <= HEIGHTS_M[-1] and not len(pinches_of(hand, height)):
+    if height <= HEIGHTS_M[-1] and not len(flat_pinches(hand, height)):
         return (
             f"{obj.name} is {1e3 * height:.0f} mm high, and fingertips of {hand.name} that rest beside it do not face "
             "each other this close to their ends"
@@ -355,7 +355,7 @@ def _widest_gap(pairs: Crossings, fits: NDArray[np.bool_], scene: Environment, t
     low, high = 0.0, WIDEST_M
     while high - low > EXACT_M:
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if room_beside(pairs, scene, middle).max() >= 0.0 else (low, middle)
+        low, high = (middle, high) if end_clearance(pairs, scene, middle).max() >= 0.0 else (low, middle)
     return low
 
 
@@ -403,7 +403,7 @@ class ReachSampling:
         return found, number.numpy()
 
 
-def size_to_pads(hand: HandModel, width: Floats) -> Size | None:
+def classify_size(hand: HandModel, width: Floats) -> Size | None:
     """Classify an object with pair widths (P,) as too small or wide for the pads; None if a pair fits."""
     known = oppositions_of(hand)
     if not len(known) or not len(width):
@@ -415,17 +415,17 @@ def size_to_pads(hand: HandModel, width: Floats) -> Size | None:
 
 def _postures(hand: HandModel, width: Floats, size: Size | None) -> Oppositions:
     """Return the postures for pairs of the widths (P,), empty if none fits a pair."""
-    if size == "wide" and width.min() + 2 * ROOM_M[0] > widest_span(hand):
-        return Oppositions.of_none(hand)
-    known = oppositions_of(hand) if size is None else spans_of(hand, size)
-    return known if (width + 2 * ROOM_M[0] <= known.widest).any() else Oppositions.of_none(hand)
+    if size == "wide" and width.min() + 2 * ROOM_M[0] > largest_width(hand):
+        return Oppositions.empty(hand)
+    known = oppositions_of(hand) if size is None else postures_for_size(hand, size)
+    return known if (width + 2 * ROOM_M[0] <= known.widest).any() else Oppositions.empty(hand)
 
 
 @cached_by_content(8)
 def _grips(hand: HandModel, obj: ObjectModel, device: str) -> tuple[Any, bool] | None:
     """Return `ReachSampling.grips` and `.only`; None if no posture fits a pair."""
     pairs, out = crossings_of(obj), kernels.Grips()
-    size = size_to_pads(hand, pairs.width)
+    size = classify_size(hand, pairs.width)
     known = _postures(hand, pairs.width, size)
     if not len(known):
         return None

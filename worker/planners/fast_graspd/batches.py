@@ -14,12 +14,12 @@ from graspd.service.model.fidelity import Fidelity
 from graspd.service.model.transforms import Floats
 from graspd.worker.grasps import GraspSet
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.planners.fast_graspd.scene_starts import free_ways
+from graspd.worker.planners.fast_graspd.scene_starts import free_directions
 from graspd.worker.planners.fast_graspd.schedule import WarmStart, in_scene
 from graspd.worker.planners.fast_graspd.starts import start_generator
 from graspd.worker.planners.port import BatchRequest
 from graspd.worker.planners.threads import StepCounter
-from graspd.worker.simulation.environment import PlacedGrasps, placed_together
+from graspd.worker.simulation.environment import PlacedGrasps, join_placed
 
 Rows = NDArray[np.intp]
 
@@ -53,16 +53,16 @@ class Batches:
         hands = known.starts * known.coarse_iterations + finalists(known) * known.fine_iterations
         self._steps = [StepCounter(one.wanted.count * (hands + 1), one.run) for one in asked]
         placed = [one.placed for one in wanted if one.placed is not None]
-        self.placed: PlacedGrasps | None = placed_together(placed) if placed else None
+        self.placed: PlacedGrasps | None = join_placed(placed) if placed else None
         self.ways: list[Floats] = []
         """Free directions of each scene."""
         for owner, scenes in enumerate(placed):
             try:
                 # Either all batches have scenes or none has: the number of a scene selects its directions.
-                self.ways += [free_ways(scene, obj) for scene in scenes.scenes]
+                self.ways += [free_directions(scene, obj) for scene in scenes.scenes]
             except InputError as error:
                 self.ways += [np.zeros((0, 3))] * len(scenes.scenes)
-                self.put_out(owner, error)
+                self.fail(owner, error)
 
     @property
     def has_rollout(self) -> bool:
@@ -71,16 +71,16 @@ class Batches:
         several = first.placed is not None or first.fidelity.finalists > 1
         return several and all(one.wanted.rollout is not None for one in self.asked)
 
-    def put_out(self, owner: int, error: Exception) -> None:
+    def fail(self, owner: int, error: Exception) -> None:
         self.errors.setdefault(owner, error)
 
-    def going(self, rows: Rows) -> NDArray[np.bool_]:
+    def is_active(self, rows: Rows) -> NDArray[np.bool_]:
         """Return a mask (n,) of the rows whose batches are still planned."""
         return ~np.isin(self.owner[rows], list(self.errors))
 
-    def left(self) -> Rows:
+    def active_rows(self) -> Rows:
         """Return the rows of the batches that are still planned; raise the first batch's error if all have stopped."""
-        rows = np.flatnonzero(self.going(np.arange(len(self.owner))))
+        rows = np.flatnonzero(self.is_active(np.arange(len(self.owner))))
         if not len(rows):
             raise self.errors[min(self.errors)]
         return rows
@@ -94,7 +94,7 @@ class Batches:
                 try:
                     self._steps[owner](count * work, message)
                 except TaskCancelled as error:
-                    self.put_out(owner, error)
+                    self.fail(owner, error)
         if len(self.errors) == len(self.asked):
             raise self.errors[min(self.errors)]
 
@@ -122,7 +122,7 @@ class Batches:
                 self._steps[owner](0, "rollout")
                 scores[own] = rollout(grasps.take(own), placed.take(own) if placed is not None else None, beat[own])
             except Exception as error:
-                self.put_out(owner, error)
+                self.fail(owner, error)
         return scores
 
 

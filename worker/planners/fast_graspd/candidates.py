@@ -17,9 +17,9 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.data import HandState
 from graspd.worker.simulation.environment import PlacedGrasps
 
-#: Number of a grasp's candidates that are seated (fine phase) and simulated at once: seating costs half of a rollout.
+#: Number of a grasp's candidates that are refined (fine phase) and simulated at once: refining costs half a rollout.
 TOGETHER: Final = 2
-#: A seated hand with a merit above this has no rollout unless its grasp has no other candidate: of 176 such hands of
+#: A refined hand with a merit above this has no rollout unless its grasp has no other candidate: of 176 such hands of
 #: Allegro and Shadow 3 lifted at half friction.
 HOPEFUL: Final = 0.3
 #: A grasp with a score above this has failed: the object is lost, or the trajectory is blocked.
@@ -91,10 +91,10 @@ class Selection:
         return np.array([int(grasp) in self.grasps for grasp in which], bool)
 
     def take(
-        self, found: GraspSet, seated: Refinements, rows: NDArray[np.intp], which: NDArray[np.intp], score: Floats
+        self, found: GraspSet, refined: Refinements, rows: NDArray[np.intp], which: NDArray[np.intp], score: Floats
     ) -> None:
         """Store candidates `rows` (k,) of the grasps `which` (k,) where they are better, or the first ones."""
-        state, losses = seated.state[rows], seated.losses[rows]
+        state, losses = refined.state[rows], refined.losses[rows]
         for k in np.flatnonzero((score < self.score[which]) | ~self.has(which)):
             grasp = int(which[k])
             self.grasps[grasp] = found.take(slice(k, k + 1))
@@ -106,11 +106,11 @@ class Selection:
         return joined([self.grasps[k] for k in range(len(self.score))])
 
 
-def tried(
+def select_by_rollout(
     hand: HandModel,
     obj: ObjectModel,
     order: NDArray[np.intp],
-    seat: Seat,
+    refine: Seat,
     placed: PlacedGrasps | None,
     rollout: RolloutOf,
     *,
@@ -119,7 +119,7 @@ def tried(
     device: str = "cpu",
 ) -> Selection:
     """Return each grasp's first candidate with a good enough rollout, or else the one with the smallest score.
-    `together` candidates of each grasp are seated and simulated in the order (n, each) of merit, then as many again for
+    `together` candidates of each grasp are refined and simulated by merit, `order` (n, each), then as many again for
     grasps without a good one. Unbalanced or infeasible hands have no rollout; a grasp's first hand is still used.
     Candidates that do not beat the scores `beat` (n,) of earlier attempts leave these scores unchanged."""
     good = GOOD if placed is None else GOOD_IN_SCENES
@@ -128,21 +128,21 @@ def tried(
     for wave in np.split(order, range(together, order.shape[1], together), axis=1):
         if not len(left):
             break
-        seated = seat(wave[left], left)
-        for rows in ranked(seated.merit, len(left)).T:
-            worth = (seated.merit[rows] < HOPEFUL) | (taken.score[left] > POOR)
-            open_ = ~(taken.score[left] < good) & (worth & ~seated.infeasible[rows] | ~taken.has(left))
+        refined = refine(wave[left], left)
+        for rows in rank_hands(refined.merit, len(left)).T:
+            worth = (refined.merit[rows] < HOPEFUL) | (taken.score[left] > POOR)
+            open_ = ~(taken.score[left] < good) & (worth & ~refined.infeasible[rows] | ~taken.has(left))
             if not open_.any():
                 continue
             which = left[open_]
             where = placed.take(which) if placed is not None else None
             found = with_postures(
-                hand, obj, seated.state[rows[open_]], seated.losses[rows[open_]], where, device=device
+                hand, obj, refined.state[rows[open_]], refined.losses[rows[open_]], where, device=device
             )
-            hopeless = seated.infeasible[rows[open_]] | ~worth[open_]
+            hopeless = refined.infeasible[rows[open_]] | ~worth[open_]
             score = _scores(found, hopeless, which, taken.score[which], rollout)
-            _gentler(hand, obj, found, score, which, rollout, device)
-            taken.take(found, seated, rows[open_], which, score)
+            _reduce_squeeze(hand, obj, found, score, which, rollout, device)
+            taken.take(found, refined, rows[open_], which, score)
         left = left[~(taken.score[left] < good)]
     return taken
 
@@ -158,7 +158,7 @@ def _scores(
     return score
 
 
-def _gentler(
+def _reduce_squeeze(
     hand: HandModel,
     obj: ObjectModel,
     found: GraspSet,
@@ -182,7 +182,7 @@ def _gentler(
 
 #: Coulomb coefficient for the balance of contacts: lower than in any test, for a reserve.
 FRICTION: Final = 0.3
-#: The same in scenes: hands that balance at this friction mostly lift at half friction (AUC .80 of seated hands of
+#: The same in scenes: hands that balance at this friction mostly lift at half friction (AUC .80 of refined hands of
 #: Allegro and Shadow whose merit is below .1; .74 with `FRICTION`).
 SCENE_FRICTION: Final = 0.15
 #: Weight of L_stable relative to the residual of the balance.
@@ -221,7 +221,7 @@ def merits(
     return merit
 
 
-def ranked(merit: Floats, grasps: int) -> NDArray[np.intp]:
+def rank_hands(merit: Floats, grasps: int) -> NDArray[np.intp]:
     """Return rows (grasps, each) of each grasp's hands, the best first; hands of one grasp are adjacent."""
     each = merit.reshape(grasps, -1)
     # The stable sort keeps hands of equal merit in the order of their starts.

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from graspd.service.model.fidelity import Fidelity
 from graspd.service.model.transforms import Floats
-from graspd.worker.control.postures import standing_off, touching_links
+from graspd.worker.control.postures import fingers_off_object, touching_links
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet, joined
 from graspd.worker.hands.model import HandModel
@@ -34,15 +34,15 @@ from graspd.worker.planners.fast_graspd.candidates import (
     Refinements,
     merits,
     posture_of,
-    ranked,
-    tried,
+    rank_hands,
+    select_by_rollout,
     with_postures,
 )
 from graspd.worker.planners.fast_graspd.pairs import Pair, pair_of
 from graspd.worker.planners.fast_graspd.schedule import AROUND, DILATION, WarmStart, coarse_schedule, fine_schedule
 from graspd.worker.planners.fast_graspd.starts import NO_PLACE, Probe
 from graspd.worker.planners.port import BatchRequest, Method, PlanRequest
-from graspd.worker.planners.threads import cut, run_parts
+from graspd.worker.planners.threads import run_parts, split_batch
 from graspd.worker.quality.gate import MAX_PENETRATION_MM, MIN_CONTACT_LINKS
 from graspd.worker.simulation.data import Data, HandState
 from graspd.worker.simulation.environment import PlacedGrasps
@@ -160,7 +160,7 @@ def optimise_pair(pair: Pair, wanted: PlanRequest, run: ExecutionContext) -> lis
     """Run `optimise_batch` for a pair on `run.device`; its geometry may differ from the fidelity's."""
     batches = Batches([BatchRequest(wanted, run)], pair.fine.obj.model)
     parts = optimise(pair, batches, run)
-    batches.left()
+    batches.active_rows()
     return parts
 
 
@@ -168,21 +168,22 @@ def optimise(pair: Pair, batches: Batches, run: ExecutionContext, *, postures: b
     """Run several batches; return the parts of those that did not stop, possibly with others.
     `postures` adds the pregrasp and squeeze postures. Raise the first batch's error if all have stopped."""
     launch = _Launch(pair, batches)
-    begun = _begun(launch, batches.left(), run)
-    rows = _with_place(launch, begun)
+    begun = _draw_all_starts(launch, batches.active_rows(), run)
+    rows = _rows_with_starts(launch, begun)
     begun = begun.take(np.flatnonzero(np.isin(begun.rows, rows)), batches.fidelity.starts)
 
     def work(which: range) -> LaunchPart:
-        return _work(launch, begun.take(np.arange(which.start, which.stop), batches.fidelity.starts))
+        return _optimise_part(launch, begun.take(np.arange(which.start, which.stop), batches.fidelity.starts))
 
-    parts = run_parts(cut(len(rows), run, least=PART), work)
+    parts = run_parts(split_batch(len(rows), run, least=PART), work)
     if batches.placed is None or batches.has_rollout:
-        parts = [_tried_again(launch, reduce(LaunchPart.followed_by, parts), run)]
+        parts = [_retry(launch, reduce(LaunchPart.followed_by, parts), run)]
     if not postures or batches.has_rollout:
         return parts
     whole = reduce(LaunchPart.followed_by, parts)
     return run_parts(
-        cut(len(rows), run, least=PART), lambda which: _posed(launch, whole.take(np.arange(which.start, which.stop)))
+        split_batch(len(rows), run, least=PART),
+        lambda which: _add_postures(launch, whole.take(np.arange(which.start, which.stop))),
     )
 
 
@@ -223,7 +224,7 @@ class _Launch:
 
 
 @dataclass(frozen=True)
-class _Begun:
+class _Starts:
     """Starts of the hands of grasps; hands of one grasp are adjacent."""
 
     rows: Rows
@@ -232,30 +233,30 @@ class _Begun:
     touch: Floats | None
     """Share of the dilation at which each hand touches; None: the whole dilation."""
 
-    def take(self, which: NDArray[np.intp], each: int) -> _Begun:
+    def take(self, which: NDArray[np.intp], each: int) -> _Starts:
         hands = (which[:, None] * each + np.arange(each)).ravel()
         touch = None if self.touch is None else self.touch[hands]
-        return _Begun(self.rows[which], self.state[hands], self.depth[hands], touch)
+        return _Starts(self.rows[which], self.state[hands], self.depth[hands], touch)
 
 
-def _begun(launch: _Launch, rows: Rows, run: ExecutionContext) -> _Begun:
-    def work(which: range) -> _Begun:
+def _draw_all_starts(launch: _Launch, rows: Rows, run: ExecutionContext) -> _Starts:
+    def work(which: range) -> _Starts:
         some = rows[which.start : which.stop]
-        found = _set_out(launch, some, np.zeros(len(some), int))
+        found = _draw_starts(launch, some, np.zeros(len(some), int))
         launch.batches.step(some, 1, "starts")
         return found
 
-    parts = run_parts(cut(len(rows), run, least=PART), work)
+    parts = run_parts(split_batch(len(rows), run, least=PART), work)
     touch = (
         np.concatenate([part.touch for part in parts if part.touch is not None]) if parts[0].touch is not None else None
     )
     depth = np.concatenate([part.depth for part in parts])
-    return _Begun(
+    return _Starts(
         np.concatenate([part.rows for part in parts]), HandState.joined([p.state for p in parts]), depth, touch
     )
 
 
-def _set_out(launch: _Launch, rows: Rows, attempt: Rows) -> _Begun:
+def _draw_starts(launch: _Launch, rows: Rows, attempt: Rows) -> _Starts:
     batches, coarse = launch.batches, launch.coarse
     fidelity, placed, generators = batches.fidelity, launch.placed(rows), batches.generators(rows, attempt)
     if placed is None:
@@ -268,10 +269,10 @@ def _set_out(launch: _Launch, rows: Rows, attempt: Rows) -> _Begun:
         starts_of = batches.warm or scene_starts.clear_scene_starts
         state, depth = starts_of(coarse, generators, each=fidelity.starts, placed=placed, ways=batches.ways)
     touch = Probe(coarse, len(state.pivot)).nearest(state) / DILATION if fidelity.dilation == "touch" else None
-    return _Begun(rows, state, depth, touch)
+    return _Starts(rows, state, depth, touch)
 
 
-def _with_place(launch: _Launch, begun: _Begun) -> Rows:
+def _rows_with_starts(launch: _Launch, begun: _Starts) -> Rows:
     """Return the rows of the batches that found starts.
     Around a free object every grasp must have one. In scenes one per batch suffices, in this part or in another."""
     batches = launch.batches
@@ -280,13 +281,13 @@ def _with_place(launch: _Launch, begun: _Begun) -> Rows:
     for owner in sorted(set(owners.tolist())):
         own = deep[owners == owner]
         if batches.placed is None and own.max() > NO_PLACE:
-            batches.put_out(owner, starts.no_place(launch.coarse))
+            batches.fail(owner, starts.no_start_error(launch.coarse))
         elif batches.placed is not None and own.min() > NO_PLACE and not batches.asked[owner].wanted.others_have_place:
-            batches.put_out(owner, scene_starts.no_place(launch.coarse))
-    return batches.left()
+            batches.fail(owner, scene_starts.no_start_error(launch.coarse))
+    return batches.active_rows()
 
 
-def _work(launch: _Launch, begun: _Begun, beat: Floats | None = None) -> LaunchPart:
+def _optimise_part(launch: _Launch, begun: _Starts, beat: Floats | None = None) -> LaunchPart:
     """Optimise hands and select one per grasp; with rollouts, the scores `beat` (n,) count as selected before."""
     batches, pair, rows = launch.batches, launch.pair, begun.rows
     fidelity, placed, n = batches.fidelity, launch.placed(rows), len(rows)
@@ -305,9 +306,11 @@ def _work(launch: _Launch, begun: _Begun, beat: Floats | None = None) -> LaunchP
         if placed is None:
             merit -= NEARNESS * data.near_share(NEAR_M, len(state.pivot))
         else:
-            merit += scene_starts.hindrance(launch.coarse, state, placed.take(np.repeat(np.arange(n), fidelity.starts)))
-        order = ranked(merit, n)[:, :last]
-    seats = _Seats(launch, rows, state, losses, curve)
+            merit += scene_starts.obstruction(
+                launch.coarse, state, placed.take(np.repeat(np.arange(n), fidelity.starts))
+            )
+        order = rank_hands(merit, n)[:, :last]
+    fine_phase = _FinePhase(launch, rows, state, losses, curve)
     if batches.has_rollout:
 
         def rollout(grasps: GraspSet, which: Rows, beat: Floats) -> Floats:
@@ -315,18 +318,20 @@ def _work(launch: _Launch, begun: _Begun, beat: Floats | None = None) -> LaunchP
 
         together = 1 if placed is None else TOGETHER
         device = pair.hand.device
-        taken = tried(hand, obj, order, seats.seated, placed, rollout, beat=beat, together=together, device=device)
+        taken = select_by_rollout(
+            hand, obj, order, fine_phase.refine, placed, rollout, beat=beat, together=together, device=device
+        )
         found, score = taken.joined(), taken.score
         if placed is None:
-            off = standing_off(hand, obj, found.grasp, device=device)
+            off = fingers_off_object(hand, obj, found.grasp, device=device)
             score = np.where(off & (score < STANDS), STANDS + 1e-3 * score, score)
         return LaunchPart(rows, taken.state, taken.losses, score, curve, found)
-    seated = seats.seated(np.sort(order, axis=1), np.arange(n))
-    winners = ranked(seated.merit, n)[:, 0] if last > 1 else np.arange(n)
-    return LaunchPart(rows, seated.state[winners], seated.losses[winners], seated.merit[winners], curve)
+    refined = fine_phase.refine(np.sort(order, axis=1), np.arange(n))
+    winners = rank_hands(refined.merit, n)[:, 0] if last > 1 else np.arange(n)
+    return LaunchPart(rows, refined.state[winners], refined.losses[winners], refined.merit[winners], curve)
 
 
-def _tried_again(launch: _Launch, part: LaunchPart, run: ExecutionContext) -> LaunchPart:
+def _retry(launch: _Launch, part: LaunchPart, run: ExecutionContext) -> LaunchPart:
     """Retry grasps that fail their rollout or, if free, have poor balance; select the first good or the best attempt.
     The last few grasps would leave cores idle, and a hand costs a third more in a small launch. Several of their
     attempts therefore run at once. Attempts after a good one are dropped, so the result equals sequential attempts."""
@@ -337,7 +342,7 @@ def _tried_again(launch: _Launch, part: LaunchPart, run: ExecutionContext) -> La
     while done < len(limits) and len(poor := np.flatnonzero(part.merit > limits[done])):
         ahead = int(np.clip(PART * run.cores // len(poor), 1, min(AHEAD, limits[done:].count(limits[done]))))
         attempt = np.repeat(np.arange(done + 1, done + 1 + ahead), len(poor))
-        again = _set_out_again(launch, np.tile(part.rows[poor], ahead), attempt, np.tile(part.merit[poor], ahead), run)
+        again = _run_attempts(launch, np.tile(part.rows[poor], ahead), attempt, np.tile(part.merit[poor], ahead), run)
         merit, attempts, chosen = part.merit.copy(), part.attempts.copy(), np.arange(len(part.rows))
         for made, limit in zip(np.split(np.arange(len(attempt)), ahead), limits[done:], strict=False):
             wanting = merit[poor] > limit
@@ -349,32 +354,32 @@ def _tried_again(launch: _Launch, part: LaunchPart, run: ExecutionContext) -> La
     return part
 
 
-def _set_out_again(launch: _Launch, rows: Rows, attempt: Rows, merit: Floats, run: ExecutionContext) -> LaunchPart:
+def _run_attempts(launch: _Launch, rows: Rows, attempt: Rows, merit: Floats, run: ExecutionContext) -> LaunchPart:
     """Run later attempts (n,) of grasps with merits (n,) so far; the merit of grasps without a start is inf.
     The attraction term is off: with it, half as many grasps hold on a bowl's wall."""
     launch = replace(launch, pulled=False)
 
     def work(which: range) -> LaunchPart:
         some = slice(which.start, which.stop)
-        begun = _set_out(launch, rows[some], attempt[some])
+        begun = _draw_starts(launch, rows[some], attempt[some])
         # Attempts at failed grasps may run at once, so they do not depend on each other's scores.
-        made = _work(launch, begun, np.where(merit[some] < STANDS, merit[some], np.inf))
+        made = _optimise_part(launch, begun, np.where(merit[some] < STANDS, merit[some], np.inf))
         # As in the first attempt: around a free object every hand needs a start, in scenes one hand per grasp.
         deep = begun.depth.reshape(len(made.rows), -1)
         lost = (deep.max(axis=1) if launch.batches.placed is None else deep.min(axis=1)) > NO_PLACE
         return replace(made, merit=np.where(lost, np.inf, made.merit))
 
-    return reduce(LaunchPart.followed_by, run_parts(cut(len(rows), run), work))
+    return reduce(LaunchPart.followed_by, run_parts(split_batch(len(rows), run), work))
 
 
-def _posed(launch: _Launch, part: LaunchPart) -> LaunchPart:
+def _add_postures(launch: _Launch, part: LaunchPart) -> LaunchPart:
     hand, obj = launch.pair.hand.model, launch.pair.fine.obj.model
     placed, device = launch.placed(part.rows), launch.pair.hand.device
     return replace(part, grasps=with_postures(hand, obj, part.state, part.loss, placed, device=device))
 
 
 @dataclass
-class _Seats:
+class _FinePhase:
     """Fine phase and projection of hands that have passed the coarse phase."""
 
     launch: _Launch
@@ -382,9 +387,9 @@ class _Seats:
     state: HandState
     losses: Floats
     curve: list[Floats]
-    """Loss curve, continued by the first hands that are seated."""
+    """Loss curve, continued by the first hands that are refined."""
 
-    def seated(self, rows: NDArray[np.intp], which: NDArray[np.intp]) -> Refinements:
+    def refine(self, rows: NDArray[np.intp], which: NDArray[np.intp]) -> Refinements:
         launch, flat = self.launch, rows.ravel()
         fidelity, mine = launch.batches.fidelity, self.rows[which]
         state, losses = self.state[flat], self.losses[flat]
@@ -426,7 +431,7 @@ def _descend(
         batches.step(rows, each * chunk, name)
         if len(batches.errors) > out:
             out = len(batches.errors)
-            data.switch_off(np.repeat(~batches.going(rows), each))
+            data.deactivate(np.repeat(~batches.is_active(rows), each))
         if not wp.get_device(data.device).is_cuda:
             curve.append(_losses(data, data.capacity).reshape(len(rows), each).mean(axis=1))
     return data.state(data.capacity)

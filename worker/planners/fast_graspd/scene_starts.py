@@ -2,7 +2,7 @@
 Most starts are antipodal; in the others the palm faces a random point of the object, as in `starts`.
 A start has `ROOM` more clearance from obstacles than the later margin, so that the optimisation can rotate the hand.
 
-Before the expensive phases `hindrance` tests whether each hand can leave its grasp: open, along the approach, and
+Before the expensive phases `obstruction` tests whether each hand can leave its grasp: open, along the approach, and
 closed, by the lift. A hand hooked around an edge holds well but cannot reach its grasp. A hand close below a board
 cannot lift."""
 
@@ -27,16 +27,30 @@ from graspd.service.model.transforms import (
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.mesh_geometry import points_in
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.planners.fast_graspd.antipodal_starts import NEAR_M, AntipodalHands, Openings, across, promising
+from graspd.worker.planners.fast_graspd.antipodal_starts import (
+    NEAR_M,
+    AntipodalHands,
+    Openings,
+    place_across,
+    select_draws,
+)
 from graspd.worker.planners.fast_graspd.candidates import posture_of
-from graspd.worker.planners.fast_graspd.starts import CLEAR, POSTURE_NOISE, TILT, Probe, at_distances, frames_about, put
+from graspd.worker.planners.fast_graspd.starts import (
+    CLEAR,
+    POSTURE_NOISE,
+    TILT,
+    Probe,
+    at_distances,
+    frames_about,
+    store_states,
+)
 from graspd.worker.planners.fitting import surface_of
 from graspd.worker.planners.port import NoStartFound
 from graspd.worker.quality.contact import finger_of_body
 from graspd.worker.simulation.data import HandState
 from graspd.worker.simulation.environment import RISE_M, STANDOFF_M, Environment, PlacedGrasps
 from graspd.worker.simulation.model import Model
-from graspd.worker.simulation.mounting import mounting_lack
+from graspd.worker.simulation.mounting import missing_mounting_clearance
 
 #: Clearance of a start from obstacles in addition to the later margin [m].
 ROOM: Final = 0.006
@@ -65,7 +79,7 @@ _UNIFORM: Final = 7
 _AcrossPairs = list[tuple[NDArray[np.intp], AntipodalHands]]
 
 
-def free_ways(scene: Environment, obj: ObjectModel) -> Floats:
+def free_directions(scene: Environment, obj: ObjectModel) -> Floats:
     """Return free approach directions (K, 3), unit vectors in the object frame.
     Along a free direction, a ball of a palm's width can move from the object by `STANDOFF_M` without contact with an
     obstacle. Raises InputError: there is no free direction."""
@@ -81,7 +95,7 @@ def free_ways(scene: Environment, obj: ObjectModel) -> Floats:
     return np.asarray(ways[free])
 
 
-def no_place(model: Model) -> NoStartFound:
+def no_start_error(model: Model) -> NoStartFound:
     hand, obj = model.hand.model, model.obj.model
     return NoStartFound(
         f"{hand.name} finds no free place around {obj.name} in this scene: the object is too large, or its "
@@ -95,7 +109,7 @@ def clear_scene_starts(
     """Return a start for each generator, `each` per grasp, and its depth (n,) [m].
     The start is the first clear draw, or the least deep one; antipodal starts take the clear draw with the best placed
     pair. In a narrow scene some grasps find no clear start: they are returned as blocked, and the other grasps form the
-    batch. `ways` are the `free_ways` of each scene."""
+    batch. `ways` are the `free_directions` of each scene."""
     hand, obj = model.hand.model, model.obj.model
     probe = Probe(model, len(generators), room=ROOM)
     used = set(placed.index.tolist())
@@ -103,7 +117,7 @@ def clear_scene_starts(
     scene = np.repeat(placed.index, each)
     reaching = np.arange(len(scene)) % each % EVERY < REACHING
     reaching &= np.array([len(openings[s].sums) > 0 for s in scene.tolist()], bool)
-    count, around = len(scene), _Around(hand, obj, ways, openings)
+    count, around = len(scene), _SceneDraws(hand, obj, ways, openings)
     uniform = np.array([g.random((DRAWS, _UNIFORM)) for g in generators])
     normal = np.zeros((count, 0, 2 + hand.dofs))
     best = HandState(np.zeros((count, 3)), np.tile([1.0, 0, 0, 0], (count, 1)), np.zeros((count, hand.dofs)))
@@ -122,7 +136,7 @@ def clear_scene_starts(
         reach = reaching[rows] & (number < REACHES)
         numbers = np.where(reach, order[rows, min(number, REACHES - 1)], number)
         states, across_pairs = around.draws(uniform[rows, numbers], normal[rows, number], scene[rows], reach)
-        off = _raise(states, across_pairs, np.flatnonzero(reach), placed, scene[rows], probe)
+        off = _raise_draws(states, across_pairs, np.flatnonzero(reach), placed, scene[rows], probe)
         worth = off < beside[rows, None]
         worth[~reach | (depth[rows] > CLEAR)] = True
         found = _depths(probe, states, placed, scene[rows], worth)
@@ -135,7 +149,7 @@ def clear_scene_starts(
         taken = states[(at[0] * len(RETREATS) + pick)[better]]
         depth[rows[better]] = least[better]
         beside[rows[better]] = np.where(least <= CLEAR, off[at], beside[rows])[better]
-        put(best, rows[better], taken)
+        store_states(best, rows[better], taken)
     return best, depth
 
 
@@ -161,22 +175,22 @@ def _depths(
             some = states[left * len(RETREATS) + k]
             found[left, k] = probe.depths(some)
             clear = np.flatnonzero(found[left, k] <= CLEAR)
-            lack = _mounting_lack(probe, some[clear], placed, scene[left[clear]], exact=True)
+            lack = _missing_mounting_clearance(probe, some[clear], placed, scene[left[clear]], exact=True)
             found[left[clear], k] = np.maximum(found[left[clear], k], lack)
             open_[left] = found[left, k] <= CLEAR
     return found
 
 
-def _mounting_lack(
+def _missing_mounting_clearance(
     probe: Probe, states: HandState, placed: PlacedGrasps, scene: NDArray[np.intp], *, exact: bool
 ) -> Floats:
     """Return the clearance (n,) missing at mountings in scenes (n,), relative to the margin plus `ROOM` [m]."""
     hand, obj = probe.model.hand.model, probe.model.obj.model
     poses = posture_of(hand, obj, states).hand_pose
-    return mounting_lack(hand, poses, placed.scenes, scene, room=ROOM, exact=exact)
+    return missing_mounting_clearance(hand, poses, placed.scenes, scene, room=ROOM, exact=exact)
 
 
-def _raise(
+def _raise_draws(
     states: HandState,
     across_pairs: _AcrossPairs,
     rows: NDArray[np.intp],
@@ -195,17 +209,17 @@ def _raise(
     probe.depths(states[rows * repeat])
     lifted = np.zeros((len(scene), 3))
     lack = probe.data.depths.obstacles.numpy()[: len(rows)].astype(float)
-    lack = np.maximum(lack, _mounting_lack(probe, states[rows * repeat], placed, scene[rows], exact=False))
+    lack = np.maximum(lack, _missing_mounting_clearance(probe, states[rows * repeat], placed, scene[rows], exact=False))
     lifted[rows] = lack[:, None] * up[rows]
     every = (rows[:, None] * repeat + np.arange(repeat)).ravel()
     states.pivot[every] += np.repeat(lifted[rows], repeat, axis=0)
     for at, reaches in across_pairs:
-        off[at] = reaches.beside(lifted[at][:, None] + np.array(RETREATS)[:, None] * reaches.away[:, None])
+        off[at] = reaches.pad_distance(lifted[at][:, None] + np.array(RETREATS)[:, None] * reaches.away[:, None])
     return off
 
 
 @dataclass(frozen=True)
-class _Around:
+class _SceneDraws:
     hand: HandModel
     obj: ObjectModel
     ways: Sequence[Floats]
@@ -219,7 +233,7 @@ class _Around:
         for s in np.unique(scene[reaching]):
             rows = np.flatnonzero(reaching & (scene == s))
             opening, ways, drawn = self.openings[s], self.ways[s], uniform[rows, :CANDIDATES, :6]
-            order[rows], least[rows] = promising(
+            order[rows], least[rows] = select_draws(
                 self.hand, self.obj, opening, drawn, ways, placed.scenes[s], room=ROOM, keep=REACHES
             )
         return order, least
@@ -235,7 +249,7 @@ class _Around:
         for s in np.unique(scene):
             rows = np.flatnonzero((scene == s) & reach)
             if len(rows):
-                one = across(self.hand, self.obj, self.openings[s], uniform[rows, :6], self.ways[s])
+                one = place_across(self.hand, self.obj, self.openings[s], uniform[rows, :6], self.ways[s])
                 pivot[rows], rotation[rows], away[rows] = one.pivot, quat_from_matrix(one.turn), one.away
                 q[rows] = one.q(self.hand, normal[rows, 2:])
                 reaching.append((rows, one))
@@ -296,20 +310,20 @@ DEEPEST_M: Final = 0.01
 UP: Final = (0.5, 1.0)
 
 
-def hindrance(model: Model, state: HandState, placed: PlacedGrasps) -> Floats:
+def obstruction(model: Model, state: HandState, placed: PlacedGrasps) -> Floats:
     """Compute the merit (n,) that hands lose for a blocked retreat or lift in their scenes.
     The loss grows with the depth of the hand in object or obstacles on the trajectory, and of its mounting at the
     grasp."""
     hand, obj = model.hand.model, model.obj.model
-    mounted = mounting_lack(hand, posture_of(hand, obj, state).hand_pose, placed.scenes, placed.index)
-    deep = np.maximum(_back(model, state, placed.index), mounted)
+    mounted = missing_mounting_clearance(hand, posture_of(hand, obj, state).hand_pose, placed.scenes, placed.index)
+    deep = np.maximum(_retreat_obstruction(model, state, placed.index), mounted)
     rows = np.flatnonzero(np.array([not _open_above(scene) for scene in placed.scenes])[placed.index])
     if len(rows):
-        deep[rows] = np.maximum(deep[rows], _rising(model, state[rows], placed.take(rows)))
+        deep[rows] = np.maximum(deep[rows], _lift_obstruction(model, state[rows], placed.take(rows)))
     return np.asarray(WEIGHT * np.clip(deep - TOLERATED_M, 0.0, DEEPEST_M), float)
 
 
-def _back(model: Model, state: HandState, scenes: NDArray[np.integer]) -> Floats:
+def _retreat_obstruction(model: Model, state: HandState, scenes: NDArray[np.integer]) -> Floats:
     hand = model.hand.model
     finger = finger_of_body(hand)
     driven = np.zeros(hand.dofs, bool)
@@ -334,7 +348,7 @@ def _open_above(scene: Environment) -> bool:
     return all(len(o.planes) == 1 and o.planes[0, :3] @ scene.up > 1 - 1e-6 for o in scene.obstacles)
 
 
-def _rising(model: Model, state: HandState, placed: PlacedGrasps) -> Floats:
+def _lift_obstruction(model: Model, state: HandState, placed: PlacedGrasps) -> Floats:
     n = len(state.pivot)
     up = np.array([scene.up for scene in placed.scenes])[placed.index]
     pivot = np.concatenate([state.pivot + share * RISE_M * up for share in UP])

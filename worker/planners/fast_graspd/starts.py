@@ -112,7 +112,7 @@ def draw(pair: _Pair, generators: list[np.random.Generator]) -> tuple[HandState,
     return HandState(pivot, rotation, np.clip(q, hand.lower, hand.upper)), approach
 
 
-def _retreated(state: HandState, approach: Floats) -> HandState:
+def _retreats(state: HandState, approach: Floats) -> HandState:
     back = np.array(RETREATS)[None, :, None]
     return at_distances(state.pivot[:, None] - back * approach[:, None], state.rotation, state.q)
 
@@ -157,11 +157,11 @@ def sample_starts(model: Model, *, seed: int, batch: int, indices: range, each: 
     state, depth = clear_starts(model, generators, each=each)
     open_further(model, generators, state, depth, np.ones(len(depth), bool))
     if depth.max() > NO_PLACE:
-        raise no_place(model)
+        raise no_start_error(model)
     return state
 
 
-def no_place(model: Model) -> InputError:
+def no_start_error(model: Model) -> InputError:
     hand, obj = model.hand.model, model.obj.model
     return InputError(
         f"{hand.name} finds no free place around {obj.name}: the object is too large or encloses the hand; "
@@ -182,11 +182,13 @@ def clear_starts(model: Model, generators: list[np.random.Generator], *, each: i
     deepest = np.full(count, np.inf)
     if jaws is None and each > 1 and (reaching := ReachSampling.of(model)) is not None:
         rows = np.arange(count)
-        _reach(reaching, generators, rows if reaching.only else rows[rows % each % 2 == 1], probe, best, deepest)
+        _draw_antipodal(
+            reaching, generators, rows if reaching.only else rows[rows % each % 2 == 1], probe, best, deepest
+        )
 
     def drawn(rows: NDArray[np.intp]) -> HandState:
         if jaws is None:
-            return _retreated(*draw(pair, [generators[i] for i in rows]))
+            return _retreats(*draw(pair, [generators[i] for i in rows]))
         return jaws.draw(np.array([generators[i].random(UNIFORM) for i in rows]))
 
     _draw_until_clear(drawn, probe, DRAWS, np.flatnonzero(deepest > CLEAR), best, deepest)
@@ -211,7 +213,7 @@ def open_further(
         pair = _Pair(wider, obj, OPENED_GAP)
 
         def drawn(rows: NDArray[np.intp], pair: _Pair = pair) -> HandState:
-            return _retreated(*draw(pair, [generators[i] for i in rows]))
+            return _retreats(*draw(pair, [generators[i] for i in rows]))
 
         _draw_until_clear(drawn, probe, OPENED_DRAWS, rows[depth[rows] > CLEAR], state, depth)
     return lost
@@ -238,12 +240,12 @@ def _draw_until_clear(
         found = states[np.arange(len(rows)) * depth.shape[1] + pick]
         depth = depth[np.arange(len(rows)), pick]
         better = depth < deepest[rows]
-        put(best, rows[better], found[better])
+        store_states(best, rows[better], found[better])
         deepest[rows[better]] = depth[better]
         rows = rows[deepest[rows] > CLEAR]
 
 
-def _reach(
+def _draw_antipodal(
     reaching: ReachSampling,
     generators: list[np.random.Generator],
     rows: NDArray[np.intp],
@@ -264,14 +266,14 @@ def _reach(
         first[left] = number[some] + 1
         depth = probe.depths(found)
         clear = depth <= CLEAR
-        put(best, rows[left[clear]], found[clear])
+        store_states(best, rows[left[clear]], found[clear])
         deepest[rows[left[clear]]] = depth[clear]
         left = left[~clear]
         if not len(left):
             return
 
 
-def put(states: HandState, rows: NDArray[np.intp], others: HandState) -> None:
+def store_states(states: HandState, rows: NDArray[np.intp], others: HandState) -> None:
     states.pivot[rows], states.rotation[rows], states.q[rows] = others.pivot, others.rotation, others.q
 
 

@@ -62,7 +62,7 @@ def expose(
         local = wp.normalize(wp.vec3f(x, y, 1.0))
         direction = wp.transform_vector(camera, local)
         if k == 0:
-            near = rays.may_meet(placed_in, world, eye, direction, spread)
+            near = rays.may_hit(placed_in, world, eye, direction, spread)
         if flat:
             # Only the point where the ray meets the plane changes between passes.
             hit.distance = offset / wp.dot(hit.normal, direction)
@@ -83,7 +83,7 @@ def expose(
             offset = wp.dot(hit.normal, point - eye)
         cosine = wp.max(wp.dot(hit.normal, toward), 0.0)
         visible = wp.float32(0.0)
-        if cosine > 0.0 and not rays.in_the_way(placed_in, world, point + hit.normal * rays.CLEAR, toward):
+        if cosine > 0.0 and not rays.is_occluded(placed_in, world, point + hit.normal * rays.CLEAR, toward):
             visible = wp.float32(1.0)
         if not shaded:
             total += wp.vec3f(visible)

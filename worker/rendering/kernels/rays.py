@@ -49,7 +49,7 @@ def bit_of(k: wp.int32):
 
 
 @wp.func
-def goes_through(lower: wp.vec3f, upper: wp.vec3f, origin: wp.vec3f, inverse: wp.vec3f, far: wp.float32):
+def passes_through(lower: wp.vec3f, upper: wp.vec3f, origin: wp.vec3f, inverse: wp.vec3f, far: wp.float32):
     """Check whether a ray passes through bounds before `far`."""
     a = wp.cw_mul(lower - origin, inverse)
     b = wp.cw_mul(upper - origin, inverse)
@@ -79,7 +79,7 @@ def box_distance(half: wp.vec3f, origin: wp.vec3f, direction: wp.vec3f):
 
 
 @wp.func
-def may_meet(
+def may_hit(
     placed: wp.array2d[PlacedSolid], world: wp.int32, origin: wp.vec3f, direction: wp.vec3f, spread: wp.float32
 ):
     """Return a mask with bit k set if a unit ray within `spread` of this one may hit solid k. Solids from the 64th on
@@ -91,7 +91,7 @@ def may_meet(
         # Inside the bounds, a ray deviates most at their farthest corner.
         off = spread * wp.length(wp.max(wp.abs(there.lower - origin), wp.abs(there.upper - origin)))
         wide = wp.vec3f(off, off, off)
-        if goes_through(there.lower - wide, there.upper + wide, origin, inverse, FAR):
+        if passes_through(there.lower - wide, there.upper + wide, origin, inverse, FAR):
             near = near | bit_of(k)
     return near
 
@@ -120,7 +120,7 @@ def first_hit(
     origin: wp.vec3f,
     direction: wp.vec3f,
 ):
-    """Return the first hit of a ray among solids that it `may_meet`; meshes hit from inside are ignored."""
+    """Return the first hit of a ray among solids that it `may_hit`; meshes hit from inside are ignored."""
     hit = RayHit()
     hit.shape = wp.int32(-1)
     hit.distance = FAR
@@ -131,7 +131,7 @@ def first_hit(
     inverse = inverse_of(direction)
     for k in range(placed.shape[1]):
         there = placed[world, k]
-        if near & bit_of(k) != wp.uint64(0) and goes_through(there.lower, there.upper, origin, inverse, hit.distance):
+        if near & bit_of(k) != wp.uint64(0) and passes_through(there.lower, there.upper, origin, inverse, hit.distance):
             start = there.turn * (origin - there.place)
             along = there.turn * direction
             if there.mesh != wp.uint64(0):
@@ -161,12 +161,12 @@ def first_hit(
 
 
 @wp.func
-def in_the_way(placed: wp.array2d[PlacedSolid], world: wp.int32, origin: wp.vec3f, direction: wp.vec3f):
+def is_occluded(placed: wp.array2d[PlacedSolid], world: wp.int32, origin: wp.vec3f, direction: wp.vec3f):
     """Check whether a ray hits anything."""
     inverse = inverse_of(direction)
     for k in range(placed.shape[1]):
         there = placed[world, k]
-        if goes_through(there.lower, there.upper, origin, inverse, FAR):
+        if passes_through(there.lower, there.upper, origin, inverse, FAR):
             start = there.turn * (origin - there.place)
             along = there.turn * direction
             if there.mesh != wp.uint64(0):

@@ -80,7 +80,7 @@ class HalfSpaces:
 
 
 @wp.kernel
-def rooms(
+def half_space_clearance(
     chain_in: Chain,
     spaces_in: HalfSpaces,
     scene_in: wp.array(dtype=wp.int32),

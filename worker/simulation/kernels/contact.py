@@ -118,7 +118,7 @@ def displacement_gradient(s: vec6, physics: Physics):
 
 
 @wp.func
-def leaked(pull: wp.float32, gap: wp.float32, physics: Physics):
+def free_gradient(pull: wp.float32, gap: wp.float32, physics: Physics):
     """Return dL/drho of a free point at distance `gap` from the dilated surface, from that on contact."""
     if physics.one_sided == 1 and pull < 0.0:
         return float(0.0)
@@ -313,7 +313,7 @@ def gauss_seidel(
             y = y - g * j
             wp.atomic_add(contacts_inout.gradient, b, i, share * g)
         else:
-            g = leaked(wp.dot(mj, y) / w, -c, physics_in)
+            g = free_gradient(wp.dot(mj, y) / w, -c, physics_in)
             if g != 0.0:
                 wp.atomic_add(contacts_inout.gradient, b, i, share * g)
 
@@ -403,7 +403,7 @@ def jacobi(
                         g += physics_in.friction * along / w
                         carried -= (physics_in.friction * along / w) * j
             else:
-                g = leaked(g, -c, physics_in)
+                g = free_gradient(g, -c, physics_in)
             if g != 0.0:
                 wp.atomic_add(contacts_inout.gradient, b, i, part * g)
         if touching > 0.0:

@@ -62,7 +62,7 @@ def climb(hull: Hull, start: int, x: vec6):
 
 
 @wp.func
-def span(hull: Hull, e: int, f: int, k: int, p: int, point: wp.array(dtype=vec6)):
+def create_facet(hull: Hull, e: int, f: int, k: int, p: int, point: wp.array(dtype=vec6)):
     """Create facet e from point p and the ridge that seen facet f shares with its unseen neighbour k."""
     g = hull.neighbour[f, k]
     back = wp.int32(0)
@@ -84,7 +84,7 @@ def span(hull: Hull, e: int, f: int, k: int, p: int, point: wp.array(dtype=vec6)
 
 
 @wp.func
-def link(hull: Hull, e: int, k: int, mark: wp.array(dtype=wp.int64), now: int, mask: wp.int64):
+def connect_facet(hull: Hull, e: int, k: int, mark: wp.array(dtype=wp.int64), now: int, mask: wp.int64):
     """Join facet e to the fresh facets with common ridges; return the change in unpaired ridges."""
     total = wp.int64(0)
     for j in range(6):
@@ -161,7 +161,7 @@ def insert(
                     failed = 1
                 else:
                     top = top + 1
-                span(hull, e, f, k, p, point)
+                create_facet(hull, e, f, k, p, point)
                 hull.fresh[born] = e
                 hull.side[born] = k
                 born = born + 1
@@ -174,7 +174,7 @@ def insert(
         failed = 1
     else:
         for n in range(born):
-            pending = pending + link(hull, hull.fresh[n], hull.side[n], mark, stamp, wp.int64(size - 1))
+            pending = pending + connect_facet(hull, hull.fresh[n], hull.side[n], mark, stamp, wp.int64(size - 1))
     if pending != 0:
         failed = 1
     for n in range(born):

@@ -24,7 +24,7 @@ class FingerJams:
 
 
 @wp.func
-def on_way(
+def path_displacement(
     fingers: Fingers, hands: Hands, jams: FingerJams, open: wp.array2d(dtype=wp.float64), b: wp.int32, d: wp.int32
 ):
     """Return the displacement of a dof from the grasp."""
@@ -36,7 +36,7 @@ def on_way(
 
 
 @wp.kernel
-def place_on_way(
+def place_on_path(
     chain_in: Chain,
     fingers_in: Fingers,
     hands_in: Hands,
@@ -53,7 +53,7 @@ def place_on_way(
     bodies_out.rotation[b, 0] = hands_in.rotation[b]
     for body in range(1, chain_in.parent.shape[0]):
         d = chain_in.dof[body]
-        q = hands_in.q[b, d] + way_in * on_way(fingers_in, hands_in, jams_in, open_in, b, d)
+        q = hands_in.q[b, d] + way_in * path_displacement(fingers_in, hands_in, jams_in, open_in, b, d)
         place_body(chain_in, bodies_out, b, body, joint_value(chain_in, body, q))
 
 
@@ -107,7 +107,7 @@ def limit_depth(more_in: wp.float32, jams_inout: FingerJams):
 
 
 @wp.kernel
-def hold_back(less_in: wp.float64, jams_inout: FingerJams):
+def shorten_paths(less_in: wp.float64, jams_inout: FingerJams):
     """Reduce the path of jammed fingers to a share `less`; finish hands without any. Reset depths. Over B."""
     b = wp.tid()
     if jams_inout.going[b] == 0:
@@ -122,10 +122,10 @@ def hold_back(less_in: wp.float64, jams_inout: FingerJams):
 
 
 @wp.kernel
-def take_way(fingers_in: Fingers, hands_in: Hands, jams_in: FingerJams, open_inout: wp.array2d(dtype=wp.float64)):
+def take_path(fingers_in: Fingers, hands_in: Hands, jams_in: FingerJams, open_inout: wp.array2d(dtype=wp.float64)):
     """Write the dofs of fingers after jams are held back. Launch over (B, D)."""
     b, d = wp.tid()
-    open_inout[b, d] = hands_in.q[b, d] + on_way(fingers_in, hands_in, jams_in, open_inout, b, d)
+    open_inout[b, d] = hands_in.q[b, d] + path_displacement(fingers_in, hands_in, jams_in, open_inout, b, d)
 
 
 @wp.struct

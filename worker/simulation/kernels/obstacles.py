@@ -111,7 +111,7 @@ def obstacle_distance(obstacles: Obstacles, k: wp.int32, f: Feature):
 
 
 @wp.func
-def kept(features: Features, obstacles: Obstacles, i: wp.int32, k: wp.int32, room: wp.float32):
+def required_clearance(features: Features, obstacles: Obstacles, i: wp.int32, k: wp.int32, room: wp.float32):
     """Return the required clearance of feature i from obstacle k, plus `room` [m]."""
     out = features.margin[i] + room
     if features.tip[i] != 0:
@@ -120,7 +120,7 @@ def kept(features: Features, obstacles: Obstacles, i: wp.int32, k: wp.int32, roo
 
 
 @wp.func
-def may_meet(
+def is_near(
     features: Features,
     obstacles: Obstacles,
     piece: wp.int32,
@@ -142,7 +142,7 @@ def may_meet(
         for p in range(obstacles.first_plane[k], obstacles.first_plane[k + 1]):
             plane = obstacles.planes[p]
             beyond = wp.max(beyond, wp.dot(wp.vec3(plane[0], plane[1], plane[2]), middle) - plane[3])
-        if beyond - features.extent[piece] < kept(features, obstacles, i, k, room) + more:
+        if beyond - features.extent[piece] < required_clearance(features, obstacles, i, k, room) + more:
             return True
     return False
 
@@ -162,14 +162,14 @@ def penalty(
     hands = hands_inout
     if hands.active[b] == 0 or hands.scene[b] < 0:
         return
-    if not may_meet(features_in, obstacles_in, piece, hands.scene[b], b, 0.0, room_in, hands.body_p, hands.body_q):
+    if not is_near(features_in, obstacles_in, piece, hands.scene[b], b, 0.0, room_in, hands.body_p, hands.body_q):
         return
     for i in range(features_in.first[piece], features_in.first[piece + 1]):
         f = posed(features_in, i, b, hands.body_p, hands.body_q)
         weight = 2.0 * weight_in[hands.iteration[0]]
         for k in range(obstacles_in.first[hands.scene[b]], obstacles_in.first_solid[hands.scene[b]]):
             nd = obstacle_distance(obstacles_in, k, f)
-            short = nd[3] - kept(features_in, obstacles_in, i, k, room_in)
+            short = nd[3] - required_clearance(features_in, obstacles_in, i, k, room_in)
             if short < 0.0:
                 n = wp.vec3(nd[0], nd[1], nd[2])
                 if weight != 0.0:
@@ -192,13 +192,13 @@ def residuals(
     hands = hands_in
     if hands.active[b] == 0 or hands.scene[b] < 0:
         return
-    if not may_meet(features_in, obstacles_in, piece, hands.scene[b], b, near_in, 0.0, hands.body_p, hands.body_q):
+    if not is_near(features_in, obstacles_in, piece, hands.scene[b], b, near_in, 0.0, hands.body_p, hands.body_q):
         return
     for i in range(features_in.first[piece], features_in.first[piece + 1]):
         f = posed(features_in, i, b, hands.body_p, hands.body_q)
         for k in range(obstacles_in.first[hands.scene[b]], obstacles_in.first_solid[hands.scene[b]]):
             nd = obstacle_distance(obstacles_in, k, f)
-            margin = kept(features_in, obstacles_in, i, k, 0.0)
+            margin = required_clearance(features_in, obstacles_in, i, k, 0.0)
             if nd[3] < margin + near_in:
                 n = wp.vec3(nd[0], nd[1], nd[2])
                 gap = nd[3] - margin - target_in

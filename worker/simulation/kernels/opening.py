@@ -78,7 +78,7 @@ def body_wrenches(
 
 
 @wp.kernel
-def leave(
+def opening_directions(
     chain_in: Chain,
     fingers_in: Fingers,
     plain_in: wp.float64,
@@ -131,7 +131,7 @@ def leave(
 
 
 @wp.kernel
-def open_plainly(
+def open_against_closing(
     fingers_in: Fingers, stuck_in: wp.float32, first_in: Sweep, sweep_out: Sweep, step_out: wp.array(dtype=wp.int32)
 ):
     """Restart hands with a finger that moved less than `stuck`, against `closing`. Launch over B."""

@@ -53,7 +53,7 @@ def count_marks(
 
 
 @wp.func
-def before(
+def marked_before(
     counts: wp.array2d(dtype=wp.int32), mark: wp.array2d(dtype=wp.int32), least: wp.int32, b: wp.int32, i: wp.int32
 ):
     """Return the number of points before the i-th whose mark is at least `least`."""
@@ -83,10 +83,10 @@ def pack(
     last = i == marked_in.mark.shape[1] - 1
     if mark == NONE and not last:
         return
-    k = before(kept_in, marked_in.mark, KEPT, b, i)
+    k = marked_before(kept_in, marked_in.mark, KEPT, b, i)
     near = wp.int32(0)
     if mark == NEAR or last:
-        near = before(near_in, marked_in.mark, NEAR, b, i)
+        near = marked_before(near_in, marked_in.mark, NEAR, b, i)
     if mark == NEAR:
         packed_out.near[b, near] = k
     if mark != NONE:

@@ -9,7 +9,14 @@ evaluations."""
 import warp as wp
 
 from graspd.worker.simulation.kernels.kinematics import Hands
-from graspd.worker.simulation.kernels.obstacles import Features, Obstacles, kept, lowest_point, obstacle_distance, posed
+from graspd.worker.simulation.kernels.obstacles import (
+    Features,
+    Obstacles,
+    lowest_point,
+    obstacle_distance,
+    posed,
+    required_clearance,
+)
 from graspd.worker.simulation.kernels.pieces import Pieces, piece_centre, piece_distance, piece_rotation
 from graspd.worker.simulation.kernels.projection import Residuals, emit
 from graspd.worker.simulation.kernels.wrenches import add_wrench
@@ -41,13 +48,15 @@ class NearestObstacle:
 
 
 @wp.func
-def meeting(t0: wp.float32, f0: wp.float32, g0: wp.float32, t1: wp.float32, f1: wp.float32, g1: wp.float32):
+def tangent_intersection(
+    t0: wp.float32, f0: wp.float32, g0: wp.float32, t1: wp.float32, f1: wp.float32, g1: wp.float32
+):
     """Return the intersection of two tangents of a convex function, g0 < 0 < g1; between t0 and t1."""
     return wp.clamp((f1 - f0 + g0 * t0 - g1 * t1) / (g0 - g1), t0, t1)
 
 
 @wp.func
-def balanced(n0: wp.vec3, g0: wp.float32, n1: wp.vec3, g1: wp.float32):
+def edge_gradient(n0: wp.vec3, g0: wp.float32, n1: wp.vec3, g1: wp.float32):
     """Return the gradient of the least value on an edge, with slopes g0 < 0 < g1 beside it.
     At a bend it is the mixture of both sides' gradients without a slope along the edge."""
     share = g1 / (g1 - g0)
@@ -102,7 +111,7 @@ def least_on_edge(
     for _look in range(LOOKS):
         g0 = wp.dot(n0, along)
         g1 = wp.dot(n1, along)
-        t = meeting(t0, f0, g0, t1, f1, g1)
+        t = tangent_intersection(t0, f0, g0, t1, f1, g1)
         if f0 + g0 * (t - t0) >= wp.min(limit, wp.min(f0, f1) - EXACT):
             break
         at = convex_distance(pieces, piece, obstacles, k, a + t * along)
@@ -122,7 +131,7 @@ def least_on_edge(
     if f0 < f1:
         out.t = t0
         out.value = f0
-    out.gradient = balanced(n0, wp.dot(n0, along), n1, wp.dot(n1, along))
+    out.gradient = edge_gradient(n0, wp.dot(n0, along), n1, wp.dot(n1, along))
     return out
 
 
@@ -213,7 +222,7 @@ def penalty(
     first = features_in.first[piece]
     weight = 2.0 * weight_in[hands.iteration[0]]
     for k in range(obstacles_in.first_solid[hands.scene[b]], obstacles_in.first[hands.scene[b] + 1]):
-        keep = kept(features_in, obstacles_in, first, k, room_in)
+        keep = required_clearance(features_in, obstacles_in, first, k, room_in)
         if apart(pieces_in, obstacles_in, piece, k, b, keep, hands.body_p, hands.body_q):
             continue
         for i in range(first, features_in.first[piece + 1]):
@@ -251,7 +260,7 @@ def residuals(
     body = pieces_in.body[piece]
     first = features_in.first[piece]
     for k in range(obstacles_in.first_solid[hands.scene[b]], obstacles_in.first[hands.scene[b] + 1]):
-        margin = kept(features_in, obstacles_in, first, k, 0.0)
+        margin = required_clearance(features_in, obstacles_in, first, k, 0.0)
         keep = margin + near_in
         target = margin + target_in
         if apart(pieces_in, obstacles_in, piece, k, b, keep, hands.body_p, hands.body_q):

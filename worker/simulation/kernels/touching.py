@@ -229,7 +229,7 @@ def scale_torques(
 
 
 @wp.kernel
-def hold(
+def net_wrench(
     effort_in: wp.array(dtype=wp.float64),
     matrix_in: wp.array3d(dtype=wp.float64),
     share_in: wp.array2d(dtype=wp.float64),

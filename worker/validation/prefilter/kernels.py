@@ -184,7 +184,7 @@ def push(w: wp.int32, number: wp.int32, terms: TestConstants, worlds: Worlds, en
 
 
 @wp.func
-def take(
+def take_next(
     w: wp.int32,
     terms: TestConstants,
     grasps: GraspCommands,
@@ -225,11 +225,11 @@ def begin(
     engine_out: Engine,
     state_out: wp.array(dtype=wp.int32),
 ):
-    take(wp.tid(), terms_in, grasps_in, worlds_out, engine_out, state_out)
+    take_next(wp.tid(), terms_in, grasps_in, worlds_out, engine_out, state_out)
 
 
 @wp.kernel
-def look(
+def check_state(
     # Model:
     terms_in: TestConstants,
     grasps_in: GraspCommands,
@@ -301,7 +301,7 @@ def look(
     if over or worlds_out.ticks[w] >= MOST:
         found_out.ticks[g] = worlds_out.ticks[w]
         found_out.overflow[g] = engine_out.overflow[w]
-        take(w, terms_in, grasps_in, worlds_out, engine_out, state_out)
+        take_next(w, terms_in, grasps_in, worlds_out, engine_out, state_out)
 
 
 @wp.kernel

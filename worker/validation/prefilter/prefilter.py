@@ -146,7 +146,7 @@ class WorldPool:
 
     def _validate(self, grasps: GraspSet, run: ExecutionContext) -> PrefilterOutcomes:
         n = len(grasps)
-        self._room_for(n)
+        self._reserve(n)
         starts = self._states(grasps.pregrasp)
         depth, short = self._depths(self._states(grasps.grasp))
         at_start, short_too = self._depths(starts)
@@ -154,7 +154,7 @@ class WorldPool:
         queue, found = np.flatnonzero(~inside), self._found
         for name in ("outcome", "margin", "ticks", "overflow"):
             getattr(found, name).zero_()
-        self._ask(grasps, starts, queue)
+        self._upload(grasps, starts, queue)
         self._simulate(len(queue), run)
         outcome = found.outcome.numpy()[:n].astype(np.uint8)
         outcome[inside, 0] = protocol.Outcome.PENETRATION
@@ -167,7 +167,7 @@ class WorldPool:
             ticks=found.ticks.numpy()[:n],
         )
 
-    def _room_for(self, n: int) -> None:
+    def _reserve(self, n: int) -> None:
         """Allocate arrays for at least `n` grasps. Allocation is rare, because graphs refer to these arrays."""
         if n <= self._capacity:
             return
@@ -193,7 +193,7 @@ class WorldPool:
             out[:, scene.root_qpos : scene.root_qpos + 7] = posture.hand_pose
         return out.astype(np.float32)
 
-    def _ask(self, grasps: GraspSet, starts: NDArray[np.float32], queue: NDArray[np.intp]) -> None:
+    def _upload(self, grasps: GraspSet, starts: NDArray[np.float32], queue: NDArray[np.intp]) -> None:
         scene, parts = self.scene, (grasps.pregrasp, grasps.grasp, grasps.squeeze)
         poses = np.stack([part.hand_pose for part in parts], axis=1)
         joints = np.stack([part.joint_positions for part in parts], axis=1)
@@ -248,7 +248,7 @@ class WorldPool:
         for _ in range(self._steps):
             self._engine.step(self._model, self._data)
         outputs = [self._worlds, self._arrays, self._found, self._state]
-        wp.launch(kernels.look, self.worlds, inputs=[self._terms, self._asked], outputs=outputs)
+        wp.launch(kernels.check_state, self.worlds, inputs=[self._terms, self._asked], outputs=outputs)
 
 
 _pools: OrderedDict[tuple[str, str, int], WorldPool] = OrderedDict()
@@ -266,12 +266,12 @@ class PrefilterVerdicts:
     def contradicted(self, rollouts: dict[int, Rollout]) -> int:
         return sum(rollouts[row].success != held for row, held in self.rechecked.items())
 
-    def believed(self, contradicted: int) -> bool:
+    def is_trusted(self, contradicted: int) -> bool:
         """Check whether so few verdicts were contradicted that all other verdicts are trusted."""
         return contradicted <= max(1, _MOST_CONTRADICTED * len(self.rechecked))
 
 
-def first_terms(hand: HandModel, level: str, run: ExecutionContext) -> list[Any]:
+def prefilter_key_terms(hand: HandModel, level: str, run: ExecutionContext) -> list[Any]:
     """Return the prefilter's terms for `verdict_key`; empty if it is not used for verdicts of this level.
     The prefilter is not used for grippers: their flat pads touch over an area, where the engines distribute contacts
     differently. It is not used for hands with tendons: the engines differ on a tenth of Shadow's grasps
@@ -285,7 +285,9 @@ def first_terms(hand: HandModel, level: str, run: ExecutionContext) -> list[Any]
     return [mujoco_warp_version(), REVISION, *BAND, PATIENCE, MOST_TICKS, RECHECK_ONE_IN]
 
 
-def screened(scene: Scene, terms: str, grasps: GraspSet, *, level: str, run: ExecutionContext) -> PrefilterVerdicts:
+def run_prefilter(
+    scene: Scene, terms: str, grasps: GraspSet, *, level: str, run: ExecutionContext
+) -> PrefilterVerdicts:
     """Run the prefilter on grasps in a scene; `terms` is a digest of everything that determines the scene."""
     postures = GraspSet(grasps.grasp, grasps.pregrasp, grasps.squeeze, grasps.stability_loss)
     if not len(grasps):
@@ -300,7 +302,7 @@ def screened(scene: Scene, terms: str, grasps: GraspSet, *, level: str, run: Exe
         log.warning("%s has no memory for the prefilter: the CPU validates %d grasps", run.device, len(grasps))
         return PrefilterVerdicts({}, {})
     clear = found.clearly_failed | (found.clearly_held if level == "fast" else False)
-    rechecked = clear & _drawn(grasps)
+    rechecked = clear & _recheck_sample(grasps)
     if found.overflow.any():
         log.warning("%d of %d grasps overflow the prefilter; the CPU validates them", found.overflow.sum(), len(grasps))
     return PrefilterVerdicts(
@@ -322,7 +324,7 @@ def _pool(scene: Scene, terms: str, device: str, count: int) -> WorldPool:
     return _pools[key]
 
 
-def _drawn(grasps: GraspSet) -> NDArray[np.bool_]:
+def _recheck_sample(grasps: GraspSet) -> NDArray[np.bool_]:
     """Select (N,) one grasp in `RECHECK_ONE_IN` by the digest of its pose, independently of its batch."""
     pose = np.ascontiguousarray(grasps.grasp.hand_pose, float)
     digests = (hashlib.sha256(row.tobytes()).digest() for row in pose)

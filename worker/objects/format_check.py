@@ -53,7 +53,7 @@ _MESHES: Final = {
 }
 
 
-def refuse_stand_in(name: str, data: bytes, error: type[InputError]) -> None:
+def check_format(name: str, data: bytes, error: type[InputError]) -> None:
     """Raise `error` if a file does not match its suffix; the message names its kind and the fix."""
     head = data[:1024].removeprefix(b"\xef\xbb\xbf").lstrip()
     # The 80 bytes at the beginning of a binary STL may be any text.
@@ -68,7 +68,7 @@ def refuse_stand_in(name: str, data: bytes, error: type[InputError]) -> None:
         raise error(f"{name} is a ZIP archive, not the file itself: unpack it, or name it .zip")
 
 
-def other_format(name: str, data: bytes) -> str | None:
+def true_format(name: str, data: bytes) -> str | None:
     """Return the true mesh format of a file that its reader refuses, and the fix; None if unknown."""
     own, head = PurePosixPath(name).suffix.lower(), data[:4096].lstrip()
     for suffix, pattern in _MESHES.items():

@@ -22,8 +22,8 @@ from graspd.worker.grasps import GraspSet, joined
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners import BatchRequest, NoStartFound, synthesize_batches
-from graspd.worker.rounds import Round, taken
-from graspd.worker.simulation.environment import Scenes, scenes_together
+from graspd.worker.rounds import Round, select_rows
+from graspd.worker.simulation.environment import Scenes, join_scenes
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.prefilter.prefilter import PrefilterVerdicts
 
@@ -76,7 +76,7 @@ def validated_batches(
     ordered = [found[number] for number in sorted(found)]
     if (like := next(filter(None, ordered), None)) is None:
         raise refused[0]
-    return [one or _nothing(like) for one in ordered]
+    return [one or _empty_batch(like) for one in ordered]
 
 
 #: Number of a batch within its job, and its result.
@@ -119,7 +119,7 @@ class _Job:
         several = [one for one in self.scenes if one is not None] if len({*map(id, self.scenes)}) > 1 else []
         ends = accumulate((len(one.object_pose) for one in several), initial=0)
         own = [range(*both) for both in pairwise(ends)] if several else [None] * len(self.sizes)
-        scenes = scenes_together(several) if several else self.scenes[0]
+        scenes = join_scenes(several) if several else self.scenes[0]
         going, waiting = dict[int, Batch](), deque[Batch]()
         with (
             Scoring(self.hand, self.obj, self.request, scenes=scenes, pieces=self.pieces, run=run) as scoring,
@@ -144,7 +144,7 @@ class _Job:
             except TaskCancelled:
                 stop.set()
                 if self.partial:
-                    scoring.goes_on()
+                    scoring.ignore_cancellation()
                     yield from ((number, batch.finish()) for number, batch in going.items() if batch.rounds)
                 raise
             finally:
@@ -181,7 +181,7 @@ def _planned(scoring: Scoring, batches: Sequence[Batch]) -> _Wave:
     rollout, request, asked = scoring.rollout(known), scoring.request, list[BatchRequest]()
     for batch in batches:
         assert batch.needed is not None
-        wanted = batch.wanted(batch.needed, rollout, others_have_place=batch.candidates > 0)
+        wanted = batch.plan_request(batch.needed, rollout, others_have_place=batch.candidates > 0)
         asked.append(BatchRequest(wanted, batch.run.part(*batch.needed.progress).part(0.0, PARTS[0])))
     with exclusive:
         made = synthesize_batches(scoring.hand, scoring.obj, asked, method=request.method, options=request.options)
@@ -190,7 +190,7 @@ def _planned(scoring: Scoring, batches: Sequence[Batch]) -> _Wave:
         for batch, one, grasps in zip(batches, asked, made, strict=True):
             if isinstance(grasps, TaskCancelled):
                 raise grasps
-            told.append(batch.told(one.wanted, grasps) if isinstance(grasps, GraspSet) else grasps)
+            told.append(batch.grasps_to_store(one.wanted, grasps) if isinstance(grasps, GraspSet) else grasps)
         good = [grasps for grasps in told if isinstance(grasps, GraspSet)]
         whole = joined(good) if good else None
         return _Wave(batches, told, whole, known, scoring.prefiltered(whole) if whole is not None else None)
@@ -200,19 +200,19 @@ def _scored(scoring: Scoring, wave: _Wave) -> Iterator[tuple[Batch, Exception | 
     """Validate and measure a wave at once; yield each batch with its planning error or None."""
     parts: Iterator[Round] = iter(())
     if wave.whole is not None:
-        scored = scoring.scored(wave.whole, scoring.run.quiet(), wave.known, wave.prefilter)
+        scored = scoring.evaluate(wave.whole, scoring.run.quiet(), wave.known, wave.prefilter)
         parts = iter(scored.split([len(made) for made in wave.made if isinstance(made, GraspSet)]))
     for batch, made in zip(wave.batches, wave.made, strict=True):
         if isinstance(made, Exception):
-            yield batch, batch.refused(made) if isinstance(made, NoStartFound) else made
+            yield batch, batch.explain_refusal(made) if isinstance(made, NoStartFound) else made
             continue
         assert batch.needed is not None
-        batch.add(batch.noted(batch.needed, next(parts), made))
+        batch.add(batch.complete_round(batch.needed, next(parts), made))
         yield batch, None
 
 
-def _nothing(like: ValidatedBatch) -> ValidatedBatch:
+def _empty_batch(like: ValidatedBatch) -> ValidatedBatch:
     """Return a batch without grasps and without candidates."""
-    grasps, columns = taken(like.grasps, like.columns, np.zeros(0, int))
+    grasps, columns = select_rows(like.grasps, like.columns, np.zeros(0, int))
     seconds, shares = (dict.fromkeys(counts, 0.0) for counts in (like.seconds, like.shares))
     return ValidatedBatch(grasps, columns, 0, dict.fromkeys(like.rejected, 0), {}, like.verdict_key, 0, seconds, shares)

@@ -38,7 +38,7 @@ _LOOKS: Final = 15
 
 
 @dataclass(frozen=True)
-class SameHand:
+class HandMatch:
     """Mapping of the joints and base of the model `theirs` to those of `ours`."""
 
     ours: HandModel
@@ -67,20 +67,20 @@ class SameHand:
         return compose(invert(a[self.bodies]), b)
 
 
-def same_hand(
+def match_hands(
     ours: HandModel,
     theirs: HandModel,
     joint_map: Mapping[str, str] | None = None,
     *,
     tolerance_m: float = TOLERANCE_M,
     seed: int = 0,
-) -> SameHand:
+) -> HandMatch:
     """Match two models of a hand: `ours`, for which grasps were planned, and `theirs`.
     Joints are matched by `joint_map` (ours to theirs) or name, ignoring case and a common prefix of all names of a hand
     (`rh_`, `robot0:`). The bases are fitted for the best agreement of fingertips over random postures. A fingertip is
     the mean of the corners of a finger's last body.
     Raises InputError: a joint has no match in the other model, or fingertips differ by more than `tolerance_m` [m]."""
-    joints = _matched(ours, theirs, joint_map or {})
+    joints = _matching_bodies(ours, theirs, joint_map or {})
     tips = [body for body in ours.fingertips if body]
     rng = np.random.default_rng(seed)
     mine = ours.expand(rng.uniform(ours.lower, ours.upper, (POSTURES, ours.dofs)))
@@ -88,8 +88,8 @@ def same_hand(
     there = body_poses(theirs, np.tile(IDENTITY_POSE, (POSTURES, 1)), mine[:, joints])
     twins = dict(zip(ours.joint_body[joints].tolist(), theirs.joint_body.tolist(), strict=True))
     other = [twins[body] for body in tips]
-    where = np.stack([apply(here[:, b], _middle(ours, b)) for b in tips], axis=1)
-    base, places = _fit(where[:_FITTED], there[:_FITTED, other], np.array([_middle(theirs, b) for b in other]))
+    where = np.stack([apply(here[:, b], _body_centre(ours, b)) for b in tips], axis=1)
+    base, places = _fit(where[:_FITTED], there[:_FITTED, other], np.array([_body_centre(theirs, b) for b in other]))
     error = np.linalg.norm(apply(base, apply(there[:, other], places)) - where, axis=-1)
     if error.max() > tolerance_m:
         worst = tips[int(error.max(axis=0).argmax())]
@@ -98,19 +98,19 @@ def same_hand(
             f"{1e3 * error.max():.2f} mm from where {ours.name} has it, {1e3 * tolerance_m:g} mm are allowed; "
             "compare axes and zeros of the joints, or name the pairs: --joint-map OURS=THEIRS"
         )
-    return SameHand(ours, theirs, joints, base, float(error.max()))
+    return HandMatch(ours, theirs, joints, base, float(error.max()))
 
 
-def _matched(ours: HandModel, theirs: HandModel, joint_map: Mapping[str, str]) -> NDArray[np.intp]:
+def _matching_bodies(ours: HandModel, theirs: HandModel, joint_map: Mapping[str, str]) -> NDArray[np.intp]:
     for here, there in joint_map.items():
         for name, hand in ((here, ours), (there, theirs)):
             if name not in hand.joint_names:
                 raise InputError(f"--joint-map names the joint {name!r}, which {hand.name} does not have")
     said = {there: here for here, there in joint_map.items()}
-    plain_ours = {_plain(name, ours.joint_names): name for name in ours.joint_names if name not in joint_map}
+    plain_ours = {_strip_prefix(name, ours.joint_names): name for name in ours.joint_names if name not in joint_map}
     exact = set(plain_ours.values())
     twins = {
-        name: said.get(name) or (name if name in exact else plain_ours.get(_plain(name, theirs.joint_names)))
+        name: said.get(name) or (name if name in exact else plain_ours.get(_strip_prefix(name, theirs.joint_names)))
         for name in theirs.joint_names
     }
     missing = [name for name, twin in twins.items() if twin is None]
@@ -129,7 +129,7 @@ def _matched(ours: HandModel, theirs: HandModel, joint_map: Mapping[str, str]) -
     return np.array(found, np.intp)
 
 
-def _plain(name: str, names: Sequence[str]) -> str:
+def _strip_prefix(name: str, names: Sequence[str]) -> str:
     """Strip the common prefix of all names, up to its last non-alphanumeric character."""
     alike = 0
     while len(names) > 1 and alike < len(name) and all(other[: alike + 1] == name[: alike + 1] for other in names):
@@ -137,7 +137,7 @@ def _plain(name: str, names: Sequence[str]) -> str:
     return name[max((k + 1 for k in range(alike) if not name[k].isalnum()), default=0) :].lower()
 
 
-def _middle(hand: HandModel, body: int) -> Floats:
+def _body_centre(hand: HandModel, body: int) -> Floats:
     corners = [piece.vertices for piece in hand.pieces if piece.body == body]
     return np.concatenate(corners).mean(axis=0) if corners else np.zeros(3)
 
@@ -148,7 +148,7 @@ def _fit(where: Floats, poses: Floats, guess: Floats) -> tuple[Floats, Floats]:
     3)."""
     from scipy.optimize import least_squares  # slow to load
 
-    start = _placed(apply(poses, guess), where)
+    start = _align_points(apply(poses, guess), where)
 
     def pose_of(x: Floats) -> Floats:
         angle = float(np.linalg.norm(x[3:6]))
@@ -168,7 +168,7 @@ def _fit(where: Floats, poses: Floats, guess: Floats) -> tuple[Floats, Floats]:
     return pose_of(found.x), found.x[6:].reshape(-1, 3)
 
 
-def _placed(points: Floats, where: Floats) -> Floats:
+def _align_points(points: Floats, where: Floats) -> Floats:
     """Return the pose that best aligns points (..., 3) with others (Kabsch)."""
     a, b = points.reshape(-1, 3), where.reshape(-1, 3)
     left, _, right = np.linalg.svd((a - a.mean(axis=0)).T @ (b - b.mean(axis=0)))

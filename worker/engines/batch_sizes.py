@@ -30,10 +30,10 @@ def batches_at_once(device: str, join: int | None) -> int:
     import warp as wp
 
     found = wp.get_device(device)
-    return fitting(int(found.sm_count), int(found.free_memory))
+    return batches_that_fit(int(found.sm_count), int(found.free_memory))
 
 
-def fitting(multiprocessors: int, free_bytes: int) -> int:
+def batches_that_fit(multiprocessors: int, free_bytes: int) -> int:
     """Return a power of two, so that launches can be halved evenly; at least 1."""
     grasps = min(GRASPS_PER_MULTIPROCESSOR * multiprocessors, MEMORY_SHARE * free_bytes / BYTES_PER_GRASP)
     batches = max(1, min(MOST, int(grasps // BATCH_SIZE)))

@@ -17,20 +17,20 @@ _known: Final[LRUCache[str, ProposalNetwork]] = LRUCache(16)
 _lock: Final = threading.Lock()
 
 
-def keep_file(path: Path) -> str:
+def cache_file(path: Path) -> str:
     """Load a network's file, cache it and return its digest; raise InputError if the file is no network."""
     data = read_file(path)
     digest = digest_bytes(data)
-    keep(digest, from_bytes(data, str(path)))
+    store_network(digest, from_bytes(data, str(path)))
     return digest
 
 
-def keep(digest: str, network: ProposalNetwork) -> None:
+def store_network(digest: str, network: ProposalNetwork) -> None:
     with _lock:
         _known[digest] = network
 
 
-def kept(digest: str) -> ProposalNetwork:
+def load_network(digest: str) -> ProposalNetwork:
     """Return the network cached under a digest; raise InputError if there is none."""
     with _lock:
         found = _known.get(digest)
