@@ -34,7 +34,7 @@ from graspd.service.model.states import Priority, Stage, State
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.leading import PART
-from graspd.service.queue.lists import held_key, queue_name
+from graspd.service.queue.entries import held_key, queue_name
 from graspd.service.queue.rq_queue import EVENTS, RqQueue
 from graspd.service.run.embedded import server_command
 from graspd.service.settings import Settings

@@ -30,7 +30,7 @@ from graspd.service.model.messages import TaskMessage
 from graspd.service.model.states import Priority, Stage
 from graspd.service.model.version import PACKAGE_VERSION
 from graspd.service.model.workers import capabilities
-from graspd.service.queue.lists import execution_keys, held_key, job_key, list_key, queue_name, rq_worker_key
+from graspd.service.queue.entries import execution_keys, held_key, job_key, list_key, queue_name, rq_worker_key
 from graspd.service.queue.port import Event, EventKind
 from graspd.service.queue.rq_queue import WORKERS, RqQueue, cancel_key, open_queue, put_event, worker_key
 from graspd.service.settings import Settings

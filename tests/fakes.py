@@ -26,7 +26,7 @@ from graspd.service.model.records import AttemptRecord, JobRecord
 from graspd.service.model.states import AssetKind, Priority, Stage
 from graspd.service.model.workers import WorkerBeat
 from graspd.service.pipeline.backends import Services
-from graspd.service.pipeline.datasets.rounds import DatasetRounds
+from graspd.service.pipeline.datasets.actions import DatasetRounds
 from graspd.service.store.integrity import put_document
 from graspd.service.store.library import publish_asset
 from graspd.service.store.manifests import ShardManifest, load_shard, publish_shard

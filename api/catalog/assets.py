@@ -18,8 +18,7 @@ from graspd.service.model.names import MOST, shorten
 from graspd.service.model.projects import EVERYTHING, ProjectScope, project_mark
 from graspd.service.model.states import AssetKind
 from graspd.service.pipeline import deletion
-from graspd.service.pipeline.backends import Services
-from graspd.service.pipeline.recording import recording
+from graspd.service.pipeline.backends import Services, recording
 from graspd.service.store import library
 from graspd.service.store.assets import ZipFiles, asset_json
 from graspd.service.store.descriptions import MAX_BYTES, HandCorrections, HandFacts, corrected, facts_of, json_object

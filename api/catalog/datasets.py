@@ -22,8 +22,7 @@ from graspd.service.pipeline import deletion
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.datasets import actions
 from graspd.service.pipeline.datasets.cost import estimate
-from graspd.service.pipeline.datasets.estimate import Estimate
-from graspd.service.pipeline.datasets.spec import DatasetRequest, Matrix
+from graspd.service.pipeline.datasets.spec import DatasetRequest, Estimate, Matrix
 from graspd.service.pipeline.fidelity_choice import Resolver
 from graspd.service.store.records import load_snapshot
 

@@ -24,8 +24,7 @@ from graspd.service.model.digests import digest_json
 from graspd.service.model.errors import ConflictError, LimitError, UnavailableError
 from graspd.service.model.projects import ProjectScope
 from graspd.service.model.webhooks import MOST_HOOKS, End, Webhook, check_url, secret_of
-from graspd.service.pipeline.backends import Services
-from graspd.service.pipeline.recording import recording
+from graspd.service.pipeline.backends import Services, recording
 
 log = logging.getLogger(__name__)
 POLL_S: Final = 0.5

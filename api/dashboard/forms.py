@@ -30,8 +30,7 @@ from graspd.service.model.options import Form, Row, rows
 from graspd.service.model.projects import ProjectScope
 from graspd.service.model.states import AssetKind, Stage
 from graspd.service.pipeline.datasets.cost import estimate
-from graspd.service.pipeline.datasets.estimate import Estimate
-from graspd.service.pipeline.datasets.spec import Matrix
+from graspd.service.pipeline.datasets.spec import Estimate, Matrix
 
 router = APIRouter(include_in_schema=False)
 

@@ -15,8 +15,7 @@ from graspd.service.index.views import CellView, DatasetView, ObjectSetView, Pag
 from graspd.service.model.base import Name
 from graspd.service.model.records import Snapshot
 from graspd.service.model.states import State
-from graspd.service.pipeline.datasets.estimate import Estimate
-from graspd.service.pipeline.datasets.spec import DatasetRequest, Matrix, Names
+from graspd.service.pipeline.datasets.spec import DatasetRequest, Estimate, Matrix, Names
 
 router = APIRouter(prefix="/v1/datasets", tags=["datasets"])
 sets_router = APIRouter(prefix="/v1/object-sets", tags=["object sets"])

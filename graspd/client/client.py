@@ -21,8 +21,7 @@ from graspd.service.model.domain import JobRequest
 from graspd.service.model.errors import ERRORS, GraspdError, InputError, RateError, UnavailableError, without_secrets
 from graspd.service.model.records import Snapshot
 from graspd.service.model.states import AssetKind, State
-from graspd.service.pipeline.datasets.estimate import Estimate
-from graspd.service.pipeline.datasets.spec import DatasetRequest, Matrix
+from graspd.service.pipeline.datasets.spec import DatasetRequest, Estimate, Matrix
 
 _PATIENCE_S: Final = 30.0
 _CONNECT_S: Final = 5.0

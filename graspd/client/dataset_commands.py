@@ -40,9 +40,8 @@ from graspd.service.model.errors import InputError, TaskError, did_you_mean
 from graspd.service.model.options import validate
 from graspd.service.model.scene_spec import known_name, scene_option
 from graspd.service.model.states import AssetKind, State
-from graspd.service.pipeline.datasets.estimate import Estimate
 from graspd.service.pipeline.datasets.export import export_shards
-from graspd.service.pipeline.datasets.spec import DatasetRequest, Matrix
+from graspd.service.pipeline.datasets.spec import DatasetRequest, Estimate, Matrix
 from graspd.service.store.object_sets import Objects, files_of_set
 
 SpecOption = Annotated[

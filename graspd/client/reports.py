@@ -23,7 +23,7 @@ from graspd.service.index.views import CellView, DatasetView, Validated
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import InputError, TaskError
 from graspd.service.model.states import AssetKind, Stage, State
-from graspd.service.pipeline.datasets.estimate import Estimate
+from graspd.service.pipeline.datasets.spec import Estimate
 from graspd.service.run.address import recorded_address
 from graspd.service.store.asset_summary import summary
 

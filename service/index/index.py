@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from sqlalchemy import URL
 
-from graspd.service.index.changes.live import Live
-from graspd.service.index.changes.records import Changes, DatasetChanges
+from graspd.service.index.changes.records import Changes, DatasetChanges, Live
 from graspd.service.index.changes.removals import Removals
 from graspd.service.index.database import Database
 from graspd.service.index.notes import KnownDamage, Notes

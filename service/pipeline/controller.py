@@ -24,11 +24,11 @@ from graspd.service.model.records import JobRecord
 from graspd.service.model.states import Priority
 from graspd.service.model.workers import WorkerBeat, requirements_of
 from graspd.service.pipeline.backends import Services
-from graspd.service.pipeline.datasets.rounds import DatasetRounds
-from graspd.service.pipeline.garbage_collector import GarbageCollector
+from graspd.service.pipeline.datasets.actions import DatasetRounds
+from graspd.service.pipeline.deletion import GarbageCollector
 from graspd.service.pipeline.identity import identify
 from graspd.service.pipeline.indexer import Indexer
-from graspd.service.pipeline.integrity_scan import IntegrityScan
+from graspd.service.pipeline.integrity import IntegrityScan
 from graspd.service.pipeline.job_actions import HELD_S, Routes, queue_tasks
 from graspd.service.pipeline.leading import PART
 from graspd.service.pipeline.lease_reaper import LeaseReaper

@@ -1,19 +1,30 @@
-"""Integrity check of a store: shards, records and uploads against their checksums. Changes nothing."""
+"""Integrity of a store: check against checksums, scan by the controller, repair.
+
+The check covers shards, records and uploads, and changes nothing. The scan is repeated and rate-limited; it resumes at
+its last position. A repair makes damaged shards again, since a shard is a function of its inputs.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import heapq
+import logging
 import re
 import tempfile
-from collections.abc import Callable, Iterator
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from typing import Any, Final
 
-from graspd.service.index.notes import Damage
+from graspd.service.index.notes import Damage, ScanNote
 from graspd.service.model import names
-from graspd.service.model.clock import age_of
+from graspd.service.model.clock import age_of, timestamp
 from graspd.service.model.digests import digest_files
 from graspd.service.model.domain import Asset
-from graspd.service.model.errors import DamagedError, InputError, NotFoundError
+from graspd.service.model.errors import DamagedError, GraspdError, InputError, NotFoundError
+from graspd.service.model.planning import PlannedTask, message_of, plan
 from graspd.service.model.records import (
     AttemptRecord,
     DatasetEvent,
@@ -24,13 +35,24 @@ from graspd.service.model.records import (
     Snapshot,
     Tag,
 )
-from graspd.service.model.states import AssetKind, Stage
+from graspd.service.model.states import AssetKind, Priority, Stage
+from graspd.service.model.version import STAGE_REVISIONS
 from graspd.service.model.webhooks import Webhook
+from graspd.service.pipeline.backends import Services
 from graspd.service.store.assets import ZipFiles
 from graspd.service.store.integrity import is_sealed
-from graspd.service.store.library import UNPACKED_LIMIT_BYTES, load_check
+from graspd.service.store.library import UNPACKED_LIMIT_BYTES, builtin_assets, load_asset, load_check, publish_builtins
 from graspd.service.store.manifests import ShardManifest
-from graspd.service.store.records import CHARTS, IN_SCENES, STABILITY, DeletedJob, Deletion, parse_record
+from graspd.service.store.records import (
+    CHARTS,
+    IN_SCENES,
+    STABILITY,
+    DeletedJob,
+    Deletion,
+    parse_record,
+    read_record,
+    task_attempts,
+)
 from graspd.service.store.store import Store
 
 #: Key patterns of records, and the model of each.
@@ -184,3 +206,216 @@ def _manifest(store: Store, key: str, stage: Stage, shard: str, read: Read, unse
     if digest.hexdigest() != manifest.sha256:
         return Damage(file, f"its SHA-256 is {digest.hexdigest()[:12]}..., expected {manifest.sha256[:12]}...", shard)
     return None
+
+
+log = logging.getLogger(__name__)
+#: Least interval of rounds over a small store [s].
+ROUND_S: Final = 3600.0
+#: Interval of checks of known damage, so that repaired objects soon leave the list [s].
+_AGAIN_S: Final = 60.0
+_KNOWN: Final = 1000
+#: Keys in memory at once; further keys need another listing of the folder.
+_KEYS: Final = 10_000
+#: Least cost of an object, so that a million small objects are not read at once [bytes].
+_LEAST: Final = 16 * 2**10
+#: Most backlog that is read at once after a pause [s].
+_BURST_S: Final = 0.25
+#: Interval of queries whether `graspd admin store verify` pauses the scan [s].
+_PAUSE_S: Final = 5.0
+
+
+class Interrupted(Exception):
+    """The process stops, or `graspd admin store verify` reads the store."""
+
+
+class IntegrityScan:
+    """Read through the store; record new and repaired damage in the index."""
+
+    def __init__(
+        self, services: Services, stop: threading.Event, *, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._services, self._stop, self._clock = services, stop, clock
+        self._rate = services.settings.integrity_scan_mb_per_s * 2**20
+        self._asked = -_PAUSE_S
+        self._paid = clock()
+        self._looked = clock()
+
+    def run(self) -> None:
+        """Run until `stop` is set; wait for an unavailable backend."""
+        while not self._stop.is_set():
+            try:
+                if self._may_read() and self.advance():
+                    continue
+            except Interrupted:
+                pass
+            except GraspdError as error:
+                log.warning("%s; the integrity scan continues later", error)
+            except Exception:
+                log.exception("the integrity scan failed and will continue later")
+            self._stop.wait(_PAUSE_S)
+
+    def _may_read(self) -> bool:
+        """Check that `store verify` does not pause the scan; queries the index every few seconds."""
+        now = self._clock()
+        if now - self._asked >= _PAUSE_S:
+            if self._services.index.notes.is_scan_paused():
+                return False
+            self._asked = now
+        return True
+
+    def advance(self) -> bool:
+        """Read some more objects; return whether more can be read now. Interrupted: `store verify` reads now."""
+        self._recheck_if_due(None)
+        note = self._services.index.notes.scan_note()
+        if note.folder >= len(FOLDERS):
+            if (age_of(note.started) or 0.0) < ROUND_S:
+                return False
+            note = ScanNote()
+        note = note if note.started else replace(note, started=timestamp())
+        keys = self._keys(FOLDERS[note.folder], note.after)
+        for key in keys:
+            if is_checked(key):
+                self._check(key)
+            self._recheck_if_due(replace(note, after=key))
+        over = len(keys) < _KEYS
+        note = replace(note, folder=note.folder + over, after="" if over else keys[-1])
+        if note.folder == len(FOLDERS):
+            note = replace(note, ended=timestamp())
+        self._services.index.notes.set_scan_note(note)
+        return True
+
+    def _recheck_if_due(self, reached: ScanNote | None) -> None:
+        if self._clock() - self._looked > _AGAIN_S:
+            if reached is not None:
+                self._services.index.notes.set_scan_note(reached)
+            self.look_again()
+
+    def look_again(self) -> None:
+        """Check known damage again; remove repaired and deleted objects from the list."""
+        self._looked = self._clock()
+        _, known = self._services.index.damage.known(limit=_KNOWN)
+        if well := [one.key for one in known if self._is_repaired(one)]:
+            self._services.index.damage.mark([], intact=well)
+
+    def _is_repaired(self, one: Damage) -> bool:
+        stem, dot, _ = one.key.rpartition(".")
+        keys = [f"{stem}.json", f"{stem}.h5"] if one.shard and dot else [one.key]
+        return all(examine(self._services.store, key, read=self._pace) is None for key in keys)
+
+    def _check(self, key: str) -> None:
+        self._pace(_LEAST)
+        wrong = examine(self._services.store, key, read=self._pace)
+        if wrong is not None and not may_await_manifest(self._services.store, wrong):
+            log.warning("%s: %s", wrong.key, wrong.what)
+            self._services.index.damage.mark([wrong])
+
+    def _keys(self, folder: str, after: str) -> list[str]:
+        listed = self._services.store.list(folder, offset=after or None)
+        return heapq.nsmallest(_KEYS, (entry.key for entry in listed))
+
+    def _pace(self, size: int) -> None:
+        """Wait until `size` more bytes are within the rate."""
+        now = self._clock()
+        self._paid = max(self._paid, now - _BURST_S) + size / self._rate
+        if self._stop.wait(max(0.0, self._paid - now)) or not self._may_read():
+            raise Interrupted
+
+
+_OF_ASSET: Final = re.compile(r"assets/(hand|object|network)/([0-9a-f]{32})/(.+)")
+
+
+def repair(services: Services, found: Sequence[Damage]) -> tuple[list[Damage], list[Damage]]:
+    """Move damaged objects below `damaged/`, and queue what can be made again; return repaired objects, and the rest.
+
+    A worker stores a repaired shard only if its checksum equals the manifest's.
+    """
+    harmed = {one.shard for one in found if one.shard}
+    repaired, left = [], []
+    for one in found:
+        if why := _fix(services, one, harmed):
+            left.append(Damage(one.key, f"{one.what}; {why}", one.shard))
+        else:
+            repaired.append(one)
+    return repaired, left
+
+
+def _fix(services: Services, one: Damage, harmed: set[str]) -> str:
+    """Repair one object; return the reason if this is impossible, else ""."""
+    if one.what == FOREIGN:
+        services.store.set_aside(one.key)
+        return ""
+    if match := _OF_ASSET.fullmatch(one.key):
+        return _asset(services, one.key, AssetKind(match[1]), match[2], match[3])
+    if not one.shard:
+        return "put a copy in its place"
+    stage = STAGES[one.key.split("/")[1]]
+    if may_await_manifest(services.store, one):
+        return "its manifest may follow soon; run the command again in a minute"
+    planned = _task_of_shard(services, stage, one.shard)
+    if isinstance(planned, str):
+        if one.what == NO_MANIFEST:
+            services.store.set_aside(one.key)
+            return ""
+        return planned
+    job, task = planned
+    if harmed & set(task.inputs):
+        return "its input is made again first; run the command again when that is done"
+    if one.what != MISSING:
+        _clear(services, one, stage)
+    number = len(task_attempts(services.store, task.id)) + 1
+    message = message_of(job, task, attempt=number, max_attempt=number)
+    services.queue.enqueue([message], Priority.BULK, again=True)
+    return ""
+
+
+def _asset(services: Services, key: str, kind: AssetKind, digest: str, file: str) -> str:
+    """Move derived files of a hand or an object away; a new check and the next task make them again.
+
+    Built-in assets are stored again from the program.
+    """
+    if (kind, digest) in {(one.kind, one.digest) for one in builtin_assets()}:
+        services.store.set_aside(key)
+        publish_builtins(services.store)
+    elif file == "files.zip":
+        return "upload the same files again, or put a copy in its place"
+    elif file == "asset.json":
+        return "put a copy in its place"
+    else:
+        services.store.set_aside(key)
+    if file in ("model.glb", "check.json") and not services.store.exists(key):
+        services.store.set_aside(names.asset_check(kind, digest))
+        with contextlib.suppress(NotFoundError, DamagedError):
+            services.index.write.add_asset(load_asset(services.store, kind, digest), None)
+            services.index.live.set_asset_waiting([digest], queued=False)
+    return ""
+
+
+def _clear(services: Services, one: Damage, stage: Stage) -> None:
+    """Move a damaged result away; a file without manifest stays if the index contains its checksum."""
+    file, manifest = names.shard_file(stage, one.shard), names.shard_manifest(stage, one.shard)
+    if one.what == BAD_MANIFEST:
+        services.store.set_aside(manifest)
+    if one.what not in (BAD_MANIFEST, NO_MANIFEST) or not _matches_index(services, one.shard, file):
+        services.store.set_aside(file)
+
+
+def _matches_index(services: Services, shard: str, file: str) -> bool:
+    try:
+        return services.index.shards.get(shard).sha256 == hashlib.sha256(services.store.get(file)).hexdigest()
+    except NotFoundError:
+        return False
+
+
+def _task_of_shard(services: Services, stage: Stage, shard: str) -> tuple[JobRecord, PlannedTask] | str:
+    """Return the task that makes a shard, or the reason why there is none."""
+    job = services.index.shards.job_of(shard)
+    if job is None:
+        return "no job makes it, so it cannot be made again; put a copy in its place"
+    try:
+        record = read_record(JobRecord, services.store, names.job_record(job))
+    except (NotFoundError, DamagedError) as error:
+        return f"the job that makes it cannot be read: {error}"
+    if (made := record.revisions.get(stage)) != STAGE_REVISIONS[stage]:
+        return f"it is of revision {made} of {stage}, and this graspd makes revision {STAGE_REVISIONS[stage]}"
+    task = next((task for task in plan(record) if task.output == shard), None)
+    return (record, task) if task is not None else "its job does not make it"

@@ -1,40 +1,150 @@
-"""Actions of a user on jobs: submit, cancel, retry."""
+"""Actions of a user on jobs: submit, cancel, retry; which assets they may use, and how many tasks a job has."""
 
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final, Literal, TypeVar
 
 import numpy as np
+from sqlalchemy import Connection
 
 from graspd.service.index.queries.feed import ReadyTask
+from graspd.service.index.queries.overview import BatchCost
+from graspd.service.index.queries.rates import Rates, candidates
 from graspd.service.index.views import AssetView, JobView
 from graspd.service.model import names
 from graspd.service.model.clock import timestamp
 from graspd.service.model.digests import job_id
-from graspd.service.model.domain import JobOptions, JobRequest
-from graspd.service.model.errors import ConflictError, SceneError, UnavailableError
+from graspd.service.model.domain import JobOptions, JobRequest, batches_of
+from graspd.service.model.errors import ConflictError, InputError, NotFoundError, SceneError, UnavailableError
 from graspd.service.model.messages import Origin, TaskMessage
 from graspd.service.model.planning import message_of, priority_of
 from graspd.service.model.projects import EVERYTHING, ProjectScope
-from graspd.service.model.records import JobRecord
+from graspd.service.model.records import MOST_BATCHES, JobRecord, Member
 from graspd.service.model.scene_spec import HalfSpace, Pose, Supports
 from graspd.service.model.states import AssetKind, Priority, Stage, State
 from graspd.service.model.transforms import quat_conjugate, quat_rotate
+from graspd.service.model.version import SCHEMA_OF_RANGES
 from graspd.service.model.workers import Capabilities, Requirements, WorkerBeat, capabilities, requirements_of
-from graspd.service.pipeline.backends import Services
+from graspd.service.pipeline.backends import Services, recording
 from graspd.service.pipeline.fidelity_choice import Resolver
-from graspd.service.pipeline.ranges import TaskRanges
-from graspd.service.pipeline.recording import recording
-from graspd.service.pipeline.usable import refuse_deleted, usable_asset, with_neighbours, with_network
 from graspd.service.queue.port import Event, EventKind
 from graspd.service.store.records import add_job_event, job_events, put_record, read_record, refuse_pending
 from graspd.service.telemetry import bound
+
+#: Finished tasks that are used to measure the time of a batch.
+_LOOKED_AT: Final = 64
+#: Workers assumed if none is present: a service may start them once a task waits.
+_EXPECTED: Final = 8
+#: Cache lifetime of measured workers and rates [s].
+_KNOWN_S: Final = 10.0
+
+
+class TaskRanges:
+    def __init__(
+        self, services: Services, *, scope: ProjectScope = EVERYTHING, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        """`scope` limits the measurements that count."""
+        self._services, self._scope, self._clock = services, scope, clock
+        self._read_again = -math.inf
+        self._workers: list[WorkerBeat] = []
+        self._costs: list[BatchCost] = []
+
+    def sized(self, job: JobRecord, *, among: int = 1) -> JobRecord:
+        """Return a job with its number of batches per task, one `among` several that share the workers."""
+        batches, wanted_s = batches_of(job.request.grasps), self._services.settings.task_s
+        # Pictures of a batch are already a file of megabytes.
+        if batches == 1 or job.request.views or not wanted_s:
+            return job
+        if self._clock() >= self._read_again:
+            self._workers = self._services.queue.workers()
+            self._costs = self._services.index.costs.of_batches(Stage.SYNTHESIZE, limit=_LOOKED_AT, scope=self._scope)
+            self._read_again = self._clock() + _KNOWN_S
+        able = [worker for worker in self._workers if Stage.SYNTHESIZE in worker.stages]
+        if any(worker.ability.schemas[1] < SCHEMA_OF_RANGES for worker in able):
+            return job
+        # A small job shows its grasps batch by batch; a GPU makes them all in one launch.
+        if job.priority is Priority.INTERACTIVE and not (able and all(one.device.startswith("cuda") for one in able)):
+            return job
+        rate = Rates(self._costs, job.request, {one.device for one in able}).of(job.request.hand, job.request.object)
+        batch_s = rate.seconds_per_try * candidates(rate, job.request) / batches
+        by_time = int(wanted_s / max(1e-3, batch_s or wanted_s))
+        workers = -(-(len(able) or _EXPECTED) // among)
+        return job.model_copy(update={"span": span_of(batches, by_time, workers)})
+
+
+def span_of(batches: int, by_time: int, workers: int) -> int:
+    """Return the batches per task of a job; `by_time` batches last as long as a task should.
+
+    All tasks but the last have equal length, and no worker is idle while another has two tasks.
+    """
+    most = max(1, min(by_time, MOST_BATCHES, -(-batches // max(1, workers))))
+    return -(-batches // -(-batches // most))
+
+
+Options = TypeVar("Options", bound=JobOptions)
+
+
+def usable_asset(services: Services, kind: AssetKind, name: str, scope: ProjectScope = EVERYTHING) -> AssetView:
+    """Return a hand, object or network, by name or digest, that jobs may use.
+
+    NotFoundError: none is in scope. InputError: it failed its check. ConflictError: its check is still running.
+    """
+    asset = services.index.assets.get(kind, name, scope=scope)
+    if asset.verdict == "refuse":
+        raise InputError(f"{kind.value} {name!r} was refused: {asset.message}")
+    if asset.verdict is None:
+        why = f" ({asset.message})" if asset.message else ""
+        raise ConflictError(f"{kind.value} {name!r} is still being checked{why}; submit again in a moment")
+    return asset
+
+
+def refuse_deleted(services: Services, wanted: Sequence[tuple[AssetKind, str]], connection: Connection) -> None:
+    if missing := services.index.assets.missing(wanted, within=connection):
+        raise NotFoundError(f"there is no {missing[0]} any more; it was deleted just now")
+
+
+def with_neighbours(
+    services: Services, options: Options, scope: ProjectScope = EVERYTHING
+) -> tuple[Options, Sequence[AssetView]]:
+    """Return options with the present digests of the neighbours' names, and these neighbours.
+
+    A digest in the request itself, for example one copied from a job, stays. Errors as in `usable_asset`; InputError if
+    a name and a digest belong to two objects.
+    """
+    beside = [usable_asset(services, AssetKind.OBJECT, one.digest or one.object, scope) for one in options.beside]
+    found = []
+    for one, asset in zip(options.beside, beside, strict=True):
+        if one.object not in (asset.name, asset.digest):
+            raise InputError(f"the neighbour {one.object!r} has the digest of {asset.name!r}; omit the digest")
+        found.append(one.model_copy(update={"object": asset.name, "digest": asset.digest}))
+    return options.with_beside(found), beside
+
+
+def with_network(
+    services: Services, options: Options, hands: Sequence[AssetView | Member], scope: ProjectScope = EVERYTHING
+) -> Options:
+    """Return options with the digest of their network; unchanged if their method uses none.
+
+    Errors as in `usable_asset`; InputError if the network proposes grasps of another hand.
+    """
+    if not options.network:
+        return options
+    network = usable_asset(services, AssetKind.NETWORK, options.network, scope)
+    own = str(network.facts.get("hand_digest", ""))
+    if other := next((hand for hand in hands if hand.digest != own), None):
+        raise InputError(
+            f"network {network.name!r} proposes grasps of {network.facts.get('hand')} ({own[:12]}), not of "
+            f"{other.name} ({other.digest[:12]})"
+        )
+    return options.model_copy(update={"options": {**options.options, "network": network.digest}})
+
 
 log = logging.getLogger(__name__)
 #: Interval at which held-back tasks are checked for a capable worker [s].

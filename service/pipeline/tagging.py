@@ -8,8 +8,7 @@ from graspd.service.model import names
 from graspd.service.model.clock import timestamp
 from graspd.service.model.errors import ConflictError, LimitError, NotFoundError
 from graspd.service.model.records import MOST_TAGGED, Grasp, Tag, by_shard, tag_id
-from graspd.service.pipeline.backends import Services
-from graspd.service.pipeline.recording import recording
+from graspd.service.pipeline.backends import Services, recording
 from graspd.service.store.records import Deletion, drop_older, newest_version, put_record, put_version, removed_folder
 
 #: Called with the tag to change, None for a new one; raises if the change is not allowed.

@@ -29,9 +29,8 @@ from graspd.service.model.renamed import message_for_revision
 from graspd.service.model.states import Priority, Stage
 from graspd.service.model.workers import WorkerBeat, requirements_of
 from graspd.service.queue import entries
-from graspd.service.queue.allowed import new_job
 from graspd.service.queue.connection import connect, redis_url
-from graspd.service.queue.lists import (
+from graspd.service.queue.entries import (
     LISTS,
     RQ_WORKERS,
     execution_keys,
@@ -40,6 +39,7 @@ from graspd.service.queue.lists import (
     kinds,
     list_key,
     list_names,
+    new_job,
     place_of,
     queue_name,
     rq_worker_key,

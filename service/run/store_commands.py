@@ -34,7 +34,7 @@ def verify(
     from graspd.service.pipeline.backends import Services
     from graspd.service.pipeline.identity import identify_if_redis_answers
     from graspd.service.pipeline.integrity import MISSING, scan
-    from graspd.service.pipeline.repair import repair as fix
+    from graspd.service.pipeline.integrity import repair as fix
 
     services = Services.open(load_settings(data_dir=data_dir), make=False)
     if repair:

@@ -15,7 +15,7 @@ import yaml
 import graspd.cli
 from graspd.service.model.states import Priority, Stage
 from graspd.service.model.version import PACKAGE_VERSION
-from graspd.service.queue.lists import queue_name
+from graspd.service.queue.entries import queue_name
 from graspd.service.settings import Settings
 from tests.conftest import REPOSITORY
 from tests.deploy.composition import SERVICES, seconds

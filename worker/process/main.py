@@ -28,9 +28,9 @@ from rq.worker import WorkerStatus
 from graspd.service.model.errors import GraspdError, QueueUnavailable, TaskRefused
 from graspd.service.model.states import Stage
 from graspd.service.model.workers import WorkerBeat, capabilities
-from graspd.service.queue import allowed
+from graspd.service.queue import entries
 from graspd.service.queue.connection import redis_url
-from graspd.service.queue.lists import queue_names
+from graspd.service.queue.entries import queue_names
 from graspd.service.queue.port import Event
 from graspd.service.queue.rq_queue import RqQueue, lease_state, open_queue, renew_lease
 from graspd.service.settings import Settings
@@ -193,12 +193,12 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
             try:
                 found = super().dequeue_job_and_maintain_ttl(*args, **options)
                 self.found_none = found is None
-                return found and (allowed.allowed_job(*found), found[1])
+                return found and (entries.allowed_job(*found), found[1])
             except TaskRefused as error:
                 log.warning("%s", error)
                 self.connection.delete(found[0].key)
             except Exception as error:
-                if not allowed.is_entry_error(error):
+                if not entries.is_entry_error(error):
                     raise
                 log.warning("an entry of the queue cannot be read: %s", error)
 

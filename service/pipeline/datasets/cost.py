@@ -27,8 +27,7 @@ from graspd.service.model.planning import stages_of
 from graspd.service.model.projects import EVERYTHING, ProjectScope
 from graspd.service.model.records import request_of
 from graspd.service.model.states import AssetKind, Stage
-from graspd.service.pipeline.datasets.estimate import Estimate, RateUsed, WorkersPlan
-from graspd.service.pipeline.datasets.spec import MAX_CELLS, Matrix
+from graspd.service.pipeline.datasets.spec import MAX_CELLS, Estimate, Matrix, RateUsed, WorkersPlan
 
 WORKERS: Final = (1, 8, 64)
 #: Traffic of a task in the queue and its events, in both directions (docs/explanation/scaling.md) [bytes].

@@ -1,12 +1,16 @@
-"""Request of a user: hands x objects and the options of each cell; and the record derived from it."""
+"""Documents of datasets: a user's request, the record derived from it, and its cost estimate.
+
+The request has hands x objects and the options of each cell. No index is imported, so clients can read documents.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Annotated, Final, Self
+from typing import Annotated, Final, Literal, Self
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
+from graspd.service.index.views import View
 from graspd.service.model.base import Name
 from graspd.service.model.clock import timestamp
 from graspd.service.model.digests import digest_json, job_id
@@ -14,6 +18,7 @@ from graspd.service.model.domain import JobOptions, JobRequest
 from graspd.service.model.fidelity import AUTO
 from graspd.service.model.records import Choice, DatasetRecord, Member, request_of
 from graspd.service.model.renamed import original_request
+from graspd.service.model.states import Stage
 from graspd.service.model.version import STAGE_REVISIONS
 
 #: Most cells of a dataset: a record of this many cells has 4 MB.
@@ -95,3 +100,51 @@ def describe(
         owner=owner,
         project=project,
     )
+
+
+class WorkersPlan(View):
+    """Time and network traffic of the dataset with a number of workers."""
+
+    workers: int
+    seconds: float = Field(description="expected time until the dataset is done [s]")
+    seconds_low: float = Field(description="lower end of the interval of `seconds` [s]")
+    seconds_high: float = Field(description="upper end of the interval of `seconds` [s]")
+    network_bytes: int = Field(description="traffic between workers, store and Redis, if on different machines")
+    network_bytes_per_s: float = Field(description="average of `network_bytes` over `seconds`")
+
+
+class RateUsed(View):
+    """A rate of the estimate, and the number of cells that use it."""
+
+    hand: str
+    cells: int
+    seconds_per_valid: float | None = Field(description="None: no candidate is expected to be valid")
+    seconds_per_try: float
+    valid_yield: float
+    origin: str
+    batches: int = Field(description="finished batches on which it was measured; 0: a stored default")
+
+
+class Estimate(View):
+    cells: int
+    asked: int = Field(description="grasps requested in all cells")
+    candidates: int = Field(description="candidates to plan for the requested grasps")
+    valid: int = Field(description="expected number of grasps of the kind in `counted`")
+    counted: Literal["valid", "feasible"] = Field(
+        "valid", description="kind of grasps that `valid` counts: feasible ones without validation"
+    )
+    tasks: int
+    seconds: float
+    seconds_low: float = Field(description="lower end of the interval of `seconds` [s]")
+    seconds_high: float = Field(description="upper end of the interval of `seconds` [s]")
+    machine_factor: float | None = Field(
+        description="factor on all seconds: this machine's times over the stored ones; None: nothing measured here"
+    )
+    seconds_by_stage: dict[Stage, float]
+    seconds_per_valid: float | None
+    storage_bytes: int
+    storage_by_kind: dict[str, int]
+    plans: list[WorkersPlan]
+    rates: list[RateUsed] = Field(description="rates of the estimate, sorted by number of cells; a long list is cut")
+    measured_share: float = Field(description="share of the cells with a rate measured here")
+    unknown: list[str] = Field(description="hands and objects unknown to the service")

@@ -18,7 +18,7 @@ from graspd.service.model.errors import QuotaError
 from graspd.service.model.records import JobRecord, ObjectSet, object_set_of
 from graspd.service.model.webhooks import MOST_HOOKS
 from graspd.service.pipeline.backends import Services
-from graspd.service.pipeline.datasets.rounds import DatasetRounds
+from graspd.service.pipeline.datasets.actions import DatasetRounds
 from graspd.service.queue.rq_queue import RqQueue
 from graspd.service.settings import Settings
 from graspd.service.store import library

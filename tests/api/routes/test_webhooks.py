@@ -20,8 +20,7 @@ from graspd.service.index.outbox import append_ends
 from graspd.service.index.rebuild import rebuild
 from graspd.service.model.webhooks import WAITS_S, Webhook
 from graspd.service.pipeline.backends import Services
-from graspd.service.pipeline.http_client import Response
-from graspd.service.pipeline.webhook_dispatcher import AT_ONCE, SLOW_AT_ONCE, WebhookDispatcher
+from graspd.service.pipeline.webhook_dispatcher import AT_ONCE, SLOW_AT_ONCE, Response, WebhookDispatcher
 from graspd.service.settings import Settings
 from tests.api.conftest import BASE_URL
 from tests.api.factories import add_job, finish_all, people_of

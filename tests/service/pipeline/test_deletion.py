@@ -16,8 +16,7 @@ from graspd.service.pipeline import job_actions, tagging
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.datasets import actions
 from graspd.service.pipeline.datasets.spec import DatasetRequest
-from graspd.service.pipeline.deletion import delete_asset, delete_dataset, delete_job, restore
-from graspd.service.pipeline.garbage_collector import GarbageCollector
+from graspd.service.pipeline.deletion import GarbageCollector, delete_asset, delete_dataset, delete_job, restore
 from graspd.service.store.library import publish_asset
 from graspd.service.store.records import deletions, pending
 from tests.fakes import OBJECT_FILES, make_shard, plan_all, request, with_settings

@@ -12,8 +12,8 @@ import pytest
 
 from graspd.service.model.errors import InputError
 from graspd.service.model.webhooks import check_url
-from graspd.service.pipeline import http_client
-from graspd.service.pipeline.http_client import is_public, networks, post
+from graspd.service.pipeline import webhook_dispatcher as http_client
+from graspd.service.pipeline.webhook_dispatcher import is_public, networks, post
 
 LOOPBACK = networks("127.0.0.0/8")
 

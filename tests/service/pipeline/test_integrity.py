@@ -15,8 +15,7 @@ from graspd.service.model.states import State
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.controller import Controller
-from graspd.service.pipeline.integrity import BAD_MANIFEST, FOREIGN, MISSING, NO_MANIFEST, scan
-from graspd.service.pipeline.repair import repair
+from graspd.service.pipeline.integrity import BAD_MANIFEST, FOREIGN, MISSING, NO_MANIFEST, repair, scan
 from graspd.service.queue.port import EventKind
 from graspd.service.run import commands, store_commands
 from graspd.service.store.manifests import ShardManifest, load_manifest, load_shard

@@ -24,9 +24,16 @@ from graspd.service.pipeline.controller import Controller
 from graspd.service.pipeline.datasets import actions
 from graspd.service.pipeline.datasets.spec import DatasetRequest
 from graspd.service.pipeline.identity import ServiceRecord
-from graspd.service.pipeline.integrity import FOLDERS, MISSING, NO_MANIFEST, examine, scan
-from graspd.service.pipeline.integrity_scan import IntegrityScan, Interrupted
-from graspd.service.pipeline.repair import repair
+from graspd.service.pipeline.integrity import (
+    FOLDERS,
+    MISSING,
+    NO_MANIFEST,
+    IntegrityScan,
+    Interrupted,
+    examine,
+    repair,
+    scan,
+)
 from graspd.service.run.store_commands import app
 from graspd.service.settings import Settings
 from graspd.service.store.assets import pack as pack_files

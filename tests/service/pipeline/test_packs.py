@@ -21,7 +21,7 @@ from graspd.service.model.records import Snapshot
 from graspd.service.model.states import Stage, State
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
-from graspd.service.pipeline.repair import repair
+from graspd.service.pipeline.integrity import repair
 from graspd.service.readers import open_shards
 from graspd.service.run import commands, store_commands
 from graspd.service.store import packs

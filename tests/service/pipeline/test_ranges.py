@@ -22,10 +22,9 @@ from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.datasets import actions
 from graspd.service.pipeline.datasets.spec import DatasetRequest
-from graspd.service.pipeline.job_actions import Route, Routes
-from graspd.service.pipeline.ranges import TaskRanges, span_of
+from graspd.service.pipeline.job_actions import Route, Routes, TaskRanges, span_of
 from graspd.service.queue import entries
-from graspd.service.queue.lists import list_names, queue_name, queue_names
+from graspd.service.queue.entries import list_names, queue_name, queue_names
 from graspd.service.queue.rq_queue import RqQueue
 from graspd.service.store.library import publish_asset
 from graspd.service.store.manifests import ShardManifest, publish_shard

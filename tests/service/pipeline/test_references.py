@@ -21,8 +21,7 @@ from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.datasets import actions
 from graspd.service.pipeline.datasets.spec import DatasetRequest
-from graspd.service.pipeline.deletion import delete_asset, delete_dataset, delete_job
-from graspd.service.pipeline.garbage_collector import GarbageCollector
+from graspd.service.pipeline.deletion import GarbageCollector, delete_asset, delete_dataset, delete_job
 from graspd.service.store.library import publish_asset
 from graspd.service.store.network_file import check_network
 from tests.api.factories import fail

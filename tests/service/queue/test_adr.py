@@ -24,7 +24,7 @@ from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.indexer import Indexer
 from graspd.service.pipeline.lease_reaper import LeaseReaper
-from graspd.service.queue.lists import held_key, queue_name
+from graspd.service.queue.entries import held_key, queue_name
 from graspd.service.queue.rq_queue import RqQueue, cancel_key, rq_id
 from tests.conftest import PACKAGES, REPOSITORY
 from tests.fakes import request

@@ -22,7 +22,7 @@ from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.controller import Controller
 from graspd.service.pipeline.leading import PART
-from graspd.service.queue.allowed import TASK_FUNCTION, allowed_job
+from graspd.service.queue.entries import TASK_FUNCTION, allowed_job
 from graspd.service.queue.port import Event, EventKind
 from graspd.service.queue.rq_queue import EVENTS, METRICS, WORKERS, RqQueue, worker_key
 from tests.fakes import beat_of, request

@@ -12,7 +12,7 @@ from rq.serializers import JSONSerializer
 from graspd.service.model.clock import timestamp
 from graspd.service.model.messages import IngestMessage, TaskMessage
 from graspd.service.model.states import Priority, Stage
-from graspd.service.queue.lists import held_key, list_key, queue_name, queue_names
+from graspd.service.queue.entries import held_key, list_key, queue_name, queue_names
 from graspd.service.queue.port import BULK_EVERY, Event, EventKind
 from graspd.service.queue.rq_queue import LEAD, RqQueue, lease_state, list_worker, renew_lease, worker_key
 from graspd.worker.process.heartbeat import Heartbeat

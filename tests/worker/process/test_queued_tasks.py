@@ -56,7 +56,7 @@ FORGERIES: dict[str, Callable[[Any, Path], object]] = {
     "a job of no time": lambda redis, _: redis.hset(f"rq:job:{_job(redis, 'os.getcwd')}", "created_at", "yesterday"),
     "a job of no data": lambda redis, _: redis.hset(f"rq:job:{_job(redis, 'os.getcwd')}", "data", b"\xff\xfe"),
     "a command": lambda redis, witness: _job(redis, "os.system", f"touch {witness}"),
-    "another function of ours": lambda redis, _: _job(redis, "graspd.service.queue.allowed.run_task", {}),
+    "another function of ours": lambda redis, _: _job(redis, "graspd.service.queue.entries.run_task", {}),
     "a task without a message": lambda redis, _: _job(redis, "graspd.task", "text"),
     "a message of nothing": lambda redis, _: _job(redis, "graspd.task", {}),
 }

@@ -10,7 +10,7 @@ from graspd.service.model.domain import JobRequest
 from graspd.service.model.errors import NotFoundError
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.datasets.cost import estimate
-from graspd.service.pipeline.datasets.estimate import Estimate
+from graspd.service.pipeline.datasets.spec import Estimate
 from tests.service.pipeline.datasets.makers import done, wanted
 
 #: Seconds that a stage of the fakes says it took.

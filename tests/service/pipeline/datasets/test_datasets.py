@@ -20,9 +20,9 @@ from graspd.service.model.states import AssetKind, Priority, State
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.datasets import actions
+from graspd.service.pipeline.datasets.actions import DatasetRounds
 from graspd.service.pipeline.datasets.cost import estimate
 from graspd.service.pipeline.datasets.export import Fetch, export_shards, path_of
-from graspd.service.pipeline.datasets.rounds import DatasetRounds
 from graspd.service.pipeline.datasets.spec import DatasetRequest
 from graspd.service.pipeline.fidelity_choice import Resolver
 from graspd.service.store.records import charts_of, job_events, load_dataset, publish
