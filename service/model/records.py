@@ -147,8 +147,7 @@ class DatasetRecord(Record):
     """`dataset.json`. `jobs` has one id per cell, hand by hand, then object by object.
 
     With fidelity `auto`, `fidelities` has the chart's choice per cell at creation, and `chosen` the index of its reason
-    in
-    `choices`.
+    in `choices`.
     """
 
     version: Literal[1] = 1

@@ -152,8 +152,7 @@ class Routes:
         """Return the route of a task.
 
         If all workers of its stage are capable, the task enters their common list; if some are, a separate list; if
-        none is,
-        the task is held back. Without workers, this version's capabilities are assumed.
+        none is, the task is held back. Without workers, this version's capabilities are assumed.
         """
         here = self._here.get(need.stage) or [capabilities()]
         lacking = {one.lacks(need) for one in here} - {""}

@@ -79,8 +79,7 @@ def cancel(services: Services, name: str) -> DatasetView:
     """Stop a dataset: plan no more jobs and cancel unfinished ones; finished shards stay.
 
     A job continues if another dataset needs it or another key submitted it. Raises NotFoundError for an unknown
-    dataset,
-    ConflictError for a finished or cancelled one.
+    dataset, ConflictError for a finished or cancelled one.
     """
     with recording(services) as (connection, put):
         dataset = services.index.datasets.get(name)
