@@ -1,6 +1,6 @@
 """GraspGen's data: a JSON record per object in tar files, with an index, object lists and meshes.
 
-Murali et al., GraspGen, ICRA 2026. Written and read:
+Murali et al., GraspGen, ICRA 2026. Files that are written and read:
 
     grasps/GRIPPER/shard_000.tar         members UUID.grasps.json; uuid_index.json: {UUID: number of the shard}
     splits/GRIPPER/{train,valid}.txt     a UUID per line

@@ -1,8 +1,8 @@
 """Readers of published grasp sets: DDGC, DexGraspNet, MultiDex (GenDexGrasp), `reference-grasps/1`.
 
 Lundell et al., DDGC, RA-L 2021. Each object of the scene has a list of grasps. A grasp has position and quaternion x y
-z w of the hand in the object's frame, and eight joint angles, closing positive. The angles are spread, medial and
-distal of finger 1, the same of finger 2, then medial and distal of finger 3.
+z w of the hand in the object's frame, and eight joint angles, positive towards closing. The angles are spread, medial
+and distal of finger 1, the same of finger 2, then medial and distal of finger 3.
 
 DexGraspNet's layout: a `.npy` for each object, a list of dictionaries with `qpos` by joint name and `scale`.
 

@@ -288,9 +288,9 @@ class DeletionView(View):
     what: What
     id: str = Field(description="of the job, tag, hand, object or network; name of the dataset")
     name: str
-    at: str = Field(description="when it was deleted")
-    until: str = Field(description="until then it can be restored")
-    owner: str = Field(description="id of the key that it was submitted with")
+    at: str = Field(description="time of the deletion")
+    until: str = Field(description="time until which it can be restored")
+    owner: str = Field(description="id of the key that submitted it")
     project: str
 
 

@@ -187,7 +187,7 @@ def draw(measured: Measured, *, axis: str, hand: str = "", object: str = "") -> 
 
 
 def pareto(points: Sequence[tuple[float, float]]) -> set[int]:
-    """Return indices of points (more, more) that no other point beats in both."""
+    """Return indices of points that no other point exceeds in both coordinates."""
     return {
         index
         for index, (x, y) in enumerate(points)

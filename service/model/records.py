@@ -64,7 +64,7 @@ class JobRecord(Record):
     owner: str = Field("", max_length=64, description="id of the API key that submitted it; empty: none or unknown")
     project: Project = Field("", description="project of that key; empty: the unnamed project")
     choice: Choice | None = Field(
-        None, exclude_if=lambda value: value is None, description="resolution of fidelity `auto`"
+        None, exclude_if=lambda value: value is None, description="fidelity that a chart selected for `auto`"
     )
 
     @model_validator(mode="before")

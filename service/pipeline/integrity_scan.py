@@ -72,7 +72,7 @@ class IntegrityScan:
         return True
 
     def advance(self) -> bool:
-        """Read some more objects; return whether more can be read now. Interrupted: `store verify` reads now."""
+        """Read further objects; return False while no round is due. Interrupted: `store verify` reads the store."""
         self._recheck_if_due(None)
         note = self._services.index.notes.scan_note()
         if note.folder >= len(FOLDERS):

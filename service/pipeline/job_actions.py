@@ -199,7 +199,7 @@ def _start(services: Services, job_id: str) -> None:
 
 @contextmanager
 def _transaction(services: Services, job_id: str, refuse: Callable[[JobView], None]) -> Iterator[Callable[..., None]]:
-    """Lock a job to append an event unless `refuse` raises; of two concurrent changes the later one sees both.
+    """Lock a job to append an event unless `refuse` raises; the later of two concurrent changes reads both.
 
     Earlier events are read before the lock, because the store may be slow.
     """

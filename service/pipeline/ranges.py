@@ -59,7 +59,7 @@ class TaskRanges:
 
 
 def span_of(batches: int, by_time: int, workers: int) -> int:
-    """Return the batches per task of a job; `by_time` batches last as long as a task should.
+    """Return the batches per task of a job; `by_time` batches last the target duration of a task.
 
     All tasks but the last have equal length, and no worker is idle while another has two tasks.
     """

@@ -237,7 +237,7 @@ def _corner(half: Indices, count: int, step: int = 0) -> Indices:
 
 
 def _pairs_around(vertices: Floats, faces: Indices, edges: Indices, half: Indices) -> list[tuple[int, int]]:
-    """Pair half-edges at one edge: sorted by angle, each face is joined to the next face behind its back."""
+    """Pair half-edges at one edge: sorted by angle, each face is joined to the next face on its back side."""
     a, b = np.sort(edges[half[0]])
     axis = vertices[b] - vertices[a]
     axis /= max(float(np.linalg.norm(axis)), 1e-300)

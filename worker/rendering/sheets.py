@@ -103,7 +103,7 @@ def three_sides_sheet(
 
 
 def views_page(views: Arrays, *, title: str, subtitle: str = "") -> bytes:
-    """Return a PNG of a views shard: per placement both pictures, depth, segmentation, boxes, any hand."""
+    """Return a PNG of a views shard: per placement both pictures, depth, segmentation, boxes, and the hand, if any."""
     eye = np.asarray(views["camera/eye"])
     stereo, first = bool((eye == 2).any()), np.flatnonzero(eye != 2)
     columns: dict[str, Callable[[int], Image.Image]] = {

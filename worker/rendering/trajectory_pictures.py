@@ -163,7 +163,7 @@ class _Stage:
 
     def _best_sides(self, world: int, near: Floats, first: float, count: int) -> list[tuple[float, float]]:
         """Return azimuth and height [rad] of the sides that show most, apart from one another.
-        The score sums the visible parts of object and hand, counted in labels, each over its largest value of all
+        The score sums the visible parts of object and hand, counted in labels, each divided by its largest value of all
         sides. Ties go to the side that looks across the palm's approach."""
         sides = [(first + 2 * np.pi * a / _AROUND, h) for h in _HEIGHTS for a in range(_AROUND)]
         centre = 0.5 * (near.min(axis=0) + near.max(axis=0))

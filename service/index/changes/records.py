@@ -179,7 +179,7 @@ _OUTCOME = (shards.c.worker, shards.c.device, shards.c.seconds, shards.c.created
 
 
 def _outcome(worker: Any, device: Any, seconds: Any, created: Any) -> dict[str, Any]:
-    """Return the columns that a task row takes from its shard: values, or columns."""
+    """Return the columns of a task row that follow from its shard; arguments are values or SQL columns."""
     made = {"done": True, "worker": worker, "device": device, "seconds": seconds, "finished": created}
     return {**made, "reason": None, "queued": False, "not_before": 0.0, **NO_PROGRESS}
 

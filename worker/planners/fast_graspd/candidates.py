@@ -17,9 +17,9 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.data import HandState
 from graspd.worker.simulation.environment import PlacedGrasps
 
-#: Number of a grasp's candidates that are seated (fine phase) and simulated at once: seating costs half of a rollout.
+#: Number of a grasp's candidates refined (fine phase) and simulated at once: refinement costs half of a rollout.
 TOGETHER: Final = 2
-#: A seated hand with a merit above this has no rollout unless its grasp has no other candidate: of 176 such hands of
+#: A refined hand with a merit above this has no rollout unless its grasp has no other candidate: of 176 such hands of
 #: Allegro and Shadow 3 lifted at half friction.
 HOPEFUL: Final = 0.3
 #: A grasp with a score above this has failed: the object is lost, or the trajectory is blocked.
@@ -65,7 +65,7 @@ class Refinements:
 
 Seat = Callable[[NDArray[np.intp], NDArray[np.intp]], Refinements]
 
-"""Seats the hands of some grasps (n,), given the rows (n, each) of their starts."""
+"""Runs the fine phase for some grasps (n,), given the rows (n, each) of their starts."""
 
 RolloutOf = Callable[[GraspSet, NDArray[np.intp], Floats], Floats]
 """Scores (k,) grasps of the numbers (k,) against the scores to beat; see `worker.planners.Rollout`."""
@@ -119,8 +119,8 @@ def tried(
     device: str = "cpu",
 ) -> Selection:
     """Return each grasp's first candidate with a good enough rollout, or else the one with the smallest score.
-    `together` candidates of each grasp are seated and simulated in the order (n, each) of merit, then as many again for
-    grasps without a good one. Unbalanced or infeasible hands have no rollout; a grasp's first hand is still used.
+    `together` candidates of each grasp are refined and simulated in the order (n, each) of merit, then further ones for
+    grasps without a good candidate. Unbalanced or infeasible hands have no rollout; a grasp's first hand is still used.
     Candidates that do not beat the scores `beat` (n,) of earlier attempts leave these scores unchanged."""
     good = GOOD if placed is None else GOOD_IN_SCENES
     beat = np.full(len(order), np.inf) if beat is None else beat
@@ -182,7 +182,7 @@ def _gentler(
 
 #: Coulomb coefficient for the balance of contacts: lower than in any test, for a reserve.
 FRICTION: Final = 0.3
-#: The same in scenes: hands that balance at this friction mostly lift at half friction (AUC .80 of seated hands of
+#: The same in scenes: hands that balance at this friction mostly lift at half friction (AUC .80 of refined hands of
 #: Allegro and Shadow whose merit is below .1; .74 with `FRICTION`).
 SCENE_FRICTION: Final = 0.15
 #: Weight of L_stable relative to the residual of the balance.

@@ -382,7 +382,7 @@ class _Seats:
     state: HandState
     losses: Floats
     curve: list[Floats]
-    """Loss curve, continued by the first hands that are seated."""
+    """Loss curve, continued by the first hands in the fine phase."""
 
     def seated(self, rows: NDArray[np.intp], which: NDArray[np.intp]) -> Refinements:
         launch, flat = self.launch, rows.ravel()
