@@ -57,7 +57,7 @@ _AT_ONCE: Final = 256
 
 
 def write(lots: Sequence[ExportPart], folder: Path, out: frozenset[str]) -> ExportSummary:
-    """Write all validated grasps of each hand, good and bad; `valid.txt` lists held-out objects."""
+    """Write all validated grasps of each hand, also failed ones; `valid.txt` lists held-out objects."""
     if (folder / "grasps").exists():
         raise InputError(f"{folder} holds grasps already; give another folder as --output")
     done = ExportSummary({"grasps": 0, "good": 0, "objects": 0, "files": 0})

@@ -52,7 +52,7 @@ ROLES: Final = tuple(
 
 def read_ddgc(path: Path, *, hand: str, obj: str, number: int = 0) -> list[ImportedGrasps]:
     """Read `barrett_translation_K.npy`, with `barrett_representation_K.npy` beside it: object `number` of the scene.
-    Joints of the Barrett hand name finger (1, 2, 3) and phalanx (spread or prox, med, dist)."""
+    Joint names of the Barrett hand contain the finger (1, 2, 3) and the phalanx (spread or prox, med, dist)."""
     beside = path.with_name(path.name.replace("translation", "representation"))
     if beside == path or not beside.is_file():
         raise InputError(f"{path} needs its barrett_representation_K.npy beside it")

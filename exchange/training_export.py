@@ -84,7 +84,7 @@ def _lots(shards: Shards, format_: str, wishes: TrainingExportOptions) -> list[E
 
 
 def _chosen(shard: Shard, format_: str, wishes: TrainingExportOptions) -> np.ndarray:
-    """Return (N,) exported grasps. GraspGen, which has labels, gets good and bad ones."""
+    """Return (N,) exported grasps. GraspGen, which has labels, gets valid and failed grasps."""
     if format_ != "graspgen":
         return choose(shard, unvalidated=wishes.unvalidated, every=wishes.every)[0]
     validated = validity.validated(shard.arrays)

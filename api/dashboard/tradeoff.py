@@ -187,7 +187,7 @@ def draw(measured: Measured, *, axis: str, hand: str = "", object: str = "") -> 
 
 
 def pareto(points: Sequence[tuple[float, float]]) -> set[int]:
-    """Return indices of points that no other point exceeds in both coordinates."""
+    """Return indices of points for which no other is at least as large in both coordinates and larger in one."""
     return {
         index
         for index, (x, y) in enumerate(points)

@@ -1,6 +1,6 @@
 """Garbage collector of the store: moves deleted objects aside, a part in each round of the controller.
 
-After the grace time they are removed for good, with the shards that no job needs.
+After the grace time they are removed permanently, with the shards that no job needs.
 """
 
 from __future__ import annotations

@@ -126,7 +126,7 @@ def examine(
 
 
 def _check_sealed(store: Store, key: str, read: Read, unsealed: Unsealed) -> Damage | None:
-    """Check an object by its own checksum; without one, check its content as far as possible."""
+    """Check an object by its own checksum; without a checksum, check its content as far as possible."""
     match = _UPLOAD.fullmatch(key)
     model = next((model for pattern, model in _RECORDS if re.fullmatch(pattern, key)), None)
     try:

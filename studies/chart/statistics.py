@@ -173,7 +173,7 @@ def most_valid(row: Mapping[str, Any]) -> float:
 
 
 def pareto(points: Sequence[tuple[float, float]]) -> set[int]:
-    """Return indices of points (more, more) that no other point dominates: as good in both, better in one."""
+    """Return indices of points for which no other is at least as large in both coordinates and larger in one."""
     return {
         index
         for index, (x, y) in enumerate(points)

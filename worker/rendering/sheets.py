@@ -257,7 +257,7 @@ def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 def text(
     draw: ImageDraw.ImageDraw, at: tuple[float, float], words: str, size: int, fill: tuple[int, int, int]
 ) -> float:
-    """Write words with the baseline at `at`; `^2` is set as an exponent. Return the x where they end."""
+    """Write words with the baseline at `at`; `^2` is set as an exponent. Return the x of their end."""
     x, y = at
     for k, part in enumerate(words.split("^")):
         if k and part:

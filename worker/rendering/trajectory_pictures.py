@@ -1,4 +1,4 @@
-"""Pictures and films of grasps along their trajectories, with one camera per grasp on a good side."""
+"""Pictures and animations of grasps along their trajectories, with one camera per grasp on a good side."""
 
 from __future__ import annotations
 
@@ -207,7 +207,7 @@ def animation_kind(suffix: str) -> str:
 
 
 def animation(pictures: NDArray[np.uint8], seconds: Sequence[float], suffix: str) -> bytes:
-    """Encode a looping film of pictures (F, H, W, 3) sRGB; `suffix` is one of `KINDS`.
+    """Encode a looping animation of pictures (F, H, W, 3) sRGB; `suffix` is one of `KINDS`.
     Durations [s] are stored in milliseconds, in a GIF in hundredths of a second.
     Raises InputError: no animation format has this suffix."""
     kind = animation_kind(suffix)

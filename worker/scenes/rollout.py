@@ -68,7 +68,7 @@ def hold_rollout(
     level: Level = "standard",
 ) -> Callable[[GraspSet, PlacedGrasps | None, Floats], Floats]:
     """Return a `worker.planners.Rollout` that scores free grasps (N,) by short pushes.
-    Scores are below 2 for grasps that also hold against the six pushes, if they are better than the score to beat."""
+    Grasps with scores below 2 and `beat` are tested by the six pushes; those that fail get scores of at least 2."""
     short, run = push_rollout(hand, obj, pieces), ExecutionContext(threads=1)
 
     def rollout(grasps: GraspSet, placed: PlacedGrasps | None, beat: Floats | None = None) -> Floats:

@@ -1,7 +1,7 @@
 """DexGraspBench's force-closure test of one grasp, at three levels of cost.
 
 dexgraspbench: as published. Each of the 6 pushes starts from the closed hand and is held for 2 s. The published test
-closes the hand anew for each push, with the same result.
+closes the hand again for each push, with the same result.
 standard: the same physics. A push ends as soon as motion at twice the present rate would stay inside .8 of the limits
 until 2 s.
 fast: coarser physics (fixed root, 6 ms). Where the margin is not clear, level standard decides."""

@@ -56,7 +56,7 @@ RANGES_AT_ONCE: Final = 500
 
 
 class Changes(IndexPart):
-    """Records of the store. `within` makes a write part of a larger transaction."""
+    """Writes of jobs, shards, attempts and assets. `within` makes a write part of a larger transaction."""
 
     def add_job(self, record: JobRecord, *, within: Connection | None = None) -> State:
         """Add a job with all its tasks; tasks whose shard exists have succeeded."""

@@ -42,7 +42,7 @@ class DatasetRounds:
         return False
 
     def _plan(self, work: DatasetWork, deadline: float) -> bool:
-        """Make jobs for the cells without one; return whether all are made."""
+        """Make jobs for the cells without a job; return whether all are made."""
         after = -1
         while not work.cancelled:
             cells = self._services.index.dataset_feed.cells_to_plan(work.name, after=after, limit=_CELLS_AT_ONCE)

@@ -165,7 +165,7 @@ def optimise_pair(pair: Pair, wanted: PlanRequest, run: ExecutionContext) -> lis
 
 
 def optimise(pair: Pair, batches: Batches, run: ExecutionContext, *, postures: bool = False) -> list[LaunchPart]:
-    """Run several batches; return the parts of those that did not stop, possibly with others.
+    """Run several batches; the returned parts contain all batches that did not stop, and possibly others.
     `postures` adds the pregrasp and squeeze postures. Raise the first batch's error if all have stopped."""
     launch = _Launch(pair, batches)
     begun = _begun(launch, batches.left(), run)
