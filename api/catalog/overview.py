@@ -124,7 +124,7 @@ class Overview:
         return found
 
     def fingerprint(self) -> str:
-        """Return a text that changes whenever a job or task in scope, or a worker, changes."""
+        """Return a text that differs after each change of a worker, or of a job or task in scope."""
         with self._lock:
             at, digest = self._fingerprints.get(project_scope(), (0.0, ""))
             now = time.monotonic()

@@ -1,7 +1,7 @@
 """HTTP client of webhooks: POST to a user's URL, on public machines only, with bounded time and bytes.
 
-The name is resolved here, all its addresses are checked, and the connection uses one of them, so a name that later
-resolves to another machine (DNS rebinding) has no effect. Redirects are not followed.
+The name is resolved here, all its addresses are checked, and the connection uses one of them. A name that later
+resolves to another machine (DNS rebinding) thus has no effect. Redirects are not followed.
 """
 
 from __future__ import annotations

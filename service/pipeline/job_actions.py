@@ -151,8 +151,8 @@ class Routes:
     def place(self, need: Requirements) -> Route:
         """Return the route of a task.
 
-        If all workers of its stage are capable, the task enters their common list; if some are, a separate list; if
-        none is, the task is held back. Without workers, this version's capabilities are assumed.
+        If all workers of its stage are capable, the task enters their common list; if some are capable, a separate
+        list. It is held back if none is capable. Without workers, this version's capabilities are assumed.
         """
         here = self._here.get(need.stage) or [capabilities()]
         lacking = {one.lacks(need) for one in here} - {""}

@@ -97,8 +97,8 @@ def lift_rollout(
 ) -> Callable[[GraspSet, PlacedGrasps | None, Floats], Floats]:
     """Return a `worker.planners.Rollout` that scores grasps (N,) in scenes by short lifts.
     Scores are below 1 for grasps with a clear trajectory that lift at half friction, below 2 at full friction.
-    Candidates that hold the hanging object briefly are validated by the whole lift test, because a squeeze may turn
-    an object out of the hand slowly at first. `threads` are per call; on the CPU, planners already use all threads."""
+    Candidates that hold the hanging object briefly are validated by the whole lift test: a squeeze may slowly turn an
+    object out of the hand. `threads` are per call; on the CPU, planners already use all threads."""
     shorts, run = LiftRollouts(hand, obj, pieces, threads=threads), ExecutionContext(threads=threads)
 
     def rollout(grasps: GraspSet, placed: PlacedGrasps | None, beat: Floats | None = None) -> Floats:

@@ -1,10 +1,10 @@
 """Seconds and bytes of a batch: measured on this service's finished batches if possible, else stored.
 
-The nearest measurement counts: of the same hand and object, else of the same hand, else of any hand; always with the
-same method, fidelity, validator and kind of device. `STORED` and `STORED_METHODS` have the stored values with their
-origin. After the first measurement, one factor (seconds of this machine divided by stored seconds) scales all stored
-values, so that comparisons of fidelities never mix two machines. Every rate has an interval: the scatter of measured
-batches, or the observed error of a stored value.
+The nearest measurement counts: of the same hand and object, else of the same hand, else of any hand. Method, fidelity,
+validator and kind of device are always the same. `STORED` and `STORED_METHODS` have the stored values with their
+origin. After the first measurement, one factor (seconds of this machine / stored seconds) scales all stored values.
+Comparisons of fidelities thus never mix two machines. Every rate has an interval: the scatter of measured batches, or
+the observed error of a stored value.
 """
 
 from __future__ import annotations

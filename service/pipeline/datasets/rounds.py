@@ -1,7 +1,7 @@
 """Users' actions on datasets, a part in each round of the controller: plan, cancel and retry jobs.
 
-The index records which cells have a job, and a job's event names the causing event of the dataset, so another
-controller can continue without applying an event twice.
+The index records which cells have a job, and a job's event names the causing event of the dataset. Another controller
+can therefore continue without applying an event twice.
 """
 
 from __future__ import annotations
