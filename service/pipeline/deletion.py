@@ -61,7 +61,7 @@ def delete_asset(
 
 
 def delete_job(services: Services, job_id: str, *, owner: str = "") -> None:
-    """Delete a job; shards that no other job needs follow later. ConflictError: unfinished, or in a dataset."""
+    """Delete a job; shards that no other job needs are deleted later. ConflictError: unfinished, or in a dataset."""
     job = services.index.jobs.get(job_id)
     try:
         record = read_record(JobRecord, services.store, names.job_record(job_id))

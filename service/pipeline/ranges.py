@@ -36,7 +36,7 @@ class TaskRanges:
         self._costs: list[BatchCost] = []
 
     def sized(self, job: JobRecord, *, among: int = 1) -> JobRecord:
-        """Return a job with its number of batches per task, one `among` several that share the workers."""
+        """Return a job with its number of batches per task, if `among` jobs share the workers."""
         batches, wanted_s = batches_of(job.request.grasps), self._services.settings.task_s
         # Pictures of a batch are already a file of megabytes.
         if batches == 1 or job.request.views or not wanted_s:

@@ -1,7 +1,7 @@
 """Webhook dispatcher: signed reports of ends, one at a time to each address, retried with back-off.
 
 A failed delivery pauses all deliveries to its address. Projects take turns; within a project, the least recently used
-address comes first. Addresses that failed last share half of the slots, so the others are not delayed.
+address comes first. Addresses whose last delivery failed share half of the slots, so the others are not delayed.
 """
 
 from __future__ import annotations

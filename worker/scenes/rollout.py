@@ -196,7 +196,7 @@ def scene_verdicts(
 
 
 def outcomes_in_scenes(columns: Arrays) -> dict[str, NDArray[np.bool_]]:
-    """Return which grasps (N,) are clear, lift, and lift at half friction, from `scene_verdicts`' columns."""
+    """Return masks (N,) of grasps that are clear, lift, and lift at half friction, from columns of `scene_verdicts`."""
     clear = np.asarray(columns["quality/success"] >= 0)
     if "quality/lift_outcome" not in columns:
         return {"clear": clear, "lift": np.zeros_like(clear), "lift_hard": np.zeros_like(clear)}
