@@ -97,7 +97,7 @@ class JobDetail(Job):
     attempts: list[AttemptView]
     mean: MeanMetrics
     diversity: Diversity | None = Field(
-        None, description="of the valid grasps (all stored ones if not validated); absent: none"
+        None, description="diversity of the valid grasps (all stored ones if not validated)"
     )
     shards: list[Shard]
 

@@ -286,7 +286,7 @@ class DeletionView(View):
     """Resource that was deleted within the grace time."""
 
     what: What
-    id: str = Field(description="of the job, tag, hand, object or network; name of the dataset")
+    id: str = Field(description="id of the job, tag, hand, object or network; name of the dataset")
     name: str
     at: str = Field(description="time of the deletion")
     until: str = Field(description="time until which it can be restored")

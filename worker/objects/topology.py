@@ -232,7 +232,7 @@ def part_double_edges(vertices: Floats, faces: Indices) -> tuple[Floats, Indices
 
 
 def _corner(half: Indices, count: int, step: int = 0) -> Indices:
-    """Return the number 3 f + k of the corner at which a half-edge starts, or ends with step 1."""
+    """Return the number 3 f + k of the corner at which a half-edge starts; with step 1, at which it ends."""
     return 3 * (half % count) + (half // count + step) % 3
 
 
