@@ -97,7 +97,7 @@ class JobDetail(Job):
     attempts: list[AttemptView]
     mean: MeanMetrics
     diversity: Diversity | None = Field(
-        None, description="diversity of the valid grasps (all stored ones if not validated)"
+        None, description="diversity of the valid grasps (all stored ones if not validated); absent: none"
     )
     shards: list[Shard]
 

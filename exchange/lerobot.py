@@ -5,9 +5,9 @@
     data/chunk-CCC/file-FFF.parquet                       frames, with pictures as PNG
 
 A frame is a waypoint of the trajectory, from the standoff to the squeeze. `observation.state` is the present posture;
-`action` is the next posture, in the last frame the lift. A posture has the root's position [m] and quaternion w x
-y z in the table's frame, then all moving joints [rad or m]. `observation.environment_state` is the object's rest pose
-in the same frame. Waypoints have no times, so `fps` only numbers them.
+`action` is the next posture, in the last frame the lift. A posture has the root's position [m] and quaternion w x y z
+in the table's frame, then all moving joints [rad or m]. `observation.environment_state` is the object's rest pose in
+the same frame. Waypoints have no times, so `fps` only numbers them.
 
 The importer `lerobot` reads trajectories of data sets from graspd, in the object's frame."""
 
