@@ -21,7 +21,7 @@ class StageStatus(StageProgress):
     """Progress of one stage of a job, and its expected end."""
 
     state: State
-    progress: float = Field(ge=0, le=1, description="share done; running tasks count by their own progress")
+    progress: float = Field(ge=0, le=1, description="finished share; running tasks count with their progress")
     message: str = Field("", description="activity of a running task, or why a task waits")
     rate_per_s: float | None = Field(None, description="tasks per second of all current workers")
     eta_s: float | None = Field(None, description="expected time until the stage ends [s]")
@@ -97,7 +97,7 @@ class JobDetail(Job):
     attempts: list[AttemptView]
     mean: MeanMetrics
     diversity: Diversity | None = Field(
-        None, description="of the valid grasps (all stored ones if not validated); absent: none"
+        None, description="diversity of the valid grasps (all stored ones if not validated); absent: none"
     )
     shards: list[Shard]
 

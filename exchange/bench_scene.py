@@ -1,9 +1,9 @@
 """Objects and scenes in DexGraspBench's layout, and grasps on a table in the format of its tabletop test.
 
-An object has a mesh, convex pieces, facts, and scenes: floating at scale 1, and on a table. Poses in the files of a
-table are in its frame, z up, with its top at z = 0. The evaluator has only a floor there. Grasps on a table have two
-more fields, for arms. `approach_qpos` (W, 7 + J) leads from the standoff to the pregrasp with the hand open.
-`lift_qpos` (7 + J,) is the raised squeeze. The evaluator raises a hand without arm itself."""
+Files of an object are its mesh, convex pieces, facts, and scenes, in which it floats at scale 1 or stands on a table.
+Poses in the files of a table are in its frame, z up, with its top at z = 0. The evaluator has only a floor there.
+Grasps on a table have two more fields, for arms. `approach_qpos` (W, 7 + J) leads from the standoff to the pregrasp
+with the hand open. `lift_qpos` (7 + J,) is the raised squeeze. The evaluator raises a hand without arm itself."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def write_object(obj: ObjectModel, name: str, root: Path) -> tuple[Path, Path]:
 
 
 def _facts(obj: ObjectModel, solid: float) -> dict[str, Any]:
-    """Return facts with the scale of density: at density 1 the weighed pieces have this mass."""
+    """Return mass, density, bounds and centre of mass; at density 1 the pieces have the mass `solid`."""
     _, extents = trimesh.bounds.oriented_bounds(obj.hull_vertices)
     return {
         "gravity_center": obj.centre_of_mass.tolist(),

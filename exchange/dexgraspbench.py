@@ -46,7 +46,7 @@ NAME: Final = "graspd"
 
 
 def read(path: Path, *, hand: str, obj: str) -> list[ImportedGrasps]:
-    """Read a file or folder: one set per scale, grasps on tables apart. Without a mapping, joints are those of
+    """Read a file or folder: one set per scale, separate sets for tables. Without a mapping, joints are those of
     `hand`."""
     # Descriptions of scenes are also pickled dictionaries.
     files = [path] if path.is_file() else [f for f in sorted(path.rglob("*.npy")) if "scene_cfg" not in f.parts]

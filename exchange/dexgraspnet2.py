@@ -227,7 +227,7 @@ _MEMBERS: Final = 1024
 def write(
     lots: Sequence[ExportPart], pictures: Pictures, folder: Path, out: frozenset[str], noise: DepthNoise | None = None
 ) -> ExportSummary:
-    """Write each scene that has pictures and grasps, planned in it or carried over into it."""
+    """Write each scene that has pictures and grasps, planned in it or transferred to it."""
     top = folder / "data"
     if top.exists():
         raise InputError(f"{top} exists already; give another folder as --output")

@@ -145,7 +145,7 @@ def _write_group(
 def _rows_of(
     lot: ExportPart, scenes: _Scenes, folder: Path, *, seen: bool
 ) -> Iterator[tuple[Path, int, NDArray[np.intp]]]:
-    """Yield the lot's rows by scene file and type; skip scenes without a picture if others have one."""
+    """Yield the lot's rows by scene file and type; skip scenes without a picture if others have a picture."""
     index = np.full(len(lot.grasps), _FREE) if lot.placed is None else np.asarray(lot.placed.index)
     types = np.asarray(lot.shard.arrays.get("quality/grasp_type", np.zeros(len(index))), np.intp)
     for scene in sorted({int(index[row]) for row in lot.rows}):

@@ -1,6 +1,6 @@
 """GraspGen's data: a JSON record per object in tar files, with an index, object lists and meshes.
 
-Murali et al., GraspGen, ICRA 2026. Written and read:
+Murali et al., GraspGen, ICRA 2026. Files that are written and read:
 
     grasps/GRIPPER/shard_000.tar         members UUID.grasps.json; uuid_index.json: {UUID: number of the shard}
     splits/GRIPPER/{train,valid}.txt     a UUID per line
@@ -57,7 +57,7 @@ _AT_ONCE: Final = 256
 
 
 def write(lots: Sequence[ExportPart], folder: Path, out: frozenset[str]) -> ExportSummary:
-    """Write all validated grasps of each hand, good and bad; `valid.txt` lists held-out objects."""
+    """Write all validated grasps of each hand, also failed ones; `valid.txt` lists held-out objects."""
     if (folder / "grasps").exists():
         raise InputError(f"{folder} holds grasps already; give another folder as --output")
     done = ExportSummary({"grasps": 0, "good": 0, "objects": 0, "files": 0})

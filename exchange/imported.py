@@ -1,4 +1,4 @@
-"""Imported grasps before our quality stage: scaled objects, and safe reading of NumPy pickles.
+"""Imported grasps before validation: scaled objects, and safe reading of NumPy pickles.
 
 A pickle may call any function while it is loaded. Only arrays, numbers, strings and their containers are allowed here.
 """

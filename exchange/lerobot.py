@@ -1,13 +1,13 @@
-"""A LeRobot data set (v3.0): the trajectory of a grasp as an episode, seen by one camera beforehand.
+"""A LeRobot data set (v3.0): the trajectory of a grasp as an episode, with a picture taken before the motion.
 
     meta/info.json, meta/stats.json                       features, numbers, statistics of each feature
     meta/tasks.parquet, meta/episodes/chunk-000/...       texts of the tasks; position of each episode's frames
     data/chunk-CCC/file-FFF.parquet                       frames, with pictures as PNG
 
-A frame is a waypoint of the trajectory, from the standoff to the squeeze. `observation.state` is the present posture,
-`action` the next one, after the last frame the lift. A posture has the root's position [m] and quaternion w x y z in
-the table's frame, then all moving joints [rad or m]. `observation.environment_state` is the object's rest pose in the
-same frame. Waypoints have no times, so `fps` only numbers them.
+A frame is a waypoint of the trajectory, from the standoff to the squeeze. `observation.state` is the present posture;
+`action` is the next posture, in the last frame the lift. A posture has the root's position [m] and quaternion w x y z
+in the table's frame, then all moving joints [rad or m]. `observation.environment_state` is the object's rest pose in
+the same frame. Waypoints have no times, so `fps` only numbers them.
 
 The importer `lerobot` reads trajectories of data sets from graspd, in the object's frame."""
 

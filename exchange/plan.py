@@ -46,8 +46,8 @@ class ExportPart:
 
 
 def held_out(kinds: Mapping[str, str], share: float) -> frozenset[str]:
-    """Return the objects of a share of the kinds, ordered by hash: at least one kind, but not all; none of a single
-    kind."""
+    """Return the objects of a share of the families, ordered by hash: at least one family but not all; none if there is
+    only one."""
     order = sorted(set(kinds.values()), key=lambda kind: hashlib.sha256(kind.encode()).digest())
     chosen = order[: min(max(1, round(share * len(order))), len(order) - 1)]
     return frozenset(name for name, kind in kinds.items() if kind in chosen)

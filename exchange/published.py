@@ -1,8 +1,8 @@
 """Readers of published grasp sets: DDGC, DexGraspNet, MultiDex (GenDexGrasp), `reference-grasps/1`.
 
 Lundell et al., DDGC, RA-L 2021. Each object of the scene has a list of grasps. A grasp has position and quaternion x y
-z w of the hand in the object's frame, and eight joint angles, closing positive. The angles are spread, medial and
-distal of finger 1, the same of finger 2, then medial and distal of finger 3.
+z w of the hand in the object's frame, and eight joint angles, positive towards closing. The angles are spread, medial
+and distal of finger 1, the same of finger 2, then medial and distal of finger 3.
 
 DexGraspNet's layout: a `.npy` for each object, a list of dictionaries with `qpos` by joint name and `scale`.
 
@@ -52,7 +52,7 @@ ROLES: Final = tuple(
 
 def read_ddgc(path: Path, *, hand: str, obj: str, number: int = 0) -> list[ImportedGrasps]:
     """Read `barrett_translation_K.npy`, with `barrett_representation_K.npy` beside it: object `number` of the scene.
-    Joints of the Barrett hand name finger (1, 2, 3) and phalanx (spread or prox, med, dist)."""
+    Joint names of the Barrett hand contain the finger (1, 2, 3) and the phalanx (spread or prox, med, dist)."""
     beside = path.with_name(path.name.replace("translation", "representation"))
     if beside == path or not beside.is_file():
         raise InputError(f"{path} needs its barrett_representation_K.npy beside it")

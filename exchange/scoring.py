@@ -1,4 +1,4 @@
-"""Imported grasps through our quality stage, as base shards with their origin."""
+"""Validation and metrics of imported grasps, written as base shards with their origin."""
 
 from __future__ import annotations
 

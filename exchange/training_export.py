@@ -1,8 +1,8 @@
 """Export of shards as training folders of other projects: grasps, pictures, splits by object family.
 
 Families compare the distribution of distances between two random surface points (D2 of Osada et al., "Shape
-distributions", 2002) over their root mean square. Rotated, moved, mirrored, scaled and remeshed copies have the same
-distribution."""
+distributions", 2002), divided by their root mean square. Rotated, moved, mirrored, scaled and remeshed copies have the
+same distribution."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def _export_parts(shards: Shards, format_: str, wishes: TrainingExportOptions) -
 
 
 def _exported_rows(shard: Shard, format_: str, wishes: TrainingExportOptions) -> np.ndarray:
-    """Return (N,) exported grasps. GraspGen, which has labels, gets good and bad ones."""
+    """Return (N,) exported grasps. GraspGen, which has labels, gets valid and failed grasps."""
     if format_ != "graspgen":
         return select_grasps(shard, unvalidated=wishes.unvalidated, every=wishes.every)[0]
     validated = validity.validated(shard.arrays)
@@ -103,7 +103,7 @@ SAME: Final = 0.006
 
 
 def shape_signature(obj: ObjectModel) -> Floats:
-    """Return (50,) quantiles of the distance between two surface points, over its root mean square."""
+    """Return (50,) quantiles of the distance between two surface points, divided by its root mean square."""
     corners = np.asarray(obj.vertices, float)[np.asarray(obj.faces)]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     rng = np.random.default_rng(0)

@@ -153,7 +153,7 @@ def fail(message: str, code: int) -> NoReturn:
 
 
 def plain_console(*, stderr: bool = False) -> Console:
-    """Return a terminal that prints verbatim; Rich reads `[red]` as a style and `:x:` as a sign."""
+    """Return a terminal that prints verbatim; Rich reads `[red]` as a style and `:x:` as an emoji."""
     from rich.console import Console
 
     return Console(stderr=stderr, markup=False, emoji=False, highlight=False)

@@ -115,11 +115,9 @@ class Settings(BaseSettings):
         ge=0,
         description="target duration of tasks of large jobs [s]; it sets the number of batches per task; 0: one batch",
     )
-    task_timeout_s: float = Field(1800.0, gt=0, description="longest run of one task [s]")
+    task_timeout_s: float = Field(1800.0, gt=0, description="maximum run time of one task [s]")
     worker_max_memory_mb: int = Field(
-        0,
-        ge=0,
-        description="resident memory of a worker above which a new one replaces it [MiB]; 0: half of all memory",
+        0, ge=0, description="resident memory at which a worker is replaced [MiB]; 0: half of all memory"
     )
     retry_backoff_s: float = Field(
         2.0, ge=0, description="wait before the second attempt [s]; doubled before each further one"

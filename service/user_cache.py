@@ -42,7 +42,7 @@ def load(file: Path) -> bytes | None:
 
 
 def store(file: Path, content: bytes, *, limit_bytes: int = _LIMIT_BYTES) -> None:
-    """Write an entry after its SHA-256; remove the least recently used entries of its folder above `limit_bytes`."""
+    """Write an entry with its SHA-256; remove the least recently used entries of its folder above `limit_bytes`."""
     with suppress(OSError):
         write_atomically(file, [hashlib.sha256(content).digest(), content])
         evict(file.parent, file.suffix, limit_bytes, keep=file)

@@ -459,7 +459,7 @@ class Batch:
         return PlanRequest(len(rows), knobs, seed, number, placed, rollout, rows.start, others_have_place)
 
     def grasps_to_store(self, wanted: PlanRequest, planned: GraspSet) -> GraspSet:
-        """Return the grasps to validate and store: positions on the grid, scene numbers of the job."""
+        """Return the grasps to validate and store, with rounded positions and the job's scene numbers."""
         index = None if wanted.placed is None else self._scenes.start + wanted.placed.index
         return replace(planned, scene=index).moved(np.zeros(3))
 

@@ -47,14 +47,14 @@ class KeyLimits(BaseModel):
 
     requests_per_minute: int | None = Field(None, ge=0)
     concurrency: int | None = Field(None, ge=0, description="concurrent requests")
-    grasps_in_flight: int | None = Field(None, ge=0, description="grasps of its jobs that have not ended")
+    grasps_in_flight: int | None = Field(None, ge=0, description="maximum grasps in unfinished jobs")
     jobs_per_day: int | None = Field(None, ge=0, description="new jobs per day (UTC)")
 
 
 class ProjectLimits(BaseModel):
     """Shared limits of the keys of one project. None or 0: no limit."""
 
-    grasps_in_flight: int | None = Field(None, ge=0, description="grasps of its jobs that have not ended")
+    grasps_in_flight: int | None = Field(None, ge=0, description="maximum grasps in unfinished jobs")
     grasps_per_day: int | None = Field(None, ge=0, description="requested grasps per day (UTC)")
     gpu_seconds_per_day: int | None = Field(
         None, ge=0, description="GPU workers' time on its tasks per day (UTC), after which new jobs are refused [s]"

@@ -65,8 +65,7 @@ class Assets:
         """Store an upload. Workers check hands and objects; a network is checked here.
 
         With `self_test` the check of a hand includes grasps. All projects may use `shared` assets. With `rename` the
-        asset gets
-        the next free name if its name is taken; content that exists already keeps its name.
+        asset gets the next free name if its name is taken; content that exists already keeps its name.
         """
         found = network_report(files, name) if kind is AssetKind.NETWORK else None
         project = project_scope().project

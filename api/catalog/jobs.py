@@ -94,7 +94,7 @@ class Jobs:
         self._paces = TaskRates()
 
     def submit(self, request: JobRequest, *, idempotency_key: str | None = None) -> JobDetail:
-        """Record a job, or return the existing identical one."""
+        """Record a job, or return the existing identical job."""
         key = caller.get()
         bound: contextlib.AbstractContextManager[None] = contextlib.nullcontext()
         if idempotency_key is not None:

@@ -124,7 +124,7 @@ class Overview:
         return found
 
     def fingerprint(self) -> str:
-        """Return a text that changes whenever a job or task in scope, or a worker, changes."""
+        """Return a text that differs after each change of a worker, or of a job or task in scope."""
         with self._lock:
             at, digest = self._fingerprints.get(project_scope(), (0.0, ""))
             now = time.monotonic()
@@ -286,11 +286,11 @@ class DeletionView(View):
     """Resource that was deleted within the grace time."""
 
     what: What
-    id: str = Field(description="of the job, tag, hand, object or network; name of the dataset")
+    id: str = Field(description="id of the job, tag, hand, object or network; name of the dataset")
     name: str
-    at: str = Field(description="when it was deleted")
-    until: str = Field(description="until then it can be restored")
-    owner: str = Field(description="id of the key that it was submitted with")
+    at: str = Field(description="time of the deletion")
+    until: str = Field(description="time until which it can be restored")
+    owner: str = Field(description="id of the key that submitted it")
     project: str
 
 

@@ -213,7 +213,7 @@ class Expectations:
         self._lock = threading.Lock()
 
     def of(self, form: Mapping[str, Any]) -> list[tuple[str, str, Estimate | None]]:
-        """Return each offered fidelity, its description, and its estimate for a form; None if that is not possible."""
+        """Return each offered fidelity, its description, and its estimate for a form; None if there is no estimate."""
         wanted = {
             key: value for key, value in form.items() if key not in ("hand", "object", "fidelity") and value != ""
         }

@@ -39,8 +39,7 @@ class RateLimit(HttpMiddleware):
     """Finds the key of a request (`scope["state"]["key"]`) and enforces the limits of that key.
 
     A request without a key counts against its address. An open service serves only one machine and has no limits.
-    Refusals
-    are 429 with Retry-After; every counted response has RateLimit and RateLimit-Policy
+    Refusals are 429 with Retry-After; every counted response has RateLimit and RateLimit-Policy
     (draft-ietf-httpapi-ratelimit-headers-10).
     """
 

@@ -1,6 +1,6 @@
 """Middleware of all routes: request ids, security headers, HEAD (RFC 9110 §9.3.2), prefix, origin.
 
-The application's paths have no prefix: it is removed from incoming paths here, unless the proxy already did so, and
+The application's paths have no prefix. It is removed from incoming paths here, unless the proxy already did so, and
 added to addresses in response headers. Rendering adds it to addresses in pages (`with_prefix`).
 """
 

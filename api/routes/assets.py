@@ -187,7 +187,7 @@ correction_router = APIRouter(prefix="/v1/hands", tags=["hands"])
 class CorrectionRequest(HandCorrections):
     """Corrections, and the name of the corrected hand."""
 
-    name: Name | None = Field(None, description="of the corrected hand; default: the hand's name with the next number")
+    name: Name | None = Field(None, description="name of the corrected hand; default: the hand's name with a number")
 
 
 @correction_router.post("/{name}/corrections", status_code=202, dependencies=SUBMIT, responses=responses(400, 404, 409))

@@ -1,7 +1,7 @@
 """DexGraspNet's energies, gradients on bodies, and Metropolis-adjusted descent.
 
 E = E_fc + 100 E_dis + 100 E_pen + 10 E_spen + E_joints
-step 0.005 * 0.95^floor(t / 50), each gradient over its root mean square, v <- 0.98 g^2 + 0.02 v
+step 0.005 * 0.95^floor(t / 50), each gradient divided by its root mean square, v <- 0.98 g^2 + 0.02 v
 temperature 18 * 0.95^floor(t / 30): a proposal is accepted with probability min(1, exp((E - E') / T))"""
 
 import warp as wp

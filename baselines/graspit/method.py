@@ -3,10 +3,10 @@
 Virtual contacts are a few points of a hand: two on each link's inner side, and some on the palm. GraspIt! has files of
 them for its own hands; here they are computed for any hand.
 
-GraspIt! has eigengrasps for two hands here. Barrett: spread; all fingers. Human hand: flexion of the knuckles with a
-little of the distal joints; knuckles against distal joints. It has none for Allegro or Shadow. In this module a hand
-with one closing dof per finger uses Barrett's. Any other hand uses the human hand's, by the position of each joint
-along its finger."""
+GraspIt! has two eigengrasps for each of two hands here. Barrett: spread; closing of all fingers. Human hand: flexion of
+the knuckles with a little of the distal joints; knuckles against distal joints. It has none for Allegro or Shadow. In
+this module a hand with one closing dof per finger uses Barrett's eigengrasps. Any other hand uses the human hand's, by
+the position of each joint along its finger."""
 
 from __future__ import annotations
 

@@ -95,8 +95,8 @@ def executions(
     tool: ToolFrame,
     quality: dict[str, NDArray[Any]],
 ) -> Executions:
-    """Return the grasps with a trajectory, planned in their scene; for a free object planned here, if a retreat
-    exists."""
+    """Return grasps with trajectories: those of their scene, or for a free object, if a retreat exists, those planned
+    here."""
     frame, at = "object", np.tile(IDENTITY_POSE, (len(grasps), 1))
     free = np.ones(len(grasps), bool)
     if placed is None or grasps.approach is None or grasps.coming is None or grasps.lift is None:

@@ -7,8 +7,8 @@
 Each grasp has six key frames in the scene: standoff, arrival, pregrasp, grasp, squeeze, lift. The hand must not touch
 anything during its approach, and closes in 0.8 s. With gravity it then rises within 0.4 s and holds for 2 s. Without
 gravity the object is pushed in six directions for 2 s each; the force [N] is ten times its mass [kg]. The object may
-end 5 cm and 15 degrees from its goal. Without --full a test ends early if the object's present velocities keep it there
-for 2 s."""
+end up to 5 cm and 15 degrees from its goal. Without --full a test ends early if the object's present velocities keep it
+there for 2 s."""
 
 import argparse
 import json

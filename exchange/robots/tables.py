@@ -1,12 +1,12 @@
 """Grasps as text files: three CSV tables, and Isaac Sim's grasp file (`isaac_grasp`, version 1.0).
 
-Poses in the tables are poses of the tool frame: x y z [m], unit quaternion qw qx qy qz. Joint columns [rad or m] are
-named.
+Poses in the tables are poses of the tool frame: x y z [m], unit quaternion qw qx qy qz. Joint columns [rad or m] have
+the joints' names.
 
 In Isaac Sim's file, a grasp is the pose of the gripper's frame in the object's frame: position [m], quaternion w and
 xyz. `cspace_position` has the joints that hold, `pregrasp_cspace_position` the joints before. Joints that the URDF
 couples are omitted. Names of the two frames are informative. Isaac Sim uses `..._frame_link`, Isaac ROS `..._frame`, so
-both are written. Pressing joint commands and trajectories are under our own key, which readers ignore."""
+both are written. Joint commands of the squeeze and trajectories are under our own key, which readers ignore."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ def add_key(
     jobs_per_day: JobsOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Make a key and show it once. Limits default to those of the settings."""
+    """Make a key and show it once. Default limits are those of the settings."""
     given = _given_limits(
         requests_per_minute=requests_per_minute,
         concurrency=concurrency,

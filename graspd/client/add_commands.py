@@ -179,7 +179,7 @@ def add_set(
     url: str | None,
     json: bool,
 ) -> None:
-    """Upload objects as a set and report it; InputError if some were refused, after each is listed."""
+    """Upload objects as a set and report it; list refused objects, then raise InputError."""
     with open_client(url) as client:
         say = None if json else typer.echo
         told = upload_set(client, objects, name, prefix=prefix, options=options, shared=shared, wait=wait, say=say)

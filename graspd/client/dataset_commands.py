@@ -106,7 +106,7 @@ def plan_request(
 
 
 def read_spec(file: Path) -> dict[str, Any]:
-    """Return the keys of a spec; InputError if the file is none."""
+    """Return the keys of a spec; InputError if the file is invalid."""
     kind, load = ("JSON", json.loads) if file.suffix == ".json" else ("TOML", tomllib.loads)
     try:
         found = load(file.read_text())

@@ -79,7 +79,7 @@ def print_rows(
     empty: str = "",
     json: bool,
 ) -> None:
-    """Print a list as JSON, or as a table (`empty` instead of an empty one); columns `whole` are not broken."""
+    """Print a list as JSON or a table; `empty` replaces a table without rows; columns `whole` are not wrapped."""
     if json:
         emit(document)
         return
@@ -273,7 +273,7 @@ class JobDisplay:
 
 
 def _size_of(stage: StageStatus, job: Job) -> tuple[int, str]:
-    """Return how many things a stage makes, and their name."""
+    """Return the number of items that a stage makes, and their name."""
     return (job.requested, "grasps") if stage.stage is Stage.SYNTHESIZE else (stage.tasks, "tasks")
 
 

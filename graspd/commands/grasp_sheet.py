@@ -1,4 +1,4 @@
-"""Sheets and films of the grasps of a base shard: at the grasp, in the scene, or along the trajectory."""
+"""Sheets and animations of the grasps of a base shard: at the grasp, in the scene, or along the trajectory."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def _waypoint(way: list[Waypoint], name: str) -> Waypoint:
     return next(point for point in way if point.name == name)
 
 
-#: Width of the film [px], and its height as a share of the width.
+#: Width of the animation [px], and its height as a share of the width.
 WIDTH: Final = 480
 HIGH: Final = 0.75
 
@@ -133,14 +133,14 @@ HIGH: Final = 0.75
 FILM_SAMPLES: Final = 24
 #: Used share of the velocity limits of joints and hand.
 SPEED: Final = 0.5
-#: Time for which the open hand is shown before its motion, and the lifted object before the film repeats [s].
+#: Time for which the open hand is shown before its motion, and the lifted object before the animation repeats [s].
 BEFORE_S: Final = 0.4
 AFTER_S: Final = 1.4
 
 
 @dataclass(frozen=True)
 class GraspAnimation:
-    """Film of the trajectories of grasps of a shard, one after the other."""
+    """Animation of the trajectories of grasps of a shard, one after the other."""
 
     shard: Shard
     hand: HandModel
@@ -150,7 +150,7 @@ class GraspAnimation:
     width: int | None = None
 
     def file(self, suffix: str) -> bytes:
-        """Return the film as GIF, WebP or animated PNG."""
+        """Return the animation as GIF, WebP or animated PNG."""
         animation_kind(suffix)
         pictures: list[NDArray[np.uint8]] = []
         seconds: list[float] = []

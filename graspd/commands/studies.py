@@ -36,7 +36,7 @@ app = CommandGroup()
 def bench(
     hand: Annotated[str, typer.Option(help="URDF, ZIP with a URDF, or built-in hand.")] = "allegro",
     object_: Annotated[str, typer.Option("--object", help="Mesh or built-in object.")] = "mug",
-    fidelity: Annotated[list[str] | None, typer.Option(help="Fidelity; repeatable. Default: all offered.")] = None,
+    fidelity: Annotated[list[str] | None, typer.Option(help="Fidelity; repeatable. Default: all.")] = None,
     batch: Annotated[list[int] | None, typer.Option(min=1, help="Grasps per call; repeatable.")] = None,
     join: Annotated[list[int] | None, typer.Option(min=1, help="Batches per launch; repeatable.")] = None,
     threads: Annotated[list[int] | None, typer.Option(min=1, help="CPU threads; repeatable.")] = None,
@@ -159,7 +159,7 @@ def _read_maps(path: Path) -> Stability:
 
 
 def _merge(parts: list[Stability]) -> Stability:
-    """Merge several runs; of maps with the same name, the later one counts."""
+    """Merge several runs; a later map replaces an earlier map of the same name."""
     maps = {one.name: one for part in parts for one in part.maps}
     commands = "; ".join(dict.fromkeys(part.command for part in parts))
     return replace(parts[-1], command=commands, maps=list(maps.values()))

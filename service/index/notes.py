@@ -37,9 +37,9 @@ class StoreMark:
     """Mark that shows whether index or store is an older copy."""
 
     mark: str = ""
-    """Mark that index and store share; empty before the first."""
+    """Mark that index and store share; empty before the first mark."""
     before: str = ""
-    """Previous mark of the store during an update; otherwise equal."""
+    """Previous mark of the store during an update; otherwise equal to `mark`."""
     changes: int = 0
 
 
@@ -69,7 +69,7 @@ class Notes(IndexPart):
         return None if value is None else str(value["id"])
 
     def name_service(self, identity: str, *, instead: bool = False) -> str:
-        """Set the id of the index's service if unset, or `instead` of it; return the valid id."""
+        """Set the id of the index's service if it is unset or `instead` is true; return the present id."""
         with self.database.writing() as connection:
             known = None if instead else self.service(within=connection)
             if known is None:

@@ -33,7 +33,7 @@ def append_ends(connection: Connection, rows: Sequence[dict[str, Any]]) -> None:
     """Append ends to the feed within a transaction.
 
     The number of an end is the time in milliseconds, or the last number plus 1: a rebuilt index thus continues after
-    the numbers of a lost one. Writers run one at a time, so numbers appear in order.
+    the numbers of a lost index. Writers run one at a time, so numbers appear in order.
     """
     if rows:
         first = max(last_end(connection) + 1, int(time.time() * 1000))
@@ -51,7 +51,7 @@ class Outbox(IndexPart):
         return [EndView(**row) for row in self.database.rows(query)]
 
     def untold_datasets(self, *, limit: int = 200) -> list[tuple[str, int]]:
-        """Return datasets whose end is not reported since their last event, with their number of events."""
+        """Return datasets whose end was not reported after their last event, with their number of events."""
         query = select(datasets.c.name, datasets.c.events).where(
             datasets.c.planned.is_(True), datasets.c.applied >= datasets.c.events, datasets.c.told < datasets.c.events
         )

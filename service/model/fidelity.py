@@ -32,7 +32,7 @@ class Fidelity(Model):
     patience: int = Field(
         10, ge=0, le=100_000, description="fine iterations without improvement before a grasp stops; 0: never"
     )
-    velocities: Literal[7, 13] = Field(7, description="initial object velocities per simulation (M)")
+    velocities: Literal[7, 13] = Field(7, description="number of one-step simulations, one per object velocity (M)")
     contact_solver: Literal["direct", "jacobi", "gauss_seidel"] = "direct"
     optimizer: Literal["adam", "gd"] = "adam"
     leak: Literal["one_sided", "two_sided"] = "one_sided"

@@ -26,7 +26,7 @@ class TaskMessage(Model):
 
     # The alias is needed because the message's field `schema` is an attribute of BaseModel.
     schema_: int = Field(alias="schema", description="oldest schema that can express the message")
-    newest_schema: int = Field(0, ge=0, description="newest schema known to the writer; 0: the same as `schema`")
+    newest_schema: int = Field(0, ge=0, description="newest schema that the writer supports; 0: the same as `schema`")
     task_id: Word
     job_id: Word
     stage: Stage

@@ -205,7 +205,7 @@ def share_of(project: str, key: str) -> str:
 
 
 class RoundRobin:
-    """Fair scheduling: order of the latest turns. Their loss, when the process ends, costs at most one turn."""
+    """Fair scheduling: order of the latest turns. They are lost when the process ends, which costs at most one turn."""
 
     def __init__(self) -> None:
         self._served: dict[str, int] = {}

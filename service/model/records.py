@@ -64,7 +64,7 @@ class JobRecord(Record):
     owner: str = Field("", max_length=64, description="id of the API key that submitted it; empty: none or unknown")
     project: Project = Field("", description="project of that key; empty: the unnamed project")
     choice: Choice | None = Field(
-        None, exclude_if=lambda value: value is None, description="resolution of fidelity `auto`"
+        None, exclude_if=lambda value: value is None, description="fidelity that a chart selected for `auto`"
     )
 
     @model_validator(mode="before")
@@ -147,8 +147,7 @@ class DatasetRecord(Record):
     """`dataset.json`. `jobs` has one id per cell, hand by hand, then object by object.
 
     With fidelity `auto`, `fidelities` has the chart's choice per cell at creation, and `chosen` the index of its reason
-    in
-    `choices`.
+    in `choices`.
     """
 
     version: Literal[1] = 1

@@ -1,7 +1,7 @@
 """Reports and capabilities of workers, requirements of tasks: several versions may run in parallel.
 
-A message states a range of schemas: from the oldest that can express it to the newest that its writer knows. A worker
-also reads a range, and has one revision of each stage.
+A message states a range of schemas: from the oldest that can express it to the newest that its writer supports. A
+worker also reads a range, and has one revision of each stage.
 """
 
 from __future__ import annotations

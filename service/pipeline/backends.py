@@ -54,7 +54,7 @@ log = logging.getLogger(__name__)
 
 @contextmanager
 def recording(services: Services, made: Sequence[str] = ()) -> Iterator[tuple[Connection, Put]]:
-    """Yield a write transaction of the index and a function that puts records; undo them, and `made`, on failure.
+    """Yield a write transaction of the index and a function that puts records; a failure deletes them and `made`.
 
     No other process writes meanwhile: checks before the records still hold at the write of the rows.
     """

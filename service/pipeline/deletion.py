@@ -3,7 +3,7 @@
 One step under the index's write lock writes `deletions/{what}/{id}.json` and removes the rows. From then on the
 resource does not exist: rebuilds omit it, and nothing of its id is accepted. The garbage collector then moves its
 objects aside, a part in each round of the controller, removes the record, and can resume after a kill. After the grace
-time they are removed for good, with the shards that no job needs.
+time they are removed permanently, with the shards that no job needs.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def delete_asset(
 
 
 def delete_job(services: Services, job_id: str, *, owner: str = "") -> None:
-    """Delete a job; shards that no other job needs follow later. ConflictError: unfinished, or in a dataset."""
+    """Delete a job; shards that no other job needs are deleted later. ConflictError: unfinished, or in a dataset."""
     job = services.index.jobs.get(job_id)
     try:
         record = read_record(JobRecord, services.store, names.job_record(job_id))

@@ -58,7 +58,7 @@ class Resolver:
     """Replaces `auto` by a fidelity. Each chart is read once, at the first request that needs it.
 
     Requests for a free object use the newest chart of free objects; requests with a scene use the newest chart of that
-    kind of scene (`charts_of`): a grasp that resists six pushes may fail to leave a bin.
+    kind of scene (`charts_of`). A grasp that resists six pushes may fail to leave a bin.
     """
 
     def __init__(self, store: Store) -> None:
@@ -151,7 +151,7 @@ def cheapest(chart: Row, target: str, *, method: str, hand: str, object_: str) -
 
 
 def _nearest(runs: Sequence[Row], metric: str, wanted: Mapping[str, str]) -> tuple[Near, list[Row]] | None:
-    """Return the nearest runs of which one has the accuracy."""
+    """Return the most similar runs, at least one of which has the accuracy."""
     for measured_on, same in _NEAR:
         near = [run for run in runs if all(run[name] == wanted[name] for name in same)]
         if any(run.get(metric) is not None for run in near):

@@ -1,8 +1,8 @@
 """Identity of the service of a store, an index and a Redis.
 
-Two services on one of them would undo each other's work. The store contains a chain of create-only records; the last
-record identifies its service. Index and Redis repeat the id. If one of them is lost, the other identifies the service;
-empty ones count as a second service, and `graspd admin index rebuild` makes it the present one.
+Two services with a common store, index or Redis would undo each other's work. The store contains a chain of create-only
+records; the last record identifies its service. Index and Redis repeat the id. If one is lost, the other identifies the
+service. If both are empty, they count as a second service; `graspd admin index rebuild` makes it the present one.
 """
 
 from __future__ import annotations

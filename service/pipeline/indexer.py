@@ -210,7 +210,7 @@ class Indexer:
 
 @contextmanager
 def _skip_invalid(what: str) -> Iterator[None]:
-    """Skip an invalid event: any client of Redis can write one, and it must not block others."""
+    """Skip an invalid event: any client of Redis can write invalid events, which must not block others."""
     try:
         yield
     except UnavailableError:

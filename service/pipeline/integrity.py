@@ -148,7 +148,7 @@ def examine(
 
 
 def _check_sealed(store: Store, key: str, read: Read, unsealed: Unsealed) -> Damage | None:
-    """Check an object by its own checksum; without one, check its content as far as possible."""
+    """Check an object by its own checksum; without a checksum, check its content as far as possible."""
     match = _UPLOAD.fullmatch(key)
     model = next((model for pattern, model in _RECORDS if re.fullmatch(pattern, key)), None)
     try:
@@ -264,7 +264,7 @@ class IntegrityScan:
         return True
 
     def advance(self) -> bool:
-        """Read some more objects; return whether more can be read now. Interrupted: `store verify` reads now."""
+        """Read further objects; return False while no round is due. Interrupted: `store verify` reads the store."""
         self._recheck_if_due(None)
         note = self._services.index.notes.scan_note()
         if note.folder >= len(FOLDERS):

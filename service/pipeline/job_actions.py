@@ -57,7 +57,7 @@ class TaskRanges:
         self._costs: list[BatchCost] = []
 
     def sized(self, job: JobRecord, *, among: int = 1) -> JobRecord:
-        """Return a job with its number of batches per task, one `among` several that share the workers."""
+        """Return a job with its number of batches per task, if `among` jobs share the workers."""
         batches, wanted_s = batches_of(job.request.grasps), self._services.settings.task_s
         # Pictures of a batch are already a file of megabytes.
         if batches == 1 or job.request.views or not wanted_s:
@@ -80,7 +80,7 @@ class TaskRanges:
 
 
 def span_of(batches: int, by_time: int, workers: int) -> int:
-    """Return the batches per task of a job; `by_time` batches last as long as a task should.
+    """Return the batches per task of a job; `by_time` batches last the target duration of a task.
 
     All tasks but the last have equal length, and no worker is idle while another has two tasks.
     """
@@ -261,9 +261,8 @@ class Routes:
     def place(self, need: Requirements) -> Route:
         """Return the route of a task.
 
-        If all workers of its stage are capable, the task enters their common list; if some are, a separate list; if
-        none is,
-        the task is held back. Without workers, this version's capabilities are assumed.
+        If all workers of its stage are capable, the task enters their common list; if some are capable, a separate
+        list. It is held back if none is capable. Without workers, this version's capabilities are assumed.
         """
         here = self._here.get(need.stage) or [capabilities()]
         lacking = {one.lacks(need) for one in here} - {""}
@@ -310,7 +309,7 @@ def _start(services: Services, job_id: str) -> None:
 
 @contextmanager
 def _transaction(services: Services, job_id: str, refuse: Callable[[JobView], None]) -> Iterator[Callable[..., None]]:
-    """Lock a job to append an event unless `refuse` raises; of two concurrent changes the later one sees both.
+    """Lock a job to append an event unless `refuse` raises; the later of two concurrent changes reads both.
 
     Earlier events are read before the lock, because the store may be slow.
     """

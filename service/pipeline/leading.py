@@ -32,7 +32,7 @@ _LOOK_S: Final = 0.1
 
 class Leadership:
     def __init__(self, queue: RqQueue, *, lease_s: float, alive: HeartbeatFile, name: str | None = None) -> None:
-        """`alive` is touched while another leads. A restarted process of the same name need not wait for its lease."""
+        """`alive` is touched while another process leads. A restarted process of the same name leads at once."""
         self._queue, self._lease_s, self._alive = queue, lease_s, alive
         self.holder = name or f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(4)}"
 

@@ -1,11 +1,7 @@
 """Webhook dispatcher: signed reports of ends, one at a time to each address, retried with back-off.
 
 A failed delivery pauses all deliveries to its address. Projects take turns; within a project, the least recently used
-address comes first. Addresses that failed last share half of the slots, so the others are not delayed.
-
-Requests go to public machines only, with bounded time and bytes. The name is resolved here, all its addresses are
-checked, and the connection uses one of them, so a name that later resolves to another machine (DNS rebinding) has no
-effect. Redirects are not followed.
+address comes first. Addresses whose last delivery failed share half of the slots, so the others are not delayed.
 """
 
 from __future__ import annotations

@@ -117,7 +117,7 @@ def new_job(message: dict[str, Any], **options: Any) -> Job:
 
 
 def allowed_job(job: Job, queue: Queue) -> Job:
-    """Return a safe job for one from Redis; TaskRefused if that is not a task of graspd."""
+    """Return a safe copy of a job from Redis; TaskRefused if the job is not a task of graspd."""
     try:
         name, message = str(job.func_name), job.args[0]
     except (DeserializationError, LookupError, TypeError):
@@ -128,7 +128,7 @@ def allowed_job(job: Job, queue: Queue) -> Job:
 
 
 def is_entry_error(error: Exception) -> bool:
-    """Check whether RQ failed to read an entry rather than to take it: unreadable entries are discarded."""
+    """Check whether RQ took an entry but could not parse it: unreadable entries are discarded."""
     if not hasattr(error, "job_id"):  # RQ sets job_id on errors of reading an entry's job.
         return isinstance(error, UnicodeDecodeError)
     return not isinstance(error, RedisError) or is_type_error(error)

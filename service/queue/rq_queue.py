@@ -239,7 +239,7 @@ class RqQueue:
             self.connection.set(_SERVICE, identity, nx=not instead)
 
     def lead(self, holder: str, seconds: float) -> bool:
-        """Acquire or renew the leadership of the controllers for some seconds; False if another one leads."""
+        """Acquire or renew the leadership of the controllers for some seconds; False if another controller leads."""
         with _convert_errors():
             new = self.connection.lock(LEAD, timeout=seconds, thread_local=False)
             lease = self._leases.setdefault(holder, new)
@@ -386,7 +386,7 @@ def lease_state(connection: Any, job: Job, execution: Execution) -> tuple[bool, 
 
 
 def renew_lease(pipe: Any, job: Job, execution: Execution, ttl: int) -> None:
-    """Renew the lease of a task. RQ stores whole seconds, and a lease may be as short as one."""
+    """Renew the lease of a task. RQ stores whole seconds, and a lease may be as short as a second."""
     registry = job.started_job_registry
     execution.heartbeat(registry, ttl, pipe)
     pipe.zadd(registry.key, {execution.composite_key: time.time() + ttl}, xx=True)

@@ -205,9 +205,8 @@ def graspness(points: NDArray[Any], hands: NDArray[Any], *, touch_m: float = TOU
     """Compute the share of the grasps whose hand touches each point.
 
     Wang et al. 2021 (Graspness Discovery in Clutters, eq. 1) count poses of a parallel gripper, sampled around each
-    point,
-    that hold and are clear. A multi-finger hand touches several places, and its grasps are optimised. Here graspness
-    counts the valid grasps of a scene that touch the point.
+    point, that hold and are clear. A multi-finger hand touches several places, and its grasps are optimised. Here
+    graspness counts the valid grasps of a scene that touch the point.
 
     Args:
         points: (P, 3) in the object's frame [m].

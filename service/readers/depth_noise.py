@@ -140,8 +140,7 @@ def shadows(depth: Floats, focal_baseline: float) -> Bools:
     """Find the pixels (H, W) hidden from the right eye; disparity [px] is `focal_baseline` [px m] / depth.
 
     Each pixel is projected into the other picture, which shows the nearest surface. A pixel is hidden if it is more
-    than
-    one pixel of disparity behind that surface (as in a left-right check), or outside the picture.
+    than one pixel of disparity behind that surface (as in a left-right check), or outside the picture.
     """
     height, width = depth.shape
     with np.errstate(divide="ignore"):

@@ -80,7 +80,7 @@ class ShardCache:
         if os.getpid() != self._process and not store.url.startswith(("file:", "memory:")):
             raise InputError(
                 f"{store.url} cannot be read in a fork of the process that opened it; "
-                "start the processes anew: DataLoader(..., multiprocessing_context='spawn')"
+                "start new processes: DataLoader(..., multiprocessing_context='spawn')"
             )
         digest = hashlib.sha256()
         try:

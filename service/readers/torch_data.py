@@ -59,7 +59,7 @@ class Samples(Dataset[Sample]):
 class ShuffledShards(IterableDataset[Sample]):
     """Grasps of any number of shards in random order, read shard by shard.
 
-    Each epoch shuffles the shards anew and distributes them over the processes of a `DataLoader` and the ranks of a
+    Each epoch shuffles the shards again and distributes them over the processes of a `DataLoader` and the ranks of a
     distributed run. A buffer mixes grasps of several shards.
     """
 

@@ -36,7 +36,7 @@ class Waypoint:
 def trajectory_of(shard: Shard, row: int) -> list[Waypoint]:
     """Return the trajectory of a grasp: pregrasp, grasp, squeeze; approach and lift if present.
 
-    The last waypoint of an approach and the pregrasp have the same hand pose; in between the open fingers close.
+    The last waypoint of an approach and the pregrasp have the same hand pose; the open fingers close between them.
     """
     rest = np.zeros(3)
 

@@ -1,4 +1,4 @@
-"""Summary of an asset's check: sizes and guesses. The check's messages have the repairs."""
+"""Summary of an asset's check: sizes and guesses. The check's messages list the repairs."""
 
 from __future__ import annotations
 

@@ -186,7 +186,7 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
         "camera/scene_index": Column("V", "i4", "1", "none", "row of the scene in the scene shard"),
         "camera/eye": Column("V", "u1", "enum", "none", "0 mono, 1 left, 2 right"),
         "camera/stereo_baseline_m": Column(
-            "V", "f8", "m", "camera", "distance of the right eye from the left; 0: mono"
+            "V", "f8", "m", "camera", "distance between the two cameras of a stereo pair; 0: mono"
         ),
         "image/rgb": Column("V H W 3", "u1", "sRGB", "image", "colour"),
         "image/depth": Column("V H W", "f4", "m", "camera", "distance along the optical axis; inf: no surface"),

@@ -35,8 +35,7 @@ def files_of_hand(path: Path) -> tuple[dict[str, Path], str]:
     """Find a hand's files with relative names, and the name of its description (empty for a folder).
 
     Files of a description are named relative to its ROS package, else to its folder. Links to targets outside the
-    hand's
-    folder are ignored.
+    hand's folder are ignored.
     """
     files, main = (_files_of_folder(path), "") if path.is_dir() else _files_of_description(path)
     return files | _appearance_files(files, path.resolve() if path.is_dir() else _package(path.resolve())), main

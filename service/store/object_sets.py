@@ -88,7 +88,7 @@ def _common(owners: Mapping[tuple[str, ...], list[str]]) -> tuple[str, ...]:
 
 
 def _variants(names: list[str]) -> bool:
-    """Check whether the meshes of a folder belong to one object: a single mesh, or file names of processing steps."""
+    """Check whether the meshes of a folder belong to one object: a single mesh, or names of processing steps."""
     stems = [PurePosixPath(name).stem.lower() for name in names]
     return len(stems) == 1 or any(stem in PREFERRED for stem in stems)
 

@@ -218,8 +218,8 @@ class Deletion(Record):
     id: str
     at: str
     owner: str = Field("", description="id of the API key that deleted it")
-    name: str = Field("", description="what its users call it, where that is not its id")
-    submitter: str = Field("", description="id of the API key that it was submitted with")
+    name: str = Field("", description="name for users, if it differs from the id")
+    submitter: str = Field("", description="id of the API key that submitted it")
     project: str = ""
     job: JobRecord | None = None
     attempts: tuple[tuple[str, int], ...] = ()

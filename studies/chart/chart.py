@@ -128,8 +128,8 @@ def settings_of(
     run: ExecutionContext,
 ) -> list[Setting]:
     """Return a setting for every method, fidelity and batch; methods without fidelities have one each.
-    Methods with a step budget need seconds per grasp: they get `baseline_batch` grasps per call, other methods the
-    first batch. Raises InputError: a method is unknown, or an option belongs to no method."""
+    Methods with a step budget take seconds per grasp: they get `baseline_batch` grasps per call, other methods without
+    fidelities `batches[0]`. Raises InputError: a method is unknown, or an option belongs to no method."""
     variants = [_variant(text) for text in methods]
     given = _options_of(options, [name for name, _, _ in variants])
     found: list[Setting] = []

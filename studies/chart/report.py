@@ -158,7 +158,7 @@ def _first(value: float | None) -> str:
 
 
 def _ratios(rows: Sequence[Row]) -> str:
-    """Return the speed-up of `fast_graspd`'s default in valid grasps per second over each other method."""
+    """Return the speed-up of `fast_graspd`'s default over each other method, in valid grasps per second."""
     own = [r for r in rows if (r["method"], r["fidelity"]) == ("fast_graspd", "standard")]
     others = [r for r in rows if r["method"] != "fast_graspd"]
     if not own or not others:

@@ -2,8 +2,8 @@
 
 Methods that plan in scenes run in both modes, other methods only in the second. In both modes grasp i uses scene i of
 the object's stable faces, in turn. The tests are equal: clear trajectory, lift, lift under the unmodified protocol,
-lift at half friction, and lift in models around the nominal one. Speed is lifted grasps over seconds; on a CPU over
-core-seconds, which are independent of other load. It is measured for planner and postures alone, and end to end: with
+lift at half friction, and lift in models around the nominal one. Speed is lifted grasps per second; on a CPU per
+core-second, which is independent of other load. It is measured for planner and postures alone, and end to end: with
 trajectory, validator and metrics of lifted grasps."""
 
 from __future__ import annotations

@@ -158,7 +158,7 @@ def _bar(runs: Sequence[dict[str, Any]], key: str) -> tuple[float, float]:
 
 
 def _ratio_bar(runs: Sequence[dict[str, Any]], key: str, seconds: str, side: str) -> float:
-    """Return the bar of valid grasps over seconds, each cell weighted by its seconds."""
+    """Return the bar of valid grasps per second, each cell weighted by its seconds."""
     weight = np.array([sum(r[seconds]) for r in runs])
     value = np.array([r[key] for r in runs])
     off = np.array([r[f"{key}_{side}"] for r in runs]) - value

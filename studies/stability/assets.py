@@ -199,8 +199,8 @@ _EFFORT: Final = 1.0
 
 def ring_hand(fingers: int, *, coupling: Coupling = "each joint", size: float = 1.0, ratio: float = 0.8) -> HandModel:
     """Return a hand of equal fingers around a palm.
-    `coupling` is which joints one drive moves. `size` is relative to a human hand. `ratio` is the rotation of a coupled
-    distal joint over the middle joint's. Raises HandError: the hand is unusable."""
+    `coupling` is which joints one drive moves. `size` is relative to a human hand. `ratio` is a coupled distal joint's
+    rotation divided by the middle joint's. Raises HandError: the hand is unusable."""
     radius, height = (size * x for x in _PALM_M)
     parts = [f'<robot name="ring"><link name="palm">{_solid("cylinder", -height / 2, radius, height)}</link>']
     for k in range(fingers):

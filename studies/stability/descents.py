@@ -43,7 +43,7 @@ RESIDUAL: Final = (0.35, 0.9)
 class Descent:
     state: HandState
     depths: Floats
-    """(n,) deepest penetration after the projection, as in a job [m]; before the projection it is millimetres."""
+    """(n,) deepest penetration after the projection, as in a job [m]; before the projection, millimetres."""
     drift: float
     """Largest deviation of a quaternion's norm from 1, before the projection normalises it."""
 

@@ -69,7 +69,7 @@ def ball_world(dt: float, speed: float) -> World:
 
 
 def position_based(solver: Solver, *, dt: float, speed: float) -> tuple[float, float]:
-    """Return a ball's largest energy over its initial one, and deepest penetration [m]; position-based integrator."""
+    """Return the ratio of a ball's largest energy to its initial one, and deepest penetration [m]; position-based."""
     points = _cage_around(dt, speed)
     world = ball_world(dt, speed)
 
@@ -102,7 +102,7 @@ def force_based(*, dt: float, speed: float, stiffness: float, mass: float = 1.0)
 
 
 def _extremes(points: Floats, flight: Iterator[tuple[Floats, float]]) -> tuple[float, float]:
-    """Return largest energy and deepest penetration of a flight, given as centres and energies over the initial one."""
+    """Return largest energy and deepest penetration of a flight of centres and energies relative to the initial one."""
     most, deepest = 1.0, 0.0
     for centre, energy in flight:
         most, deepest = max(most, energy), max(deepest, _largest_depth(points, centre))

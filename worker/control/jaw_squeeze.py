@@ -1,4 +1,4 @@
-"""Squeeze posture of a gripper: its jaws close to contact, then press by force over position gain."""
+"""Squeeze posture of a gripper: its jaws close to contact, then further by force / position gain."""
 
 from __future__ import annotations
 

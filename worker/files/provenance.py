@@ -266,7 +266,7 @@ def _check_digest(shard: Shard, kind: str, digest: str, given: str) -> None:
 
 
 def id_of_columns(columns: Columns) -> str:
-    """Return the id of a shard that no job made, by which later shards name it: a digest of its columns."""
+    """Return the id of a shard that no job made: a digest of its columns, which names it in later shards."""
     found = hashlib.sha256()
     for name in sorted(columns):
         array = np.ascontiguousarray(columns[name])

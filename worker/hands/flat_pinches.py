@@ -44,8 +44,8 @@ SQUARE: Final = 0.7
 
 
 def flat_pinches(hand: HandModel, height: float) -> Oppositions:
-    """Return postures for an object of this height [m]; none if it reaches the pads or the hand has one finger.
-    The palm's approach without its part along `axis` points at the plane. `middle` is half the height above it."""
+    """Return postures for objects of a height [m]; none for one finger, or for objects as high as the pads.
+    The palm's approach, projected perpendicular to `axis`, points at the plane, `middle` half the height above it."""
     known = [h for h in HEIGHTS_M if h >= height]
     return _cached_pinches(hand, known[0]) if known and len(hand.fingertips) > 1 else Oppositions.empty(hand)
 
@@ -82,8 +82,8 @@ class _Evaluation:
     middle: Floats
     width: Floats
     short: Floats
-    """(N,) height of the ends above the plane, over the largest height that reaches the object. The larger value of the
-    opposing end and of the other ends' mean counts."""
+    """(N,) ratio of the ends' height above the plane to the largest height that reaches the object. The larger value of
+    the opposing end and of the other ends' mean counts."""
     facing: Floats
     """(N,) cosine between the surface within the height and the line between the ends; the lower value of both
     sides."""

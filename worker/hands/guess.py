@@ -82,7 +82,7 @@ def _with_palm(hand: HandModel, tree: Tree, options: HandOptions) -> HandModel:
 
 
 def _gripper(hand: HandModel, jaws: Jaws, tree: Tree, options: HandOptions) -> HandModel:
-    """Set up a gripper from its jaws: approach open, pads ahead, grasp between them."""
+    """Set up a gripper from its jaws: open on the approach, with the palm behind the point between the pads."""
     approach = _stated_approach(hand, tree, options)
     if approach is None:
         approach = _approach_of_jaws(hand, jaws)
@@ -142,7 +142,7 @@ def _fingertips(hand: HandModel, tree: Tree, options: HandOptions) -> tuple[int,
 
 
 def guess_approach(hand: HandModel) -> tuple[Floats, bool]:
-    """Return the direction out of the palm, and whether the side on which the hand grasps is a tie.
+    """Return the direction out of the palm, and whether both sides of the palm are equally likely.
     Two estimates are added. The mean motion of the fingertips during closing points out of a human-like palm. The
     position of the tips of the half-closed hand is ahead of a gripper's palm, but far along the fingers of a human-like
     hand. Their sum has the smallest error. If fingers oppose each other, the tip motions cancel to a sideways residual
@@ -172,7 +172,7 @@ def _tips_ahead(hand: HandModel) -> Floats:
 
 
 def _residual_motion(ways: Floats, ahead: Floats) -> float:
-    """Return the length of the sum of tip motions across `ahead`, over the sum of their lengths.
+    """Return the ratio of the length of the sum of tip motions across `ahead` to the sum of their lengths.
     The ratio is 0 if fingers close around an axis, 1 if all move the same way."""
     axis = _unit(ahead)
     across = ways - np.outer(ways @ axis, axis)
@@ -208,7 +208,7 @@ def _between_fingers(hand: HandModel) -> tuple[Floats, bool]:
 def _joint_direction(
     hand: HandModel, rough: Floats, within: float, least: int, beside: Floats | None = None
 ) -> Floats | None:
-    """Return a direction that at least `least` lines of the joints share, within `within` degrees of a rough one."""
+    """Return a direction that at least `least` lines of the joints share, within `within` degrees of an estimate."""
     body = hand.joint_body[:_JOINTS]
     pose = body_poses(hand, IDENTITY_POSE, hand.expand(np.clip(0.0, hand.lower, hand.upper)))[0, body]
     axes = quat_rotate(pose[:, 3:], hand.axis[body])

@@ -93,8 +93,8 @@ class Jaws:
 
 def closing_by_geometry(hand: HandModel) -> Floats:
     """Return the direction (D,) in which each dof brings opposing surfaces together: +1 or -1; 0: no direction.
-    The sign belongs to the sum over postures from all dofs at their lower limits to all at their upper limits. Summed
-    is the area of facing surfaces times the speed at which they separate."""
+    The sign is that of a sum over postures, from all dofs at their lower limits to all at their upper limits. Each
+    summand is the area of facing surfaces times the speed at which they separate."""
     points = _points(hand)
     balance, total = np.zeros(hand.dofs), np.zeros(hand.dofs)
     for share in np.linspace(0.05, 0.95, 5):
@@ -160,12 +160,12 @@ def _motion(hand: HandModel, points: SurfacePoints, q: Floats, dof: int) -> Floa
 
 
 def _normal_speed(motion: Floats, normal: Floats) -> Floats:
-    """Return the speed (N,) of points along their normals, of either sign, over the speed of the fastest point."""
+    """Return the ratio (N,) of the points' speed along their normals, of either sign, to that of the fastest point."""
     return np.asarray(np.abs(np.einsum("ni,ni->n", motion, normal)) / np.abs(motion).max(initial=1e-12))
 
 
 def _facing(place: Floats, normal: Floats, points: SurfacePoints, among: Ints) -> tuple[Ints, Ints, Floats]:
-    """Return the points of `among` that face another body, the nearest faced point of each, and the gap [m]."""
+    """Return the points of `among` that face another body, the nearest point that each faces, and the gap [m]."""
     aside = _ASIDE * np.sqrt(points.area.sum() / len(points))
     first, second, gaps = [], [], []
     for i in among:

@@ -70,7 +70,7 @@ class _Reader:
         self.notes = notes + coupled.notes
 
     def roots(self) -> list[int]:
-        """Return bodies on the world with moving parts below: the others are furniture or objects."""
+        """Return bodies on the world with moving parts below: other bodies belong to the environment."""
         model = self.model
         moving = {
             chain_up(model, int(model.jnt_bodyid[j]))[-1]

@@ -87,7 +87,7 @@ class Drag:
 @dataclass(frozen=True)
 class HandModel:
     """Kinematic tree of L bodies with D independent degrees of freedom (dofs) that drive J moving joints.
-    Joint value of body l: ``multiplier[l] * q[dof[l]] + offset[l]``, with mimic chains and couplings folded in."""
+    Joint value of body l: ``multiplier[l] * q[dof[l]] + offset[l]``, which includes mimic chains and couplings."""
 
     name: str
     digest: str
@@ -107,7 +107,7 @@ class HandModel:
     offset: Floats
     dof_names: tuple[str, ...]
     lower: Floats
-    """(D,) limits [rad or m], with the limits of mimicking joints folded in."""
+    """(D,) limits [rad or m], including the limits of mimicking joints."""
     upper: Floats
     effort: Floats
     """(D,) torque or force limit [N m or N]; positive."""
@@ -130,7 +130,7 @@ class HandModel:
     masses: Floats
     """(L,) mass of each body [kg], from the URDF or, without a stated mass, from volume at 1000 kg/m^3."""
     velocity: Floats = field(default_factory=lambda: np.zeros(0))
-    """(D,) speed limit [rad/s or m/s], with the limits of mimicking joints folded in; 0 if not stated."""
+    """(D,) speed limit [rad/s or m/s], including the limits of mimicking joints; 0 if not stated."""
     arm: tuple[Joint, ...] = ()
     """Joints, fixed ones too, from the root of the original robot to `root_link`, for export."""
     visuals: Visuals = NO_VISUALS

@@ -68,8 +68,8 @@ class HandOptions(_Options):
     )
     palm: Annotated[PalmOptions | None, BeforeValidator(lambda v: {"link": v} if isinstance(v, str) else v)] = None
     approach: Vector | None = Field(None, description="direction out of the palm, palm link frame")
-    preshape: dict[str, Finite] = Field(default_factory=dict, description="joint values in which the hand approaches")
-    closing: dict[str, int] = Field(default_factory=dict, description="-1, 0, +1: how a joint closes the hand")
+    preshape: dict[str, Finite] = Field(default_factory=dict, description="joint values on the approach")
+    closing: dict[str, int] = Field(default_factory=dict, description="sign of a joint's closing motion: -1, 0 or +1")
     fingertips: tuple[str, ...] = ()
     stiffness: Finite | dict[str, Finite] | None = None
     effort: Finite | dict[str, Finite] | None = None

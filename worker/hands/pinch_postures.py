@@ -92,7 +92,7 @@ class Oppositions:
 
 @cached_by_content(32)
 def oppositions_of(hand: HandModel) -> Oppositions:
-    """Return the opposed postures of a hand, cached in memory and on this machine; one finger has none."""
+    """Return the opposed postures of a hand, cached in memory and on this machine; hands with one finger have none."""
     return Oppositions.cached("oppositions", (hand.content,), lambda: _oppositions(hand))
 
 

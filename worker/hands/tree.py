@@ -201,7 +201,7 @@ def _check_travel(dof: str, lower: float, upper: float, moving: dict[str, Mimic]
 
 
 def _limits_bind(joint: Joint, drive: Mimic, robot: Robot, options: HandOptions) -> bool:
-    """Check whether a joint's own limits bind it. A URDF follower's limits do not, as in ROS: most are wrong."""
+    """Check whether a joint's own limits bind it. A URDF follower's limits do not bind, as in ROS: most are wrong."""
     return joint.name == drive.joint or robot.format != "URDF" or joint.name in options.couplings
 
 

@@ -32,8 +32,8 @@ _READ: Final = (".xacro", ".urdf", ".xml", ".yaml", ".yml")
 def expand(files: Mapping[str, bytes], main: str, arguments: Mapping[str, str]) -> bytes:
     """Expand a xacro file with values of its `<xacro:arg>` to a URDF.
     Includes and `$(find PACKAGE)` are searched among the hand's files only. Raises HandError: the file cannot be
-    expanded, or refers to files outside the hand's folder. OSError: the machine killed the child, or the child neither
-    computed nor ended; the file is not at fault."""
+    expanded, or refers to files outside the hand's folder. OSError: the child was killed or hung; the file is not at
+    fault."""
     given = {
         "main": main,
         "arguments": dict(arguments),

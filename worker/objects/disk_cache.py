@@ -39,7 +39,7 @@ def cached_arrays(
     *,
     fits: Callable[[Arrays], bool] = lambda _: True,
 ) -> Arrays:
-    """Load arrays from a folder of the user's cache, or compute and cache them; the same bit for bit.
+    """Load arrays from a folder of the user's cache, or compute and cache them; both give the same bits.
     All inputs that determine the arrays are in `terms`, besides the code of some modules. Errors of `make` are not
     cached. Loaded arrays that do not `fit` are recomputed."""
     file = _file(kind, terms, code)

@@ -19,7 +19,7 @@ _MAX_VERTICES = 30_000
 class MeshDistance:
     """Exact distances to one mesh.
     Its triangles are cut into pieces no longer than a fixed length. The best triangle of the nearest pieces gives a
-    distance. It is proven if the centre of the next piece is farther away by more than a piece's radius."""
+    distance. This distance is exact if the centre of the next piece is farther away by more than a piece's radius."""
 
     def __init__(self, vertices: Floats, faces: Indices) -> None:
         from scipy.spatial import cKDTree
@@ -44,7 +44,7 @@ class MeshDistance:
 
     def largest(self, points: Floats) -> float:
         """Return the largest distance of any of the points (N, 3) to the surface [m].
-        Only points whose first upper bound exceeds the largest proven distance need a proof."""
+        Exact distances are computed only for points whose first upper bound exceeds the largest exact distance."""
         bounds = self(points, np.inf)
         order = np.argsort(-bounds)
         proven = 0.0
@@ -91,7 +91,7 @@ def deviation(one: tuple[Floats, Indices], two: tuple[Floats, Indices], samples:
 
 
 def surface_points(vertices: Floats, faces: Indices, samples: int) -> Floats:
-    """Return points for the comparison of surfaces: vertices, every n-th of very many, and even samples."""
+    """Return points for the comparison of surfaces: vertices (every n-th if there are very many), and even samples."""
     return np.concatenate(
         [vertices[:: max(1, len(vertices) // _MAX_VERTICES)], sample_faces(vertices, faces, samples)[0]]
     )

@@ -116,7 +116,7 @@ def from_manifold(solid: Any) -> tuple[Floats, Indices]:
 
 
 def unite(parts: list[tuple[Floats, Indices]], holes: list[tuple[Floats, Indices]]) -> Any | None:
-    """Unite outward meshes and subtract the holes (outward too); None if one of them is no solid.
+    """Unite outward meshes and subtract the holes (outward too); None if a mesh is no solid.
     A part inside a hole does not belong to the solid around the hole, so it stays."""
     solids: list[Any] = [to_manifold(*part) for part in parts]
     cuts: list[Any] = [to_manifold(*hole) for hole in holes]

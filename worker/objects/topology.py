@@ -232,12 +232,12 @@ def part_double_edges(vertices: Floats, faces: Indices) -> tuple[Floats, Indices
 
 
 def _corner(half: Indices, count: int, step: int = 0) -> Indices:
-    """Return the number 3 f + k of the corner at which a half-edge starts, or ends with step 1."""
+    """Return the number 3 f + k of the corner at which a half-edge starts; with step 1, at which it ends."""
     return 3 * (half % count) + (half // count + step) % 3
 
 
 def _pairs_around(vertices: Floats, faces: Indices, edges: Indices, half: Indices) -> list[tuple[int, int]]:
-    """Pair half-edges at one edge: sorted by angle, each face is joined to the next face behind its back."""
+    """Pair half-edges at one edge: sorted by angle, each face is joined to the next face on its back side."""
     a, b = np.sort(edges[half[0]])
     axis = vertices[b] - vertices[a]
     axis /= max(float(np.linalg.norm(axis)), 1e-300)

@@ -1,9 +1,9 @@
 """Pool of processes on this machine, one core each; `worker.pool.child` is the process itself.
 
 Threads share Python's lock: work that holds it for a tenth of its time does not fill 16 cores. Processes are started
-fresh, since a CUDA context and the threads of an engine do not survive a fork. Every end of the parent closes their
-pipe, at which they end. The library's `ProcessPoolExecutor` would import the program that calls `graspd.synthesize`
-once more in each process."""
+fresh, since a CUDA context and the threads of an engine do not survive a fork. They end when the end of the parent
+closes their pipes. The library's `ProcessPoolExecutor` would import the program that calls `graspd.synthesize` once
+more in each process."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Fitness of a worker: an unfit one returns tasks, to save their attempts, and goes into quarantine.
 
 A worker is unfit in two cases. Its engine fails the check, before the first task or after a task failed for another
-reason than its input. Or several different tasks fail here in a row, while other workers did two of them.
+reason than its input. Or several different tasks fail here in a row, while other workers completed two of them.
 
 A worker in quarantine is listed with the reason and gets no tasks. It repeats its check after increasing pauses and
 resumes when the check passes. If it does not pass, or cannot find the fault, the process ends and a fresh one starts

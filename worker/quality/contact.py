@@ -31,7 +31,7 @@ def spread_contacts(
     near: NDArray[np.bool_], place: Floats, normal: Floats, *, scale: float, limit: int
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Choose at most `limit` of the points `near` (B, T, N) of each grasp and threshold, spread as widely as possible.
-    Spread is measured by position (B, N, 3) over `scale`, the torque scale [m], and by normal (B, N, 3).
+    Spread is measured by position (B, N, 3) divided by `scale`, the torque scale [m], and by normal (B, N, 3).
     Return indices (B, T, limit) and their number (B, T); further indices are undefined."""
     grasps, sets, _ = near.shape
     count = near.sum(axis=2)

@@ -12,7 +12,7 @@ _Z: Final = 1.959963984540054
 
 
 def wilson(part: int, whole: int) -> tuple[float, float]:
-    """Return the 95 % interval of a share (Wilson 1927); at shares 0 and 1 it has a width, unlike a bootstrap's.
+    """Return the 95 % interval of a share (Wilson 1927); at shares 0 and 1 its width is above 0, unlike a bootstrap's.
     Raises ValueError: `whole` is 0, or less than `part`."""
     bounds = binomtest(part, whole).proportion_ci(method="wilson")
     return float(bounds.low), float(bounds.high)

@@ -105,7 +105,7 @@ _DIGITS: Final = 7
 class Overlap:
     """Conservative overlap test of a hand's pieces with a closed object.
     A piece is excluded only if no face of the object reaches into it and neither body contains a part of the other. A
-    face also counts as reaching in if only a plane through one edge of each would separate both."""
+    face also counts as reaching in if only a plane through an edge of each separates face and piece."""
 
     def __init__(self, hand: HandModel, probe: Probe) -> None:
         self._probe = probe

@@ -48,7 +48,7 @@ def cone_edges(normals: Floats, friction: float, *, edges: int = EDGES) -> Float
 def wrenches(
     points: Floats, normals: Floats, *, friction: float, centre: Floats, radius: float, edges: int = EDGES
 ) -> Floats:
-    """Return edge wrenches (..., E, 6): force, then torque about `centre` over `radius`, the object's largest [m].
+    """Return edge wrenches (..., E, 6): force, then torque about `centre` / `radius`, the object's largest [m].
     Contacts are at `points` (..., 3) [m] with unit normals (..., 3) into the object."""
     force = cone_edges(normals, friction, edges=edges)
     torque = cross((np.asarray(points, float) - centre)[..., None, :] / radius, force)

@@ -1,6 +1,6 @@
 """Setup of a render before its cameras: random properties of each scene, and stages for tracing.
 
-Materials and lights are random but pleasing."""
+Materials and lights are random within plausible ranges."""
 
 from __future__ import annotations
 

@@ -108,7 +108,7 @@ def three_sides_sheet(
 
 
 def views_page(views: Arrays, *, title: str, subtitle: str = "") -> bytes:
-    """Return a PNG of a views shard: per placement both pictures, depth, segmentation, boxes, any hand."""
+    """Return a PNG of a views shard: per placement both pictures, depth, segmentation, boxes, and the hand, if any."""
     eye = np.asarray(views["camera/eye"])
     stereo, first = bool((eye == 2).any()), np.flatnonzero(eye != 2)
     columns: dict[str, Callable[[int], Image.Image]] = {
@@ -262,7 +262,7 @@ def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 def text(
     draw: ImageDraw.ImageDraw, at: tuple[float, float], words: str, size: int, fill: tuple[int, int, int]
 ) -> float:
-    """Write words with the baseline at `at`; `^2` is set as an exponent. Return the x where they end."""
+    """Write words with the baseline at `at`; `^2` is set as an exponent. Return the x of their end."""
     x, y = at
     for k, part in enumerate(words.split("^")):
         if k and part:

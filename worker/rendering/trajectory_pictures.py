@@ -1,4 +1,4 @@
-"""Pictures and films of grasps along their trajectories, with one camera per grasp on a good side."""
+"""Pictures and animations of grasps along their trajectories, with one camera per grasp on a good side."""
 
 from __future__ import annotations
 
@@ -163,7 +163,7 @@ class _Stage:
 
     def _best_sides(self, world: int, near: Floats, first: float, count: int) -> list[tuple[float, float]]:
         """Return azimuth and height [rad] of the sides that show most, apart from one another.
-        The score sums the visible parts of object and hand, counted in labels, each over its largest value of all
+        The score sums the visible parts of object and hand, counted in labels, each divided by its largest value of all
         sides. Ties go to the side that looks across the palm's approach."""
         sides = [(first + 2 * np.pi * a / _AROUND, h) for h in _HEIGHTS for a in range(_AROUND)]
         centre = 0.5 * (near.min(axis=0) + near.max(axis=0))
@@ -207,7 +207,7 @@ def animation_kind(suffix: str) -> str:
 
 
 def animation(pictures: NDArray[np.uint8], seconds: Sequence[float], suffix: str) -> bytes:
-    """Encode a looping film of pictures (F, H, W, 3) sRGB; `suffix` is one of `KINDS`.
+    """Encode a looping animation of pictures (F, H, W, 3) sRGB; `suffix` is one of `KINDS`.
     Durations [s] are stored in milliseconds, in a GIF in hundredths of a second.
     Raises InputError: no animation format has this suffix."""
     kind = animation_kind(suffix)

@@ -27,7 +27,7 @@ _TABLE: Final = Obstacle.half_space(UP, 0.0)
 
 
 class Rejection(IntEnum):
-    """Reason to reject a grasp in a scene; if several reasons apply, the first one."""
+    """Reason to reject a grasp in a scene; the first of several applicable reasons."""
 
     NONE = 0
     TABLE_AT_CONTACT = 1

@@ -67,7 +67,7 @@ def rest_poses(spec: SceneSpec, obj: ObjectModel, *, count: int, seed: int) -> d
 
 def _each_face(obj: ObjectModel, seed: int) -> dict[str, Floats]:
     """Return one scene per stable face on which at least `LEAST_PROBABILITY` of drops end.
-    Faces on which the object rolls are used only if every face is such a face."""
+    Faces on which the object rolls are used only if there are no others."""
     faces = resting_faces(obj)
     stable = faces.stable
     share = reference_share(obj, stable.tolist())

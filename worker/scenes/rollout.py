@@ -68,7 +68,7 @@ def hold_rollout(
     level: Level = "standard",
 ) -> Callable[[GraspSet, PlacedGrasps | None, Floats], Floats]:
     """Return a `worker.planners.Rollout` that scores free grasps (N,) by short pushes.
-    Scores are below 2 for grasps that also hold against the six pushes, if they are better than the score to beat."""
+    Grasps with scores below 2 and `beat` are tested by the six pushes; those that fail get scores of at least 2."""
     shorts, run = ShortTests(hand, obj, pieces), ExecutionContext(threads=1)
 
     def rollout(grasps: GraspSet, placed: PlacedGrasps | None, beat: Floats | None = None) -> Floats:
@@ -97,8 +97,8 @@ def lift_rollout(
 ) -> Callable[[GraspSet, PlacedGrasps | None, Floats], Floats]:
     """Return a `worker.planners.Rollout` that scores grasps (N,) in scenes by short lifts.
     Scores are below 1 for grasps with a clear trajectory that lift at half friction, below 2 at full friction.
-    Candidates that hold the hanging object briefly are validated by the whole lift test, because a squeeze may turn
-    an object out of the hand slowly at first. `threads` are per call; on the CPU, planners already use all threads."""
+    Candidates that hold the hanging object briefly are validated by the whole lift test: a squeeze may slowly turn an
+    object out of the hand. `threads` are per call; on the CPU, planners already use all threads."""
     shorts, run = ShortTests(hand, obj, pieces, threads=threads), ExecutionContext(threads=threads)
 
     def rollout(grasps: GraspSet, placed: PlacedGrasps | None, beat: Floats | None = None) -> Floats:
@@ -196,7 +196,7 @@ def scene_verdicts(
 
 
 def outcomes_in_scenes(columns: Arrays) -> dict[str, NDArray[np.bool_]]:
-    """Return which grasps (N,) are clear, lift, and lift at half friction, from `scene_verdicts`' columns."""
+    """Return masks (N,) of grasps that are clear, lift, and lift at half friction, from columns of `scene_verdicts`."""
     clear = np.asarray(columns["quality/success"] >= 0)
     if "quality/lift_outcome" not in columns:
         return {"clear": clear, "lift": np.zeros_like(clear), "lift_hard": np.zeros_like(clear)}

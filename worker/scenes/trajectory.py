@@ -52,7 +52,7 @@ class Trajectory:
     closing: Floats
     """(N,) least clearance from the pregrasp to the grasp [m]."""
     coming: Floats
-    """(N,) least clearance on the approach [m]; where `touching` is False also free of the object."""
+    """(N,) least clearance from obstacles on the approach [m]; `touching` is the contact with the object."""
     lifting: Floats
     """(N,) least clearance on the lift [m]."""
     touching: NDArray[np.bool_]

@@ -163,7 +163,7 @@ class DeviceObject:
         )
 
     def thinned(self, count: int) -> DeviceObject:
-        """Return the object with its first `count` samples, which are as even as all farthest-point samples."""
+        """Return the object with its first `count` samples, in farthest-point order: they are even."""
         if count >= len(self.samples):
             return self
         with wp.ScopedDevice(self.device):

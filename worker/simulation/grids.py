@@ -1,7 +1,7 @@
 """Distance grid of an object with the lists of near faces of its cells, cached on disk.
 
-Both depend on the object alone and take a fifth of a process's time to its first grasp. Later processes on a CPU read
-the file. A GPU computes them faster than a file is read."""
+Both depend on the object alone and take a fifth of the time of a process until its first grasp. Later processes on a
+CPU read the file. A GPU computes them faster than a file is read."""
 
 from __future__ import annotations
 

@@ -169,7 +169,7 @@ def _lost_in_closing(batch: ValidatedBatch) -> NDArray[np.bool_]:
 
 
 def _drive_compliance(hand: HandModel) -> float:
-    """Return the least fingertip motion [m] over which a closing dof goes from zero torque to its limit."""
+    """Return the least fingertip motion [m] by which the torque of a closing dof rises from zero to its limit."""
     if jaws_of(hand) is not None:
         return math.inf
     step = 1e-4

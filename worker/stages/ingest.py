@@ -75,9 +75,9 @@ def check_in_child(
     memory_bytes: int = MEMORY_LIMIT_BYTES,
     cpu_s: int = CPU_LIMIT_S,
 ) -> tuple[dict[str, Any], bytes]:
-    """Check a hand or object; return the result, or a refusal that states how the check itself ended.
+    """Check a hand or object; return the result, or a refusal that states how the check crashed.
     The model for viewers (glTF) is empty after a refusal, or if making it would take too long.
-    Raises OSError: the machine ended the check; the file is not at fault. TaskCancelled: the task should stop."""
+    Raises OSError: the check was killed, or the disk is full. TaskCancelled: the task should stop."""
     with tempfile.TemporaryDirectory(prefix="graspd-ingest-") as folder:
         source, target, errors = (Path(folder) / file for file in ("files.zip", "check.json", "errors.txt"))
         source.write_bytes(pack(files))

@@ -63,7 +63,7 @@ class ConvexPieces:
     vertices: tuple[Floats, ...]
     """One (V, 3) array of corners per piece, object frame [m]."""
     volume_ratio: float
-    """Volume of the union over the object's volume."""
+    """Ratio of the union's volume to the object's volume."""
     excess_m: float
     """Mean height of the union above the object's surface [m]."""
     digest: str

@@ -1,8 +1,8 @@
 """Simulated displacement of an object in a rigid hand during 0.15 s of gravity (Hasson et al. 2019).
 
-The hand is fixed in its grasp posture. The object has 1 kg and friction 3. Gravity acts along -z of its frame for 35
-steps of 1/240 s. In free fall it would move by 10.7 cm. The protocol was made for PyBullet with a restitution of 0.5;
-MuJoCo has no restitution."""
+The hand is fixed in its grasp posture. The object has mass 1 kg and friction coefficient 3. Gravity acts along -z of
+its frame for 35 steps of 1/240 s. In free fall it would move by 10.7 cm. The protocol was made for PyBullet with a
+restitution of 0.5; MuJoCo has no restitution."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ class LiftOutcome(IntEnum):
 class LiftTest:
     outcome: LiftOutcome = LiftOutcome.NOT_TRIED
     margin: float = 0.0
-    """Largest displacement or rotation from the commanded pose over its limit, after the end of the lift."""
+    """Largest ratio of deviation from the commanded position or rotation to its limit, after the end of the lift."""
     steps: int = 0
 
     @property

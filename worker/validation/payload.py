@@ -259,7 +259,7 @@ class Shake(FixedRootScene):
     """Shake tests of grasps in one scene. Not thread-safe."""
 
     def margin(self, grasps: GraspSet, row: int) -> float:
-        """Return the worst displacement or rotation in the hand over its limit; from 1 on the object is lost."""
+        """Return the largest ratio of motion in the hand to its limit; from 1 on the object is lost."""
         if not self._closed(grasps, row):
             return LOST
         self._hang(0.0, self.scene.mass)
@@ -288,7 +288,7 @@ def shake_margins(
     held: NDArray[np.bool_] | None = None,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Floats:
-    """Return shake margins (N,): worst displacement or rotation over its limit; below 1 the grasp holds.
+    """Return shake margins (N,): largest ratio of displacement or rotation to its limit; below 1 the grasp holds.
     nan: grasps that are not `held` (N,)."""
 
     def make() -> Shake:

@@ -74,8 +74,8 @@ class LiftRollout(Lift):
         self._half, self._whole = scenes
 
     def score(self, grasps: GraspSet, row: int, beat: float = np.inf) -> float:
-        """Return displacement or rotation over its limit after hanging at half friction; below 1: lifted. If it is not
-        below 1, return the same at full friction plus `SLIPS`, or `beat` if `beat` is below 1 + `SLIPS`."""
+        """Return the ratio of motion to its limit after hanging at half friction; below 1: lifted. If it is not below
+        1, return the same at full friction plus `SLIPS`, or `beat` if `beat` is below 1 + `SLIPS`."""
         self.scene = self._half
         if self._begin(grasps, row).outcome is not LiftOutcome.NOT_TRIED:
             return DEEP
@@ -92,8 +92,8 @@ class LiftRollout(Lift):
         return SLIPS + self._hang_score(HANGS_WHOLE)
 
     def _hang_score(self, weights: float, enough: float = GONE) -> float:
-        """Return displacement or rotation over its limit, extrapolated to `HOLD_S` after support removal.
-        As soon as the present value reaches `enough`, return it without extrapolation."""
+        """Return the ratio of motion to its limit, extrapolated to `HOLD_S` after support removal. As soon as the
+        present value reaches `enough`, return it without extrapolation."""
         self.data.mocap_pos[1] = self._scene_pose[:3] - AWAY_M * self._up
         self.data.xfrc_applied[self.scene.object_body, :3] = -weights * self.scene.push * self._up
         return self._extrapolate(HANGING, enough)
@@ -107,9 +107,9 @@ class PushRollout(Test):
         self._half, self._whole = scenes
 
     def score(self, grasps: GraspSet, row: int, beat: float = np.inf) -> float:
-        """Return the worst displacement or rotation over its limit in pushes at half friction; below 1: held.
+        """Return the largest ratio of motion to its limit in pushes at half friction; below 1: held.
         If it is not below 1, return the same at full friction plus `SLIPS`.
-        Return inf as soon as the score cannot improve on `beat`; below 1 + `SLIPS`, only half friction would."""
+        Return inf as soon as the score cannot improve on `beat`; below 1 + `SLIPS`, only half friction could."""
         self.scene = self._half
         if self._start(grasps, row).outcomes[0] is Outcome.PENETRATION:
             return DEEP
@@ -125,7 +125,7 @@ class PushRollout(Test):
         return SLIPS + self._push_score()
 
     def _push_score(self, enough: float = 1.0) -> float:
-        """Return the worst displacement or rotation over its limit; stop at the first push that reaches `enough`."""
+        """Return the largest ratio of motion to its limit; stop at the first push that reaches `enough`."""
         worst = 0.0
         for corner in CORNERS:
             self._restore()

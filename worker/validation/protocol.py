@@ -1,7 +1,7 @@
 """DexGraspBench's force-closure test of one grasp, at three levels of cost.
 
 dexgraspbench: as published. Each of the 6 pushes starts from the closed hand and is held for 2 s. The published test
-closes the hand anew for each push, with the same result.
+closes the hand again for each push, with the same result.
 standard: the same physics. A push ends as soon as motion at twice the present rate would stay inside .8 of the limits
 until 2 s.
 fast: coarser physics (fixed root, 6 ms). Where the margin is not clear, level standard decides."""
@@ -45,8 +45,8 @@ STILL: Final = 0.5
 LOST: Final = 10.0
 #: Rotation during closing or rising above which the object is lost [rad]; no passing grasp reached half of it.
 LOST_ROTATION: Final = math.radians(30.0)
-#: Coarse physics are trusted if their largest displacement or rotation over its limit is outside this band. False
-#: accepts have small motion: a band that begins at 0.7 of the limit leaves nearly twice as many.
+#: Coarse physics are trusted if their largest ratio of displacement or rotation to its limit is outside this band.
+#: False accepts have small motion: a band that begins at 0.7 of the limit leaves nearly twice as many.
 FAST_BAND: Final = (0.3, 3.0)
 
 
@@ -71,7 +71,7 @@ class ValidatedBy(IntEnum):
 class Rollout:
     outcomes: list[Outcome] = field(default_factory=lambda: [Outcome.NOT_TRIED] * len(DIRECTIONS))
     margin: float = 0.0
-    """Largest displacement or rotation over its limit, after the end of the squeeze."""
+    """Largest ratio of displacement or rotation to its limit, after the end of the squeeze."""
     penetration_m: float = 0.0
     self_penetration_m: float = 0.0
     steps: int = 0
@@ -224,7 +224,7 @@ class Test:
         return Outcome.HELD
 
     def _extrapolate(self, stages: int, enough: float = 1.0) -> float:
-        """Return displacement or rotation over its limit, extrapolated from now to `HOLD_S`.
+        """Return the larger ratio of displacement or rotation to its limit, extrapolated from now to `HOLD_S`.
         Simulate at most `stages` stages; as soon as the present value reaches `enough`, return it."""
         before = self._excess()
         for stage in range(1, stages + 1):

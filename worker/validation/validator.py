@@ -41,7 +41,7 @@ class Verdicts:
     outcome: NDArray[np.uint8]
     """(N, 6) `Outcome` of each push +x -x +y -y +z -z; pushes after the first failure are not simulated."""
     margin: Floats
-    """(N,) largest displacement or rotation over its limit."""
+    """(N,) largest ratio of displacement or rotation to its limit."""
     penetration_depth_mm: Floats
     """(N,) penetration of hand and object, measured with the engine's convex pieces."""
     self_penetration_depth_mm: Floats
@@ -49,7 +49,7 @@ class Verdicts:
     hard: bool
     pieces: int
     volume_ratio: float
-    """Volume of the object's convex pieces over its own."""
+    """Ratio of the volume of the object's convex pieces to its own."""
     excess_m: float
     """Mean height of the pieces above the object's surface [m]."""
     terms: str

@@ -58,7 +58,7 @@ RANGES_AT_ONCE: Final = 500
 
 
 class Changes(IndexPart):
-    """Records of the store. `within` makes a write part of a larger transaction."""
+    """Writes of jobs, shards, attempts and assets. `within` makes a write part of a larger transaction."""
 
     def add_job(self, record: JobRecord, *, within: Connection | None = None) -> State:
         """Add a job with all its tasks; tasks whose shard exists have succeeded."""
@@ -181,7 +181,7 @@ _OUTCOME = (shards.c.worker, shards.c.device, shards.c.seconds, shards.c.created
 
 
 def _outcome(worker: Any, device: Any, seconds: Any, created: Any) -> dict[str, Any]:
-    """Return the columns that a task row takes from its shard: values, or columns."""
+    """Return the columns of a task row that follow from its shard; arguments are values or SQL columns."""
     made = {"done": True, "worker": worker, "device": device, "seconds": seconds, "finished": created}
     return {**made, "reason": None, "queued": False, "not_before": 0.0, **NO_PROGRESS}
 

@@ -194,7 +194,7 @@ def _derive_task_states(connection: Connection, touched: Mapping[str, Collection
 
 
 def _first_batch_failed() -> ColumnElement[bool]:
-    """Return whether the first batch of a job failed because of its scenes or of the weight."""
+    """Return whether the first batch of a job failed because of its scenes or the object's weight."""
     last = (attempts.c.task_id == tasks.c.id) & (attempts.c.number == tasks.c.last_attempt)
     failed = (tasks.c.done.is_(False), tasks.c.exhausted.is_(True), tasks.c.last_attempt > tasks.c.retried_upto)
     first = (tasks.c.job_id == jobs.c.id, tasks.c.batch == 0)

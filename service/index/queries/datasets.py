@@ -167,7 +167,7 @@ def _states(connection: Connection, row: Any) -> dict[State, int]:
 
 
 def _tasks_of_cell(options: JobOptions, span: int | None) -> int:
-    """Return the number of tasks of a cell by its job's batches per task; None: unplanned, assume one."""
+    """Return the number of tasks of a cell by its job's batches per task; None: unplanned; one is assumed."""
     return ranges_of(options.grasps, span or 1) * len(stages_of(options))
 
 

@@ -1,7 +1,7 @@
 """Queries of grasps: filters, and pages sorted by a metric, among millions of rows.
 
-This module chooses the database index: SQLite has no statistics of the values, and scans the index of an order to
-its end for a rare match. There are three plans:
+This module chooses the database index: SQLite has no statistics of the values, and scans a whole index for a rare
+match. There are three plans:
 
 1. A condition leaves few rows: fetch them by its index, and sort them.
 2. Otherwise a bounded number of rows is read in the wanted order until the page is full.

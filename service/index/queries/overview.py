@@ -128,7 +128,7 @@ UNFINISHED: Final = (State.QUEUED, State.RUNNING)
 
 @dataclass(frozen=True)
 class IndexStatus:
-    """Unfinished jobs, and the production of the last minute."""
+    """Unfinished jobs, and the grasps made in the last minute."""
 
     jobs: Mapping[State, int]
     oldest_s: Mapping[State, float]

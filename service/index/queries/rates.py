@@ -1,10 +1,10 @@
 """Seconds and bytes of a batch: measured on this service's finished batches if possible, else stored.
 
-The nearest measurement counts: of the same hand and object, else of the same hand, else of any hand; always with the
-same method, fidelity, validator and kind of device. `STORED` and `STORED_METHODS` have the stored values with their
-origin. After the first measurement, one factor (seconds of this machine over stored seconds) scales all stored
-values, so that comparisons of fidelities never mix two machines. Every rate has an interval: the scatter of measured
-batches, or the observed error of a stored value.
+The nearest measurement counts: of the same hand and object, else of the same hand, else of any hand. Method, fidelity,
+validator and kind of device are always the same. `STORED` and `STORED_METHODS` have the stored values with their
+origin. After the first measurement, one factor (seconds of this machine / stored seconds) scales all stored values.
+Comparisons of fidelities thus never mix two machines. Every rate has an interval: the scatter of measured batches, or
+the observed error of a stored value.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Machine:
     """Speed of this machine relative to the stored numbers."""
 
     factor: float = 1.0
-    """Median over all batches of the seconds here over the stored seconds."""
+    """Median over all batches of the ratio of the seconds here to the stored seconds."""
     spread: tuple[float, float] = (1.0, 1.0)
     """Interval of single batches, as factors of the median."""
     batches: int = 0
@@ -197,7 +197,7 @@ def _is_stored(request: JobOptions) -> bool:
 
 
 def _spread(values: list[float], least: tuple[float, float]) -> tuple[float, float]:
-    """Return the middle eight tenths of the values over their median, not narrower than `least`."""
+    """Return the middle eight tenths of the values, divided by their median and not narrower than `least`."""
     if len(values) < 2 or (middle := median(values)) <= 0:
         return least
     tenths = quantiles(values, n=10, method="inclusive")
@@ -229,7 +229,7 @@ def _rate_on_machine(machine: Machine, stored: StageRate) -> StageRate:
 
 
 def scene_rate(batches: Iterable[BatchCost], options: JobOptions, machine: Machine) -> StageRate:
-    """Return seconds per batch and scene, and bytes: per grasp and scene, or per scene for grasps planned in scenes."""
+    """Return seconds per batch and scene. Bytes are per grasp and scene, or per scene for grasps planned in scenes."""
     found = [batch for batch in batches if batch.request.scenes and batch.request.in_scene == options.in_scene]
     rows = sum(batch.count for batch in found)
     if not rows:

@@ -79,9 +79,8 @@ class Statistics(IndexPart):
     ) -> dict[Metric, list[Distribution | None]]:
         """Return one distribution per metric and filter in common bins; None without grasps.
 
-        The grasps are a sample of about `at_most` per filter: ids of shards are digests, so the ids below a bound are a
-        fair
-        sample, and they are adjacent in the index.
+        The grasps are a sample of about `at_most` per filter. Ids of shards are digests, so the ids below a bound are a
+        fair sample; they are adjacent in the index.
         """
         samples = [self._values(where, metrics, at_most) for where in filters]
         found: dict[Metric, list[Distribution | None]] = {}

@@ -1,7 +1,7 @@
 """Actions of users on datasets: create, cancel, retry, snapshot; the controller carries out a part in each round.
 
-The index records which cells have a job, and a job's event names the causing event of the dataset, so another
-controller can continue without applying an event twice.
+The index records which cells have a job, and a job's event names the causing event of the dataset. Another controller
+can therefore continue without applying an event twice.
 """
 
 from __future__ import annotations
@@ -87,8 +87,7 @@ def cancel(services: Services, name: str) -> DatasetView:
     """Stop a dataset: plan no more jobs and cancel unfinished ones; finished shards stay.
 
     A job continues if another dataset needs it or another key submitted it. Raises NotFoundError for an unknown
-    dataset,
-    ConflictError for a finished or cancelled one.
+    dataset, ConflictError for a finished or cancelled one.
     """
     with recording(services) as (connection, put):
         dataset = services.index.datasets.get(name)
@@ -249,7 +248,7 @@ class DatasetRounds:
         return False
 
     def _plan(self, work: DatasetWork, deadline: float) -> bool:
-        """Make jobs for the cells without one; return whether all are made."""
+        """Make jobs for the cells without a job; return whether all are made."""
         after = -1
         while not work.cancelled:
             cells = self._services.index.dataset_feed.cells_to_plan(work.name, after=after, limit=_CELLS_AT_ONCE)

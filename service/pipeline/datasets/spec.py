@@ -138,7 +138,7 @@ class Estimate(View):
     seconds_low: float = Field(description="lower end of the interval of `seconds` [s]")
     seconds_high: float = Field(description="upper end of the interval of `seconds` [s]")
     machine_factor: float | None = Field(
-        description="factor on all seconds: this machine's times over the stored ones; None: nothing measured here"
+        description="factor on all seconds: ratio of this machine's times to the stored times; None: not measured"
     )
     seconds_by_stage: dict[Stage, float]
     seconds_per_valid: float | None

@@ -18,9 +18,9 @@ class Condition(StrEnum):
     GOOD = "good"
     WARNING = "warning"
     BAD = "bad"
-    """It does not work, or will lose data."""
+    """The part does not work, or will lose data."""
     SKIPPED = "skipped"
-    """It was not checked; the message has the reason."""
+    """The part was not checked; the message has the reason."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Check:
 
 
 def run_checks(checks: Sequence[Check]) -> Iterator[Finding]:
-    """Yield findings in the order of the checks, each as soon as it and all before it are complete."""
+    """Yield findings in the order of the checks, each as soon as it and all earlier ones are complete."""
     started = time.monotonic()
     runs = [_Run(check) for check in checks]
     for run in runs:

@@ -17,7 +17,7 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.data import HandState
 from graspd.worker.simulation.environment import PlacedGrasps
 
-#: Number of a grasp's candidates that are refined (fine phase) and simulated at once: refining costs half a rollout.
+#: Number of a grasp's candidates refined (fine phase) and simulated at once: refinement costs half of a rollout.
 TOGETHER: Final = 2
 #: A refined hand with a merit above this has no rollout unless its grasp has no other candidate: of 176 such hands of
 #: Allegro and Shadow 3 lifted at half friction.
@@ -65,7 +65,7 @@ class Refinements:
 
 Seat = Callable[[NDArray[np.intp], NDArray[np.intp]], Refinements]
 
-"""Seats the hands of some grasps (n,), given the rows (n, each) of their starts."""
+"""Runs the fine phase for some grasps (n,), given the rows (n, each) of their starts."""
 
 RolloutOf = Callable[[GraspSet, NDArray[np.intp], Floats], Floats]
 """Scores (k,) grasps of the numbers (k,) against the scores to beat; see `worker.planners.Rollout`."""
@@ -119,8 +119,8 @@ def select_by_rollout(
     device: str = "cpu",
 ) -> Selection:
     """Return each grasp's first candidate with a good enough rollout, or else the one with the smallest score.
-    `together` candidates of each grasp are refined and simulated by merit, `order` (n, each), then as many again for
-    grasps without a good one. Unbalanced or infeasible hands have no rollout; a grasp's first hand is still used.
+    `together` candidates of each grasp are refined and simulated in the order (n, each) of merit, then further ones for
+    grasps without a good candidate. Unbalanced or infeasible hands have no rollout; a grasp's first hand is still used.
     Candidates that do not beat the scores `beat` (n,) of earlier attempts leave these scores unchanged."""
     good = GOOD if placed is None else GOOD_IN_SCENES
     beat = np.full(len(order), np.inf) if beat is None else beat

@@ -55,7 +55,7 @@ class Pair:
 
 
 def pair_of(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, device: str, *, in_scenes: bool = False) -> Pair:
-    """Return the pair, cached. Without a projection out of a free object, samples are those of the fidelity."""
+    """Return the pair, cached. A projection out of a free object uses more object samples than `fidelity` states."""
     count = fidelity.object_points
     if fidelity.polish_iterations and not in_scenes:
         count = max(count, min(DENSER * count, DENSEST))

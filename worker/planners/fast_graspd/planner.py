@@ -165,7 +165,7 @@ def optimise_pair(pair: Pair, wanted: PlanRequest, run: ExecutionContext) -> lis
 
 
 def optimise(pair: Pair, batches: Batches, run: ExecutionContext, *, postures: bool = False) -> list[LaunchPart]:
-    """Run several batches; return the parts of those that did not stop, possibly with others.
+    """Run several batches; the returned parts contain all batches that did not stop, and possibly others.
     `postures` adds the pregrasp and squeeze postures. Raise the first batch's error if all have stopped."""
     launch = _Launch(pair, batches)
     begun = _draw_all_starts(launch, batches.active_rows(), run)
@@ -387,7 +387,7 @@ class _FinePhase:
     state: HandState
     losses: Floats
     curve: list[Floats]
-    """Loss curve, continued by the first hands that are refined."""
+    """Loss curve, continued by the first hands in the fine phase."""
 
     def refine(self, rows: NDArray[np.intp], which: NDArray[np.intp]) -> Refinements:
         launch, flat = self.launch, rows.ravel()

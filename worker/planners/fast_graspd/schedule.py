@@ -1,5 +1,5 @@
 """Weights per iteration, and the interface of starts that another method proposes.
-The coarse phase shrinks the dilation; the fine phase refines the hand."""
+The coarse phase shrinks the dilation; the fine phase brings the hand into contact."""
 
 from __future__ import annotations
 

@@ -171,8 +171,8 @@ def no_start_error(model: Model) -> InputError:
 
 def clear_starts(model: Model, generators: list[np.random.Generator], *, each: int = 1) -> tuple[HandState, Floats]:
     """Return a start per generator, the least deep of its draws, and its depth (n,) [m]; most are clear.
-    Every second of the `each` starts of a grasp, from the second on, is antipodal if possible. All are antipodal if
-    the object is too small or too wide for the hand's pads."""
+    The second, fourth, ... of the `each` starts of a grasp are antipodal if possible. All are antipodal if the object
+    is too small or too wide for the hand's pads."""
     hand, obj = model.hand.model, model.obj.model
     count, jaws = len(generators), JawStarts.of(hand, obj)
     retreats = RETREATS if jaws is None else JAW_RETREATS

@@ -35,7 +35,7 @@ class RayHit:
 
 @wp.func
 def inverse_of(direction: wp.vec3f):
-    """Return one over each component, finite."""
+    """Return the reciprocal of each component, finite."""
     inverse = wp.vec3f()
     for k in range(3):
         d = direction[k]

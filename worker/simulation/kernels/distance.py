@@ -56,7 +56,7 @@ def nearest(skin: Skin, p: wp.vec3, reach: wp.float32):
     Points outside the box [low, high] are only looked up within `reach`; farther ones get distance = reach, normal 0.
     The sign is ray parity, or the winding number for open meshes: both are right near creases. Between a node of
     `coarse` and a point the distance changes at most by their separation. With this bound, points beyond reach are not
-    looked up, farther faces are not searched, and a certain sign is not computed."""
+    looked up, farther faces are not searched, and the sign is not computed where it is certain."""
     out = NearestPoint()
     out.distance = reach
     out.closest = p

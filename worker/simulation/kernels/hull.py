@@ -305,7 +305,7 @@ def measure_hulls(
     hull_inout: Hull,
     result_out: wp.array2d(dtype=wp.float64),
 ):
-    """Build one hull after the other from 7 facets: facet i omits corner i and neighbours all others.
+    """Build one hull after the other from 7 facets: facet i omits corner i and is next to all others.
     Points are about a point inside the first simplex; distances are from `origin_in`. `result_out` has three numbers:
     least distance of a facet, at most 0 for an outside origin; volume, nan where `whole_in` is 0; 1 if feasible."""
     hull = hull_inout

@@ -46,7 +46,7 @@ class Feature:
 
 @wp.struct
 class Obstacles:
-    """Convex obstacles of all scenes in sequence, unbounded ones first; a scene -1 has none."""
+    """Convex obstacles of all scenes in sequence, unbounded ones first; scene number -1: no obstacles."""
 
     first: wp.array(dtype=wp.int32)  # (S + 1,)
     first_solid: wp.array(dtype=wp.int32)  # (S,) first one with corners

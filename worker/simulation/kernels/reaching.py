@@ -1,4 +1,4 @@
-"""Random hands around an object, between opposed fingers, until one is clear in a grid of distances.
+"""Random hands with an object between opposed fingers, drawn until one is clear in a grid of distances.
 
 One thread draws for one start. A draw's numbers follow from the start's seed and the draw's number, not from other
 draws. Hands are tested as balls."""

@@ -1,9 +1,9 @@
 """Links of a hand against solid obstacles: boxes, boards, neighbours' convex pieces.
 
 The nearest points of two separate convex bodies lie on a corner and a face or on two edges. If they overlap, a corner
-or an edge of one is in the other. Tested are therefore the link's features and edges against the obstacle, and the
-obstacle's edges against the link. Along a straight edge the signed distance from a convex body is a convex function.
-Its least value is found between two tangents below it: their intersection is a lower bound, so distant edges cost two
+or an edge of one is in the other. The tests therefore compare the link's features and edges with the obstacle, and the
+obstacle's edges with the link. Along a straight edge the signed distance from a convex body is a convex function. Its
+least value is found between two tangents below it: their intersection is a lower bound, so distant edges cost two
 evaluations."""
 
 import warp as wp
@@ -51,7 +51,7 @@ class NearestObstacle:
 def tangent_intersection(
     t0: wp.float32, f0: wp.float32, g0: wp.float32, t1: wp.float32, f1: wp.float32, g1: wp.float32
 ):
-    """Return the intersection of two tangents of a convex function, g0 < 0 < g1; between t0 and t1."""
+    """Return the place between t0 and t1 at which tangents of a convex function with slopes g0 < 0 < g1 intersect."""
     return wp.clamp((f1 - f0 + g0 * t0 - g1 * t1) / (g0 - g1), t0, t1)
 
 

@@ -1,6 +1,6 @@
 """Signed distance of hand points to the mesh, smoothed by Phong projection (paper, section III-B).
 
-Given are the closest point b on a face, barycentric weights w_k, and corner normals n_k. The projection onto the
+The inputs are the closest point b on a face, barycentric weights w_k, and corner normals n_k. The projection onto the
 tangent plane of corner k is pi_k(b) = b - ((b - v_k).n_k) n_k. The smoothed surface point is
     r* = (1 - alpha) b + alpha sum_k w_k pi_k(b)   (Boubekeur & Alexa 2008; the paper's formula drops the first b).
 The distance is sign |r - b| + (b - r*).n with n the interpolated normal. Unlike sign |r - r*| it is continuous across

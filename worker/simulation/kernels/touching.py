@@ -63,7 +63,7 @@ def touch(
 
 @wp.func
 def apart(touching: NearbySurface, radius: wp.float64, b: wp.int32, i: wp.int32, j: wp.int32):
-    """Return the squared separation of two contacts: by place over `radius`, and by direction."""
+    """Return the squared separation of two contacts: by place divided by `radius`, and by direction."""
     place = (wp.vec3d(touching.closest[b, i]) - wp.vec3d(touching.closest[b, j])) / radius
     turn = wp.vec3d(touching.normal[b, i]) - wp.vec3d(touching.normal[b, j])
     return wp.dot(place, place) + wp.dot(turn, turn)
@@ -169,8 +169,8 @@ def columns(
     matrix_out: wp.array3d(dtype=wp.float64),
 ):
     """Compute columns (B, C * E, 7 + D) of the balance. Launch over (B, C).
-    Each edge of a contact's pyramid has unit normal force. Its rows are its wrench, with torque over `radius`; `sum`;
-    and the torques of the dofs that exert it, over their limits."""
+    Each edge of a contact's pyramid has unit normal force. Its rows are its wrench, with torque / `radius`; `sum`;
+    and the torques of the dofs that exert it, divided by their limits."""
     b, c = wp.tid()
     if c >= count_in[b]:
         return
@@ -239,9 +239,8 @@ def net_wrench(
     residual_out: wp.array(dtype=wp.float64),
     torque_out: wp.array2d(dtype=wp.float64),
 ):
-    """Compute the net wrench of forces in these shares (B, C * E) over the sum of their normal components. Launch over
-    B.
-    Also compute the torques (B, D) that exert them at the sum `total`, or at less within limits."""
+    """Compute the net wrench of forces in these shares (B, C * E), divided by the sum of their normal components.
+    Launch over B. Also compute the torques (B, D) that exert them at the sum `total`, or at less within limits."""
     b = wp.tid()
     whole = wp.float64(0.0)
     for k in range(count_in[b]):

@@ -104,7 +104,7 @@ class WorldVerdicts:
     outcome: wp.array2d(dtype=wp.int32)
     """(N, 6)"""
     margin: wp.array(dtype=wp.float32)
-    """Largest displacement or rotation over its limit so far."""
+    """Largest ratio of displacement or rotation to its limit so far."""
     ticks: wp.array(dtype=wp.int32)
     overflow: wp.array(dtype=wp.int32)
 

@@ -58,7 +58,7 @@ class PrefilterOutcomes:
     outcome: NDArray[np.uint8]
     """(N, 6) `Outcome` of each push; an undecided grasp has pushes without a simulation."""
     margin: Floats
-    """(N,) worst displacement or rotation over its limit."""
+    """(N,) largest ratio of displacement or rotation to its limit."""
     penetration_m: Floats
     self_penetration_m: Floats
     overflow: NDArray[np.bool_]
