@@ -16,10 +16,10 @@ from graspd.api.access.auth import Proxy
 from graspd.api.access.keys import KeyFile
 from graspd.api.dashboard import pages
 from graspd.api.dashboard.rendering import STATIC, problem_page
-from graspd.api.formatting import host_name, is_loopback
+from graspd.api.formatting import is_loopback
 from graspd.api.metrics import Metrics
 from graspd.api.middleware.limits import BodyLimit, RateLimit, Rates
-from graspd.api.middleware.request_context import Head, RequestContext, RootPath, SameOrigin
+from graspd.api.middleware.request_context import Head, RequestContext, RootPath, SameOrigin, host_name
 from graspd.api.routes import assets, datasets, grasps, jobs, system
 from graspd.api.routes.assets import asset_router
 from graspd.api.routes.dependencies import EXPORTS, FORMS, UPLOADS, RequestLimiter, provide

@@ -111,12 +111,6 @@ FILTERS: Final[Mapping[str, Callable[..., str]]] = {
 }
 
 
-def host_name(host: str) -> str:
-    if host.startswith("["):
-        return host[1:].partition("]")[0]
-    return host.rpartition(":")[0] if host.count(":") == 1 else host
-
-
 def is_loopback(host: str) -> bool:
     if host == "localhost":
         return True

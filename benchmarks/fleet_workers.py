@@ -26,10 +26,9 @@ from rq.defaults import DEFAULT_WORKER_TTL as LEASE_KEPT_S
 
 from graspd.service.model import names
 from graspd.service.model.clock import timestamp
-from graspd.service.model.messages import TaskMessage
+from graspd.service.model.messages import TaskMessage, capabilities
 from graspd.service.model.states import Priority, Stage
 from graspd.service.model.version import PACKAGE_VERSION
-from graspd.service.model.workers import capabilities
 from graspd.service.queue.entries import execution_keys, held_key, job_key, list_key, queue_name, rq_worker_key
 from graspd.service.queue.port import Event, EventKind
 from graspd.service.queue.rq_queue import WORKERS, RqQueue, cancel_key, open_queue, put_event, worker_key

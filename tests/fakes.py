@@ -20,11 +20,10 @@ from graspd.service.index.views import TaskView
 from graspd.service.model import names
 from graspd.service.model.clock import timestamp
 from graspd.service.model.domain import JobRequest
-from graspd.service.model.messages import TaskMessage
+from graspd.service.model.messages import TaskMessage, WorkerBeat
 from graspd.service.model.planning import PlannedTask, message_of, plan
 from graspd.service.model.records import AttemptRecord, JobRecord
 from graspd.service.model.states import AssetKind, Priority, Stage
-from graspd.service.model.workers import WorkerBeat
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.datasets.actions import DatasetRounds
 from graspd.service.store.integrity import put_document

@@ -7,8 +7,8 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
+from graspd.service.model.messages import WorkerBeat
 from graspd.service.model.states import Priority, Stage
-from graspd.service.model.workers import WorkerBeat
 from graspd.service.queue.port import Event, Lease, Message, QueueStatus, priority_order
 from graspd.service.queue.rq_queue import RqQueue
 

@@ -18,7 +18,6 @@ from starlette.requests import Request
 from starlette.routing import Match
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from graspd.api.formatting import host_name
 from graspd.api.metrics import Metrics
 from graspd.api.problems import ApiError, answer
 from graspd.service.model.errors import GraspdError
@@ -230,3 +229,9 @@ def _place(origin: str) -> str | None:
         return urlsplit(origin).netloc
     except ValueError:
         return None
+
+
+def host_name(host: str) -> str:
+    if host.startswith("["):
+        return host[1:].partition("]")[0]
+    return host.rpartition(":")[0] if host.count(":") == 1 else host

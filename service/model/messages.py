@@ -1,15 +1,24 @@
-"""Messages of the queue: tasks and their origin."""
+"""Messages in Redis: tasks and their origin; reports and capabilities of workers, requirements of tasks.
+
+Several versions may run in parallel. A message states a range of schemas: from the oldest that can express it to the
+newest that its writer supports. A worker also reads a range, and has one revision of each stage.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Literal, Self
+import os
+import socket
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import ConfigDict, Field, model_validator
 
 from graspd.service.model.base import Digest, Model, Name, Word
+from graspd.service.model.clock import timestamp
 from graspd.service.model.domain import JobRequest, check_digests
 from graspd.service.model.states import AssetKind, Stage
+from graspd.service.model.version import OLDEST_TASK_SCHEMA, PACKAGE_VERSION, STAGE_REVISIONS, TASK_SCHEMA
 
 
 class Origin(Model):
@@ -68,3 +77,84 @@ class IngestMessage(Model):
 
 def message_type(raw: Mapping[str, Any]) -> type[TaskMessage | IngestMessage]:
     return IngestMessage if raw.get("stage") == Stage.INGEST else TaskMessage
+
+
+#: Any client can write to Redis, so values from there have bounded lengths and sizes.
+HostWord = Annotated[str, Field(max_length=300)]
+Count = Annotated[int, Field(ge=0, lt=2**31)]
+Amount = Annotated[float, Field(ge=0, le=1e15, allow_inf_nan=False)]
+
+
+@dataclass(frozen=True)
+class WorkerBeat:
+    """Status report of a living worker."""
+
+    name: HostWord
+    host: HostWord
+    pid: Count
+    device: HostWord
+    device_name: HostWord
+    stages: tuple[Stage, ...]
+    version: Annotated[str, Field(max_length=64)]
+    state: Annotated[str, Field(max_length=32)]
+    """checking, idle, busy, stopping or quarantined."""
+    task_id: Word
+    started: Annotated[str, Field(max_length=32)]
+    seen: Annotated[str, Field(max_length=32)]
+    reason: Annotated[str, Field(max_length=300)] = ""
+    schemas: tuple[Count, Count] = (0, 0)
+    """Oldest and newest readable task message; workers of graspd 0.1 report none and get no tasks."""
+    revisions: Annotated[dict[HostWord, Count], Field(max_length=16)] = field(default_factory=dict)
+    done: Amount = 0.0
+    total: Amount = 0.0
+    """Total work of the task, in the unit of `done`; 0: unknown."""
+    message: Annotated[str, Field(max_length=300)] = ""
+
+    @classmethod
+    def of_this_process(cls, name: str, device: str, stages: Iterable[Stage]) -> Self:
+        host, now, own = socket.gethostname(), timestamp(), capabilities()
+        facts = (host, os.getpid(), device, "", tuple(stages), PACKAGE_VERSION, "checking", "", now, now)
+        return cls(name, *facts, schemas=own.schemas, revisions=dict(own.revisions))
+
+    @property
+    def ability(self) -> Capabilities:
+        return Capabilities(self.schemas, self.revisions)
+
+
+#: First schema of messages with a range.
+FIRST_SCHEMA: Final = 2
+
+
+@dataclass(frozen=True)
+class Requirements:
+    stage: Stage
+    schema: int
+    newest: int
+    revision: int
+    """Revision of the stage; 0 for the check of an asset, which has no revision."""
+
+
+@dataclass(frozen=True)
+class Capabilities:
+    schemas: tuple[int, int]
+    revisions: Mapping[str, int]
+
+    def lacks(self, need: Requirements) -> str:
+        oldest, newest = self.schemas
+        if need.schema > newest:
+            return f"the task needs schema {need.schema}, but the worker reads at most schema {newest}"
+        if need.newest < oldest:
+            return f"the task has at most schema {need.newest}, but the worker reads schemas from {oldest} on"
+        made = self.revisions.get(need.stage.value, 0)
+        if need.revision and need.revision != made:
+            return f"the task needs revision {need.revision} of {need.stage.value}, but the worker has revision {made}"
+        return ""
+
+
+def capabilities() -> Capabilities:
+    return Capabilities((OLDEST_TASK_SCHEMA, TASK_SCHEMA), STAGE_REVISIONS)
+
+
+def requirements_of(message: TaskMessage | IngestMessage) -> Requirements:
+    revision = message.revision if isinstance(message, TaskMessage) else 0
+    return Requirements(message.stage, message.schema_, message.newest_schema or message.schema_, revision)

@@ -7,7 +7,7 @@ from typing import Final
 PACKAGE_VERSION: Final = "0.2.0"
 
 #: Newest schema of task messages, and the oldest readable one. A message states the schemas that can read it, so
-#: workers of two versions may run in parallel (`service/model/workers.py`).
+#: workers of two versions may run in parallel (`service/model/messages.py`).
 TASK_SCHEMA: Final = 6
 OLDEST_TASK_SCHEMA: Final = 2
 #: First schema with tasks of several batches.

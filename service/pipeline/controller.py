@@ -19,10 +19,10 @@ from graspd.service.index.rebuild import complete_if_new, rebuild
 from graspd.service.model import names
 from graspd.service.model.clock import timestamp
 from graspd.service.model.errors import BusyError, DamagedError, NotFoundError, StoreUnavailable, UnavailableError
+from graspd.service.model.messages import WorkerBeat, requirements_of
 from graspd.service.model.planning import RoundRobin, ingest_id, ingest_message
 from graspd.service.model.records import JobRecord
 from graspd.service.model.states import Priority
-from graspd.service.model.workers import WorkerBeat, requirements_of
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.datasets.actions import DatasetRounds
 from graspd.service.pipeline.deletion import GarbageCollector

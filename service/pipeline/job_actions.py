@@ -23,7 +23,15 @@ from graspd.service.model.clock import timestamp
 from graspd.service.model.digests import job_id
 from graspd.service.model.domain import JobOptions, JobRequest, batches_of
 from graspd.service.model.errors import ConflictError, InputError, NotFoundError, SceneError, UnavailableError
-from graspd.service.model.messages import Origin, TaskMessage
+from graspd.service.model.messages import (
+    Capabilities,
+    Origin,
+    Requirements,
+    TaskMessage,
+    WorkerBeat,
+    capabilities,
+    requirements_of,
+)
 from graspd.service.model.planning import message_of, priority_of
 from graspd.service.model.projects import EVERYTHING, ProjectScope
 from graspd.service.model.records import MOST_BATCHES, JobRecord, Member
@@ -31,7 +39,6 @@ from graspd.service.model.scene_spec import HalfSpace, Pose, Supports
 from graspd.service.model.states import AssetKind, Priority, Stage, State
 from graspd.service.model.transforms import quat_conjugate, quat_rotate
 from graspd.service.model.version import SCHEMA_OF_RANGES
-from graspd.service.model.workers import Capabilities, Requirements, WorkerBeat, capabilities, requirements_of
 from graspd.service.pipeline.backends import Services, recording
 from graspd.service.pipeline.fidelity_choice import Resolver
 from graspd.service.queue.port import Event, EventKind

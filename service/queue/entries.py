@@ -31,10 +31,9 @@ from rq.serializers import JSONSerializer
 from rq.worker_registration import WORKERS_BY_QUEUE_KEY
 
 from graspd.service.model.errors import TaskRefused
-from graspd.service.model.messages import message_type
+from graspd.service.model.messages import FIRST_SCHEMA, Capabilities, Requirements, WorkerBeat, message_type
 from graspd.service.model.renamed import convert_names
 from graspd.service.model.states import Priority, Stage
-from graspd.service.model.workers import FIRST_SCHEMA, Capabilities, Requirements, WorkerBeat
 from graspd.service.queue.port import Event, Message, priority_order
 
 Entry = TypeVar("Entry", WorkerBeat, Event)

@@ -10,9 +10,8 @@ from typing import Annotated, Any, Final
 from pydantic import BeforeValidator, ConfigDict, Field
 
 from graspd.service.model.base import Model, Word
-from graspd.service.model.messages import IngestMessage, TaskMessage
+from graspd.service.model.messages import Amount, Count, HostWord, IngestMessage, TaskMessage, WorkerBeat
 from graspd.service.model.states import Priority, Stage
-from graspd.service.model.workers import Amount, Count, HostWord, WorkerBeat
 
 Message = TaskMessage | IngestMessage
 

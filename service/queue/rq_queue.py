@@ -25,9 +25,9 @@ from rq.serializers import JSONSerializer
 from graspd.service.model.base import first_line
 from graspd.service.model.clock import age_of
 from graspd.service.model.errors import QueueUnavailable
+from graspd.service.model.messages import WorkerBeat, requirements_of
 from graspd.service.model.renamed import message_for_revision
 from graspd.service.model.states import Priority, Stage
-from graspd.service.model.workers import WorkerBeat, requirements_of
 from graspd.service.queue import entries
 from graspd.service.queue.connection import connect, redis_url
 from graspd.service.queue.entries import (

@@ -12,7 +12,7 @@ from typing import Any, Final
 from redis.exceptions import RedisError
 
 from graspd.service.model.clock import timestamp
-from graspd.service.model.workers import WorkerBeat
+from graspd.service.model.messages import WorkerBeat
 from graspd.service.queue.connection import connect
 from graspd.service.queue.port import Event, EventKind
 from graspd.service.queue.rq_queue import list_worker, unlist_worker

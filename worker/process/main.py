@@ -26,8 +26,8 @@ from rq.serializers import JSONSerializer
 from rq.worker import WorkerStatus
 
 from graspd.service.model.errors import GraspdError, QueueUnavailable, TaskRefused
+from graspd.service.model.messages import WorkerBeat, capabilities
 from graspd.service.model.states import Stage
-from graspd.service.model.workers import WorkerBeat, capabilities
 from graspd.service.queue import entries
 from graspd.service.queue.connection import redis_url
 from graspd.service.queue.entries import queue_names

@@ -23,11 +23,17 @@ from graspd.service.model.errors import (
     TaskRefused,
     UnavailableError,
 )
-from graspd.service.model.messages import IngestMessage, Origin, TaskMessage, message_type
+from graspd.service.model.messages import (
+    IngestMessage,
+    Origin,
+    TaskMessage,
+    capabilities,
+    message_type,
+    requirements_of,
+)
 from graspd.service.model.records import AttemptRecord
 from graspd.service.model.renamed import convert_names
 from graspd.service.model.states import Stage
-from graspd.service.model.workers import capabilities, requirements_of
 from graspd.service.queue.port import Event, EventKind, Message
 from graspd.service.store.manifests import ShardManifest, load_manifest, publish_shard, shard_exists
 from graspd.service.store.records import put_record

@@ -39,6 +39,7 @@ from graspd.service.index.tables import (
     workers,
 )
 from graspd.service.model.domain import Asset
+from graspd.service.model.messages import WorkerBeat
 from graspd.service.model.planning import ranges_of
 from graspd.service.model.records import (
     AttemptRecord,
@@ -50,7 +51,6 @@ from graspd.service.model.records import (
     Snapshot,
 )
 from graspd.service.model.states import State
-from graspd.service.model.workers import WorkerBeat
 from graspd.service.store.manifests import ShardManifest
 
 #: Ranges entered in one transaction of some tenths of a second, during which other writers wait.

@@ -21,9 +21,9 @@ from typing import Any, Final
 from redis.exceptions import RedisError
 
 from graspd.service.model.errors import GraspdError, QueueUnavailable
+from graspd.service.model.messages import WorkerBeat
 from graspd.service.model.states import Stage
 from graspd.service.model.version import PACKAGE_VERSION
-from graspd.service.model.workers import WorkerBeat
 from graspd.service.pipeline.leading import PART
 from graspd.service.queue.rq_queue import RqQueue, open_queue
 from graspd.service.run.address import local_url, recorded_address

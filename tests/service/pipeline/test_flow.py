@@ -13,8 +13,8 @@ from graspd.service.index.tables import tasks
 from graspd.service.model import names
 from graspd.service.model.clock import timestamp
 from graspd.service.model.errors import ConflictError
+from graspd.service.model.messages import capabilities
 from graspd.service.model.states import Priority, Stage, State
-from graspd.service.model.workers import capabilities
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.controller import Controller, PeriodicDuty

@@ -13,11 +13,11 @@ from pydantic import ValidationError
 
 from graspd.service.index.changes.records import Changes
 from graspd.service.index.rebuild import differences
+from graspd.service.model.messages import FIRST_SCHEMA, Requirements, WorkerBeat, capabilities
 from graspd.service.model.planning import message_of, needed_schema, plan
 from graspd.service.model.records import JobRecord
 from graspd.service.model.states import AssetKind, Priority, Stage, State
 from graspd.service.model.version import SCHEMA_OF_RANGES, STAGE_REVISIONS, TASK_SCHEMA
-from graspd.service.model.workers import FIRST_SCHEMA, Requirements, WorkerBeat, capabilities
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.datasets import actions
