@@ -125,7 +125,7 @@ def plain(text: str) -> str:
     return text.encode(errors="replace").decode()
 
 
-def answer(request: Request, error: Exception) -> JSONResponse:
+def error_response(request: Request, error: Exception) -> JSONResponse:
     slug, title, status, detail = describe(error)
     if isinstance(error, HTTPException) and status == 404:
         detail = f"there is no {request.url.path}"
@@ -191,7 +191,7 @@ def install(app: FastAPI, page: Callable[[Request, dict[str, Any]], Response]) -
             slug, title, status, detail = describe(error)
             facts = {"type": slug, "title": title, "status": status, "detail": detail}
             return page(request, facts | {"request_id": request_id_of(request)})
-        return answer(request, error)
+        return error_response(request, error)
 
     async def any_error(request: Request, error: Exception) -> Response:
         return answer_any(request, error)

@@ -26,7 +26,7 @@ from graspd.api.access.auth import caller as present_caller
 from graspd.api.access.keys import Key, KeyFile
 from graspd.api.access.keys import Scope as KeyScope
 from graspd.api.middleware.request_context import SAFE_METHODS, HttpMiddleware
-from graspd.api.problems import ApiError, answer
+from graspd.api.problems import ApiError, error_response
 from graspd.service.model.errors import LimitError
 from graspd.service.settings import Settings
 from graspd.service.telemetry import bind
@@ -75,7 +75,7 @@ class RateLimit(HttpMiddleware):
             return
         headers = _headers(allowance, admission)
         if admission.refused:
-            await answer(request, _refusal(admission, allowance, headers))(scope, receive, send)
+            await error_response(request, _refusal(admission, allowance, headers))(scope, receive, send)
             return
         kept = time.monotonic()
 
@@ -338,6 +338,6 @@ def _too_large(limit: int) -> LimitError:
 
 
 async def _refuse(error: Exception, scope: Scope, receive: Receive, send: Send) -> None:
-    response = answer(Request(scope), error)
+    response = error_response(Request(scope), error)
     response.headers["Connection"] = "close"
     await response(scope, receive, send)

@@ -19,7 +19,7 @@ from starlette.routing import Match
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from graspd.api.metrics import Metrics
-from graspd.api.problems import ApiError, answer
+from graspd.api.problems import ApiError, error_response
 from graspd.service.model.errors import GraspdError
 from graspd.service.telemetry import bind
 
@@ -206,7 +206,7 @@ class SameOrigin(HttpMiddleware):
 
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
         error = self._refusal(scope)
-        await (answer(Request(scope), error) if error else self.app)(scope, receive, send)
+        await (error_response(Request(scope), error) if error else self.app)(scope, receive, send)
 
     def _refusal(self, scope: Scope) -> ApiError | None:
         headers = Headers(scope=scope)

@@ -46,10 +46,11 @@ def _mesh(name: str) -> str:
     return f"DATA/objects/{name}/clean.stl"
 
 
-def _on_its_way(hand: str, obj: str, scene: str) -> tuple[str, str]:
+def _trajectory_pictures(hand: str, obj: str, scene: str) -> tuple[str, str]:
+    picture = f"OUT/images/scenes/{Path(scene).stem}.png"
     return (
-        f"graspd synth --hand {hand} --object {obj} --scene {scene} --scenes 2 -n 8 -o WORK/way.h5",
-        f"graspd pictures WORK/way.h5 --way -n 2 --size 240 --palette -o OUT/images/scenes/{Path(scene).stem}.png",
+        f"graspd synth --hand {hand} --object {obj} --scene {scene} --scenes 2 -n 8 -o WORK/trajectory.h5",
+        f"graspd pictures WORK/trajectory.h5 --trajectory -n 2 --size 240 --palette -o {picture}",
     )
 
 
@@ -648,17 +649,17 @@ STUDIES: Final = (
         "pictures of scenes, approaches and neighbours",
         ("images/scenes/*",),
         (
-            *_on_its_way("shadow", "bottle", "table"),
-            *_on_its_way("allegro", "mug", "bin"),
-            *_on_its_way("barrett", "mug", "shelf"),
-            *_on_its_way("allegro", "block", "examples/scenes/beside_a_box.yaml"),
+            *_trajectory_pictures("shadow", "bottle", "table"),
+            *_trajectory_pictures("allegro", "mug", "bin"),
+            *_trajectory_pictures("barrett", "mug", "shelf"),
+            *_trajectory_pictures("allegro", "block", "examples/scenes/beside_a_box.yaml"),
             "python -m benchmarks.scene_pictures --object mug --object bottle --object block "
             f"--object mustard={_mesh('006_mustard_bottle')} --object soup_can={_mesh('005_tomato_soup_can')} "
             f"--object drill={_mesh('035_power_drill')} --out OUT/images/scenes",
         ),
         (
-            "graspd synth --hand barrett --object block --scene table --scenes 1 -n 1 -o WORK/way.h5",
-            "graspd pictures WORK/way.h5 --way -n 1 --size 120 --palette -o OUT/images/scenes/table.png",
+            "graspd synth --hand barrett --object block --scene table --scenes 1 -n 1 -o WORK/trajectory.h5",
+            "graspd pictures WORK/trajectory.h5 --trajectory -n 1 --size 120 --palette -o OUT/images/scenes/table.png",
         ),
         ALL,
     ),

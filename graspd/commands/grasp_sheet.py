@@ -40,10 +40,14 @@ from graspd.worker.rendering.trajectory_pictures import (
     trajectory_pictures,
 )
 
-Kind = Literal["one side", "three sides", "way"]
+Kind = Literal["one side", "three sides", "trajectory"]
 #: Edge of a grasp's picture [px], and rays per pixel. Path tracing time grows with both: three small pictures take half
 #: as long as one large picture.
-LOOKS: Final[dict[Kind, tuple[int, int]]] = {"one side": (300, SAMPLES), "three sides": (160, 8), "way": (300, SAMPLES)}
+LOOKS: Final[dict[Kind, tuple[int, int]]] = {
+    "one side": (300, SAMPLES),
+    "three sides": (160, 8),
+    "trajectory": (300, SAMPLES),
+}
 
 
 @dataclass(frozen=True)
@@ -73,7 +77,7 @@ class GraspSheet:
         title = f"{said.get('hand', self.hand.name)} on {said.get('object', self.obj.name)}"
         title += f", {self.scene}" if self.scene else ""
         captions = figures(self.shard.arrays, self.rows)
-        if self.kind == "way":
+        if self.kind == "trajectory":
             names, drawn = self._strip_pictures()
             below = [[f"{k + 1}   " + ",  ".join(" ".join(pair) for pair in one)] for k, one in enumerate(captions)]
             cells = [[Image.fromarray(picture) for picture in strip] for strip in drawn]
@@ -85,17 +89,17 @@ class GraspSheet:
 
     def _strip_pictures(self) -> tuple[tuple[str, ...], NDArray[np.uint8]]:
         """Return the names of the postures, and their pictures (N, F, H, W, 3)."""
-        ways = [trajectory_of(self.shard, int(row)) for row in self.rows]
-        names = STRIP if any(point.name == "lift" for point in ways[0]) else FREE_STRIP
-        drawn = self._render([[_waypoint(way, name) for name in names] for way in ways], 1)
+        trajectories = [trajectory_of(self.shard, int(row)) for row in self.rows]
+        names = STRIP if any(point.name == "lift" for point in trajectories[0]) else FREE_STRIP
+        drawn = self._render([[_waypoint(trajectory, name) for name in names] for trajectory in trajectories], 1)
         return names, drawn[:, 0]
 
     def _grasp_pictures(self) -> NDArray[np.uint8]:
         """Return pictures at the grasp (N, A, H, W, 3)."""
         sides = 3 if self.kind == "three sides" else 1
         if self.scene:
-            ways = [trajectory_of(self.shard, int(row)) for row in self.rows]
-            return self._render([[_waypoint(way, "grasp")] for way in ways], sides)[:, :, 0]
+            trajectories = [trajectory_of(self.shard, int(row)) for row in self.rows]
+            return self._render([[_waypoint(trajectory, "grasp")] for trajectory in trajectories], sides)[:, :, 0]
         shown, samples = Posture.from_columns(self.shard.arrays).take(self.rows), LOOKS[self.kind][1]
         at = (shown.hand_pose, shown.joint_positions, self.size, THREE_SIDES[:sides])
         return grasp_pictures(self.hand, self.obj, *at, run=self.run, samples=samples)
@@ -121,8 +125,8 @@ def _scene_of(shard: Shard) -> SceneSpec | None:
     return None if spec is None or spec.kind == "free" or "grasp/scene_index" not in shard.arrays else spec
 
 
-def _waypoint(way: list[Waypoint], name: str) -> Waypoint:
-    return next(point for point in way if point.name == name)
+def _waypoint(trajectory: list[Waypoint], name: str) -> Waypoint:
+    return next(point for point in trajectory if point.name == name)
 
 
 #: Width of the animation [px], and its height as a share of the width.
@@ -157,9 +161,9 @@ class GraspAnimation:
         for row in self.rows:
             found = self._execute(row)
             limits, names = hand_limits(found.hand), found.hand.joint_names
-            way = time_motions(straight_paths(found, 0), names, limits.velocity, speed=SPEED)
-            pictures.append(self._render(row, waypoints(found, way)))
-            shown = [STEP_S, *np.diff(way.time).tolist()]
+            trajectory = time_motions(straight_paths(found, 0), names, limits.velocity, speed=SPEED)
+            pictures.append(self._render(row, waypoints(found, trajectory)))
+            shown = [STEP_S, *np.diff(trajectory.time).tolist()]
             shown[0] += BEFORE_S
             shown[-1] += AFTER_S
             seconds += shown
@@ -172,20 +176,22 @@ class GraspAnimation:
         tool = tool_frame(None, self.hand.root_link, {})
         return executions(self.hand, self.obj, grasps, rows=one, placed=placed, tool=tool, quality={})
 
-    def _render(self, row: np.intp, way: Sequence[Waypoint]) -> NDArray[np.uint8]:
+    def _render(self, row: np.intp, trajectory: Sequence[Waypoint]) -> NDArray[np.uint8]:
         width = self.width or WIDTH
         around = surroundings_of(self.shard, np.array([row]))
         size = (width, round(HIGH * width))
         (sides,) = trajectory_pictures(
-            self.hand, self.obj, [way], around, size, whole=True, run=self.run, samples=FILM_SAMPLES
+            self.hand, self.obj, [trajectory], around, size, whole=True, run=self.run, samples=FILM_SAMPLES
         )
         return np.asarray(sides[0])
 
 
-def waypoints(found: Executions, way: RobotTrajectory) -> list[Waypoint]:
+def waypoints(found: Executions, trajectory: RobotTrajectory) -> list[Waypoint]:
     """Return the points of the first grasp's trajectory, in the frame of the object at rest."""
-    poses = compose(invert(found.object_pose[0]), way.hand_pose)
-    held = way.phase.index("lift")
+    poses = compose(invert(found.object_pose[0]), trajectory.hand_pose)
+    held = trajectory.phase.index("lift")
     carried = np.where(np.arange(len(poses))[:, None] < held, 0.0, poses[:, :3] - poses[held - 1, :3])
-    closed = way.phase.index("squeeze") - 1
-    return [Waypoint("grasp" if k == closed else "", pose, way.joints[k], carried[k]) for k, pose in enumerate(poses)]
+    closed = trajectory.phase.index("squeeze") - 1
+    return [
+        Waypoint("grasp" if k == closed else "", pose, trajectory.joints[k], carried[k]) for k, pose in enumerate(poses)
+    ]

@@ -132,12 +132,16 @@ def pictures(
     count: Annotated[
         int | None,
         typer.Option(
-            "--count", "-n", min=1, max=400, help="Number of best grasps; default: 12, with --way 4, with --animate 1."
+            "--count",
+            "-n",
+            min=1,
+            max=400,
+            help="Number of best grasps; default: 12, with --trajectory 4, with --animate 1.",
         ),
     ] = None,
     three: Annotated[bool, typer.Option("--three-sides", help="Draw each grasp from three sides.")] = False,
-    way: Annotated[
-        bool, typer.Option("--way", help="Draw the trajectory of each grasp: standoff, pregrasp, grasp, lift.")
+    trajectory: Annotated[
+        bool, typer.Option("--trajectory", help="Draw the trajectory of each grasp: standoff, pregrasp, grasp, lift.")
     ] = False,
     animate: Annotated[
         bool, typer.Option("--animate", help="Animate approach, closing and lift: .gif, .webp or .png.")
@@ -161,8 +165,8 @@ def pictures(
     json: JsonFlag = False,
 ) -> None:
     """Draw the best valid grasps by epsilon with their metrics on one sheet, in their scenes if any."""
-    if way + three + animate > 1:
-        raise InputError("--way, --three-sides and --animate exclude one another")
+    if trajectory + three + animate > 1:
+        raise InputError("--trajectory, --three-sides and --animate exclude one another")
     if animate:
         animation_kind(output.suffix)
     base = read_shard(grasps, kind="base")
@@ -170,14 +174,16 @@ def pictures(
     if row:
         rows = _named_rows(base, row, chosen, word)
     else:
-        rows = best(base.arrays, count or (1 if animate else 4 if way else 12), chosen)
+        rows = best(base.arrays, count or (1 if animate else 4 if trajectory else 12), chosen)
     among = int(chosen.sum())
     models = (hand_of_shard(base, hand), object_of_shard(base, object), rows)
     run = ExecutionContext(Device(device).resolve())
     if animate:
         page = GraspAnimation(base, *models, run, size).file(output.suffix)
     else:
-        sheet = GraspSheet(base, *models, "way" if way else "three sides" if three else "one side", run, size)
+        sheet = GraspSheet(
+            base, *models, "trajectory" if trajectory else "three sides" if three else "one side", run, size
+        )
         page = sheet.png(subtitle=f"{len(rows)} of {among} {word}{'' if row else ', by epsilon at 5 mm'}")
     write_output(output, with_palette(page) if palette and not animate else page)
     told = {"file": str(output), "grasps": len(rows), "of": among, "kind": word, "rows": rows.tolist()}

@@ -16,7 +16,7 @@ from graspd.service.model.errors import InputError
 from graspd.service.pipeline.datasets.export import path_of
 from graspd.service.readers import ShardFile, Shards
 from graspd.service.store.shards import open_shard
-from graspd.studies.cards.contents import Contents, ShardContents, pieces
+from graspd.studies.cards.contents import Contents, ShardContents, read_shards
 from graspd.studies.cards.numbers import numbers
 from graspd.studies.cards.page import render_card
 from graspd.studies.cards.plots import draw
@@ -52,7 +52,7 @@ def write_card(
         raise InputError(f"the folder {folder} cannot be made: {error.strerror}") from None
 
     def counted() -> Iterator[ShardContents]:
-        for number, piece in enumerate(pieces(contents), start=1):
+        for number, piece in enumerate(read_shards(contents), start=1):
             yield piece
             progress(number, len(contents.shards))
 

@@ -224,16 +224,16 @@ class ShardContents:
     revision: int | None = None
 
 
-def pieces(contents: Contents) -> Iterator[ShardContents]:
+def read_shards(contents: Contents) -> Iterator[ShardContents]:
     """Yield every shard in the order of `Shards`; prefetch a few of the next ones."""
     sizes = {shard.id: shard.size_bytes for shard in contents.snapshot.shards} if contents.snapshot else {}
     with ThreadPoolExecutor(_THREADS, thread_name_prefix="card") as pool:
         files = iter(contents.shards)
         while some := list(islice(files, _AT_ONCE)):
-            yield from pool.map(lambda file: _piece(contents, file, sizes.get(file.id)), some)
+            yield from pool.map(lambda file: _read_shard_file(contents, file, sizes.get(file.id)), some)
 
 
-def _piece(contents: Contents, file: ShardFile, size: int | None) -> ShardContents:
+def _read_shard_file(contents: Contents, file: ShardFile, size: int | None) -> ShardContents:
     manifest = _manifest(contents, file)
     unopened = None if manifest is None else _unread_shard(file, manifest)
     if unopened is not None and file.kind == "views":

@@ -84,7 +84,7 @@ def test_render_shows_the_supports_and_the_best_grasp(in_bin):
 
 
 def test_pictures_of_grasps_in_scenes_show_walls_and_whole_way(in_bin):
-    for more, columns in ("", 1), ("--way", 4), ("--three-sides --palette", 3):
+    for more, columns in ("", 1), ("--trajectory", 4), ("--three-sides --palette", 3):
         output = in_bin.with_name("bin.png")
         graspd(f"pictures -n 1 {PICTURES} {more} -o", output, in_bin)
         with Image.open(output) as image:
@@ -93,12 +93,12 @@ def test_pictures_of_grasps_in_scenes_show_walls_and_whole_way(in_bin):
 
 def test_pictures_draw_the_best_first_and_each_posture_of_a_way(base):
     output = base.with_name("way.png")
-    for more, columns in ("", 1), ("--way", 3):
+    for more, columns in ("", 1), ("--trajectory", 3):
         assert graspd(f"pictures -n 2 {PICTURES} {more} -o", output, base)["rows"] == [2, 1]
         with Image.open(output) as image:
             # Two rows of three pictures and their margins, where the way is asked for.
             assert image.width > columns * 48 and (not more or image.height > 2 * 48 + 74)
-    refused(f"pictures {PICTURES} --way --three-sides -o", output, base)
+    refused(f"pictures {PICTURES} --trajectory --three-sides -o", output, base)
 
 
 def test_a_film_shows_the_way_of_the_grasp_that_is_named(in_bin):
@@ -113,7 +113,7 @@ def test_a_film_shows_the_way_of_the_grasp_that_is_named(in_bin):
         assert sum(shown) >= 1000 * (BEFORE_S + 5 * SHORTEST_S + AFTER_S)
     for more, said in (
         ("--row 1 --animate -o lift.mp4", "an animation is written as .gif, .webp, .png, not as .mp4"),
-        ("--row 1 --animate --way", "exclude one another"),
+        ("--row 1 --animate --trajectory", "exclude one another"),
         ("--row 3", "has the rows 0 to 2: there is no row 3"),
     ):
         assert said in refused(f"{words} {more}", in_bin)

@@ -92,7 +92,7 @@ def case(folder: Path, *, drawn: bool = True, **options: Any) -> Case:
 
 
 def undrawn(contents: Contents) -> dict[str, Any]:
-    return numbers(contents, tally_of(contents, card_contents.pieces(contents)))
+    return numbers(contents, tally_of(contents, card_contents.read_shards(contents)))
 
 
 @pytest.fixture(scope="module")
