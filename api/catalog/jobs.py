@@ -135,11 +135,12 @@ class Jobs:
         state: State | None = None,
         hand: str | None = None,
         object: str | None = None,
+        prefix: str = "",
         limit: int = 50,
         cursor: str | None = None,
     ) -> Page[Job]:
         page = self._services.index.jobs.page(
-            state=state, hand=hand, object=object, limit=limit, cursor=cursor, scope=project_scope()
+            state=state, hand=hand, object=object, prefix=prefix, limit=limit, cursor=cursor, scope=project_scope()
         )
         return Page[Job](items=[self._job(job, ()) for job in page.items], next=page.next)
 

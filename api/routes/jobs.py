@@ -52,9 +52,10 @@ def list_jobs(
     state: State | None = None,
     hand: Annotated[str | None, Query(max_length=64)] = None,
     object: Annotated[str | None, Query(max_length=64)] = None,
+    prefix: Annotated[str, Query(max_length=32, description="first characters of the ids")] = "",
 ) -> Page[Job]:
     """List jobs, newest first."""
-    page = jobs.page(state=state, hand=hand, object=object, limit=paging.limit, cursor=paging.cursor)
+    page = jobs.page(state=state, hand=hand, object=object, prefix=prefix, limit=paging.limit, cursor=paging.cursor)
     return paging.linked(page)
 
 

@@ -67,8 +67,9 @@ class Client(AbstractContextManager["Client"]):
     def job(self, job_id: str) -> JobDetail:
         return self._document(JobDetail, "GET", path_of("jobs", job_id))
 
-    def jobs(self, *, state: State | None = None, limit: int = 50) -> Page[Job]:
-        return self._document(Page[Job], "GET", "/v1/jobs", params={"state": state, "limit": limit})
+    def jobs(self, *, state: State | None = None, prefix: str = "", limit: int = 50) -> Page[Job]:
+        """Return the newest jobs, at most `limit`, whose ids begin with `prefix`."""
+        return self._document(Page[Job], "GET", "/v1/jobs", params={"state": state, "prefix": prefix, "limit": limit})
 
     def cancel(self, job_id: str) -> JobDetail:
         return self._document(JobDetail, "POST", path_of("jobs", job_id, "cancel"))

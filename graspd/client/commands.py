@@ -271,11 +271,11 @@ def _asset_name(client: Client, kind: AssetKind, value: str) -> str:
 def _full_id(client: Client, prefix: str) -> str:
     if len(prefix) >= 32:
         return prefix
-    return _unique_id([job.id for job in client.jobs(limit=200).items], prefix)
+    return _unique_id([job.id for job in client.jobs(prefix=prefix, limit=2).items], prefix)
 
 
 def _unique_id(ids: Iterable[str], prefix: str) -> str:
     found = {id for id in ids if id.startswith(prefix)}
     if len(found) > 1:
-        raise InputError(f"{len(found)} job ids begin with {prefix!r}; give more characters")
+        raise InputError(f"several job ids begin with {prefix!r}; give more characters")
     return found.pop() if found else prefix

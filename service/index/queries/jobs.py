@@ -31,12 +31,15 @@ class Jobs(IndexPart):
         state: State | None = None,
         hand: str | None = None,
         object: str | None = None,
+        prefix: str = "",
         limit: int = 50,
         cursor: str | None = None,
         scope: ProjectScope = EVERYTHING,
     ) -> Page[JobView]:
+        """Return a page of jobs, the newest first; `prefix` has the first characters of their ids."""
         same = _equality_conditions({jobs.c.state: state, jobs.c.hand: hand, jobs.c.object: object})
         query, key = select(jobs).where(*in_scope(scope, jobs), *same), (jobs.c.created, jobs.c.id)
+        query = query.where(jobs.c.id.startswith(prefix, autoescape=True)) if prefix else query
         with self.database.reading() as connection:
             rows, following = page_rows(connection, query, *key, limit=limit, cursor=cursor)
             return Page(items=_job_views(connection, rows), next=following)

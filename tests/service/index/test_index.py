@@ -85,11 +85,11 @@ def test_a_job_that_found_fewer_grasps_tells_the_outcomes(services: Services) ->
     assert listed.note is not None and not listed.outcomes
 
 
-def test_jobs_are_chosen_by_state_hand_and_object(services: Services) -> None:
+def test_jobs_are_chosen_by_id_state_hand_and_object(services: Services) -> None:
     job, _ = job_actions.submit(services, request())
-    found = services.index.jobs.page(state=State.QUEUED, hand="gripper", object="ball").items
+    found = services.index.jobs.page(state=State.QUEUED, hand="gripper", object="ball", prefix=job.id[:4]).items
     assert [one.id for one in found] == [job.id]
-    for other in ({"state": State.FAILED}, {"hand": "other"}, {"object": "other"}):
+    for other in ({"state": State.FAILED}, {"hand": "other"}, {"object": "other"}, {"prefix": "%"}):
         assert services.index.jobs.page(**other).items == []
 
 
