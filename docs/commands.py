@@ -234,11 +234,13 @@ def say(text: str) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("pages", nargs="*", help="names of pages; default: all")
-    given = parser.parse_args(arguments).pages
+    parser.add_argument("pages", nargs="*", help="names or paths of pages; default: all")
+    given = {Path(name).name for name in parser.parse_args(arguments).pages}
+    if unknown := given - {page.name for page in PAGES}:
+        parser.error(f"no page of the docs is called {', '.join(sorted(unknown))}")
     failed = []
     for page in PAGES:
-        if page.name in (given or [page.name]) and not all(line.reason for line in lines_of(page)):
+        if (not given or page.name in given) and not all(line.reason for line in lines_of(page)):
             say(page.name)
             failed += run_page(page)
     say("\n".join(failed) or "all that was run ended well")

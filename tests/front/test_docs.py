@@ -99,6 +99,8 @@ def test_a_documented_command_that_fails_turns_the_run_red(tmp_path: Path, monke
     assert re.findall(r"^page\.md: (.*)", capsys.readouterr().out, re.MULTILINE) == [f"{failing} a", "graspd --version"]
     page.write_text(f"```sh\n{good}```\n")
     assert main([]) == 0
+    with pytest.raises(SystemExit):
+        main(["no_such_page.md"])
 
 
 def test_the_lines_that_read_the_first_grasps_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
