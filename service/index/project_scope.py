@@ -88,6 +88,4 @@ def decode(cursor: str, *kinds: type | tuple[type, ...]) -> tuple[Any, ...]:
 
 
 def page_size(limit: int) -> int:
-    if limit < 1:
-        raise InputError("the limit must be at least 1")
     return min(limit, MAX_LIMIT)

@@ -116,11 +116,12 @@ def test_what_nobody_validated_has_no_label(on_tables: Path, tmp_path: Path) -> 
         ({"transforms": [[1, 2], [3]]}, "no record"),
         ({"object_in_gripper": [True]}, "shape"),
         ({"squeeze_pose": [[0, 0, 0, 1, 0, 0, 0]]}, "numbers of pregrasps"),
+        *[({"scale": scale}, "has an object of scale") for scale in (0, -1, "inf", "nan")],
     ],
 )
 def test_a_record_that_is_wrong_is_told(data: Path, tmp_path: Path, change: dict, said: str) -> None:
     record = record_of(data, "block")
-    record["grasps"] |= change
+    record["object" if "scale" in change else "grasps"] |= change
     with pytest.raises(InputError, match=said):
         read_back(record, tmp_path)
 

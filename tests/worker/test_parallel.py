@@ -241,18 +241,18 @@ def test_waves_of_batches_in_scenes_are_the_same(pair, own_scenes, apart: bool) 
     assert set(np.concatenate([one.grasps.scene for one in waves])) <= {0, 1}, "numbered as the batch has them"
 
 
-@pytest.mark.parametrize("refused", [0, 1])
-def test_a_batch_without_a_place_has_no_grasps_but_for_the_first(pair, own_scenes, monkeypatch, refused) -> None:
+@pytest.mark.parametrize(("refused", "first"), [({0}, 0), ({1}, 0), ({0, 1}, 4)])
+def test_a_batch_without_a_place_has_no_grasps_but_for_the_first(pair, own_scenes, monkeypatch, refused, first) -> None:
     whole = batched_generation.synthesize_batches
 
     def narrow(hand, obj, asked: Sequence[BatchRequest], **named):
         made = whole(hand, obj, asked, **named)
-        return [NoStartFound("no way in") if k == refused else grasps for k, grasps in enumerate(made)]
+        return [NoStartFound("no way in") if k in refused else grasps for k, grasps in enumerate(made)]
 
     monkeypatch.setattr(batched_generation, "synthesize_batches", narrow)
     wish = ASKED.model_copy(update={"validation": "none", "want": "candidates"})
-    asked = {"sizes": [2, 2], "scenes": own_scenes[:2], "join": 2, "empty_on": (NoStartFound,)}
-    with nullcontext() if refused else pytest.raises(NoStartFound, match="no way in"):
+    asked = {"sizes": [2, 2], "scenes": own_scenes[:2], "join": 2, "empty_on": (NoStartFound,), "first": first}
+    with nullcontext() if refused == {1} else pytest.raises(NoStartFound, match="no way in"):
         made = validated_batches(*pair, wish, **asked, run=ExecutionContext(threads=2))
         assert [len(one.grasps) for one in made] == [2, 0]
 

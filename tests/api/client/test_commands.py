@@ -263,6 +263,8 @@ def test_a_dataset_is_created_listed_cancelled_and_retried(graspd: Shell, servic
     graspd.json("datasets", "cancel", "kitchen")
     until(service, "kitchen", State.CANCELLED)
     assert graspd.json("datasets", "status", "kitchen")["state"] == "cancelled"
+    waited = graspd(*CREATE, "--yes", "--wait")
+    assert waited.returncode == 1 and "`graspd datasets retry kitchen` runs it again" in waited.stderr
     graspd.json("datasets", "retry", "kitchen")
     until(service, "kitchen", State.QUEUED)
 

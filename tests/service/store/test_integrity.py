@@ -17,7 +17,7 @@ from graspd.service.model.states import Stage
 from graspd.service.store import validity
 from graspd.service.store.integrity import CheckedObjects, read_checked
 from graspd.service.store.manifests import ShardManifest, load_shard
-from graspd.service.store.shards import read_shard
+from graspd.service.store.shards import read_shard, write_shard
 from graspd.service.store.store import Store, open_store
 from tests.damage import cut, flip, flipped, flipped_values, overwrite, remove
 from tests.fakes import make_shard, message_for
@@ -135,6 +135,12 @@ def test_a_verdict_counts_only_where_there_is_one(said: Any, is_valid: bool, is_
     columns = {f"quality/{name}": np.array([value]) for name, value in named if value is not None}
     assert validity.selection(columns).tolist() == [is_valid]
     assert validity.selection(columns, unvalidated=True).tolist() == [is_unvalidated]
+
+
+def test_a_column_of_other_axes_is_not_written(store: Store, shard: ShardManifest) -> None:
+    found = read_shard(store.get(shard.key))
+    with pytest.raises(InputError, match=r"grasp/hand_pose has 3 axes; the schema says \(N, 7\)"):
+        write_shard("base", {**found.arrays, "grasp/hand_pose": found["grasp/hand_pose"][None]}, found.attributes)
 
 
 def external_link(file: h5py.File, secret: Path) -> None:

@@ -44,6 +44,7 @@ _LEG = (
 )
 EMPTY = '<limit lower="0" upper="0"/>'
 _ARM = link("world", "") + joint("arm", "world", "base")
+_DEBT = '<inertial><mass value="-0.1"/></inertial>'
 _FREE = '<link name="ball"/><joint name="loose" type="floating"><parent link="base"/><child link="ball"/></joint>'
 SOURCE = builtin_files(AssetKind.HAND, "barrett")
 WORDS = [b"nan", b"-1e308", b"inf", b"0", b"", b"<", b'"', b"&x;", b"../../", b"palm", b"finger_1_medial", b"\xff\xfe"]
@@ -230,6 +231,8 @@ def coupled(multiplier: float) -> dict:
         (jaws(EMPTY, EMPTY), {}, "joint 'jl' has limits 0 .. 0: the exporter left them empty"),
         (jaws(EMPTY, EMPTY, _ARM), {}, "limits of jl leave one value; fill"),
         (jaws(LIMIT, LIMIT, _FREE), {}, "joint 'loose': type 'floating' cannot be used"),
+        (jaws().replace(b'"1 0 0"', b'"1 0"'), {}, "axis of joint 'jl': xyz='1 0' must be three finite numbers"),
+        (jaws(LIMIT, LIMIT, link("tip", _DEBT)), {}, "mass of link 'tip' is negative; give it in kilograms"),
     ],
 )
 def test_what_is_wrong_with_a_urdf_is_told_by_name(data: bytes, options: dict, told: str) -> None:

@@ -55,6 +55,11 @@ def test_a_surface_is_tested_where_the_fidelity_says() -> None:
     assert found == [3 * QUICK.object_points, QUICK.object_points, QUICK.object_points, 13_000]
 
 
+def test_a_scene_takes_no_more_starts_than_a_fidelity_may() -> None:
+    most = schedule.in_scene(QUICK.model_copy(update={"starts": 60, "finalists": 40}))
+    assert (most.starts, most.finalists) == (64, 64)
+
+
 def test_recipes_without_pull_or_fine_phase_and_descent_run() -> None:
     pulls = [schedule.loss_options(FIDELITIES[name]).pull for name in ("standard", "paper", "control")]
     assert pulls == [schedule.PULL, 0, 0] and schedule.PULL > 0

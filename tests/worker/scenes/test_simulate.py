@@ -156,6 +156,8 @@ def test_a_flat_object_is_refused_by_name():
     thin = dataclasses.replace(bracket(), name="sheet", digest="f" * 32, volume=1e-9, **flat)
     with pytest.raises(MeshError, match="sheet"):
         drop(thin, count=1, seed=0)
+    with pytest.raises(MeshError, match="hull of 'sheet' is flat"):
+        resting_faces(dataclasses.replace(thin, hull_vertices=corners * UP[::-1]))
 
 
 def rolling_can() -> ObjectModel:

@@ -110,7 +110,7 @@ def _primitive(document: dict[str, Any], binary: bytes, primitive: dict[str, Any
         order = np.arange(len(points), dtype=np.int64)
     match primitive.get("mode", _TRIANGLES):
         case 5:
-            turned = np.arange(max(len(order) - 2, 0)) % 2
+            turned = np.arange(len(order) - 2) % 2
             at = np.arange(len(turned))
             order = np.stack([order[at], order[at + 1 + turned], order[at + 2 - turned]], axis=1).reshape(-1)
         case 6:
