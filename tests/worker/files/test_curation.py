@@ -96,13 +96,8 @@ def test_faces_are_told_by_what_lies_below() -> None:
         with pytest.raises(InputError, match="type, direction, face"):
             Balance(by)
     tilted = [np.sin(0.1), 0.0, -np.cos(0.1)]
-    assert face_numbers(np.array([[0, 0, -1.0], [0, 1.0, 0], tilted, [0.0, 0, 0], [0, 0, 1.0]])).tolist() == [
-        0,
-        1,
-        0,
-        -1,
-        2,
-    ]
+    down = np.array([[0, 0, -1.0], [0, 1.0, 0], tilted, [0.0, 0, 0], [0, 0, 1.0]])
+    assert face_numbers(down).tolist() == [0, 1, 0, -1, 2]
 
 
 def base_of(valid: list[int], feasible: list[int], success: list[int] | None) -> Shard:
@@ -115,16 +110,13 @@ UNVALIDATED = base_of([0, 0], [1, 0], None)
 
 
 def test_valid_grasps_are_taken_unless_others_are_asked_for() -> None:
-    assert (
-        select_grasps(VALIDATED)[0].tolist() == [True, False, False] and select_grasps(VALIDATED, every=True)[0].all()
-    )
-    assert select_grasps(UNVALIDATED, unvalidated=True)[0].tolist() == [True, False]
-    words = [
-        select_grasps(VALIDATED)[1],
-        select_grasps(UNVALIDATED, unvalidated=True)[1],
-        select_grasps(VALIDATED, every=True)[1],
-    ]
-    assert words == ["valid grasps", "feasible grasps that are not validated", "grasps of any kind"]
+    for base, wish, mask, words in (
+        (VALIDATED, {}, [True, False, False], "valid grasps"),
+        (VALIDATED, {"every": True}, [True] * 3, "grasps of any kind"),
+        (UNVALIDATED, {"unvalidated": True}, [True, False], "feasible grasps that are not validated"),
+    ):
+        found, name = select_grasps(base, **wish)
+        assert (found.tolist(), name) == (mask, words)
 
 
 @pytest.mark.parametrize(
