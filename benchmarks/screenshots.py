@@ -137,7 +137,11 @@ def photograph(address: str, places: dict[str, str], folder: Path, only: set[str
                     page.evaluate(f"scrollTo(0, {share / 10} * document.body.scrollHeight)")
                     page.wait_for_timeout(700)
                 page.evaluate("scrollTo(0, 0)")
+            if whole:  # bars that stick to the window's edge would cover what lies there
+                page.evaluate("document.querySelectorAll('.act, .reading').forEach(b => b.style.position = 'static')")
             picture = Image.open(io.BytesIO(page.screenshot(full_page=whole))).convert("RGB")
+            # 256 colours are a fifth of the bytes; an octree keeps the few pixels of a legend.
+            picture = picture.quantize(256, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
             picture.save(folder / f"dashboard-{name}.png", optimize=True)
             context.close()
         browser.close()

@@ -38,6 +38,7 @@ COLUMNS = ("contact_area_cm2", "epsilon", "wrench_volume", "intersection_volume_
 class Results:
     success: list[NDArray[np.int8]] = field(default_factory=list)
     hard: list[NDArray[np.int8]] = field(default_factory=list)
+    dexgraspbench: list[NDArray[np.int8]] = field(default_factory=list)
     depth: list[NDArray[np.generic]] = field(default_factory=list)
     best: list[list[float]] = field(default_factory=list)
     seconds: float = 0.0
@@ -48,6 +49,7 @@ class Results:
         self.seconds += found.seconds
         self.success.append(validate(hand, obj, found, pieces=pieces).success)
         self.hard.append(validate(hand, obj, found, hard=True, pieces=pieces).success)
+        self.dexgraspbench.append(validate(hand, obj, found, level="dexgraspbench", pieces=pieces).success)
         table = measure(hand, obj, found, friction=FRICTION, thresholds_m=[THRESHOLD_M])
         self.depth.append(table["quality/penetration_depth_mm"])
         order = np.argsort(table["quality/epsilon"][:, 0])[::-1][:BEST]
@@ -56,7 +58,8 @@ class Results:
 
     def summary(self) -> str:
         held = np.array(self.success)
-        cells = [f"{held.mean():.3f}", f"{np.array(self.hard).mean():.3f}", f"{held.any(axis=1).mean():.2f}"]
+        cells = [f"{held.mean():.3f}", f"{np.array(self.hard).mean():.3f}"]
+        cells += [f"{np.array(self.dexgraspbench).mean():.3f}", f"{held.any(axis=1).mean():.2f}"]
         cells += [f"{np.median(np.concatenate(self.depth)):.2f}"]
         cells += [f"{value:.2f}" for value in np.mean(self.best, axis=0)]
         cells += [f"{held.size / self.seconds:.1f}", f"{held.sum() / self.seconds:.1f}"]
@@ -74,6 +77,7 @@ def main(data: Path, count: int, names: list[str]) -> None:
     titles = (
         "success",
         "hard",
+        "DexGraspBench",
         "OSR",
         "median penetration mm",
         "CA cm²",
