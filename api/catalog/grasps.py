@@ -6,7 +6,6 @@ Details: postures, metrics at every threshold, verdict for each push, scene, and
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from itertools import zip_longest
@@ -31,7 +30,7 @@ from graspd.service.model.records import MOST_TAGGED, Grasp
 from graspd.service.model.scene_spec import supports_in
 from graspd.service.pipeline.backends import Services
 from graspd.service.readers.trajectories import scene_spec_of, slider_axis, trajectory_of
-from graspd.service.store.columns import SCHEMAS
+from graspd.service.store.columns import LIFT_OUTCOMES, PUSH_OUTCOMES
 from graspd.service.store.integrity import read_checked
 from graspd.service.store.shards import Shard, read_shard
 
@@ -152,11 +151,6 @@ def _bounds(query: models.GraspQuery, end: Literal["min", "max"]) -> dict[Metric
 _POSTURES: Final = ("pregrasp", "grasp", "squeeze")
 _OUTCOME: Final = "quality/verdict_outcome"
 _LIFT: Final = "quality/lift_outcome"
-#: Meanings of the codes in both columns, from the schema's descriptions.
-_OUTCOMES, _LIFT_OUTCOMES = (
-    {int(code): words for code, words in re.findall(r"(\d) ([a-z ]+)", SCHEMAS["base"][column].description)}
-    for column in (_OUTCOME, _LIFT)
-)
 _DIRECTIONS: Final = ("+x", "−x", "+y", "−y", "+z", "−z")
 
 
@@ -178,7 +172,7 @@ def _pushes(file: Shard, row: int) -> list[models.Push]:
     if outcomes is None or _verdict(file, "quality/success", row) is None:
         return []
     return [
-        models.Push(direction=direction, outcome=_OUTCOMES.get(code, "unknown"))
+        models.Push(direction=direction, outcome=PUSH_OUTCOMES.get(code, "unknown"))
         for direction, code in zip(_DIRECTIONS, outcomes[row].tolist(), strict=False)
     ]
 
@@ -233,7 +227,7 @@ def _scene(file: Shard, row: int) -> models.GraspScene | None:
         supports=list(supports_in(spec)),
         neighbours=_neighbours(file, number),
         clearance_m=_value(file, "quality/clearance_m", row),
-        lift=_LIFT_OUTCOMES.get(tried, "unknown") if tried else None,
+        lift=LIFT_OUTCOMES.get(tried, "unknown") if tried else None,
         lift_hard=_verdict(file, "quality/lift_hard", row),
     )
 

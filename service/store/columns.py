@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 from graspd.service.model.errors import InputError
 from graspd.service.model.metrics import AXIS_MEANINGS, GRASP_METRICS
@@ -51,8 +51,18 @@ def _flag(description: str, dtype: str = "i1") -> Column:
     return _absent("N", dtype, "bool", "none", description)
 
 
-def _code(description: str, shape: str = "N") -> Column:
+def _code(description: str, shape: str = "N", *, outcomes: Mapping[Any, str] | None = None) -> Column:
+    if outcomes:
+        description += ", ".join(f"{int(code)} {meaning}" for code, meaning in outcomes.items())
     return _absent(shape, "u1", "enum", "none", description)
+
+
+#: Meanings of the codes of a push and of a lift.
+PUSH_OUTCOMES: Final = dict(
+    enumerate(("not tested", "held", "penetration", "lost while closing", "displaced", "rotated", "diverged"))
+)
+_LIFT_OUTCOMES = ("not tested", "lifted", "penetration", "contact on the approach", "lost while closing", "not lifted")
+LIFT_OUTCOMES: Final = dict(enumerate((*_LIFT_OUTCOMES, "rotated", "diverged", "neighbour moved")))
 
 
 def _wrist(rows: str) -> Column:
@@ -91,11 +101,7 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
         "quality/success": _flag(
             "verdict of the validator at the level of attribute verdict_level: 1 held, 0 dropped, -1 not tested"
         ),
-        "quality/verdict_outcome": _code(
-            "outcome per push +x -x +y -y +z -z: 0 not tested, 1 held, 2 penetration, 3 lost while "
-            "closing, 4 displaced, 5 rotated, 6 diverged",
-            "N D",
-        ),
+        "quality/verdict_outcome": _code("outcome per push +x -x +y -y +z -z: ", "N D", outcomes=PUSH_OUTCOMES),
         "quality/verdict_margin": _absent(
             "N",
             "f8",
@@ -112,8 +118,7 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
         "quality/published": _flag("imported grasps: published verdict: 1 held, 0 dropped, -1 none"),
         **_measured(optional=True),
         "quality/robust_weakest": _code(
-            "perturbed parameter of the first model in which the grasp does not hold: 0 none, "
-            + ", ".join(f"{axis:d} {words}" for axis, words in AXIS_MEANINGS.items())
+            "perturbed parameter of the first model in which the grasp does not hold: 0 none, ", outcomes=AXIS_MEANINGS
         ),
         # Grasps planned in scenes also have the scene, the approach and the lift.
         "scene/object_pose": _absent("S 7", "f8", "m, 1", "scene", "object frame at rest in each scene; z is up"),
@@ -134,10 +139,7 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
         ),
         "grasp/lift": _absent("N 7", "f8", "m, 1", "object", f"squeeze posture raised by 10 cm: {_POSE}"),
         "grasp/wrist_positions": _wrist("N"),
-        "quality/lift_outcome": _code(
-            "lift test: 0 not tested, 1 lifted, 2 penetration, 3 contact on the approach, 4 lost while "
-            "closing, 5 not lifted, 6 rotated, 7 diverged, 8 neighbour moved"
-        ),
+        "quality/lift_outcome": _code("lift test: ", outcomes=LIFT_OUTCOMES),
         "quality/lift_hard": _flag("lift test at half the friction: 1 lifted, 0 not, -1 not tested"),
         "quality/pushes": _flag(
             "only in files of graspd 0.2: six pushes without the scene: 1 held, 0 dropped, -1 not tested"
