@@ -41,7 +41,7 @@ from graspd.worker.stages.context import StopReason
 log = logging.getLogger(__name__)
 _PATIENCE: Final = 60  # reconnection attempts of a worker, for about a minute: longer than a restart of Redis
 _WORKER_TTL_S: Final = 20  # time that RQ waits for a task before its maintenance [s]: its `worker_ttl` less 15
-#: RQ's maintenance is off: see docs/adr/0003-silence-is-judged-by-one-clock.md.
+#: RQ's maintenance is off: see docs/adr/0003-silence-is-measured-by-one-clock.md.
 _NEVER_S: Final = 10**9
 _REFUSED_PAUSE_S: Final = 0.5
 _LONGEST_RETRY_S: Final = 2.0  # longest wait between two attempts to reach Redis [s]
