@@ -169,6 +169,41 @@ def test_accessors_beyond_their_buffer_and_cycles_are_refused() -> None:
         read_mesh("m.glb", pack_glb([document], b""))
 
 
+@pytest.mark.parametrize(
+    ("name", "old", "new", "told"),
+    [
+        ("ascii.ply", b"format ascii 1.0\n", b"", "no format"),
+        ("ascii.ply", b"vertex_indices", b"corners", "no list vertex_indices"),
+        ("ascii.ply", b"element face 12", b"element face 13", "13 rows of face are stated, 12 are there"),
+        ("little.ply", b"element face 12", b"element face 13", "states more data"),
+        ("binary.stl", stl_bytes(*box())[80:], b"", "too few for an STL"),
+        ("binary.stl", struct.pack("<I", 12), struct.pack("<I", 13), "states 13 faces, the file has 12"),
+        ("binary.stl", stl_bytes(*box()), b"no vertices\n" * 9, "neither binary STL nor text with facets"),
+        ("ascii.stl", b"endloop\nendfacet\nendsolid", b"vertex 0 0 0\nendsolid", "fewer than three vertices"),
+        ("m.off", off(box())[3:], b"", "counts of vertices and faces are missing"),
+        ("m.off", b"8 12 0", b"8 13 0", "not all of the stated 8 vertices and 13 faces"),
+        ("m.off", b"\n3 ", b"\n4 ", "states 4 corners but has 3"),
+        ("m.obj", b"\nvt 0 0", b"\nv 0 0", "vertex 9 has fewer than three"),
+        ("m.obj", b"f 6/", b"f 0/", "count from 1"),
+        ("m.obj", b"f 6/", b"f " + b"6/ " * 2**19 + b"\\\n6/", "continued line"),
+        ("m.off", b"\n-0.03 ", b"\n-3e19 ", "coordinate exceeds"),
+        ("m.glb", struct.pack("<4sI", b"glTF", 2), struct.pack("<4sI", b"glTF", 1), "glTF of version 2"),
+        ("m.glb", b"JSON", b"JSOM", "the JSON chunk is not whole"),
+        ("m.glb", b"BIN\0", b"BIM\0", "the binary chunk is not whole"),
+        ("m.glb", b'"count": 36', b'"count": 35', "the last face is not whole"),
+        ("m.glb", b'"SCALAR"', b'"VEC4"  ', "not SCALAR"),
+        ("m.glb", b'"buffer": 0', b'"buffer": 1', "the data lie in another file"),
+        ("m.glb", b'[{"mesh": 0}]', b' {"mesh": 0} ', "nodes is no list"),
+    ],
+)
+def test_a_spoilt_file_is_refused_with_its_reason(name: str, old: bytes, new: bytes, told: str) -> None:
+    assert old in FILES[name]
+    with pytest.raises(MeshError, match=told):
+        read_mesh(name, FILES[name].replace(old, new))
+    with pytest.raises(MeshError, match="empty"):
+        read_mesh(name, b"")
+
+
 def test_more_faces_than_limit_are_refused_before_they_are_read() -> None:
     corners = " ".join(["1 2 3"] * ((MAX_FACES + 100) // 3))
     with pytest.raises(LimitError, match="decimate"):
