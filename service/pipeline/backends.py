@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Self
 
 from pydantic import BaseModel
-from sqlalchemy import Connection
 
 from graspd.service.model.errors import StoreUnavailable
 from graspd.service.settings import Settings
@@ -17,8 +16,12 @@ from graspd.service.store.records import Put, put_record
 from graspd.service.store.store import Store, open_store
 
 if TYPE_CHECKING:
+    from sqlalchemy import Connection
+
     from graspd.service.index.index import Index
     from graspd.service.queue.rq_queue import RqQueue
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -47,9 +50,6 @@ class Services:
     def close(self) -> None:
         self.index.close()
         self.queue.close()
-
-
-log = logging.getLogger(__name__)
 
 
 @contextmanager

@@ -137,8 +137,9 @@ def modules_after(statement: str) -> set[str]:
         (f"import {', '.join(MODULES)}", {*WORK, "torch", "graspd.api"}),
         # A worker says that it lives before the engine and the kernels are imported.
         ("import graspd.commands.worker, graspd.worker.process.main", ENGINE),
+        ("import graspd.service.run.supervisor", {*WORK, "fastapi", "sqlalchemy"}),
     ],
-    ids=["package", "server", "client", "overview", "service", "worker"],
+    ids=["package", "server", "client", "overview", "service", "worker", "supervisor"],
 )
 def test_each_part_imports_no_more_than_it_needs(statement: str, absent: set[str]) -> None:
     assert modules_after(statement).isdisjoint(absent)
