@@ -45,6 +45,11 @@ from graspd.service.store.records import (
 )
 from graspd.service.store.store import Store
 
+log = logging.getLogger(__name__)
+RecordT = TypeVar("RecordT", bound=Record)
+BUDGET_S: Final = 0.5
+_AT_ONCE: Final = 200
+
 
 def delete_asset(
     services: Services, kind: AssetKind, name: str, *, owner: str = "", scope: ProjectScope = EVERYTHING
@@ -240,12 +245,6 @@ def _record_last(keys: Iterable[str], record: str) -> list[str]:
 
 def _put(put: Put, deletion: Deletion) -> None:
     put(names.deletion(deletion.what, deletion.id), deletion)
-
-
-log = logging.getLogger(__name__)
-RecordT = TypeVar("RecordT", bound=Record)
-BUDGET_S: Final = 0.5
-_AT_ONCE: Final = 200
 
 
 class GarbageCollector:

@@ -55,6 +55,22 @@ from graspd.service.store.records import (
 )
 from graspd.service.store.store import Store
 
+log = logging.getLogger(__name__)
+#: Least interval of rounds over a small store [s].
+ROUND_S: Final = 3600.0
+#: Interval of checks of known damage, so that repaired objects soon leave the list [s].
+_AGAIN_S: Final = 60.0
+_KNOWN: Final = 1000
+#: Keys in memory at once; further keys need another listing of the folder.
+_KEYS: Final = 10_000
+#: Least cost of an object, so that a million small objects are not read at once [bytes].
+_LEAST: Final = 16 * 2**10
+#: Most backlog that is read at once after a pause [s].
+_BURST_S: Final = 0.25
+#: Interval of queries whether `graspd admin store verify` pauses the scan [s].
+_PAUSE_S: Final = 5.0
+_OF_ASSET: Final = re.compile(r"assets/(hand|object|network)/([0-9a-f]{32})/(.+)")
+
 #: Key patterns of records, and the model of each.
 _RECORDS: Final[tuple[tuple[str, type[Any]], ...]] = (
     (r"assets/[^/]+/[^/]+/asset\.json", Asset),
@@ -208,22 +224,6 @@ def _manifest(store: Store, key: str, stage: Stage, shard: str, read: Read, unse
     return None
 
 
-log = logging.getLogger(__name__)
-#: Least interval of rounds over a small store [s].
-ROUND_S: Final = 3600.0
-#: Interval of checks of known damage, so that repaired objects soon leave the list [s].
-_AGAIN_S: Final = 60.0
-_KNOWN: Final = 1000
-#: Keys in memory at once; further keys need another listing of the folder.
-_KEYS: Final = 10_000
-#: Least cost of an object, so that a million small objects are not read at once [bytes].
-_LEAST: Final = 16 * 2**10
-#: Most backlog that is read at once after a pause [s].
-_BURST_S: Final = 0.25
-#: Interval of queries whether `graspd admin store verify` pauses the scan [s].
-_PAUSE_S: Final = 5.0
-
-
 class Interrupted(Exception):
     """The process stops, or `graspd admin store verify` reads the store."""
 
@@ -319,9 +319,6 @@ class IntegrityScan:
         self._paid = max(self._paid, now - _BURST_S) + size / self._rate
         if self._stop.wait(max(0.0, self._paid - now)) or not self._may_read():
             raise Interrupted
-
-
-_OF_ASSET: Final = re.compile(r"assets/(hand|object|network)/([0-9a-f]{32})/(.+)")
 
 
 def repair(services: Services, found: Sequence[Damage]) -> tuple[list[Damage], list[Damage]]:

@@ -45,6 +45,13 @@ from graspd.service.queue.port import Event, EventKind
 from graspd.service.store.records import add_job_event, job_events, put_record, read_record, refuse_pending
 from graspd.service.telemetry import bound
 
+log = logging.getLogger(__name__)
+Options = TypeVar("Options", bound=JobOptions)
+#: Interval at which held-back tasks are checked for a capable worker [s].
+HELD_S: Final = 10.0
+#: Allowed depth of a centre of mass in a support [m]: the centre was measured on another mesh.
+_SUNK_M: Final = 1e-3
+
 #: Finished tasks that are used to measure the time of a batch.
 _LOOKED_AT: Final = 64
 #: Workers assumed if none is present: a service may start them once a task waits.
@@ -93,9 +100,6 @@ def span_of(batches: int, by_time: int, workers: int) -> int:
     """
     most = max(1, min(by_time, MOST_BATCHES, -(-batches // max(1, workers))))
     return -(-batches // -(-batches // most))
-
-
-Options = TypeVar("Options", bound=JobOptions)
 
 
 def usable_asset(services: Services, kind: AssetKind, name: str, scope: ProjectScope = EVERYTHING) -> AssetView:
@@ -151,13 +155,6 @@ def with_network(
             f"{other.name} ({other.digest[:12]})"
         )
     return options.model_copy(update={"options": {**options.options, "network": network.digest}})
-
-
-log = logging.getLogger(__name__)
-#: Interval at which held-back tasks are checked for a capable worker [s].
-HELD_S: Final = 10.0
-#: Allowed depth of a centre of mass in a support [m]: the centre was measured on another mesh.
-_SUNK_M: Final = 1e-3
 
 
 def submit(services: Services, request: JobRequest, *, priority: Priority | None = None) -> tuple[JobView, bool]:

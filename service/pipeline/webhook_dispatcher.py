@@ -29,6 +29,15 @@ from graspd.service.model.planning import interleave
 from graspd.service.model.webhooks import SIGNATURE, secret_of, signature
 from graspd.service.pipeline.backends import Services
 
+log = logging.getLogger(__name__)
+#: Most concurrent deliveries, and the share of addresses that failed last.
+AT_ONCE: Final = 32
+SLOW_AT_ONCE: Final = AT_ONCE // 2
+_PAUSE_S: Final = 1.0
+#: Interval of rounds [s]: the summary of a large dataset takes a while.
+_DATASETS_EVERY_S: Final = 5.0
+_FORGET_EVERY_S: Final = 3600.0
+
 PATIENCE_S: Final = 10.0
 LOOK_UP_S: Final = 5.0
 #: Most bytes read of the answer after its status line and headers.
@@ -181,14 +190,6 @@ class _Connection(http.client.HTTPConnection):
         raise last
 
 
-log = logging.getLogger(__name__)
-#: Most concurrent deliveries, and the share of addresses that failed last.
-AT_ONCE: Final = 32
-SLOW_AT_ONCE: Final = AT_ONCE // 2
-_PAUSE_S: Final = 1.0
-#: Interval of rounds [s]: the summary of a large dataset takes a while.
-_DATASETS_EVERY_S: Final = 5.0
-_FORGET_EVERY_S: Final = 3600.0
 Post = Callable[..., Response]
 
 

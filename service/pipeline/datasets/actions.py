@@ -41,6 +41,11 @@ from graspd.service.store.records import (
     refuse_pending,
 )
 
+log = logging.getLogger(__name__)
+#: Most time for datasets in one round of the controller [s], because queue and lost workers must not wait long.
+BUDGET_S: Final = 0.5
+_CELLS_AT_ONCE: Final = 20
+
 
 def create(
     services: Services, request: DatasetRequest, *, owner: str = "", scope: ProjectScope = EVERYTHING
@@ -224,12 +229,6 @@ def _member_names(members: Iterable[Member]) -> str:
     found = [member.name for member in members]
     more = f" and {len(found) - 5} more" if len(found) > 5 else ""
     return ", ".join(found[:5]) + more
-
-
-log = logging.getLogger(__name__)
-#: Most time for datasets in one round of the controller [s], because queue and lost workers must not wait long.
-BUDGET_S: Final = 0.5
-_CELLS_AT_ONCE: Final = 20
 
 
 class DatasetRounds:
