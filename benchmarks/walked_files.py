@@ -7,13 +7,10 @@ usage: python -m benchmarks.walked_files
 from __future__ import annotations
 
 import json
-import shutil
-import socket
 import subprocess
 import sys
 import tempfile
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -62,19 +59,16 @@ def requests(folder: str) -> dict[str, int]:
 
     from graspd.api.app import create_app
     from graspd.service.pipeline.backends import Services
+    from graspd.service.run.embedded import server_command
     from graspd.service.settings import Settings
     from tests.api.factories import add_builtins
 
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    server = shutil.which("redis-server") or next(Path(sys.prefix).glob("lib/*/site-packages/**/redis-server"))
-    redis = subprocess.Popen([server, "--port", str(port), "--save", ""], stdout=subprocess.DEVNULL, cwd=folder)
-    settings = Settings(data_dir=Path(folder), host="127.0.0.1", redis_url=f"redis://127.0.0.1:{port}/0")
+    settings = Settings(data_dir=Path(folder), host="127.0.0.1")
+    redis = subprocess.Popen(server_command(settings), stdout=subprocess.DEVNULL)
     found: dict[str, int] = {}
     try:
-        time.sleep(1)
-        services = Services.open(settings)
+        services = Services.open(settings, patience=20)
+        services.queue.ping()
         add_builtins(services)
         with TestClient(create_app(settings, services), base_url="http://127.0.0.1") as client:
             client.post("/v1/jobs", json={**JOB, "seed": 1})

@@ -87,7 +87,7 @@ class ValidatedBatch:
     """In scenes, shares of all candidates. clear_share: no obstacle at contact, on the approach and in the lift.
     lift_share: also lifted. lift_hard_share: also lifted at half friction."""
     narrow: str | None = None
-    """In scenes without a valid grasp, the geometric reason; see `why_narrow`."""
+    """In scenes without a valid grasp, the geometric reason; see `narrow_reason`."""
     limit: Limit | None = None
     """Payload limit of the best grasps, if none is selected because of the weight."""
 

@@ -148,7 +148,7 @@ def _blocked_paths(hand: HandModel, opening: Openings, placed: PlacedGrasps | No
 
 
 def _finger_clearance(hand: HandModel, hand_pose: Floats, paths: Floats, placed: PlacedGrasps) -> Floats:
-    """Return fingers' least clearance (B, fingers) on paths (B, K, D), by `body_room`; inf for dofs without a
+    """Return fingers' least clearance (B, fingers) on paths (B, K, D), by `body_clearance`; inf for dofs without a
     finger."""
     count, steps, _ = paths.shape
     finger = fingers_of_bodies(hand)

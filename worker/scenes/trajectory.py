@@ -2,8 +2,8 @@
 
 In a scene the lift is a motion against gravity; around a free object it is the retreat along the approach. The hand's
 mounting must be clear as well, at wrist angles that are constant over the trajectory. Clearances are those of
-`body_room`, with more tolerance for fingertips that may touch a support. They are exact for half-spaces. For boxes and
-neighbours' pieces they are distances of the hand's features from planes: exact at corners, else a lower bound.
+`body_clearance`, with more tolerance for fingertips that may touch a support. They are exact for half-spaces. For boxes
+and neighbours' pieces they are distances of the hand's features from planes: exact at corners, else a lower bound.
 
 In a scene, the approach has a direction and an opening of the hand without contact with object and obstacles."""
 

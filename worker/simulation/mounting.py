@@ -72,7 +72,7 @@ def _solve_wrist(
     points: Floats,
     enough: float,
 ) -> tuple[Floats, Floats]:
-    """Return angles and clearance as `mounting_room`; the clearance of points (N, W) is overwritten."""
+    """Return angles and clearance as `choose_wrist`; the clearance of points (N, W) is overwritten."""
     wrists, count = wrist_positions(mounting), len(poses)
     number, room, rows = np.zeros(count, np.intp), np.full(count, -np.inf), np.arange(count)
     for _ in range(min(TRIES, len(wrists))):

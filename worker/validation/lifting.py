@@ -71,7 +71,7 @@ def validate_lifts(
 
     Args:
         hand: the hand; its stiffness and effort are the actuators' gains and limits.
-        obj: the object, with its mass and friction; `ObjectModel.published` has those of the protocol.
+        obj: the object, with its mass and friction; `ObjectModel.for_dexgraspbench` has those of the protocol.
         grasps: N grasps with pregrasp, squeeze and, for level lift, approach.
         placed: the grasps' scenes; `index` has the scene of each grasp.
         hard: sliding friction halved, torsional friction a tenth; also for supports.

@@ -96,7 +96,7 @@ def validate(
 
     Args:
         hand: the hand; its stiffness and effort are the actuators' gains and limits.
-        obj: the object, with its mass and friction; `ObjectModel.published` has those of the protocol.
+        obj: the object, with its mass and friction; `ObjectModel.for_dexgraspbench` has those of the protocol.
         grasps: N grasps with pregrasp and squeeze postures.
         level: dexgraspbench, standard, or fast.
         hard: sliding friction halved, torsional friction a tenth.

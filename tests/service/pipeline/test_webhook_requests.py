@@ -12,7 +12,7 @@ import pytest
 
 from graspd.service.model.errors import InputError
 from graspd.service.model.webhooks import check_url
-from graspd.service.pipeline import webhook_dispatcher as http_client
+from graspd.service.pipeline import webhook_dispatcher
 from graspd.service.pipeline.webhook_dispatcher import is_public, networks, post
 
 LOOPBACK = networks("127.0.0.0/8")
@@ -84,8 +84,8 @@ def test_a_name_is_looked_up_once(ear: tuple[str, list[Any]], monkeypatch: pytes
         dialled.append(address)
         raise OSError("no way there in a test")
 
-    monkeypatch.setattr(http_client.socket, "getaddrinfo", resolve)
-    monkeypatch.setattr(http_client.socket, "create_connection", dial)
+    monkeypatch.setattr(webhook_dispatcher.socket, "getaddrinfo", resolve)
+    monkeypatch.setattr(webhook_dispatcher.socket, "create_connection", dial)
     assert post(f"http://rebound.example:{port}/in/200", b"{}", {}).status is None
     assert dialled == [("93.184.216.34", port)] and not ear[1]
 
@@ -125,22 +125,24 @@ def test_what_is_no_address_is_refused_when_it_is_made(url: str) -> None:
 @pytest.mark.parametrize("addresses", [["10.20.30.40"], ["93.184.216.34", "10.20.30.40"]])
 def test_a_name_with_a_private_address_is_refused_untold(monkeypatch: pytest.MonkeyPatch, addresses: list[str]) -> None:
     found = [(socket.AF_INET, 1, 6, "", (one, 80)) for one in addresses]
-    monkeypatch.setattr(http_client.socket, "getaddrinfo", lambda *_, **__: found)
+    monkeypatch.setattr(webhook_dispatcher.socket, "getaddrinfo", lambda *_, **__: found)
     answer = post("http://db.internal/", b"{}", {})
     assert answer.status is None and answer.is_final
     assert "GRASPD_WEBHOOK_NETWORKS" in answer.detail and "10.20" not in answer.detail
 
 
 def test_a_name_that_cannot_be_looked_up_tells_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(http_client.socket, "getaddrinfo", Mock(side_effect=OSError("resolver 10.0.0.2: NXDOMAIN")))
+    monkeypatch.setattr(
+        webhook_dispatcher.socket, "getaddrinfo", Mock(side_effect=OSError("resolver 10.0.0.2: NXDOMAIN"))
+    )
     answer = post("http://nothing.internal/", b"{}", {})
     assert not answer.is_final and answer.detail == "the host of the address cannot be looked up"
 
 
 def test_a_look_up_that_does_not_end_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     let_go = threading.Event()
-    monkeypatch.setattr(http_client, "LOOK_UP_S", 0.05)
-    monkeypatch.setattr(http_client.socket, "getaddrinfo", lambda *_, **__: let_go.wait(60) and [])
+    monkeypatch.setattr(webhook_dispatcher, "LOOK_UP_S", 0.05)
+    monkeypatch.setattr(webhook_dispatcher.socket, "getaddrinfo", lambda *_, **__: let_go.wait(60) and [])
     try:
         assert post("http://slow.example/", b"{}", {}).status is None
     finally:
@@ -155,8 +157,8 @@ def test_all_addresses_of_a_name_together_get_the_time_of_one(monkeypatch: pytes
         clock[0] += min(timeout, 4.0)
         raise TimeoutError
 
-    monkeypatch.setattr(http_client.socket, "getaddrinfo", lambda *_, **__: found)
-    monkeypatch.setattr(http_client.socket, "create_connection", silent)
-    monkeypatch.setattr(http_client.time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(webhook_dispatcher.socket, "getaddrinfo", lambda *_, **__: found)
+    monkeypatch.setattr(webhook_dispatcher.socket, "create_connection", silent)
+    monkeypatch.setattr(webhook_dispatcher.time, "monotonic", lambda: clock[0])
     assert post("http://many.example/", b"{}", {}, patience_s=10).status is None
     assert clock[0] == 110.0

@@ -424,7 +424,7 @@ def test_gripper_opens_for_way_in_and_squeezes_within_its_stroke() -> None:
 
 
 def nonnegative_weights(matrix: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """`solved` of systems (B, K, 23) for `TARGET` with a ridge of 0.1."""
+    """`solve_nonnegative` of systems (B, K, 23) for `TARGET` with a ridge of 0.1."""
     given = [wp.array(a, dtype=kind, device="cpu") for a, kind in ((matrix, wp.float64), (count, wp.int32))]
     return np.array(solve_nonnegative(given[0], TARGET, 0.1, given[1]).numpy())
 

@@ -121,7 +121,7 @@ def parted(hand: HandModel) -> tuple[HandModel, HandModel]:
 
 
 def mujoco_room(hand, postures: Posture, obstacle: Obstacle) -> np.ndarray:
-    """As `obstacle_room` has it, by MuJoCo's distances."""
+    """As `obstacle_clearance` has it, by MuJoCo's distances."""
     if obstacle.tips_m is None:
         return mujoco_distances(hand, postures, obstacle)
     tips, rest = parted(hand)

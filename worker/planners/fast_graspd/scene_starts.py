@@ -228,7 +228,7 @@ class _SceneDraws:
     def order(
         self, uniform: Floats, scene: NDArray[np.intp], reaching: NDArray[np.bool_], placed: PlacedGrasps
     ) -> tuple[NDArray[np.intp], Floats]:
-        """Return draws (n, REACHES) of antipodal hands, see `promising`; inf for other hands."""
+        """Return draws (n, REACHES) of antipodal hands, see `select_draws`; inf for other hands."""
         order, least = np.zeros((len(scene), REACHES), np.intp), np.full((len(scene), REACHES), np.inf)
         for s in np.unique(scene[reaching]):
             rows = np.flatnonzero(reaching & (scene == s))
@@ -262,7 +262,7 @@ class _SceneDraws:
         return at_distances(pivot, rotation, q), reaching
 
     def _towards(self, uniform: Floats, normal: Floats, ways: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Place hands with palms towards random surface points; the result is like that of `across`, without a pair."""
+        """Place hands with palms towards surface points drawn at random, as `place_across` does, without a pair."""
         hand, obj = self.hand, self.obj
         corners, normals, sums = surface_of(obj)
         face = np.minimum(np.searchsorted(sums, uniform[:, 0]), len(sums) - 1)
