@@ -16,4 +16,4 @@ SCHEMA_OF_RANGES: Final = 6
 SCHEMA_OF_NETWORKS: Final = 4
 
 #: Revision of each stage's algorithm. Digests of results contain it, so results of two revisions never collide.
-STAGE_REVISIONS: Final = {"synthesize": 32, "scene": 5, "render": 6}
+STAGE_REVISIONS: Final = {"synthesize": 33, "scene": 5, "render": 6}

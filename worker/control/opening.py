@@ -62,6 +62,11 @@ def fingers_of_bodies(hand: HandModel) -> NDArray[np.int32]:
     return out
 
 
+def dof_steps(hand: HandModel) -> Floats:
+    """Return the step (D,) of each dof [rad or m]."""
+    return np.where(prismatic_dofs(hand), SLIDING_STEP_M, OPENING_STEP)
+
+
 def count_fingers(hand: HandModel) -> int:
     return max(1, len(hand.fingertips), int(fingers_of_bodies(hand).max()) + 1)
 
@@ -209,7 +214,7 @@ def _fingers(hand: HandModel) -> Any:
     out.of_body = wp.array(fingers_of_bodies(hand), dtype=wp.int32)
     out.of_dof = wp.array(fingers_of_dofs(hand), dtype=wp.int32)
     out.closing = wp.array(np.asarray(hand.closing, float), dtype=wp.float64)
-    out.step = wp.array(np.where(prismatic_dofs(hand), SLIDING_STEP_M, OPENING_STEP), dtype=wp.float64)
+    out.step = wp.array(dof_steps(hand), dtype=wp.float64)
     out.lower = wp.array(hand.lower, dtype=wp.float64)
     out.upper = wp.array(hand.upper, dtype=wp.float64)
     return out

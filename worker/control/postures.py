@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from graspd.service.model.matter import ACCELERATION
 from graspd.service.model.transforms import Floats
 from graspd.worker.control.jaw_squeeze import jaw_squeeze
-from graspd.worker.control.opening import Blocked, Openings, count_fingers, fingers_of_bodies, fingers_of_dofs
+from graspd.worker.control.opening import Blocked, Openings, count_fingers, dof_steps, fingers_of_bodies, fingers_of_dofs
 from graspd.worker.control.squeeze import HoldForces, balance_forces
 from graspd.worker.grasps import Posture
 from graspd.worker.hands.jaws import jaws_of
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.quality.posed import posing_of
+from graspd.worker.quality.posed import PostureData, posing_of
 from graspd.worker.simulation.environment import CLEAR_M, PlacedGrasps
 from graspd.worker.simulation.obstacles import body_clearance, obstacle_clearance
 
@@ -39,6 +39,12 @@ MAX_PRESSING: Final = 16
 CLOSING_M: Final = 0.009
 #: Distances at which a finger could touch the object but does not [m]. Fingers beyond are not part of the grasp.
 STANDS_OFF_M: Final = (0.005, 0.02)
+#: Reach of their measurement [m].
+FAR_M: Final = 0.025
+#: Largest number of closing steps of such fingers, each `opening.OPENING_STEP` or `SLIDING_STEP_M`, and the distance at
+#: which they stop [m]. Between two points of a finger, its surface is up to half a millimetre closer.
+CLOSING_STEPS: Final = 16
+CLOSED_M: Final = 0.0005
 #: Sum of the contact forces' normal components [N], and the Coulomb coefficient for their balance. The coefficient is
 #: smaller than the object's: forces at the edge of their friction cones slip after a small displacement.
 TOTAL_NORMAL_FORCE: Final = 50.0
@@ -128,9 +134,47 @@ def touching_links(hand: HandModel, obj: ObjectModel, grasp: Posture, *, device:
 
 def fingers_off_object(hand: HandModel, obj: ObjectModel, grasp: Posture, *, device: str = "cpu") -> NDArray[np.bool_]:
     """Return a mask (N,) of grasps with a finger whose distance from the object is in `STANDS_OFF_M`."""
+    return _fingers_off(posing_of(hand, obj, points=_POINTS, device=device), grasp).any(axis=1)
+
+
+def close_fingers(
+    hand: HandModel, obj: ObjectModel, grasp: Posture, placed: PlacedGrasps, *, device: str = "cpu"
+) -> Posture:
+    """Return N grasps whose fingers at a distance in `STANDS_OFF_M` have closed until they touch the object.
+    Fingers that would meet other fingers or obstacles first keep their posture, as do grippers."""
+    posing = posing_of(hand, obj, points=_POINTS, device=device)
+    off = _fingers_off(posing, grasp)
+    rows = np.flatnonzero(off.any(axis=1))
+    if not len(rows) or jaws_of(hand) is not None:
+        return grasp
+    pose, finger, joints = grasp.hand_pose[rows], fingers_of_dofs(hand), np.array(grasp.joint_positions, float)
+    q, moved = hand.reduce(joints[rows]), off[rows][:, finger] & (finger >= 0)
+    closing = Openings(posing, pose, q, _closed_until_contact(posing, pose, q, moved))
+    closed = closing.without_jams(_blocked_paths(hand, closing, placed.take(rows)))
+    reached = posing.finger_gaps(Posture(pose, hand.expand(closed)), FAR_M) < STANDS_OFF_M[0]
+    joints[rows] = hand.expand(np.where(moved & reached[:, finger], closed, q))
+    return Posture(np.array(grasp.hand_pose, float), joints)
+
+
+def _fingers_off(posing: PostureData, grasp: Posture) -> NDArray[np.bool_]:
+    """Return a mask (N, F) of fingers at a distance from the object in `STANDS_OFF_M`."""
     near, far = STANDS_OFF_M
-    gap = posing_of(hand, obj, points=_POINTS, device=device).finger_gaps(grasp, 2 * far)
-    return np.asarray(((gap > near) & (gap < far)).any(axis=1))
+    gap = posing.finger_gaps(grasp, FAR_M)
+    return np.asarray((gap > near) & (gap < far))
+
+
+def _closed_until_contact(posing: PostureData, hand_pose: Floats, q: Floats, moved: NDArray[np.bool_]) -> Floats:
+    """Return dofs (n, D), those of `moved` closed until their finger's distance falls to `CLOSED_M`."""
+    hand, count, looks = posing.hand, len(q), CLOSING_STEPS + 1
+    step = moved * hand.closing * dof_steps(hand)
+    path = np.clip(q[:, None] + np.arange(looks)[None, :, None] * step[:, None], hand.lower, hand.upper)
+    postures = Posture(np.repeat(hand_pose, looks, axis=0), hand.expand(path.reshape(count * looks, -1)))
+    gaps = posing.finger_gaps(postures, FAR_M).reshape(count, looks, -1)
+    last = np.maximum((gaps <= CLOSED_M).argmax(axis=1), 1)[:, None]
+    before, after = (np.take_along_axis(gaps, at, axis=1)[:, 0] for at in (last - 1, last))
+    share = np.clip((before - CLOSED_M) / np.maximum(before - after, 1e-9), 0.0, 1.0)
+    steps = (last[:, 0] - 1 + share)[:, fingers_of_dofs(hand)]
+    return np.clip(q + steps * step, hand.lower, hand.upper)
 
 
 def _blocked_paths(hand: HandModel, opening: Openings, placed: PlacedGrasps | None) -> Blocked | None:

@@ -26,8 +26,10 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.quality.contact import LINK_CONTACT_M, finger_of_body
+from graspd.worker.quality.posed import posing_of
 from graspd.worker.quality.probe import NearestPoints, Probe
 from graspd.worker.quality.wrench_space import wrenches
+from graspd.worker.simulation.environment import Obstacle, PlacedGrasps
 from graspd.worker.validation.decomposition import decompose
 from graspd.worker.validation.model import MujocoOptions, build
 from tests.worker.hands.urdfs import gripper
@@ -338,6 +340,29 @@ def around(hand: HandModel, count: int) -> Posture:
     root = OBJ.centre_of_mass - back - quat_rotate(rotation, hand.palm.centre)
     q = hand.preshape + rng.uniform(0.0, 0.5, (count, hand.dofs)) * hand.closing * hand.span
     return Posture(np.concatenate([root, rotation], axis=1), hand.expand(np.clip(q, hand.lower, hand.upper)))
+
+
+def above(plane: Obstacle, count: int) -> PlacedGrasps:
+    return PlacedGrasps((plane,), np.array([[0, 0, 0, 1.0, 0, 0, 0]]), np.zeros(count, np.intp))
+
+
+@pytest.mark.parametrize("name", ["allegro", "barrett"])
+def test_a_finger_that_stands_off_closes_until_it_touches(name: str) -> None:
+    """It keeps its posture if it would meet another finger first, or move deeper into an obstacle."""
+    hand = hand_from_path(name)
+    grasps, (near, far), finger = around(hand, 60), postures.STANDS_OFF_M, opening.fingers_of_dofs(hand)
+    posing = posing_of(hand, OBJ, points=600, device="cpu")
+    gaps = posing.finger_gaps(grasps, 0.1)
+    closed = postures.close_fingers(hand, OBJ, grasps, above(Obstacle.half_space([0, 0, 1], -2.0), 60))
+    moved = hand.reduce(closed.joint_positions) - hand.reduce(grasps.joint_positions)
+    fingers = np.stack([(moved[:, finger == f] != 0).any(axis=1) for f in range(gaps.shape[1])], axis=1)
+    after = posing.finger_gaps(closed, 0.1)
+    assert fingers.sum() > 10 and not (fingers & ~((gaps > near) & (gaps < far))).any()
+    assert (after[fingers] < near).all() and np.median(after[fingers]) == pytest.approx(postures.CLOSED_M, abs=5e-4)
+    assert (moved * hand.closing >= 0).all()
+    inside = postures.close_fingers(hand, OBJ, grasps, above(Obstacle.half_space([0, 0, 1], 1.0), 60))
+    down = (inside.joint_positions != grasps.joint_positions).any(axis=1)
+    assert down.sum() < (moved != 0).any(axis=1).sum()
 
 
 @pytest.fixture(scope="module", params=["allegro", "barrett"])

@@ -36,7 +36,7 @@ def plain(hand, obj, state: HandState, losses: np.ndarray, placed: PlacedGrasps,
     return replace(grasp_set(posture(*rows)), stability_loss=losses)
 
 
-def taken(scores, monkeypatch, merit=None, infeasible=()) -> tuple[list[int], list[int], list[int]]:
+def taken(scores, monkeypatch, merit=None, infeasible=(), off=()) -> tuple[list[int], list[int], list[int]]:
     """Hands that are taken where hand k of grasp n scores `scores[n][k]` and is the k-th most promising; those that
     were tried, and those that were refined. Some are infeasible."""
     monkeypatch.setattr(candidates, "with_postures", plain)
@@ -56,7 +56,8 @@ def taken(scores, monkeypatch, merit=None, infeasible=()) -> tuple[list[int], li
         seats.extend(rows.ravel().tolist())
         each_row = rows.ravel().astype(float)
         state = HandState(np.repeat(each_row[:, None], 3, axis=1), np.zeros((rows.size, 4)), np.zeros((rows.size, 2)))
-        return Refinements(state, each_row, worth[rows.ravel()].astype(float), np.isin(each_row, infeasible))
+        merits = worth[rows.ravel()].astype(float)
+        return Refinements(state, each_row, merits, np.isin(each_row, infeasible), np.isin(each_row, off))
 
     placed = PlacedGrasps(TABLE, np.tile([0, 0, 0, 1.0, 0, 0, 0], (n, 1)), np.arange(n))
     found = candidates.select_by_rollout(
@@ -84,6 +85,10 @@ def taken(scores, monkeypatch, merit=None, infeasible=()) -> tuple[list[int], li
         # What is infeasible is not tried, and taken only where there is nothing else.
         ([[0.5, 3.0], [4.0, 0.5]], {"infeasible": (0,)}, [1, 3], [1, 2, 3]),
         ([[0.5, 0.6]], {"infeasible": (0, 1)}, [0], []),
+        # A hand with a finger off the object is tried last, and is taken only if no other lifts at half friction;
+        # hands 4 and 1 nearly lift, so they are tried with a smaller squeeze, too.
+        ([[0.5, 0.9, 0.5], [0.1, 1.5, 0.9]], {"off": (0, 3)}, [1, 5], [1, 3, 4, 4, 5]),
+        ([[0.1, 1.5, 3.0]], {"off": (0,)}, [0], [0, 1, 1, 2]),
         # Where none is good enough the least score is taken, of equal ones the first, and no score is the worst.
         ([[3.0, 2.6, 4.0]], {}, [1], [0, 1, 2]),
         ([[2.0, 2.0]], {}, [0], None),
@@ -152,6 +157,12 @@ def attempts(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 def test_in_scenes_a_grasp_sets_out_again_while_it_fails(in_scenes, attempts, score: float, made: int) -> None:
     found = in_scenes(always(score))
     assert sorted(attempts) == sorted([*range(made)] * 4) and found.attempts == 4 * made
+
+
+def test_in_scenes_a_grasp_with_a_finger_off_its_object_is_retried_once(in_scenes, attempts, monkeypatch) -> None:
+    monkeypatch.setattr(planner, "fingers_off_object", lambda hand, obj, grasp, **_: np.ones(len(grasp), bool))
+    in_scenes(always(0.5))
+    assert sorted(attempts) == sorted([0, 1] * 4)
 
 
 def test_a_retry_is_told_the_score_to_beat(in_scenes) -> None:

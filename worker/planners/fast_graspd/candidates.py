@@ -33,7 +33,11 @@ NEARLY: Final = 2.5
 #: that hold at half friction in the whole test: Shadow .70 to .76, Allegro .81 to .88, Barrett .83 to .92, at a tenth
 #: more time.
 GOOD: Final = 0.5
-GOOD_IN_SCENES: Final = 1.0
+GOOD_IN_SCENES: Final = 0.995
+#: Added to the merit of a hand in a scene with a finger that stands off the object, and its best score: worse than
+#: that of any other hand that lifts at half friction.
+STANDING_OFF: Final = 0.2
+BEST_OFF: Final = 0.999
 #: Score of candidates without a rollout.
 HOPELESS: Final = 1e9
 
@@ -61,6 +65,8 @@ class Refinements:
     merit: Floats
     infeasible: NDArray[np.bool_]
     """Whether the depth or the number of touching links fails the geometric gate: such hands have no rollout."""
+    off: NDArray[np.bool_]
+    """Whether a finger stands off an object in a scene; such hands are simulated last and selected last."""
 
 
 Seat = Callable[[NDArray[np.intp], NDArray[np.intp]], Refinements]
@@ -129,7 +135,7 @@ def select_by_rollout(
         if not len(left):
             break
         refined = refine(wave[left], left)
-        for rows in rank_hands(refined.merit, len(left)).T:
+        for rows in rank_hands(refined.merit + STANDING_OFF * refined.off, len(left)).T:
             worth = (refined.merit[rows] < HOPEFUL) | (taken.score[left] > POOR)
             open_ = ~(taken.score[left] < good) & (worth & ~refined.infeasible[rows] | ~taken.has(left))
             if not open_.any():
@@ -142,6 +148,7 @@ def select_by_rollout(
             hopeless = refined.infeasible[rows[open_]] | ~worth[open_]
             score = _scores(found, hopeless, which, taken.score[which], rollout)
             _reduce_squeeze(hand, obj, found, score, which, rollout, device)
+            score = np.where(refined.off[rows[open_]] & (score < BEST_OFF), BEST_OFF, score)
             taken.take(found, refined, rows[open_], which, score)
         left = left[~(taken.score[left] < good)]
     return taken

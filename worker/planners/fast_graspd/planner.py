@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from graspd.service.model.fidelity import Fidelity
 from graspd.service.model.transforms import Floats
-from graspd.worker.control.postures import fingers_off_object, touching_links
+from graspd.worker.control.postures import close_fingers, fingers_off_object, touching_links
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet, joined
 from graspd.worker.hands.model import HandModel
@@ -27,6 +27,7 @@ from graspd.worker.planners.fast_graspd.batches import Batches, finalists
 from graspd.worker.planners.fast_graspd.candidates import (
     FRICTION,
     GOOD,
+    GOOD_IN_SCENES,
     NEAR_M,
     NEARNESS,
     SCENE_FRICTION,
@@ -71,7 +72,7 @@ FREE: Final = (GOOD, STANDS, *(FAILED,) * 18)
 #: Grasps in scenes with larger scores are retried; one value per attempt. Grasps that lift at full friction only are
 #: retried, too: five attempts instead of two raise the share that lifts at half friction from .63 to .67 (Allegro, 12
 #: objects of their own mass), at 3 % more time, as only half friction is tested in them.
-IN_SCENES: Final = (*(1.0,) * 5, FAILED)
+IN_SCENES: Final = (GOOD_IN_SCENES, *(1.0,) * 4, FAILED)
 #: Largest number of attempts of one grasp at once.
 AHEAD: Final = 4
 
@@ -209,16 +210,34 @@ class _Launch:
     def placed(self, rows: Rows) -> PlacedGrasps | None:
         return self.batches.placed.take(rows) if self.batches.placed is not None else None
 
+    def pair_on_device(self) -> tuple[HandModel, ObjectModel, str]:
+        return self.pair.hand.model, self.pair.fine.obj.model, self.pair.hand.device
+
     def merits(self, state: HandState, losses: Floats, depths: Floats | None = None) -> Floats:
-        hand, obj, device = self.pair.hand.model, self.pair.fine.obj.model, self.pair.hand.device
+        hand, obj, device = self.pair_on_device()
         friction = FRICTION if self.batches.placed is None else SCENE_FRICTION
         return merits(hand, obj, state, losses, depths, friction=friction, device=device)
+
+    def closed(self, state: HandState, rows: Rows) -> HandState:
+        """Close fingers that stand off the objects of scenes; `rows` (n,) are the grasps of the hands."""
+        if self.batches.placed is None:
+            return state
+        hand, obj, device = self.pair_on_device()
+        grasp = close_fingers(hand, obj, posture_of(hand, obj, state), self.batches.placed.take(rows), device=device)
+        return HandState(state.pivot, state.rotation, hand.reduce(grasp.joint_positions))
+
+    def stand_off(self, state: HandState) -> NDArray[np.bool_]:
+        """Check (n,) whether a finger stands off the object in a scene."""
+        if self.batches.placed is None:
+            return np.zeros(len(state.pivot), bool)
+        hand, obj, device = self.pair_on_device()
+        return fingers_off_object(hand, obj, posture_of(hand, obj, state), device=device)
 
     def infeasible(self, state: HandState, depths: Floats) -> NDArray[np.bool_]:
         """Check (n,) whether hands of these depths [m] fail the geometric gate; such hands have no rollout."""
         if not self.batches.has_rollout:
             return np.zeros(len(depths), bool)
-        hand, obj, device = self.pair.hand.model, self.pair.fine.obj.model, self.pair.hand.device
+        hand, obj, device = self.pair_on_device()
         links = touching_links(hand, obj, posture_of(hand, obj, state), device=device)
         return (depths > 1e-3 * MAX_PENETRATION_MM) | (links < MIN_CONTACT_LINKS)
 
@@ -373,8 +392,8 @@ def _run_attempts(launch: _Launch, rows: Rows, attempt: Rows, merit: Floats, run
 
 
 def _add_postures(launch: _Launch, part: LaunchPart) -> LaunchPart:
-    hand, obj = launch.pair.hand.model, launch.pair.fine.obj.model
-    placed, device = launch.placed(part.rows), launch.pair.hand.device
+    hand, obj, device = launch.pair_on_device()
+    placed = launch.placed(part.rows)
     return replace(part, grasps=with_postures(hand, obj, part.state, part.loss, placed, device=device))
 
 
@@ -403,9 +422,10 @@ class _FinePhase:
             losses = _losses(data, len(flat))
         # Without iterations this only measures the depth of each hand.
         options = AROUND if launch.batches.placed is None else ProjectionOptions()
+        state = launch.closed(state, np.repeat(mine, rows.shape[1]))
         state, depths = Projection(launch.fine, data, options).run(state, fidelity.polish_iterations)
         merit = launch.merits(state, losses, depths) if rows.shape[1] > 1 else np.zeros(len(flat))
-        return Refinements(state, losses, merit, launch.infeasible(state, depths))
+        return Refinements(state, losses, merit, launch.infeasible(state, depths), launch.stand_off(state))
 
 
 def _in_scenes(data: Data, placed: PlacedGrasps | None, each: int) -> Data:
