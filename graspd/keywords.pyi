@@ -1,4 +1,4 @@
-"""Keywords that follow from the options; `python -m graspd.service.docs` writes them."""
+"""Keyword arguments made from the options; `python -m graspd.service.docs` writes this file."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -138,7 +138,7 @@ def catch_stop_signals() -> Iterator[list[int]]:
     try:
         for number in before:
             signal.signal(number, note)
-    except ValueError:  # Not in the main thread: signals belong to another owner.
+    except ValueError:  # Only the main thread can set handlers of signals.
         before = {}
     try:
         yield asked
@@ -200,7 +200,7 @@ class EngineSettings:
 
 
 def engine_settings() -> EngineSettings:
-    """Load engine settings from the environment; import the slow module of settings only if a variable is set."""
+    """Load engine settings from the environment; import the settings module only if a variable is set."""
     if not any(name.upper().startswith("GRASPD_") for name in os.environ):
         return EngineSettings()
     found = load_settings()
@@ -214,7 +214,7 @@ def log_to_stderr(settings: Settings, process: str = "graspd") -> None:
 
 
 def restrict_file_access(settings: Settings) -> None:
-    """Make new files of this process and its children, and a readable data folder, private to the user."""
+    """Make the data folder, and new files of this process and its children, private to the user."""
     os.umask(0o077)
     with contextlib.suppress(OSError):
         status = settings.data_dir.stat()

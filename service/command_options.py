@@ -56,7 +56,7 @@ def parsed_options(model: type[ModelT], values: dict[str, Any]) -> ModelT:
 
 
 def pairs(texts: Iterable[str]) -> dict[str, str | int | float]:
-    """Parse `name=value` of each `--option`; values that are numbers become numbers, as in HTTP."""
+    """Parse `name=value` of each `--option`; numeric values become numbers, as in a request's JSON."""
     split = [text.partition("=") for text in texts]
     for name, equals, value in split:
         if not equals:

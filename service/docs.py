@@ -1,4 +1,4 @@
-"""`python -m graspd.service.docs` rewrites the tables of the documentation and the type stubs of keywords."""
+"""`python -m graspd.service.docs` rewrites tables of the docs and the stub of keyword arguments."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def _cells(row: Row) -> tuple[str, str, str]:
 
 def keywords_stub() -> str:
     parts = [
-        '"""Keywords that follow from the options; `python -m graspd.service.docs` writes them."""\n',
+        '"""Keyword arguments made from the options; `python -m graspd.service.docs` writes this file."""\n',
         "from collections.abc import Mapping, Sequence",
         "from pathlib import Path",
         "from typing import Any, Literal, TypedDict",

@@ -25,7 +25,7 @@ def arrow() -> Any:
 
 
 def type_of(name: str) -> Any:
-    """Return the Arrow type of a name: `image`, `text`, NumPy type; [n]: list of n, []: of any length."""
+    """Return the Arrow type of `image`, `text` or such as `int64`; suffix [n]: list of n, []: any length."""
     pa = arrow()
     if name.endswith("]"):
         inner, _, size = name[:-1].rpartition("[")
@@ -36,7 +36,7 @@ def type_of(name: str) -> Any:
 
 
 def schema_of(columns: Mapping[str, str], also: Mapping[str, str] | None = None) -> Any:
-    """Return the schema of columns by the names of `type_of`, marking pictures for Hugging Face's readers."""
+    """Return the schema of columns with types as in `type_of`; mark pictures for Hugging Face's readers."""
     pa = arrow()
     pictures = {name: {"_type": "Image"} for name, word in columns.items() if word == IMAGE}
     told = {"huggingface": json.dumps({"info": {"features": pictures}})} if pictures else {}
@@ -64,9 +64,7 @@ def read(file: Path, wanted: Iterable[str]) -> dict[str, list[Any]]:
             said = found.metadata
             size = sum(said.row_group(k).total_byte_size for k in range(said.num_row_groups))
             if size > LARGEST:
-                raise InputError(
-                    f"{file} unpacks to {size >> 20} MiB; split it into files of less than {LARGEST >> 20}"
-                )
+                raise InputError(f"{file} unpacks to {size >> 20} MiB; split it into files below {LARGEST >> 20} MiB")
             return dict(found.read(columns=names).to_pydict())
     except (OSError, pa.ArrowException, MemoryError) as error:
         raise InputError(f"{file} is not a readable Parquet file: {error}") from None

@@ -29,7 +29,7 @@ _TALKATIVE: Final = ("rq.worker", "rq.job", "rq.queue", "httpx")
 
 @contextmanager
 def bind(**subjects: Any) -> Iterator[None]:
-    """Bind subjects to log lines within, except empty values. Threads started within do not inherit them."""
+    """Add non-empty subjects to log lines of a `with` block; threads started in it do not inherit them."""
     token = _bound.set({**_bound.get(), **{name: value for name, value in subjects.items() if value}})
     try:
         yield

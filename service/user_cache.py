@@ -62,7 +62,7 @@ def write_atomically(file: Path, pieces: Iterable[bytes]) -> None:
 
 
 def evict(folder: Path, suffix: str, limit_bytes: int, *, keep: Path) -> None:
-    """Remove the least recently used files of a folder except `store`, down to `limit_bytes` for others."""
+    """Remove the least recently used files of a folder, except `keep`, beyond `limit_bytes` in total."""
     found = []
     for file in folder.glob(f"*{suffix}"):
         with suppress(FileNotFoundError):

@@ -26,7 +26,7 @@ _TIMEOUT_S: Final = 5.0
 
 @dataclass(frozen=True)
 class IndexCondition:
-    """State that the database reports."""
+    """Kind, revision, connections and write permission of an index database."""
 
     kind: str
     revision: str
@@ -38,12 +38,12 @@ class IndexCondition:
 
     @property
     def is_ready(self) -> bool:
-        """Whether an open would change nothing."""
+        """Whether opening the index would change nothing."""
         return bool(self.revision) and self.revision == self.newest
 
 
 def read_condition(url: str | URL) -> IndexCondition | None:
-    """Return the condition of an index; None without a file. Errors as in `Database`, and IndexDamaged."""
+    """Return the condition of an index, None if it has no file; errors as in `Database`, or IndexDamaged."""
     try:
         parsed = make_url(url)
         if parsed.get_backend_name() == "sqlite":

@@ -1,7 +1,7 @@
 """Connection to the index database: SQLite in WAL mode, or PostgreSQL. The first open makes the tables.
 
 There are no migrations, because the index follows from the store: `graspd admin index rebuild` replaces an index of
-another revision. Columns of new metrics are added at the open; grasps without such a value have NULL. The column of
+another revision. Columns of new metrics are added when it opens; grasps without such a value have NULL. The column of
 a removed metric stays.
 """
 
@@ -49,11 +49,11 @@ T = TypeVar("T")
 REVISION: Final = "0022"
 #: Table with the revision. graspd 0.2 reads it, and refuses an index of an unknown revision.
 REVISION_TABLE: Final = "alembic_version"
-#: Wait for other writers [s]: a job of a million grasps is one transaction of a few seconds.
+#: Longest wait for other writers [s], whose transactions may take a few seconds.
 _BUSY_TIMEOUT_S: Final = 20.0
-#: Key of PostgreSQL's advisory lock for making tables, one process at a time: the letters "grsp".
+#: Key of PostgreSQL's advisory lock that a process holds while it makes tables: "grsp" in ASCII.
 _TABLES_LOCK: Final = 0x67727370
-#: Key of the lock for writing, held until the end of a transaction by one process: the letters "grsq".
+#: Key of the advisory lock that a process holds until its write transaction ends: "grsq" in ASCII.
 _TURN_LOCK: Final = 0x67727371
 UNUSABLE: Final = (ArgumentError, NoSuchModuleError, ModuleNotFoundError, ValueError)
 #: Codes of SQLite for a file with invalid content.
@@ -66,8 +66,8 @@ class Database:
     def __init__(self, url: str | URL, *, anew: bool = False) -> None:
         """Connect, and make the tables of an empty database; `anew` replaces tables of another revision.
 
-        Raises InputError for a URL of no known database, IndexUnavailable if the database does not answer, is read-only
-        or has another revision.
+        Raises InputError for an unusable URL, IndexUnavailable if the database does not answer, is read-only or has
+        another revision.
         """
         self._url = url
         self._anew = anew
@@ -97,17 +97,17 @@ class Database:
 
     @contextmanager
     def writing(self, within: Connection | None = None) -> Iterator[Connection]:
-        """Yield a transaction, or the given one: all of it is committed, or nothing.
+        """Yield a new transaction, which is committed as a whole or not at all; or the given one.
 
-        Writers run one at a time: states are derived from rows that concurrent transactions would not see of each
-        other.
+        Writers run one at a time, because a transaction derives states from rows that a concurrent one might
+        change.
         """
         if within is not None:
             yield within
             return
         with self._handle_errors(), self._write_lock, self._current_engine().connect() as connection:
             if connection.dialect.name == "sqlite":
-                # A transaction that reads before it writes fails at once if another one writes in between.
+                # Otherwise a transaction that reads before it writes fails at once if another one writes in between.
                 connection.exec_driver_sql("BEGIN IMMEDIATE")
             else:
                 connection.exec_driver_sql(f"SET LOCAL lock_timeout = '{_BUSY_TIMEOUT_S:g}s'")
@@ -120,7 +120,7 @@ class Database:
             return connection.execute(query).mappings().all()
 
     def one(self, query: Select[Any], what: str, within: Connection | None = None) -> RowMapping:
-        """Return the first row; NotFoundError `there is no {what}` without rows."""
+        """Return the first row; NotFoundError `there is no {what}` if there is none."""
         if not (found := self.rows(query, within)):
             raise NotFoundError(f"there is no {what}")
         return found[0]
@@ -195,7 +195,7 @@ class IndexPart:
 
 
 def chunks(ids: Sequence[T], size: int = 1000) -> Iterable[Sequence[T]]:
-    """Yield ids in parts of one statement each: databases limit the number of parameters."""
+    """Yield parts of `ids` that fit into one statement: databases limit the number of parameters."""
     return (ids[start : start + size] for start in range(0, len(ids), size))
 
 
@@ -228,12 +228,12 @@ def url_error(error: Exception) -> InputError:
     why = f" ({_error_line(error)})" if isinstance(error, NoSuchModuleError | ModuleNotFoundError) else ""
     return InputError(
         f"the index URL (GRASPD_INDEX_URL) cannot be used{why}; give sqlite:///PATH or "
-        "postgresql+psycopg://HOST/NAME, and in a password %2F for / and %40 for @"
+        "postgresql+psycopg://HOST/NAME; in a password, write %2F for / and %40 for @"
     )
 
 
 def connect_postgres(url: str | URL) -> Engine:
-    """Return an engine without making tables; InputError for an encoding other than UTF-8."""
+    """Return an engine, make no tables; its connections raise InputError unless the encoding is UTF-8."""
     engine = create_engine(url, pool_pre_ping=True, pool_size=5, max_overflow=10)
 
     # Runs before SQLAlchemy inspects the connection: the inspection fails on SQL_ASCII databases, which return bytes.
@@ -291,9 +291,7 @@ def revision_of(connection: Connection) -> str:
 
 def _revision_mismatch(found: str) -> str:
     if found > REVISION:
-        return (
-            f"the index was made by a newer graspd (revision {found}, here {REVISION}); use that, or delete the index"
-        )
+        return f"the index was made by a newer graspd (revision {found}, here {REVISION}); use it, or delete the index"
     return f"the index is of an older graspd (revision {found}, here {REVISION}); run `graspd admin index rebuild`"
 
 
@@ -310,7 +308,7 @@ def _schema_transaction(engine: Engine) -> Iterator[Connection]:
             connection.commit()
         finally:
             if connection.dialect.name == "postgresql":
-                connection.rollback()  # The statement failed, or the lock could not be released.
+                connection.rollback()  # Without it, the lock cannot be released after a failed statement.
                 connection.execute(text("SELECT pg_advisory_unlock(:key)"), {"key": _TABLES_LOCK})
                 connection.commit()
 
@@ -388,7 +386,7 @@ class SqliteFile:
             yield
 
     def set_aside(self, damaged: Identity) -> None:
-        """Move a damaged file away, unless another process did; requires `opening`."""
+        """Move a damaged file away, unless another process did so; requires the lock of `opening`."""
         if damaged is None or self.identity() != damaged:
             return
         suffix = f".damaged-{datetime.now(UTC):%Y%m%dT%H%M%S}"
@@ -406,7 +404,7 @@ Row = Mapping[str, Any]
 
 
 def upsert(connection: Connection, table: Table, rows: Sequence[Row], *, keep: Sequence[str] = ()) -> None:
-    """Insert rows with equal columns; of two rows with one key the last counts. `keep` are columns without update."""
+    """Insert or update rows with equal columns; of equal keys the last counts. `keep` is never updated."""
     if not rows:
         return
     keys = [column.name for column in table.primary_key]
@@ -420,7 +418,7 @@ def upsert(connection: Connection, table: Table, rows: Sequence[Row], *, keep: S
 
 
 def update_rows(connection: Connection, table: Table, rows: Sequence[Row], *, state: str) -> None:
-    """Update rows by `id` whose column `state` is unchanged since the read."""
+    """Update rows by `id`, except rows whose column `state` no longer equals `state`."""
     if not rows:
         return
     values: dict[str, Any] = {name: bindparam(f"new_{name}") for name in rows[0] if name != "id"}

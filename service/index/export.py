@@ -13,11 +13,11 @@ from graspd.service.index.database import Database
 from graspd.service.index.tables import assets, attempts, dataset_cells, datasets, grasps, jobs, shards, spent, tasks
 from graspd.service.parquet import schema_of, write
 
-#: Exported tables. Other tables contain present state (workers, notes) or internal data.
+#: Exported tables. Other tables contain current state (workers, notes) or internal data.
 TABLES: Final[Mapping[str, Table]] = {
     table.name: table for table in (grasps, shards, jobs, tasks, attempts, assets, datasets, dataset_cells, spent)
 }
-#: Rows of a row group, the part of a file that is in memory at once.
+#: Rows in a row group; only one group is in memory at a time.
 GROUP: Final = 20_000
 
 

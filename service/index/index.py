@@ -23,7 +23,7 @@ class Index:
     """SQL rows derived from the store; `url` is an SQLAlchemy URL.
 
     Only API and controller write. Every method raises IndexUnavailable if the database does not answer. Cursors are
-    opaque, `limit` is at most 200, and an unknown id is a NotFoundError.
+    opaque, `limit` is at most 200, and an unknown id raises NotFoundError.
     """
 
     def __init__(self, url: str | URL, *, anew: bool = False) -> None:

@@ -18,13 +18,13 @@ _CHANGES: Final = "changes"
 _MARK: Final = "mark"
 _SCAN_PAUSE: Final = "integrity scan pause"
 _SERVICE: Final = "service"
-#: Most stored names of damaged records; their count has no limit.
+#: Maximum number of stored names of damaged records; all are counted.
 _NAMED: Final = 50
 
 
 @dataclass(frozen=True)
 class IndexCompleteness:
-    """Result of filling an index: complete, perhaps except for unreadable records."""
+    """State of a filled index: complete, perhaps except for unreadable records."""
 
     at: str
     left_out: int = 0
@@ -34,7 +34,7 @@ class IndexCompleteness:
 
 @dataclass(frozen=True)
 class StoreMark:
-    """Mark that shows whether index or store is an older copy."""
+    """Mark by which an older copy of the index or of the store is detected."""
 
     mark: str = ""
     """Mark that index and store share; empty before the first mark."""

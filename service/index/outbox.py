@@ -1,4 +1,4 @@
-"""Outbox: ends of jobs and datasets in order, webhooks, and deliveries."""
+"""Outbox: numbered ends of jobs and datasets, webhooks, and deliveries of ends to webhooks."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ class DueDelivery:
 def append_ends(connection: Connection, rows: Sequence[dict[str, Any]]) -> None:
     """Append ends to the feed within a transaction.
 
-    The number of an end is the time in milliseconds, or the last number plus 1: a rebuilt index thus continues after
-    the numbers of a lost index. Writers run one at a time, so numbers appear in order.
+    The number of an end is the time in milliseconds, or the last number plus 1 if that is greater. A new index thus
+    continues after the numbers of a lost one. Writers run one at a time, so numbers appear in ascending order.
     """
     if rows:
         first = max(last_end(connection) + 1, int(time.time() * 1000))
@@ -95,7 +95,7 @@ class Outbox(IndexPart):
         return [DeliveryView(**row) for row in self.database.rows(query)]
 
     def plan(self) -> None:
-        """Create deliveries of new ends; above the limit of waiting deliveries, a webhook loses its oldest ends."""
+        """Create deliveries of new ends; they fail at once if too many deliveries of the webhook are waiting."""
         for hook in self.hooks():
             mine = (ends.c.project == hook.project, ends.c.seq > hook.seen)
             query = select(ends.c.seq, ends.c.state).where(*mine).order_by(ends.c.seq).limit(_AT_ONCE)

@@ -18,12 +18,12 @@ Tests = tuple[ColumnElement[bool], ...]
 
 
 def in_scope(scope: ProjectScope, table: Table) -> Tests:
-    """Return the scope's conditions on a table with projects, or on tables joined to it."""
+    """Return the scope's conditions on a table that has a column `project`."""
     return () if scope.everything else (table.c.project == scope.project,)
 
 
 def in_scope_by_job(scope: ProjectScope, table: Table) -> Tests:
-    """Return the scope's conditions on a table of parts of jobs."""
+    """Return the scope's conditions on a table that has a column `job_id`."""
     of_project = select(jobs.c.id).where(jobs.c.project == scope.project)
     return () if scope.everything else (table.c.job_id.in_(of_project),)
 
@@ -36,13 +36,13 @@ def assets_in_scope(scope: ProjectScope) -> Tests:
 
 
 def nearest_asset(scope: ProjectScope) -> ColumnElement[int]:
-    """Return the order of assets of one name: own ones first, then shared ones."""
+    """Return the sort key of assets of one name: own ones first, then shared ones."""
     shared = or_(assets.c.builtin.is_(True), assets.c.shared.is_(True))
     return case((assets.c.project == scope.project, 0), (shared, 1), else_=2)
 
 
 def shards_in_scope(scope: ProjectScope, shard: ColumnElement[Any]) -> Tests:
-    """Return the conditions on ids of shards that a job of the project makes or reuses."""
+    """Return the conditions that a job of the scope's project makes or reuses a shard."""
     wanted = (tasks.c.shard_id == shard, tasks.c.job_id == jobs.c.id, jobs.c.project == scope.project)
     return () if scope.everything else (exists().where(*wanted),)
 

@@ -52,7 +52,7 @@ Progress = Callable[[str, int], object]
 
 
 def rebuild(index: Index, store: Store, *, progress: Progress = lambda what, number: None) -> dict[str, int]:
-    """Replace all rows by rows derived from the store; return the numbers of read records by kind, and of omitted ones.
+    """Derive all rows anew from the store; return the numbers of records read, by kind, and omitted.
 
     The old rows stay until all new ones exist. The log and `index.notes.completeness()` name each damaged record.
     """
@@ -93,7 +93,7 @@ class _Rebuild:
                     self._index.write.add_asset(load_asset(self._store, kind, digest), check, within=self._connection)
 
     def jobs(self) -> None:
-        """Read jobs, then failed attempts in order, then users' actions."""
+        """Read jobs, then failed attempts by number, then events."""
         known = []
         for key, data in self._read(names.JOBS, lambda key: key.endswith("/job.json") and key.count("/") == 2):
             with self._skip_invalid(key, "jobs"):
@@ -245,7 +245,7 @@ def _rows(table: Table, connection: Connection) -> dict[tuple[Any, ...], dict[st
 
 
 def _without_run_state(row: dict[str, Any]) -> dict[str, Any]:
-    """Return a row without present state: whether a task runs, and its progress."""
+    """Remove current state: a running task becomes queued, and a queued or cancelled one has no worker."""
     if row.get("state") == State.RUNNING.value:
         row["state"] = State.QUEUED.value
     if row.get("state") in (State.QUEUED.value, State.CANCELLED.value) and "worker" in row:

@@ -1,7 +1,7 @@
-"""Tables of the index. `LIVE_COLUMNS` are present state (progress, queue marks); the rest is derived.
+"""Tables of the index. `LIVE_COLUMNS` are current state (progress, queue marks), others are derived.
 
-A change needs another `REVISION` in `database`, which a test enforces, except for metrics of grasps. `applied` and
-`planned` of datasets are the planner's progress; tags are users' names for grasps.
+Each change, except for metrics of grasps, needs another `REVISION` in `database`; a test enforces this. `applied` and
+`planned` of datasets are the progress of the controller; tags are users' names for grasps.
 """
 
 from __future__ import annotations
@@ -218,7 +218,7 @@ damage: Final = Table(
     Column("found", String(32), nullable=False),
 )
 _PROGRESS: Final = ("progress_done", "progress_total", "progress_message")
-#: Columns and tables of present state, which a rebuild resets.
+#: Columns and tables of current state, which do not follow from the store; a rebuild keeps the tables.
 LIVE_COLUMNS: Final = frozenset({"queued", "not_before", "applied", "planned", "charged", "told", "seen", *_PROGRESS})
 LIVE_TABLES: Final = frozenset({"workers", "notes", "damage", "spent", "ends", "deliveries"})
 datasets: Final = Table(
@@ -288,7 +288,7 @@ tagged: Final = Table(
     Column("row", Integer, primary_key=True),
     Index("tagged_grasps", "shard_id", "row"),
 )
-#: Present state: a rebuilt index starts a new feed.
+#: Current state: the store does not contain it.
 ends: Final = Table(
     "ends",
     metadata,
@@ -309,7 +309,7 @@ webhooks: Final = Table(
     Column("states", JSON, nullable=False),
     Column("created", String(32), nullable=False),
     *owner_columns(),
-    # Present state: ends up to this number have deliveries.
+    # Current state: ends up to this number have deliveries.
     Column("seen", BigInteger, nullable=False, server_default="0"),
 )
 deliveries: Final = Table(

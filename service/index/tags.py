@@ -1,4 +1,4 @@
-"""Tags: users' names, from the records of the store."""
+"""Tags: users' names for grasps, from records of the store."""
 
 from __future__ import annotations
 

@@ -71,7 +71,7 @@ class JobView(Validated):
     project: str = Field("", description="its project; empty: the unnamed project")
     finished: str | None
     choice: Choice | None = Field(None, description="how a chart resolved the fidelity auto, if requested")
-    reason: str | None = Field(None, description="why the job failed: the first failed task's last attempt")
+    reason: str | None = Field(None, description="why the job failed: error of its first failed task")
     stages: list[StageProgress] = []
     rechecked: int = Field(0, description="valid grasps validated again under the unmodified DexGraspBench protocol")
     recheck_held: int = Field(0, description="rechecked grasps that held")
@@ -126,8 +126,8 @@ class ShardView(View):
     sha256: str
     size_bytes: int
     count: int = Field(
-        description="base shard: grasps; scene shard: transferred grasps, or its scenes if these come first; view "
-        "shard: pictures"
+        description="base shard: grasps; scene shard: transferred grasps, or scenes if grasps are planned in them; "
+        "views shard: pictures"
     )
     hand: str
     object: str
@@ -145,7 +145,7 @@ class ShardView(View):
 
 @insert_fields(valid=value_fields(optional=False), created=value_fields(optional=True))
 class GraspView(View):
-    """One grasp with its quality in the index; contact metrics at the threshold of the manifest (5 mm)."""
+    """One grasp with its indexed quality; contact metrics at the manifest's contact threshold (5 mm)."""
 
     shard_id: str
     row: int
@@ -257,7 +257,7 @@ class TagView(View):
 
 
 class DeliveryView(View):
-    """Delivery of an end to a URL, and its result."""
+    """Notification of a URL about an ended job or dataset, and its result."""
 
     seq: int
     kind: str
@@ -320,7 +320,7 @@ class DatasetView(Validated):
     cancelled: bool = Field(description="whether its user cancelled it; `retry` resumes it")
     outcomes: dict[str, int] = Field({}, description="rejected candidates by outcome")
 
-    @computed_field(description="why the dataset has fewer grasps than requested; null: it has all")  # type: ignore[prop-decorator]
+    @computed_field(description="why fewer grasps than requested were found; null: not applicable")  # type: ignore[prop-decorator]
     @property
     def reason(self) -> str | None:
         if not self.state.is_final or self.options.want != "valid":

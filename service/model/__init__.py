@@ -1,1 +1,1 @@
-"""Domain model for all layers: types, errors, names, digests, records and pure rules."""
+"""Domain model for all layers: types, errors, names, digests, records and pure functions."""

@@ -57,7 +57,7 @@ _CHOICES: Final = re.compile(r"'(?P<word>.*?)' is not one of (?P<expected>'.*')"
 def first_error(
     error: ValidationError, model: type[BaseModel] | None = None, names: Mapping[str, str] | None = None
 ) -> str:
-    """Return the first error after its location: `scene.touch: must be at least -1`; with `model`, the whole range."""
+    """Return the first error with its place: `scene.touch: must be at least -1`; `model` adds all bounds."""
     first = error.errors(include_url=False)[0]
     # For a union of models, pydantic adds the name of the tested model.
     place = [str(part) for part in first["loc"] if not _CLASS.match(str(part))]

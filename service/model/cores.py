@@ -15,7 +15,7 @@ _LATELY_S: Final = 2.0
 
 
 def available_cores(root: Path = ROOT) -> int:
-    """Return the number of cores of this process: its affinity, or its control group's quota, rounded up, if less."""
+    """Return the number of cores of this process: the least of its affinity and its rounded-up quotas."""
     given = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, min([given, *(math.ceil(quota) for quota in _quota_cache(root, int(time.monotonic() / _LATELY_S)))]))
 

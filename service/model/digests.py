@@ -37,7 +37,7 @@ def digest_files(kind: AssetKind, files: Mapping[str, bytes]) -> str:
 
 
 def digest_variant(digest: str, options: Mapping[str, object] | None) -> str:
-    """Return the digest of a hand or object with these read options; without options, `digest`."""
+    """Return the digest of a hand or object read with these options; without options, `digest`."""
     return digest_json({"files": digest, "options": dict(options)}) if options else digest
 
 

@@ -37,8 +37,8 @@ BATCH_SIZE: Final = 32
 #: Optional channels besides colour, depth and segmentation, in the order of shards and digests.
 EXTRA_CHANNELS: Final = ("distance", "normals", "occlusion")
 
-#: Default rechecks per job, and batches per recheck: for one grasp, the DexGraspBench protocol takes as long as
-#: planning, validation and measurement of two or three valid grasps.
+#: Default rechecks per job, and batches per recheck. One recheck takes as long as planning, validation and
+#: measurement of two or three valid grasps.
 RECHECKS: Final = 8
 _RECHECK_EVERY: Final = 2
 
@@ -63,7 +63,7 @@ SHAKE_NEEDS_A_SCENE: Final = "shake needs a lift out of a scene: choose a scene,
 
 
 def _sparse(default: Any, **facts: Any) -> Any:
-    """Return a field that documents omit at its default, so that ids and records of jobs without it are unchanged."""
+    """Return a field that JSON omits at its default: ids and records of jobs without it are unchanged."""
     return Field(default, exclude_if=lambda value: value == default, **facts)
 
 
@@ -91,7 +91,7 @@ class JobOptions(Model):
         Form("scenes", "Scene", choices=_SCENES_IN_WORDS, cells=True),
     ] = _sparse(
         "free",
-        description="scene of the grasps: free (a floating object), table, bin, shelf, or a document with "
+        description="scene of the grasps: free (a floating object), table, bin, shelf, or JSON with "
         "supports. Grasps of a scene other than free are planned, validated, rendered and counted "
         "there",
     )
@@ -99,15 +99,13 @@ class JobOptions(Model):
         Literal["drawn", "all"], Option(), Form("scenes", "Resting face", choices=_FACES_IN_WORDS, cells=True)
     ] = _sparse(
         "drawn",
-        description="resting faces of the object in its scenes. drawn: as frequent as after drops; all: one scene "
+        description="resting faces of the object in its scenes. drawn: each as often as after drops; all: one scene "
         "for each stable face, regardless of `scenes`",
     )
     neighbours: Annotated[
         tuple[BesideOption, ...],
         Option(
-            "basic",
-            flags="--with",
-            typed="neighbour in each scene: a name, or with submit a mesh to upload; up to eight",
+            "basic", flags="--with", typed="neighbour in each scene: a name, or for graspd submit a mesh; up to eight"
         ),
         Form(
             "scenes",
@@ -119,8 +117,8 @@ class JobOptions(Model):
     ] = _sparse(
         (),
         max_length=MOST_NEIGHBOURS,
-        description="names of up to eight neighbours, dropped around the object in its scenes; a scene document "
-        "places its own",
+        description="names of up to eight neighbours, dropped around the object in its scenes; a scene with "
+        "supports places its own",
     )
     touch: Annotated[
         Touch,
@@ -132,8 +130,8 @@ class JobOptions(Model):
         "contact allowed; negative: fingertips may press into the support, for flat objects",
     )
     scenes: Annotated[
-        int, Option("basic"), Form("scenes", "Scenes", "per batch; 0: none, or 4 unless the scene is free")
-    ] = Field(0, ge=0, le=64, description=f"scenes per batch of grasps; {SCENES} if a scene is named")
+        int, Option("basic"), Form("scenes", "Scenes", "per batch; 0: none if the scene is free, else 4")
+    ] = Field(0, ge=0, le=64, description=f"scenes per batch; 0: none if the scene is free, else {SCENES}")
     views: Annotated[int, Option("basic", places=JOB), Form("scenes", "Views", "camera placements per scene")] = Field(
         0, ge=0, le=256, description="camera placements per scene"
     )
@@ -169,7 +167,7 @@ class JobOptions(Model):
         Literal["valid", "candidates"], Option("basic"), Form("grasps", "Counted grasps", choices=_WANTS_IN_WORDS)
     ] = Field(
         "valid",
-        description="kind of grasps that count. valid: only valid (without validation feasible) ones; candidates: all",
+        description="grasps that count. valid: valid ones, or without validation feasible ones; candidates: all",
     )
     budget: Annotated[float, Option()] = Field(
         4.0, ge=1, le=100, description="maximum number of candidates per requested valid grasp"
@@ -311,7 +309,7 @@ class JobOptions(Model):
             raise ValueError(f"method {self.method} needs the option network: the name of a network in the service")
         if self.method in NETWORK_METHODS and not has_table(self.place):
             raise ValueError(
-                f"method {self.method} proposes grasps of objects on a table: choose scene table or bin, or a document "
+                f"method {self.method} proposes grasps of objects on a table: choose scene table or bin, or supports "
                 "with a level half-space"
             )
 
@@ -349,7 +347,7 @@ class JobOptions(Model):
 
     @property
     def beside(self) -> tuple[NamedNeighbour, ...]:
-        """Neighbours: of the scene document, then dropped ones."""
+        """Neighbours of a `SceneDocument`, then dropped neighbours."""
         placed = self.scene.neighbours if isinstance(self.scene, SceneDocument) else ()
         return (*placed, *self._named_neighbours)
 
@@ -386,7 +384,7 @@ class JobOptions(Model):
         return "kept" if self.counted == "feasible" and self.want == "candidates" else self.counted
 
     def rechecks_of(self, batch: int) -> int:
-        """Return the number of rechecks of a batch; only the first batches, by default every other, have rechecks."""
+        """Return the number of rechecks of a batch: the first batches have some, by default every other one."""
         if self.validation in ("none", "dexgraspbench"):
             return 0
         if self.rechecks == RECHECKS:

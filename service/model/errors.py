@@ -194,7 +194,7 @@ _API_KEY: Final = re.compile(r"\bgd_[A-Za-z0-9_-]{8,}")
 
 
 def without_secrets(text: str) -> str:
-    """Replace passwords in URLs and API keys by stars."""
+    """Replace API keys, and passwords in URLs, by stars."""
     if "://" in text:
         text = _PARAMETER.sub(r"\1***", _LOGIN.sub("***@", text))
     return _API_KEY.sub("gd_***", text) if "gd_" in text else text
@@ -206,7 +206,7 @@ _LISTED: Final = 20
 
 
 def available_names(word: str, names: Sequence[str]) -> str:
-    """Return `; there are: A, B` with the first names, and the most similar of at most `SEARCHED` names."""
+    """Return `; there are: A, B` with the first names, and a hint if one name is similar to `word`."""
     listed = ", ".join(names[:_LISTED]) + (", ..." if len(names) > _LISTED else "")
     return f"; there are: {listed or 'none yet'}{did_you_mean(word, names)}"
 

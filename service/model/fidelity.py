@@ -25,7 +25,7 @@ class Fidelity(Model):
         description="object surface points tested against the links; three times as many around a free object, up "
         "to 12,000",
     )
-    face_error_m: float = Field(3e-4, ge=0, le=0.01, description="simplification error bound of the object [m]")
+    face_error_m: float = Field(3e-4, ge=0, le=0.01, description="error bound of the simplified object [m]")
     coarse_iterations: int = Field(100, ge=0, le=100_000)
     fine_iterations: int = Field(40, ge=0, le=100_000)
     polish_iterations: int = Field(10, ge=0, le=100, description="Gauss-Newton steps that resolve penetration")
@@ -69,7 +69,7 @@ FIDELITIES: Final[dict[str, Fidelity]] = {
         fine_iterations=60,
         polish_iterations=15,
     ),
-    # Settings of the paper: plain descent with one rate, one contact sweep, no penetration penalty, no selection.
+    # Settings of the paper: gradient descent with one rate, one contact sweep, no penetration penalty, no selection.
     "paper": Fidelity(
         name="paper",
         starts=1,

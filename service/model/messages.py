@@ -1,4 +1,4 @@
-"""Messages in Redis: tasks and their origin; reports and capabilities of workers, requirements of tasks.
+"""Messages in Redis: tasks with origin and requirements, reports and capabilities of workers.
 
 Several versions may run in parallel. A message states a range of schemas: from the oldest that can express it to the
 newest that its writer supports. A worker also reads a range, and has one revision of each stage.
@@ -31,7 +31,7 @@ class Origin(Model):
 
 
 class TaskMessage(Model):
-    """Message of a task: with the store, all that a worker needs."""
+    """Message of a task; a worker needs only this and the store."""
 
     # The alias is needed because the message's field `schema` is an attribute of BaseModel.
     schema_: int = Field(alias="schema", description="oldest schema that can express the message")

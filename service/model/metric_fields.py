@@ -43,7 +43,7 @@ def filter_fields() -> dict[str, Any]:
 
 
 def insert_fields(**parts: Mapping[str, Any]) -> Callable[[type[M]], type[M]]:
-    """Decorate a model: insert each part of fields before the field with the part's name, `last` at the end."""
+    """Decorate a model: insert each group of fields before the field of the same name, `last` at the end."""
 
     def made(model: type[M]) -> type[M]:
         base: type[BaseModel] = next(base for base in model.__bases__ if issubclass(base, BaseModel))

@@ -1,8 +1,8 @@
-"""Table of all grasp metrics; axes of robustness, grasp types and approach directions.
+"""Table of all grasp metrics; perturbed parameters, grasp types and approach directions.
 
 Storage (`service.store.columns`), manifests, index, API, dashboard, dataset cards and docs derive from this table. A
 new metric needs a row here and a function (`MEASURES` in `worker.quality.table`); make it `optional`, since older
-shards lack it. The index adds the column at its next open (`service.index.database`). A yes-or-no property of a grasp
+shards lack it. The index adds the column when it opens (`service.index.database`). A yes-or-no property of a grasp
 is a verdict, not a metric.
 """
 
@@ -162,7 +162,7 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
         "robust_share",
         "1",
         "share of perturbed models in which the grasp holds; nan: not tested. If the test ended "
-        "early: a lower bound, or an upper bound below the required share",
+        "early: a bound on the same side of the required share",
         title="Robust share",
         short="Robust",
         optional=True,
@@ -324,6 +324,6 @@ def entropy_bits(counts: Iterable[int]) -> float:
 
 
 def evenness(counts: Iterable[int], kinds: int) -> float:
-    """Return 2^entropy / kinds: 1: uniform; 1 / kinds: a single category; 0: no grasps."""
+    """Return 2^entropy / kinds; 1: uniform, 1 / kinds: a single category, 0: no grasps."""
     counts = list(counts)
     return float(2 ** entropy_bits(counts) / kinds) if any(counts) else 0.0

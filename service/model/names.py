@@ -143,7 +143,7 @@ def check_length(name: str) -> str:
 
 @lru_cache(maxsize=4096)
 def shorten(name: str, most: int = MOST) -> str:
-    """Return the name; a long one becomes its beginning and a digest, so that it is unique, and is logged once."""
+    """Return the name; shorten a long one to its beginning and a digest, and log it once."""
     if len(name) <= most:
         return name
     short = f"{name[: most - 9]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"

@@ -30,10 +30,10 @@ def back_project(k: Floats, depth: NDArray[Any]) -> Floats:
 
 
 def surface_normals(points: Floats) -> Floats:
-    """Compute unit normals (H, W, 3) toward the camera of points (H, W, 3); nan where undefined.
+    """Compute unit normals (H, W, 3) of points (H, W, 3), directed toward the camera; nan where undefined.
 
-    Tangents are one-sided differences, on the side with less bend and no jump. On a plane 1 / z is linear in pixels, so
-    each normal belongs to the face that its pixel shows.
+    Tangents are one-sided differences, on the side with less bend and no jump; thus each normal belongs to the face
+    that its pixel shows. Bend is the second difference of 1 / z, which is linear in pixels on a plane.
     """
     along, down = _tangent(points, 1), _tangent(points, 0)
     normal = np.cross(down, along)

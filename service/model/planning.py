@@ -22,7 +22,7 @@ from graspd.service.model.records import JobRecord
 from graspd.service.model.states import AssetKind, Priority, Stage, State
 from graspd.service.model.version import OLDEST_TASK_SCHEMA, SCHEMA_OF_NETWORKS, SCHEMA_OF_RANGES, TASK_SCHEMA
 
-#: Most grasps of an interactive job, for which a user waits. Larger jobs run in bulk.
+#: Maximum number of grasps of an interactive job, for which a user waits. Larger jobs run in bulk.
 INTERACTIVE_GRASPS: Final = 4 * BATCH_SIZE
 
 MAX_BACKOFF_S: Final = 300.0
@@ -185,9 +185,9 @@ def _own_state(facts: TaskFacts, *, job_cancelled: bool) -> State:
 
 
 T = TypeVar("T")
-#: Most jobs in one scheduling round; other jobs follow in later rounds.
+#: Maximum number of jobs in one scheduling round; other jobs follow in later rounds.
 JOBS_A_ROUND: Final = 64
-#: Number of remembered turns: more than jobs with waiting tasks, because a forgotten job comes first again.
+#: Number of remembered turns, greater than the number of waiting jobs: a forgotten job comes first again.
 _REMEMBERED: Final = 100_000
 
 
@@ -274,7 +274,7 @@ def format_outcomes(outcomes: Mapping[str, int]) -> str:
 def shortfall(
     found: int, wanted: int, counted: str, candidates: int, budget: float, outcomes: Mapping[str, int], limit: str = ""
 ) -> str | None:
-    """Explain why fewer grasps were found than wanted; None if all were found. `limit`: the hand's payload limit."""
+    """Explain why fewer grasps were found than wanted, None if all were; `limit` replaces the budget."""
     if found >= wanted:
         return None
     lost, tries = format_outcomes(outcomes), candidates + outcomes.get("repeated", 0)

@@ -18,7 +18,7 @@ MARK: Final = "graspd-project.txt"
 
 @dataclass(frozen=True)
 class ProjectScope:
-    """Visible resources: of one project, with shared hands and objects, or all resources."""
+    """Visible resources: all, or those of one project and shared hands and objects."""
 
     project: str = ""
     """Project whose resource is used if two projects have the same name."""

@@ -44,7 +44,7 @@ class Choice(Record):
     reached: float = Field(description="accuracy of the chosen fidelity in these runs")
 
     def __str__(self) -> str:
-        where = "all of its runs" if self.measured_on == "all" else f"the same {self.measured_on}"
+        where = "all runs" if self.measured_on == "all" else f"the same {self.measured_on}"
         return f"chosen for {self.target}, reached {self.reached:.3g} with {where} in {self.chart}"
 
 
@@ -144,7 +144,7 @@ class Cell:
 
 
 class DatasetRecord(Record):
-    """`dataset.json`. `jobs` has one id per cell, hand by hand, then object by object.
+    """`dataset.json`. `jobs` has one id per cell, ordered by hand, then by object.
 
     With fidelity `auto`, `fidelities` has the chart's choice per cell at creation, and `chosen` the index of its reason
     in `choices`.
@@ -170,7 +170,7 @@ class DatasetRecord(Record):
         if len(self.jobs) != len(self.hands) * len(self.objects):
             raise ValueError("a dataset has a job for each hand and object")
         if len(self.fidelities) != (len(self.jobs) if self.options.fidelity == AUTO else 0):
-            raise ValueError("a dataset has a fidelity for each cell if its own is auto, and else none")
+            raise ValueError("a dataset has a fidelity for each cell if its own is auto, otherwise none")
         if self.chosen and (len(self.chosen) != len(self.jobs) or max(self.chosen) >= len(self.choices)):
             raise ValueError("a dataset has the reasons of chosen fidelities for all cells or for none")
         return self
@@ -273,7 +273,7 @@ def object_set_of(
     )
 
 
-#: Most tags of one project (or of one key without a project), and most grasps of one tag.
+#: Maximum numbers of tags of one project (or of one key without a project), and of grasps of one tag.
 MOST_TAGS: Final = 100
 MOST_TAGGED: Final = 20_000
 #: A grasp: shard id and row.

@@ -17,7 +17,7 @@ KEYS: Final = {
     "fragile": "not_robust",
 }
 _LEVELS: Final = {"letter": "dexgraspbench", "certificate": "standard", "screen": "fast"}
-#: Values of keys, by present name of the key.
+#: Values, by the current name of their key.
 VALUES: Final = {"validation": _LEVELS, "verdict_level": _LEVELS, "level": _LEVELS, "want": {"raw": "candidates"}}
 _OLD_KEYS: Final = {new: old for old, new in KEYS.items()}
 _OLD_VALUES: Final = {key: {new: old for old, new in names.items()} for key, names in VALUES.items()}

@@ -1,4 +1,4 @@
-"""Scenes: a kind, or a document of supports, neighbours and the target's pose. z of the scene frame is up.
+"""Scenes: a kind, or supports, neighbours and the target's pose. The scene frame has z upwards.
 
 A support is a half-space (everything below a plane) or a box.
 """
@@ -103,7 +103,7 @@ class SceneSpec(Model):
         if self.kind == "file" and not self.supports:
             raise ValueError("a scene file needs supports: at least one half_space or box")
         if self.kind != "file" and (self.supports or self.target is not None):
-            raise ValueError(f"a {self.kind} scene has its own supports; give them and a target with kind file")
+            raise ValueError(f"a {self.kind} scene has its own supports; give supports or a target with kind file")
         if self.kind == "free" and self.faces != "drawn":
             raise ValueError("a free object lies on no face: choose table, bin or shelf")
         if self.kind == "free" and self.touch != TOUCH:
@@ -163,7 +163,7 @@ def read_scene(path: Path) -> SceneSpec:
         raise InputError(f"the scene file {path} cannot be read: {error_text(error)}") from None
     found = _parse_document(text, path)
     if not isinstance(found, dict):
-        raise InputError(f"the scene file {path} must hold one object with supports and a target")
+        raise InputError(f"the scene file {path} must be one mapping with supports")
     try:
         spec = SceneSpec(**{"kind": "file", **found})
     except (ValidationError, TypeError) as error:
@@ -273,7 +273,7 @@ class SceneDocument(Model):
     )
 
 
-#: Scene in a request: a kind or a document, discriminated so that errors refer to the intended form.
+#: Scene in a request: a kind or a `SceneDocument`, discriminated so that errors refer to the intended form.
 SceneOption = Annotated[
     Annotated[Literal["free", "table", "bin", "shelf"], Tag("kind")] | Annotated[SceneDocument, Tag("document")],
     Discriminator(lambda value: "document" if isinstance(value, dict | SceneDocument) else "kind"),
@@ -287,7 +287,7 @@ def scene_of(
     touch: float = TOUCH,
     beside: Sequence[NeighbourSpec] = (),
 ) -> SceneSpec:
-    """Return the scene of a request, with neighbours in addition to its document's ones; ValueError if invalid."""
+    """Return the scene of a request, with the neighbours `beside` added; ValueError if it is invalid."""
     try:
         if not isinstance(option, SceneDocument):
             return SceneSpec(kind=option, faces=faces, touch=touch, neighbours=tuple(beside))

@@ -51,7 +51,7 @@ class StabilityMap:
     guard: str
     guard_test: str = ""
     lines: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
-    """Theoretical boundaries to draw over the panel of that name."""
+    """Theoretical boundaries to draw over each panel, by its name."""
     reach: str = ""
     """Which cells a job can reach, with the reason."""
 
@@ -106,7 +106,7 @@ def from_json(record: Mapping[str, Any]) -> Stability:
 
 
 def pareto(points: Sequence[tuple[float, float]]) -> set[int]:
-    """Return indices of points (more, more) that no other point dominates: as good in both, better in one."""
+    """Return indices of points that no other point dominates; more is better in both coordinates."""
     return {
         index
         for index, (x, y) in enumerate(points)
@@ -174,5 +174,5 @@ FILTERED: Final = "free, filtered"
 FREE: Final = {"gsr": True, "dexgraspbench": True, "hard": True, "robust": True, "epsilon": True, "pd_mm": False}
 IN_SCENES: Final = {"lift": True, "lift_dexgraspbench": True, "lift_hard": True, "robust": True}
 
-#: Speeds: end to end, then the planner's own, the only speed in charts of graspd 0.1.
+#: Speeds: end to end, and of the planner alone; charts of graspd 0.1 have only the latter.
 SPEEDS: Final = ("end_to_end_per_second", "valid_per_second")

@@ -116,7 +116,7 @@ def pose_to_matrix(pose: Floats) -> Floats:
 
 
 def compose(a: Floats, b: Floats) -> Floats:
-    """Compose poses (..., 7): pose of c in a's parent, given pose a and the pose b of c in a's frame."""
+    """Compose poses (..., 7): express `b`, given in the frame of `a`, in the parent frame of `a`."""
     a, b = np.asarray(a, float), np.asarray(b, float)
     position = a[..., :3] + quat_rotate(a[..., 3:], b[..., :3])
     rotation = quat_multiply(a[..., 3:], b[..., 3:])

@@ -1,4 +1,4 @@
-"""Versions in content addresses: increase one when the bytes of a result may change."""
+"""Package, message and stage versions; increase a stage's if its results may change."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from typing import Final
 
 PACKAGE_VERSION: Final = "0.2.0"
 
-#: Newest schema of task messages, and the oldest readable one. A message states the schemas that can read it, so
-#: workers of two versions may run in parallel (`service/model/messages.py`).
+#: Newest schema of task messages, and the oldest readable one. A message states its range of schemas, so workers of
+#: two versions may run in parallel (`service/model/messages.py`).
 TASK_SCHEMA: Final = 6
 OLDEST_TASK_SCHEMA: Final = 2
 #: First schema with tasks of several batches.

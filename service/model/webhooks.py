@@ -19,7 +19,7 @@ MAX_URL: Final = 500
 MOST_HOOKS: Final = 20
 MOST_WAITING: Final = 1000
 SIGNATURE: Final = "X-Graspd-Signature"
-#: Delays before the second and later attempts [s]; after the last one the delivery has failed.
+#: Delays before the second and later attempts [s]; if the last attempt fails, the delivery has failed.
 WAITS_S: Final = (5.0, 30.0, 120.0, 600.0, 3600.0, 6 * 3600.0)
 
 

@@ -78,7 +78,7 @@ Node = Flag | MetricComparison | WordComparison | TypeComparison | Negation | Co
 
 
 def parse_where(text: str) -> Node:
-    """Parse an expression to its tree; InputError states the position of a mistake, or the known names."""
+    """Parse an expression to its tree; InputError quotes the mistake, or lists the known names."""
     if len(text) > LONGEST:
         raise InputError(f"the expression is {len(text)} characters long; at most {LONGEST} are allowed")
     parser = _Parser(_tokens(text))

@@ -1,4 +1,4 @@
-"""Store, index and queue of a process; records and rows of one write transaction of the index appear together."""
+"""Store, index and queue of a process; `recording` writes records and their index rows together."""
 
 from __future__ import annotations
 
@@ -54,9 +54,9 @@ class Services:
 
 @contextmanager
 def recording(services: Services, made: Sequence[str] = ()) -> Iterator[tuple[Connection, Put]]:
-    """Yield a write transaction of the index and a function that puts records; a failure deletes them and `made`.
+    """Yield an index transaction and a function that puts records; a failure deletes these and `made`.
 
-    No other process writes meanwhile: checks before the records still hold at the write of the rows.
+    No other process writes to the index meanwhile, so checks before a record still hold when its rows are written.
     """
     keys = list(made)
 

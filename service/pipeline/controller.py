@@ -40,9 +40,9 @@ from graspd.service.store.records import newest_mark, next_mark, read_record, se
 from graspd.service.telemetry import HeartbeatFile
 
 log = logging.getLogger(__name__)
-#: Most events of one round: about one second of work. The next round follows at once.
+#: Maximum number of events of one round, about one second of work. The next round follows at once.
 _EVENTS_A_ROUND: Final = 2000
-#: Most events that may wait for the store; above this, no more are read from the stream.
+#: Maximum number of events that may wait for the store; above this, no more are read from the stream.
 _LONGEST_BACKLOG: Final = 10_000
 _FORGET_WORKERS_AFTER_S: Final = 3600.0
 _WORKERS_EVERY_S: Final = 2.0
@@ -202,7 +202,7 @@ class Controller:
 
     def _check_workers(self) -> None:
         self._announce()
-        # A worker reports its regular end, but its registration disappears a moment earlier.
+        # A worker that ends is unregistered a moment before it reports this: it does not count as lost at once.
         present = self._services.queue.workers()
         self._workers = len(present)
         # A briefly silent worker still counts in the decision whether tasks are held back.
@@ -303,7 +303,7 @@ class Controller:
     def _feed(self, present: set[str] | None = None, missing: Collection[str] = ()) -> None:
         """Queue ready tasks; without the queue's content (`present`), the marks of the index decide.
 
-        The queue refuses a second entry of a task, also while a job is queued concurrently, except for `missing` tasks.
+        The queue refuses a second entry of a task, even from a concurrent request, except for `missing` tasks.
         """
         depths = self._services.queue.depths()
         now = time.time()

@@ -1,9 +1,9 @@
 """Deletion of assets, jobs and datasets by users, and the garbage collector of the store.
 
 One step under the index's write lock writes `deletions/{what}/{id}.json` and removes the rows. From then on the
-resource does not exist: rebuilds omit it, and nothing of its id is accepted. The garbage collector then moves its
-objects aside, a part in each round of the controller, removes the record, and can resume after a kill. After the grace
-time they are removed permanently, with the shards that no job needs.
+resource does not exist: rebuilds omit it, and nothing of its id is accepted. In the following rounds of the controller,
+the garbage collector moves its objects aside, then removes that record; it can resume after a kill. After the grace
+time, it permanently removes these objects and the shards that no job needs.
 """
 
 from __future__ import annotations
@@ -223,7 +223,7 @@ def _restore_tag(services: Services, deletion: Deletion) -> None:
 def _require(services: Services, wanted: Collection[tuple[AssetKind, str]], connection: Connection) -> None:
     if missing := services.index.assets.missing(wanted, within=connection):
         kind = missing[0].partition(" ")[0]
-        raise ConflictError(f"it needs the {missing[0]}, which was deleted too: graspd {kind}s restore first")
+        raise ConflictError(f"it needs the {missing[0]}, which was deleted too; first: graspd {kind}s restore")
 
 
 def _record_of(deletion: Deletion) -> str:
@@ -262,10 +262,10 @@ class GarbageCollector:
         return False
 
     def collect(self, budget_s: float = BUDGET_S) -> bool:
-        """Remove objects deleted before the grace time, and unused shards; return whether work is left."""
+        """Remove objects whose grace time is over, and unused shards; return whether work is left."""
         deadline = self._clock() + budget_s
         before = timestamp(self._services.settings.shard_grace_s)
-        # The record of the deletion sorts first and is removed last.
+        # The record of a deletion is removed last.
         removed = [entry.key for entry in self._services.store.list(names.REMOVED)]
         for key in sorted(removed, key=lambda key: key.endswith("/deletion.json")):
             if self._clock() > deadline:
@@ -311,7 +311,7 @@ class GarbageCollector:
         return True
 
     def _remove_jobs_of(self, dataset: str, deadline: float) -> bool:
-        """Delete the jobs planned for a dataset that no other dataset contains; return whether all are gone."""
+        """Delete jobs that were planned for this dataset and are in no other; return whether all are gone."""
         try:
             jobs = load_dataset(self._services.store, dataset).jobs
         except (NotFoundError, DamagedError):
@@ -336,7 +336,7 @@ class GarbageCollector:
             yield from ((stage, shard) for stage, shard in some if shard in unneeded)
 
     def _remove_shard(self, stage: Stage, shard: str) -> None:
-        """Remove the manifest first, which ends the shard; a job entered meanwhile makes the shard again."""
+        """Remove the manifest first, so the shard no longer exists; a job entered meanwhile makes it again."""
         with self._services.index.database.writing() as connection:
             if self._services.index.removals.remove_shard(shard, within=connection):
                 self._services.store.delete(names.shard_manifest(stage, shard))

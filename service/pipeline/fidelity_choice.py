@@ -1,4 +1,4 @@
-"""Choice of the cheapest fidelity that reaches a wanted accuracy in the stored charts."""
+"""Choice of the cheapest fidelity that reaches a required accuracy in the stored charts."""
 
 from __future__ import annotations
 
@@ -122,10 +122,10 @@ def parse_target(text: str, *, in_scene: bool = False) -> tuple[str, float]:
 
 
 def cheapest(chart: Row, target: str, *, method: str, hand: str, object_: str) -> ChosenFidelity:
-    """Return the fidelity of a method with most valid grasps per second that meets a target; InputError if none does.
+    """Return a method's fastest fidelity (by valid grasps) that meets a target; InputError if none does.
 
     Runs of the same hand and object count; else runs of the hand; else all. In a chart of scenes only grasps planned
-    for them count, by lifted grasps per second.
+    in the scene count, by lifted grasps per second.
     """
     in_scene = "scene" in chart
     metric, bound = parse_target(target, in_scene=in_scene)
@@ -151,7 +151,7 @@ def cheapest(chart: Row, target: str, *, method: str, hand: str, object_: str) -
 
 
 def _nearest(runs: Sequence[Row], metric: str, wanted: Mapping[str, str]) -> tuple[Near, list[Row]] | None:
-    """Return the most similar runs, at least one of which has the accuracy."""
+    """Return the most similar runs, at least one of which has a value of `metric`."""
     for measured_on, same in _NEAR:
         near = [run for run in runs if all(run[name] == wanted[name] for name in same)]
         if any(run.get(metric) is not None for run in near):
@@ -160,12 +160,12 @@ def _nearest(runs: Sequence[Row], metric: str, wanted: Mapping[str, str]) -> tup
 
 
 def _speed(runs: Sequence[Row], fidelity: str) -> float:
-    """Return the mean over a fidelity's runs; a run without grasps, or a refused one, has speed 0."""
+    """Return the mean speed of a fidelity's runs; a run without grasps, or a refused one, has speed 0."""
     own = [run for run in runs if run["fidelity"] == fidelity]
     return sum(float(next((run[key] for key in SPEEDS if key in run), None) or 0.0) for run in own) / len(own)
 
 
 def _mean(runs: Sequence[Row], fidelity: str, metric: str) -> float | None:
-    """Return the mean over a fidelity's runs with the accuracy; robustness needs held grasps."""
+    """Return the mean of a metric over a fidelity's runs that have it; None if none has."""
     values = [float(run[metric]) for run in runs if run["fidelity"] == fidelity and run.get(metric) is not None]
     return sum(values) / len(values) if values else None

@@ -1,4 +1,4 @@
-"""Identity of the service of a store, an index and a Redis.
+"""Identity of the service that owns a store, an index and a Redis.
 
 Two services with a common store, index or Redis would undo each other's work. The store contains a chain of create-only
 records; the last record identifies its service. Index and Redis repeat the id. If one is lost, the other identifies the
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 _FILE: Final = "service.id"
 _BYTES: Final = 16
 _REDIS: Final = (
-    "this Redis belongs to another graspd service; give this one a Redis of its own, or another number of database, in "
+    "this Redis belongs to another graspd service; give this one a Redis of its own, or another database number, in "
     "GRASPD_REDIS_URL; if the other is gone for good, empty it: redis-cli FLUSHDB"
 )
 
@@ -49,7 +49,7 @@ class Identity:
 
     @property
     def is_same(self) -> bool:
-        """Whether the last service of the store is the index's."""
+        """Whether the store's last service owns the index (if that has no id: Redis or the data folder)."""
         if self.index is not None:
             return self.index == self.chain[-1]
         others = {self.redis, self.folder} - {None}

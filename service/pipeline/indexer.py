@@ -27,7 +27,7 @@ from graspd.service.store.records import read_record
 log = logging.getLogger(__name__)
 _REMEMBERED_JOBS: Final = 10_000
 _REMEMBERED_TASKS: Final = 100_000
-#: Most batches indexed in one transaction; other writers wait for a fraction of a second.
+#: Maximum number of batches indexed in one transaction; other writers wait for a fraction of a second.
 _BATCHES_AT_ONCE: Final = 200
 #: Manifests in memory at once, each of up to 64 batches.
 _MANIFESTS_AT_ONCE: Final = 32
@@ -219,7 +219,7 @@ def _skip_invalid(what: str) -> Iterator[None]:
         log.exception("%s is ignored", what)
 
 
-#: Most error names with a series of their own, as a bound against forged names; an engine raises fewer.
+#: Maximum number of error names with their own series, a bound against forged names; an engine raises fewer.
 MOST_KINDS: Final = 60
 OTHER_KIND: Final = "other"
 

@@ -63,9 +63,9 @@ _AGAIN_S: Final = 60.0
 _KNOWN: Final = 1000
 #: Keys in memory at once; further keys need another listing of the folder.
 _KEYS: Final = 10_000
-#: Least cost of an object, so that a million small objects are not read at once [bytes].
+#: Each object counts as at least this size [bytes], so that a million small objects are not read at once.
 _LEAST: Final = 16 * 2**10
-#: Most backlog that is read at once after a pause [s].
+#: Time lost in a pause that reads may make up at once, at most [s].
 _BURST_S: Final = 0.25
 #: Interval of queries whether `graspd admin store verify` pauses the scan [s].
 _PAUSE_S: Final = 5.0

@@ -1,4 +1,4 @@
-"""Actions of a user on jobs: submit, cancel, retry; which assets they may use, and how many tasks a job has."""
+"""Actions of a user on jobs (submit, cancel, retry); assets for jobs; number of tasks of a job."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class TaskRanges:
         self._costs: list[BatchCost] = []
 
     def sized(self, job: JobRecord, *, among: int = 1) -> JobRecord:
-        """Return a job with its number of batches per task, if `among` jobs share the workers."""
+        """Return a job with its number of batches per task; `among`: number of jobs that share the workers."""
         batches, wanted_s = batches_of(job.request.grasps), self._services.settings.task_s
         # Pictures of a batch are already a file of megabytes.
         if batches == 1 or job.request.views or not wanted_s:
@@ -124,7 +124,7 @@ def refuse_deleted(services: Services, wanted: Sequence[tuple[AssetKind, str]], 
 def with_neighbours(
     services: Services, options: Options, scope: ProjectScope = EVERYTHING
 ) -> tuple[Options, Sequence[AssetView]]:
-    """Return options with the present digests of the neighbours' names, and these neighbours.
+    """Return options with the current digest of each neighbour, and these neighbours.
 
     A digest in the request itself, for example one copied from a job, stays. Errors as in `usable_asset`; InputError if
     a name and a digest belong to two objects.
@@ -208,7 +208,7 @@ def enter(services: Services, record: JobRecord, *, keeps_assets: bool = False) 
     one of them was deleted. ConflictError: the same job was deleted, and its objects are still being removed.
     """
     key = names.job_record(record.id)
-    # A dataset needs its jobs even after an interruption, and its planner must not hold the lock during store access.
+    # A dataset needs its jobs even after an interruption, and must not hold the lock while it accesses the store.
     new = keeps_assets and put_record(services.store, key, record)
     with recording(services, [key] if new else []) as (connection, put):
         new = new or (not keeps_assets and put(key, record))
@@ -313,7 +313,7 @@ def _start(services: Services, job_id: str) -> None:
 
 @contextmanager
 def _transaction(services: Services, job_id: str, refuse: Callable[[JobView], None]) -> Iterator[Callable[..., None]]:
-    """Lock a job to append an event unless `refuse` raises; the later of two concurrent changes reads both.
+    """Lock a job to append an event unless `refuse` raises; a later change sees the earlier one.
 
     Earlier events are read before the lock, because the store may be slow.
     """

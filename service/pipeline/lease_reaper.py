@@ -28,7 +28,7 @@ LOST_AFTER_S: Final = 3.0
 
 
 class LeaseReaper:
-    """Detects lost leases by the lack of change, on this process's monotonic clock, not on wall clocks."""
+    """Detects lost leases by heartbeats that stay unchanged, timed by this process's monotonic clock."""
 
     def __init__(self, services: Services, indexer: Indexer, *, clock: Callable[[], float] = time.monotonic) -> None:
         self._services = services
@@ -39,7 +39,7 @@ class LeaseReaper:
         self._missing: dict[str, float] = {}
 
     def reap(self, leases: Collection[Lease]) -> list[Lease]:
-        """Take tasks from workers without a heartbeat for a lease; return their leases."""
+        """Take tasks from workers without a heartbeat for the duration of a lease; return their leases."""
         now = self._clock()
         lease_s = self._services.settings.lease_s
         # Time without checks, because Redis was unavailable or this process suspended, does not count as silence.
@@ -71,7 +71,7 @@ class LeaseReaper:
         return missing
 
     def _recover(self, missing: list[str]) -> None:
-        """Recover lost events from the store; queue tasks again whose result the store lacks."""
+        """Recover lost events from the store; queue tasks without a result in the store again."""
         again = []
         for made in (
             unpack_all(self._services.store) if missing else ()

@@ -1,4 +1,4 @@
-"""Webhook dispatcher: signed reports of ends, one at a time to each address, retried with back-off.
+"""Webhook dispatcher: signed reports of ended jobs and datasets, one per address at a time, with retries.
 
 A failed delivery pauses all deliveries to its address. Projects take turns; within a project, the least recently used
 address comes first. Addresses whose last delivery failed share half of the slots, so the others are not delayed.
@@ -30,7 +30,7 @@ from graspd.service.model.webhooks import SIGNATURE, secret_of, signature
 from graspd.service.pipeline.backends import Services
 
 log = logging.getLogger(__name__)
-#: Most concurrent deliveries, and the share of addresses that failed last.
+#: Maximum number of concurrent deliveries: in all, and to addresses whose last delivery failed.
 AT_ONCE: Final = 32
 SLOW_AT_ONCE: Final = AT_ONCE // 2
 _PAUSE_S: Final = 1.0
@@ -40,15 +40,15 @@ _FORGET_EVERY_S: Final = 3600.0
 
 PATIENCE_S: Final = 10.0
 LOOK_UP_S: Final = 5.0
-#: Most bytes read of the answer after its status line and headers.
+#: Maximum number of bytes read from the body of an answer.
 _READ_BYTES: Final = 1024
 #: Prefixes that map IPv4 addresses: the well-known one, and network-specific ones.
 _NAT64: Final = ipaddress.ip_network("64:ff9b::/96")
 _LOCAL_NAT64: Final = ipaddress.ip_network("64:ff9b:1::/48")
 Address = ipaddress.IPv4Address | ipaddress.IPv6Address
 Networks = tuple[ipaddress.IPv4Network | ipaddress.IPv6Network, ...]
-#: Addresses that the library counts as global although only internal machines reach them: of clouds (Azure's host,
-#: IBM's services), of protocols (RFC 6890, RFC 7526), of documentation (RFC 9637).
+#: Addresses that `ipaddress` counts as global although they are not public: of clouds (Azure's host, IBM's services),
+#: of protocols (RFC 6890, RFC 7526), of documentation (RFC 9637).
 _INSIDE: Final = tuple(
     ipaddress.ip_network(one)
     for one in ("168.63.129.16/32", "161.26.0.0/16", "166.8.0.0/14", "192.0.0.0/24", "192.88.99.0/24", "3fff::/20")
@@ -82,7 +82,7 @@ def networks(text: str) -> Networks:
 
 
 def is_public(address: Address) -> bool:
-    """Check whether an address is public; an IPv6 address also by the IPv4 address in it.
+    """Check whether an address is public; the IPv4 address within an IPv6 address decides.
 
     Loopback, private, link-local, shared, multicast and reserved addresses are not public.
     """
@@ -159,7 +159,7 @@ def post(
 
 
 class _Connection(http.client.HTTPConnection):
-    """Connection to one of the checked addresses, within `patience_s`; the library would resolve the name again."""
+    """Connection to one of the checked addresses, within `patience_s`; `http.client` would resolve it again."""
 
     def __init__(self, scheme: str, host: str, port: int, addresses: Sequence[str], patience_s: float) -> None:
         super().__init__(host, port)

@@ -34,8 +34,8 @@ def connect(url: str, *, patience: int = 3, timeout_s: float = _SOCKET_TIMEOUT_S
     except (ValueError, TypeError):
         # The library's message may contain part of the password.
         raise QueueUnavailable(
-            "the Redis URL (GRASPD_REDIS_URL) cannot be used; give redis://, rediss:// or unix://, and in a password "
-            "%2F for /, %23 for #, %3F for ? and %40 for @"
+            "the Redis URL (GRASPD_REDIS_URL) cannot be used; give redis://, rediss:// or unix://; in a password, "
+            "write %2F for /, %23 for #, %3F for ? and %40 for @"
         ) from None
 
 

@@ -1,14 +1,14 @@
 """Entries in Redis: lists of waiting tasks, parsing of messages, restriction of jobs to graspd's own task.
 
 Any client can write any value under any name. Unreadable entries are skipped; `sweep` removes permanent obstacles. RQ
-imports and calls any function named in a job's hash, even with the JSON serializer; likewise callbacks, and posts to
-any webhook URL. A worker therefore rebuilds each job from its id and message only. It passes the message to its engine
-and calls nothing that the job names.
+imports and calls any function or callback named in a job's hash, even with the JSON serializer, and posts to any
+webhook URL in it. A worker therefore rebuilds each job from its id and message only. It passes the message to its
+engine and calls nothing that the job names.
 
 There is one list per priority and stage, so that workers can serve selected stages. During an upgrade, a task that only
 some workers can do waits in a separate list. Its name ends in the requirements, `bulk-synthesize.2.10` for schema 2 and
-revision 10; other workers never read it. RQ defines the names of its keys. Its readers modify data as they read, so
-read-only code uses keys.
+revision 10; other workers never read it. RQ defines the names of its keys. RQ's readers modify data, so read-only
+code reads the keys directly.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _ADAPTERS: Final[dict[type, TypeAdapter[Any]]] = {kind: TypeAdapter(kind) for ki
 _ATTEMPT: Final = re.compile(r"(.+)-([0-9]{1,9})")
 #: Limit of the unpacked message; a real one has a few kilobytes.
 _MESSAGE_BYTES: Final = 1 << 20
-#: Future time of an entry that would block a stream: a stream rejects entries older than its newest.
+#: A stream whose newest id is further in the future [ms] is removed: it would reject all current entries.
 _FUTURE_MS: Final = 24 * 3600 * 1000
 
 
@@ -91,7 +91,7 @@ def events(reply: Any) -> list[tuple[str, Event | None]]:
 
 
 def sweep(connection: Any, kinds: Mapping[str, str], stream: str) -> None:
-    """Remove entries of another type than that in `kinds`, and the event stream if it accepts no entries."""
+    """Remove keys whose type differs from that in `kinds`, and the event stream if it accepts no entries."""
     with connection.pipeline(transaction=False) as pipe:
         for name in kinds:
             pipe.type(name)
@@ -138,7 +138,7 @@ LISTS: Final[str] = Queue.redis_queues_keys
 RQ_WORKERS: Final[str] = Worker.redis_workers_keys
 #: Later stages first: started batches are finished before the next one starts.
 _STAGE_ORDER: Final = (Stage.INGEST, Stage.RENDER, Stage.SCENE, Stage.SYNTHESIZE)
-#: Limit of separate lists by version; further names are ignored.
+#: Maximum number of separate lists; further names are ignored.
 _MOST_APART: Final = 64
 _APART: Final = re.compile(r"(.+)\.([0-9]{1,4})\.([0-9]{1,4})")
 _COMMON: Final = tuple(f"{priority.value}-{stage.value}" for priority, stage in product(Priority, Stage))

@@ -16,7 +16,7 @@ from graspd.service.model.states import Priority, Stage
 Message = TaskMessage | IngestMessage
 
 
-#: Every n-th task of a worker is bulk first, so that steady interactive work does not block bulk work.
+#: A worker looks for every n-th task in bulk first, so that steady interactive work does not block bulk work.
 BULK_EVERY: Final = 4
 
 

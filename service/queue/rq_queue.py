@@ -1,7 +1,7 @@
 """Queue on Redis: RQ for tasks and leases, a bounded stream for events.
 
-Each priority and stage has an RQ queue. RQ's own retries, scheduler, maintenance and result storage are unused: each
-loses or repeats work in ways that the controller does not.
+Each pair of priority and stage has an RQ queue. RQ's own retries, scheduler, maintenance and result storage are
+unused: each loses or repeats work in ways that the controller does not.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ from graspd.service.queue.port import Event, Lease, Message, Place, QueueStatus
 from graspd.service.settings import Settings
 
 EVENTS: Final = "graspd:events"
-#: Most events, 20 MB: a minute of controller downtime at four hundred tasks per second. Lost events are restored from
-#: the store.
+#: Maximum number of events (20 MB): a minute without a controller at four hundred tasks per second. Lost events are
+#: restored from the store.
 EVENTS_KEPT: Final = 50_000
 #: Consumer group, named as in graspd 0.2, so that a controller continues where one of 0.2 ended.
 _GROUP: Final = "keeper"
@@ -88,7 +88,7 @@ class RqQueue:
     def enqueue(
         self, messages: Sequence[Message], priority: Priority, *, again: bool = False, apart: bool = False
     ) -> int:
-        """Append tasks to a priority; return how many. A waiting or running task (id and attempt) is not queued twice.
+        """Append tasks to a priority's lists; return how many. Waiting and running ones are not added again.
 
         `again` replaces remaining data of tasks that the caller found missing. `apart` appends to the separate lists.
         """
@@ -168,7 +168,7 @@ class RqQueue:
         ]
 
     def holder(self, lease: Lease) -> tuple[str, Message | None]:
-        """Return worker and message of a lost lease, one round trip each; None for data that Redis has lost."""
+        """Return worker and message of a lost lease; "" and None for data that Redis has lost."""
         with _convert_errors(), self.connection.pipeline(transaction=False) as pipe:
             pipe.hmget(job_key(entries.text(lease.key[1].partition(b":")[0])), "worker_name", "data")
             (found,) = pipe.execute(raise_on_error=False)  # The name may have a value of another type.

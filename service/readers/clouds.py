@@ -88,7 +88,7 @@ class Clouds(Sequence[dict[str, Any]]):
             raise InputError(f"there is no posture {sorted(unknown)[0]!r}; choose from {', '.join(POSTURES)}")
         if points < 1 or voxel_m < 0 or touch_m <= 0 or seed < 0:
             raise InputError(
-                "clouds need at least one point, a voxel of 0 or more, a touch above 0 and a seed of 0 or more"
+                "clouds need points of at least 1, voxel_m of at least 0, touch_m above 0 and seed of at least 0"
             )
         self.pictures, self.points, self.frame, self.epoch = pictures, points, chosen, 0
         self._noise, self._whole, self._voxel, self._seed = noise_of(noise), scene, voxel_m, seed

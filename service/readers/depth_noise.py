@@ -48,9 +48,9 @@ class DepthNoise:
     axial_m: float = 0.0
     """Axial noise at distances up to `axial_from_m` [m]."""
     axial_square: float = 0.0
-    """Growth of the axial noise with the square of the distance beyond [1/m]."""
+    """Growth of the axial noise with the square of the distance beyond `axial_from_m` [1/m]."""
     axial_slope: float = 0.0
-    """Linear growth of the axial noise with the distance beyond."""
+    """Linear growth of the axial noise with the distance beyond `axial_from_m`."""
     axial_from_m: float = 0.0
     axial_angle: float = 0.0
     """Growth of the axial noise with the angle of incidence [m^1.5]."""
@@ -184,7 +184,7 @@ def _mix_edges(depth: Floats, draw: np.random.Generator) -> Floats:
 NOISES: Final[Mapping[str, DepthNoise]] = MappingProxyType(
     {
         # Intel RealSense D435 at 848 x 480 and 90 degrees: f = 424 px; baseline 50 mm; subpixel 0.08 px (issue 3904),
-        # steps of 1/32 px (subpixel linearity), 126 px searched (its 17 cm: issue 999), 99 % filled (data sheet).
+        # steps of 1/32 px (subpixel linearity), 126 px searched (nearest 17 cm: issue 999), 99 % filled (data sheet).
         # Handa et al. shift by half a pixel.
         "stereo": DepthNoise(
             424.0,

@@ -40,7 +40,7 @@ _TABLES: Final = 4096
 class PictureAddress:
     file: ShardFile
     scene_shard: str
-    """Id of the scene shard, or of the base shard with its scenes."""
+    """Id of the shard with the scene: a scene shard, or a base shard with grasps planned in scenes."""
     scene: int
     row: int
 

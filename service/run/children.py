@@ -132,7 +132,7 @@ def stop_children(children: Sequence[Child], grace_s: float) -> None:
 
 
 def kill_leftovers(folder: Path) -> list[int]:
-    """Kill the children of an earlier `graspd up` by its pid files, unless a pid was reused; return the pids."""
+    """Kill children of an earlier `graspd up` that its pid files name, unless reused; return the pids."""
     ended = []
     for file in (folder / "run").glob("*.pid"):
         try:

@@ -50,10 +50,10 @@ def up(
     ] = None,
     share_host: Annotated[
         str | None,
-        typer.Option(help="With --share: address of this machine for their workers; default: its host name."),
+        typer.Option(help="With --share: address of this machine for other machines; default: its host name."),
     ] = None,
     redis_port: Annotated[
-        int, typer.Option(min=0, max=65535, help="With --share: port of Redis for their workers; 0: any free port.")
+        int, typer.Option(min=0, max=65535, help="With --share: port of Redis for other machines; 0: any free port.")
     ] = 0,
     data_dir: DataDir = None,
     json: JsonFlag = False,
@@ -91,7 +91,7 @@ def controller(
     ] = False,
     data_dir: DataDir = None,
 ) -> None:
-    """Run the controller: lost leases, retries, index. One leads, others stand by; `graspd up` starts one."""
+    """Run a controller (retries, index); one leads, others stand by. `graspd up` starts one."""
     settings = load_settings(data_dir=data_dir)
     log_to_stderr(settings, "controller")
     restrict_file_access(settings)
@@ -146,7 +146,7 @@ def rebuild(
     data_dir: DataDir = None,
     json: JsonFlag = False,
 ) -> None:
-    """Rebuild the index from the store, and make this service its owner.
+    """Rebuild the index from the store, and make this service the owner of the store.
 
     An index of another graspd version is replaced by one with the tables of this version.
 

@@ -21,7 +21,7 @@ from graspd.service.settings import Settings
 from graspd.service.user_cache import write_atomically
 
 log = logging.getLogger(__name__)
-#: Files of an append-only Redis: from version 7 on, and before.
+#: Append-only files of Redis: folder of version 7 and later, file of earlier versions.
 _LOGS: Final = ("appendonlydir", "appendonly.aof")
 _TAIL_BYTES: Final = 1 << 16
 _READY: Final = "Ready to accept connections"

@@ -180,7 +180,7 @@ class Supervisor:
             update["port"] = reserved.getsockname()[1]
             if sys.platform == "linux":
                 self._locks.append(reserved)
-            else:  # Other systems refuse a second socket of one address.
+            else:  # Other systems refuse a second socket on one address.
                 reserved.close()
         self.settings = self._wanted.model_copy(update=update)
 

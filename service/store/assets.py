@@ -20,7 +20,7 @@ from graspd.service.model.states import AssetKind
 from graspd.service.store.descriptions import MAX_BYTES, parse_description
 
 _EPOCH: Final = (1980, 1, 1, 0, 0, 0)
-#: Creation date of built-in assets: that of the release, so that repeated publication writes the same manifest.
+#: Creation date of built-in assets: that of the release, so that repeated publication writes the same record.
 _BUILTIN_CREATED: Final = "2026-11-21T00:00:00Z"
 MAX_FILES: Final = 2000
 #: zlib's message for lack of memory, to distinguish it from damage.
@@ -28,7 +28,7 @@ _NO_MEMORY: Final = "Error -4 "
 #: Limits on one name and on all names together: every list of hands or objects contains them.
 MAX_NAME: Final = 255
 MAX_NAMES: Final = 128 << 10
-#: Limit on unpacked size over packed size: robot meshes compress about 4:1, so only ZIP bombs exceed it.
+#: Limit on the ratio of unpacked to packed size: robot meshes have about 4, so only ZIP bombs exceed it.
 UNPACK_FACTOR: Final = 8
 _PIECE_BYTES: Final = 1 << 16
 _T = TypeVar("_T")
@@ -67,7 +67,7 @@ def unpack_file(path: Path) -> dict[str, bytes]:
 
 
 def without_common_folder(files: dict[str, _T]) -> dict[str, _T]:
-    """Remove the folder's name from all names if the archive contains one folder."""
+    """Remove the folder's name from all names if all files are in one folder."""
     tops = {name.partition("/")[0] for name in files}
     if len(tops) == 1 and all("/" in name for name in files):
         return {name.partition("/")[2]: entry for name, entry in files.items()}

@@ -115,7 +115,7 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
         "quality/recheck": _flag(
             "verdict under the unmodified DexGraspBench protocol: 1 held, 0 dropped, -1 not rechecked"
         ),
-        "quality/published": _flag("imported grasps: published verdict: 1 held, 0 dropped, -1 none"),
+        "quality/published": _flag("published verdict of imported grasps: 1 held, 0 dropped, -1 none"),
         **_measured(optional=True),
         "quality/robust_weakest": _code(
             "perturbed parameter of the first model in which the grasp does not hold: 0 none, ", outcomes=AXIS_MEANINGS
@@ -142,7 +142,7 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
         "quality/lift_outcome": _code("lift test: ", outcomes=LIFT_OUTCOMES),
         "quality/lift_hard": _flag("lift test at half the friction: 1 lifted, 0 not, -1 not tested"),
         "quality/pushes": _flag(
-            "only in files of graspd 0.2: six pushes without the scene: 1 held, 0 dropped, -1 not tested"
+            "six pushes without the scene, only in files of graspd 0.2: 1 held, 0 dropped, -1 not tested"
         ),
     },
     "scene": {
@@ -211,7 +211,7 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
             "V H W 3", "u1", "sRGB", "image", "colour with the hand in its grasp pose, for display"
         ),
         "camera/hand_grasp": _absent(
-            "V", "i4", "1", "none", "row of the grasp that rgb_hand shows in the scene shard; -1: none"
+            "V", "i4", "1", "none", "row, in the scene shard, of the grasp in rgb_hand; -1: none"
         ),
     },
 }
@@ -251,7 +251,7 @@ ATTRIBUTES: Final[dict[str, RootAttribute]] = {
     "fidelity": RootAttribute("text", "settings of the fidelity, as JSON"),
     "seed": RootAttribute("integer", "seed; with batch and digests it determines the result"),
     "batch": RootAttribute("integer", "number of the first batch of the shard in its job"),
-    "batch_rows": RootAttribute("text", "JSON: rows of each batch, in order; absent: one batch", _BASE),
+    "batch_rows": RootAttribute("text", "JSON: number of rows of each batch; absent: one batch", _BASE),
     "device": RootAttribute("text", "device of the computation"),
     "seconds": RootAttribute("number", "computing time [s]"),
     "created": RootAttribute("text", "time of creation, RFC 3339"),

@@ -14,7 +14,7 @@ from pydantic_core import from_json, to_json
 from graspd.service.model.base import Model, first_error
 from graspd.service.model.errors import ConflictError, InputError
 
-#: Size limit of facts: every list of hands or objects contains them; built-in hands need 2 KB.
+#: Size limits of `asset.json` and its facts: lists of hands or objects contain the facts; built-in hands need 2 KB.
 MAX_BYTES: Final = 64 << 10
 MAX_FACTS_BYTES: Final = 8 << 10
 _MAX_DEPTH: Final = 6
@@ -137,7 +137,7 @@ def facts_of(model: bytes) -> HandFacts:
         return HandFacts.model_validate(extras["facts"] | {"links": list(extras["links"]), "bodies": bodies})
     except (struct.error, ValueError, KeyError, TypeError, ValidationError):
         raise ConflictError(
-            "the model of this hand was made by an older version and lacks facts; correct it with "
+            "an older version made the model of this hand, without joint limits and guesses; correct the hand with "
             "`graspd hands check --write`"
         ) from None
 

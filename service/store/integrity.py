@@ -180,9 +180,9 @@ _DIGITS: Final = re.compile(rb"[0-9a-f]{64}")
 _JSON: Final = b'{"checksum":"'
 _GLB: Final = b'{"extras":{"checksum":"'
 _ZIP: Final = b"sha256:"
-#: Size of a document's header and the header of its first chunk [bytes].
+#: Size of a binary glTF's header and of the header of its first chunk [bytes].
 _GLB_AT: Final = 20
-#: Size of the object's head that may contain the seal's digits if earlier bytes were lost or added [bytes].
+#: Largest displacement, by bytes added before them, at which the seal's digits are still found [bytes].
 _SLACK: Final = 4
 _END: Final = struct.Struct("<4s4H2LH")
 _END_MARK: Final = b"PK\x05\x06"

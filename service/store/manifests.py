@@ -90,7 +90,7 @@ class ShardManifest(Record):
     @model_validator(mode="after")
     def _check_summaries(self) -> ShardManifest:
         if self.stage is Stage.SYNTHESIZE and len(self.grasps) != self.counts.get("N"):
-            raise ValueError("a base shard's manifest sums up each of its grasps")
+            raise ValueError("a base shard's manifest has a summary of each grasp")
         return self
 
     @property

@@ -15,7 +15,7 @@ from graspd.service.model.errors import InputError
 from graspd.service.store.assets import check_path
 
 _SCHEME: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):(/*)")
-#: Schemes of names with a path, whose first part (a package or foreign folders) is optional.
+#: Schemes of names whose first folders (a package, or folders of another machine) are optional.
 _OURS: Final = frozenset({"package", "model", "file"})
 
 
@@ -24,11 +24,11 @@ class Reference:
     names: tuple[str, ...]
     scheme: str = ""
     tails: tuple[str, ...] = ()
-    """For names with a scheme: path tails, except the bare file name, that may be below any folder."""
+    """For names with a scheme: tails of the path, longer than the file name, to find below any folder."""
 
 
 def read_reference(written: str, base: str) -> Reference:
-    """Resolve a name with slashes or backslashes, spaces or `%20`; the message of InputError continues after the name.
+    """Resolve a name with slashes, backslashes, spaces or `%20`; InputError's text follows the name.
 
     A ROS package may be packed with or without its folder and parent folders, and next to other packages.
     `package://NAME/a/b.stl` is NAME/a/b.stl, a/b.stl or b.stl, from the description's folder or from the top.
@@ -68,7 +68,7 @@ def _inside(path: str, base: str) -> str:
         raise InputError("lies outside the hand's folder; put it inside") from None
 
 
-#: Most names that are read from one file; a material library has fewer.
+#: Maximum number of names that are read from one file; a material library has fewer.
 MAX_NAMES: Final = 64
 HEAD_BYTES: Final = 2**20
 _SPACES: Final = rb"[ \t]+"

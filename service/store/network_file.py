@@ -1,7 +1,7 @@
 """Files of proposal networks: `.npz` of schema `graspd/proposals@1`, arrays and a JSON text, no code.
 
-The architecture is fixed, so the joints imply the shape of every array. `baselines.learned.network` evaluates the
-network.
+The architecture is fixed, so the number of joints decides the shape of every array. `baselines.learned.network`
+evaluates the network.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from graspd.service.store.descriptions import json_object, parse_description
 SCHEMA: Final = "graspd/proposals@1"
 #: Size limit of a file, packed or unpacked; a network of 22 joints takes 5.4 MB [bytes].
 MAX_BYTES: Final = 64 << 20
-#: Point features of the encoder, and widths of its layers, the last before the maximum over points.
+#: Number of point features, and widths of the encoder's layers before the maximum over points.
 ENCODER: Final = (7, 64, 128, 256)
 FEATURE: Final = 256
 #: Size of the condition: feature of the cloud, its height above the table, and the label.

@@ -33,7 +33,7 @@ _HEAD: Final = struct.Struct("<8sQ")
 
 
 class _Packed(Record):
-    """Positions of a shard's manifest and file behind the directory [bytes], with their checksums."""
+    """Positions of a shard's manifest and file after the directory [bytes], with their checksums."""
 
     id: Digest
     stage: Stage

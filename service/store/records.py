@@ -189,7 +189,7 @@ def scene_kinds(store: Store) -> list[str]:
 
 
 def publish(store: Store, kind: str, record: Mapping[str, Any]) -> str:
-    """Add a record to its kind; return its key: its `created`, with a number if taken."""
+    """Store a record of a kind; return its key, made from `created`, with a number if that key is taken."""
     stem = f"{kind}/{re.sub(r'[^0-9A-Za-z]', '', str(record['created']))}"
     keys = (f"{stem}{number:03}.json" if number else f"{stem}.json" for number in itertools.count())
     data = json.dumps(record, allow_nan=False).encode()
@@ -256,7 +256,7 @@ def removed_before(key: str, at: str) -> bool:
 def deletions(store: Store, what: str = "") -> list[Deletion]:
     """Return the deletions that can be undone, newest first; `what` selects one kind of resource."""
     found: dict[str, Deletion] = {}
-    # The controller moves an object to the second folder before it leaves the first.
+    # The controller writes a deletion to the second folder before it removes it from the first.
     for folder, before_kind in ((names.DELETIONS, "/"), (names.REMOVED, "-")):
         for key in _keys(store, folder):
             if key.count("/") == 2 and (not what or key.split(before_kind)[1] == what):
@@ -267,5 +267,5 @@ def deletions(store: Store, what: str = "") -> list[Deletion]:
 
 
 def released_key(deletion: Deletion) -> str:
-    """Return the key of the list of a deleted job's shards; equal for repeated deletions."""
+    """Return the key of a `DeletedJob`, whose shards are still to be removed."""
     return f"{names.RELEASED}/{_DIGITS.sub('', deletion.at)}-{deletion.id}.json"

@@ -27,7 +27,7 @@ from graspd.service.store.integrity import check_file
 Arrays = Mapping[str, NDArray[np.generic]]
 #: Attribute of each dataset: SHA-256 of its values, which reveals damage also outside the store.
 _DIGEST: Final = "sha256"
-#: Most datasets and groups of a file; a shard has about fifty.
+#: Maximum number of datasets and groups in a file; a shard has about fifty.
 _MOST_ITEMS: Final = 1000
 #: Largest expansion factor of deflate; size that a dataset may claim without stored data [bytes].
 _MOST_DEFLATED: Final = 1032

@@ -1,1 +1,1 @@
-"""Changes of the index, each inside one transaction."""
+"""Changes of the index, each in one transaction."""

@@ -1,4 +1,4 @@
-"""Changes of rows by API and controller, all idempotent: jobs and datasets of the store, present tasks and workers."""
+"""Idempotent changes of rows by API and controller: jobs and datasets, states of tasks and workers."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ from graspd.service.model.records import (
 from graspd.service.model.states import State
 from graspd.service.store.manifests import ShardManifest
 
-#: Ranges entered in one transaction of some tenths of a second, during which other writers wait.
+#: Ranges entered in one transaction; it takes some tenths of a second, and other writers wait for it.
 RANGES_AT_ONCE: Final = 500
 
 
@@ -74,12 +74,12 @@ class Changes(IndexPart):
         self._enter(within, record, 0, goes_on=is_new)
 
     def entering(self) -> list[str]:
-        """Return the jobs with tasks that are not yet entered."""
+        """Return the ids of jobs with tasks that are not yet in the index."""
         query = select(notes.c.name).where(notes.c.name.startswith(ENTERING)).order_by(notes.c.name)
         return [name.removeprefix(ENTERING) for name in self.database.column(query)]
 
     def enter_more(self, job_id: str, record: JobRecord | None) -> None:
-        """Add the next tasks of a large job; None: its record is deleted, and no more tasks follow."""
+        """Add the next tasks of a large job; add no more if its record was deleted (None)."""
         with self.database.writing() as connection:
             is_there = connection.scalar(select(jobs.c.id).where(jobs.c.id == job_id)) is not None
             note: Any = connection.scalar(select(notes.c.value).where(notes.c.name == ENTERING + job_id))
@@ -91,7 +91,7 @@ class Changes(IndexPart):
     def add_manifests(
         self, manifests: Iterable[ShardManifest], *, within: Connection | None = None
     ) -> dict[str, State]:
-        """Add shards with their grasps; the tasks that make them have succeeded. Return the states of their jobs."""
+        """Add shards with their grasps, and mark their tasks as succeeded; return the states of their jobs."""
         new = {manifest.shard_id: manifest for manifest in manifests}
         touched: defaultdict[str, set[int]] = defaultdict(set)
         with self.database.writing(within) as connection:
@@ -109,7 +109,7 @@ class Changes(IndexPart):
     def add_attempt(
         self, attempt: AttemptRecord, *, not_before: float = 0.0, within: Connection | None = None
     ) -> State | None:
-        """Add a failed attempt; the next one is due at `not_before` [s]. Return the job's state; None: unknown task."""
+        """Add a failed attempt, the next due at `not_before` [s]; return the job's state, None if unchanged."""
         with self.database.writing(within) as connection:
             if connection.scalar(select(tasks.c.id).where(tasks.c.id == attempt.task_id)) is None:
                 return None  # The job is deleted, or the attempt is forged.
@@ -129,7 +129,7 @@ class Changes(IndexPart):
             return None if touched is None else derive_states(connection, touched.job_id, [touched.batch])
 
     def set_job_events(self, job_id: str, events: Sequence[JobEvent], *, within: Connection | None = None) -> State:
-        """Replace the user actions on a job by all its events so far, in order."""
+        """Update a job and its tasks for all its events so far, the oldest first."""
         cancelled = bool(events) and events[-1].what == "cancelled"
         with self.database.writing(within) as connection:
             connection.execute(update(jobs).where(jobs.c.id == job_id).values(cancelled=cancelled))
@@ -142,7 +142,7 @@ class Changes(IndexPart):
             return derive_states(connection, job_id)
 
     def add_asset(self, asset: Asset, check: Mapping[str, Any] | None, *, within: Connection | None = None) -> None:
-        """Add a hand or object with the result of its check; None: the check is pending."""
+        """Add an asset with the result of its check; None: the check is pending."""
         with self.database.writing(within) as connection:
             upsert(connection, assets, [asset_row(asset, check)], keep=("last_attempt", "queued", "not_before"))
 
@@ -157,7 +157,7 @@ class Changes(IndexPart):
         upsert(connection, tasks, rows, keep=[name for name in rows[0] if name != "priority"])
 
     def _enter(self, connection: Connection, record: JobRecord, first: int, *, goes_on: bool) -> None:
-        """Add some ranges from `first` on. A note stores the next range and marks the job as unfinished."""
+        """Add up to `RANGES_AT_ONCE` ranges from `first` on; `notes` has the next range until all are added."""
         number = ranges_of(record.request.grasps, record.span)
         some = range(first, min(number, first + RANGES_AT_ONCE))
         self._upsert_tasks(connection, list(task_rows(record, some)))
@@ -168,7 +168,7 @@ class Changes(IndexPart):
         derive_states(connection, record.id, [number * record.span for number in some])
 
     def _requesting_projects(self, connection: Connection, ids: Sequence[str]) -> dict[str, str]:
-        """Return the project of the first job that requested each shard, if it has one."""
+        """Map each shard to the project of the oldest job that requested it."""
         found: dict[str, str] = {}
         query = select(tasks.c.shard_id, jobs.c.project).join(jobs, jobs.c.id == tasks.c.job_id)
         oldest_first = query.order_by(jobs.c.created, jobs.c.id)
@@ -222,7 +222,7 @@ class DatasetChanges(IndexPart):
             upsert(connection, dataset_cells, cells)
 
     def set_events(self, name: str, events: Sequence[DatasetEvent], *, within: Connection | None = None) -> None:
-        """Replace the user actions on a dataset by all its events so far, in order."""
+        """Update a dataset for all its events so far, the oldest first."""
         cancelled = bool(events) and events[-1].what == "cancelled"
         number = max((event.number for event in events), default=0)
         values = {"cancelled": cancelled, "events": number, "planned": False}
@@ -251,7 +251,7 @@ _UNFINISHED = tasks.c.state.in_((State.QUEUED.value, State.RUNNING.value))
 
 class Live(IndexPart):
     def set_running(self, workers: Mapping[str, str]) -> dict[str, State]:
-        """Mark tasks as running; `workers` maps tasks to workers. Return the changed states of jobs."""
+        """Mark queued tasks as running; `workers` maps tasks to workers. Return the states of their jobs."""
         running = State.RUNNING.value
         with self.database.writing() as connection:
             waiting = select(tasks.c.id, tasks.c.job_id).where(tasks.c.state == State.QUEUED.value)
@@ -282,7 +282,7 @@ class Live(IndexPart):
     def set_waiting(
         self, task_ids: Sequence[str], *, not_before: float = 0.0, message: str | None = None
     ) -> dict[str, State]:
-        """Mark tasks as neither queued nor running, not due before `not_before`; return the states of their jobs."""
+        """Mark tasks as not running, not in the queue and due at `not_before`; return their jobs' states."""
         values = {"queued": False, "not_before": not_before, "state": State.QUEUED.value, "worker": None}
         values |= {**NO_PROGRESS, "progress_message": message and sanitize(message)}
         touched: set[str] = set()
@@ -295,7 +295,7 @@ class Live(IndexPart):
     def set_asset_waiting(
         self, digests: Iterable[str], *, queued: bool, not_before: float = 0.0, message: str | None = None
     ) -> None:
-        """Mark checks as not running, with the reason if known."""
+        """Set whether checks of assets are in the queue, when they are due, and the message if given."""
         values: dict[str, Any] = {"queued": queued, "not_before": not_before}
         if message is not None:
             values["message"] = sanitize(message)
@@ -303,7 +303,7 @@ class Live(IndexPart):
             connection.execute(update(assets).where(assets.c.digest.in_(list(digests))).values(**values))
 
     def set_workers(self, beats: Sequence[WorkerBeat], *, forget_before: str, lost_before: str = "9999") -> None:
-        """Record living workers; mark missing ones as lost, and delete them after a while."""
+        """Record living workers; mark others as lost if last seen before `lost_before`; delete very old ones."""
         rows = [
             row_from(workers, beat, stages=[stage.value for stage in beat.stages], task_id=beat.task_id or None)
             for beat in beats

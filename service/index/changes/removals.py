@@ -43,14 +43,14 @@ class Removals(IndexPart):
                 return user
             newest = select(object_sets).order_by(object_sets.c.name, object_sets.c.created, object_sets.c.digest)
             rows = {row["name"]: row for row in within.execute(newest).mappings()}
-            # The name may mean another object in the set's project, unless this object is shared.
+            # Sets of other projects can contain this object only if it is shared.
             near = [row for row in rows.values() if asset.shared or row["project"] == asset.project]
             if found := next((row["name"] for row in near if asset.name in row["objects"]), None):
                 return f"the set of objects {found!r}"
         return ""
 
     def user_of_job(self, job_id: str, *, within: Connection) -> str:
-        """Return why a job cannot be deleted, as words that follow its name; empty if it can."""
+        """Return why a job cannot be deleted, as words that follow `job ID`; empty if nothing prevents it."""
         state = within.scalar(select(jobs.c.state).where(jobs.c.id == job_id))
         if state is None:
             raise NotFoundError(f"there is no job {job_id!r}")
@@ -68,14 +68,14 @@ class Removals(IndexPart):
         return int(within.scalar(query) or 0)
 
     def planned_only(self, ids: Sequence[str]) -> list[str]:
-        """Return the given jobs that only a dataset's planner made and that no dataset contains."""
+        """Return those of the given jobs that a dataset made, not a user, and that no dataset contains."""
         planned = (jobs.c.priority == Priority.BULK.value, jobs.c.origin.is_(None))
         needed = exists().where(dataset_cells.c.job_id == jobs.c.id)
         query = select(jobs.c.id).where(jobs.c.id.in_(ids), *planned, ~needed)
         return self.database.column(query)
 
     def unneeded_shards(self, ids: Sequence[str]) -> set[str]:
-        """Return the existing shards among these ids that no task of any job makes or reads."""
+        """Return the existing shards among these ids that are the output of no task."""
         query = select(shards.c.id).where(shards.c.id.in_(ids), ~exists().where(tasks.c.shard_id == shards.c.id))
         return set(self.database.column(query))
 
@@ -122,9 +122,9 @@ def _remember_cost(shard: str, connection: Connection) -> None:
 
 
 def _user_of_neighbour(digest: str, connection: Connection) -> str:
-    """Return which job has an object among its neighbours, in a few words; empty if none does."""
+    """Return which job or dataset has an object among its neighbours, in a few words; empty if none has."""
     among = f"%{digest}%"
-    # The first test restricts an index to jobs with neighbours.
+    # The first condition uses the index `jobs_beside`, so only jobs with neighbours are read.
     of_job = select(jobs.c.id).where(jobs.c.neighbours > "", jobs.c.neighbours.like(among)).limit(1)
     if job := connection.scalar(of_job):
         return f"job {job}"

@@ -1,4 +1,4 @@
-"""Conversion of store records to rows, and derived states of tasks and jobs, in one transaction."""
+"""Conversion of store records to rows; derivation of the states of tasks and jobs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from graspd.service.model.states import State
 from graspd.service.store.manifests import ShardManifest
 
 Row = dict[str, Any]
-#: Limit for facts, repairs and message of a hand or object: all lists contain them, and their source is untrusted.
+#: Limits for facts [bytes], repairs and texts of a hand or object: lists contain them, and uploads are untrusted.
 _MOST_FACTS: Final = 64 << 10
 _MOST_REPAIRS: Final = 100
 _LONGEST_TEXT: Final = 2000
@@ -86,7 +86,7 @@ def sanitize(text: str, length: int | None = None) -> str:
 
 
 def row_from(table: Table, record: object, **others: Any) -> Row:
-    """Return a row of a record's attributes, except `others`, with text that fits its columns."""
+    """Return a row with a record's attributes; `others` replace some, and text is cut to column length."""
     row = {column.name: getattr(record, column.name) for column in table.columns if column.name not in others} | others
     lengths = {column.name: getattr(column.type, "length", None) for column in table.columns}
     return {name: sanitize(value, lengths[name]) if isinstance(value, str) else value for name, value in row.items()}
@@ -134,7 +134,7 @@ def asset_row(asset: Asset, check: Mapping[str, Any] | None) -> Row:
 
 
 def _limited_facts(facts: dict[str, Any]) -> dict[str, Any]:
-    """Return all facts, or only the numbers if they are too long; `check.json` has the rest."""
+    """Return all facts, or only numbers if the facts are too long; `check.json` has the rest."""
     if len(json.dumps(facts)) <= _MOST_FACTS:
         return facts
     return {name[:100]: value for name, value in list(facts.items())[:100] if isinstance(value, int | float)}
@@ -152,14 +152,14 @@ _WHOSE: Final = (jobs.c.project, jobs.c.owner)
 
 
 def derive_states(connection: Connection, job_id: str, batches: Collection[int] | None = None) -> State:
-    """Derive the states of a job's tasks (of some batches, or all), then the state of the job; return it."""
+    """Derive the states of a job's tasks, in all or some batches, and of the job; return the job's state."""
     return derive_batch_states(connection, {job_id: batches})[job_id]
 
 
 def derive_batch_states(connection: Connection, touched: Mapping[str, Collection[int] | None]) -> dict[str, State]:
-    """Derive the states of some batches of many jobs (None: all); return the states of these jobs.
+    """Derive the states of tasks in some batches (None: all) and of their jobs; return the jobs' states.
 
-    If the first batch finds no grasp in its scenes, the other batches of the job are skipped, as if cancelled.
+    If a job's first batch fails because of its scenes or the object's weight, the other batches are cancelled.
     """
     states: dict[str, State] = {}
     for some in chunks(list(touched), _JOBS_AT_ONCE):
@@ -194,7 +194,7 @@ def _derive_task_states(connection: Connection, touched: Mapping[str, Collection
 
 
 def _first_batch_failed() -> ColumnElement[bool]:
-    """Return whether the first batch of a job failed because of its scenes or the object's weight."""
+    """Return the condition that a job's first batch failed because of its scenes or the object's weight."""
     last = (attempts.c.task_id == tasks.c.id) & (attempts.c.number == tasks.c.last_attempt)
     failed = (tasks.c.done.is_(False), tasks.c.exhausted.is_(True), tasks.c.last_attempt > tasks.c.retried_upto)
     first = (tasks.c.job_id == jobs.c.id, tasks.c.batch == 0)
@@ -208,7 +208,7 @@ def _first_batch_failed() -> ColumnElement[bool]:
 
 
 def _changes(chain: Sequence[Any], *, cancelled: bool) -> list[tuple[str, str, bool]]:
-    """Return the tasks of a batch whose state or readiness changes, with the new values."""
+    """Return the changed tasks of a batch, each with its new state and readiness."""
     facts = [TaskFacts(running=row["state"] == State.RUNNING, **{name: row[name] for name in _FACTS}) for row in chain]
     states = batch_states(facts, job_cancelled=cancelled)
     return [

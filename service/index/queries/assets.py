@@ -35,7 +35,7 @@ class Assets(IndexPart):
         return Page(items=[AssetView(**row) for row in rows], next=following)
 
     def get(self, kind: AssetKind, name_or_digest: str, *, scope: ProjectScope = EVERYTHING) -> AssetView:
-        """Return an asset by digest or name: accepted ones first, then own, then newer ones; or NotFoundError."""
+        """Return an asset by digest or name, preferably not refused, then own, then new; or NotFoundError."""
         named = and_(assets.c.kind == kind.value, assets.c.name == name_or_digest)
         by_digest = and_(assets.c.kind == kind.value, assets.c.digest == name_or_digest)
         refused_last = case((assets.c.verdict == "refuse", 1), else_=0)
@@ -61,7 +61,7 @@ class Assets(IndexPart):
 
 
 def _not_refused() -> ColumnElement[bool]:
-    """Return the condition of an asset that is usable or in its check."""
+    """Return the condition that an asset is usable or still being checked."""
     return or_(assets.c.verdict.is_(None), assets.c.verdict != "refuse")
 
 

@@ -167,7 +167,7 @@ def _states(connection: Connection, row: Any) -> dict[State, int]:
 
 
 def _tasks_of_cell(options: JobOptions, span: int | None) -> int:
-    """Return the number of tasks of a cell by its job's batches per task; None: unplanned; one is assumed."""
+    """Return the number of tasks of a cell; `span`: batches per task, None: the cell has no job, use 1."""
     return ranges_of(options.grasps, span or 1) * len(stages_of(options))
 
 

@@ -116,7 +116,7 @@ _WAITING = (tasks.c.ready.is_(True), tasks.c.queued.is_(False))
 
 
 def _due(not_before: Column[float], now: float) -> ColumnElement[bool]:
-    # A wait longer than any back-off means that the clock was set back: the task is due too.
+    # A wait longer than any back-off means that the clock was set back: the task is due at once.
     return or_(not_before <= now, not_before > now + 2 * MAX_BACKOFF_S)
 
 
@@ -184,7 +184,7 @@ class DatasetFeed(IndexPart):
     ) -> list[tuple[int, str]]:
         """Return positions and jobs of the next cells in some states, after a position.
 
-        `unshared` omits jobs that another key submitted, and jobs that an uncancelled dataset needs too.
+        `unshared` omits jobs that another key submitted, and jobs that another uncancelled dataset needs.
         """
         query = (
             select(dataset_cells.c.position, dataset_cells.c.job_id)

@@ -5,7 +5,7 @@ match. There are three plans:
 
 1. A condition leaves few rows: fetch them by its index, and sort them.
 2. Otherwise a bounded number of rows is read in the wanted order until the page is full.
-3. Each condition matches many rows, but the conjunction hardly any: all rows are read once.
+3. Each condition matches many rows, but their conjunction hardly any: all rows are read once.
 
 `sql_condition` translates grasp expressions (`service.model.where`) to SQL.
 """
@@ -88,14 +88,14 @@ class Grasps(IndexPart):
         return [(found["shard_id"], found["row"]) for found in self.database.rows(query.where(*sql_conditions(where)))]
 
     def listed(self, wanted: Sequence[Grasp]) -> Iterator[GraspView]:
-        """Yield grasps by shard and row, in this order; missing grasps are omitted."""
+        """Yield the given grasps, ordered by shard and row; missing grasps are omitted."""
         for some in chunks(sorted(wanted)):
             query = select(grasps).where(tuple_(grasps.c.shard_id, grasps.c.row).in_(some))
             for row in self.database.rows(query.order_by(grasps.c.shard_id, grasps.c.row)):
                 yield GraspView(**row)
 
 
-#: Most rows to fetch by an index and sort: faster than a scan of a million rows.
+#: Maximum number of rows to fetch by an index and sort; this is faster than a scan of a million rows.
 SORTED_AT_ONCE: Final = 40_000
 #: Rows read in the wanted order: few at first, since most filters fill a page from them.
 LOOKED_AT: Final = (1000, 20_000)
@@ -130,7 +130,7 @@ class Condition:
     value: Any
 
     def sql(self, groups: Sequence[str] | None) -> ColumnElement[bool]:
-        """Return the test; outside the `listed` groups, in a form without index (None: all are listed)."""
+        """Return the test; if its group is not in `groups` (None: all), in a form that cannot use an index."""
         return self._of(self.column if groups is None or self.group in groups else _without_index(self.column))
 
     def on(self, rows: Subquery) -> ColumnElement[bool]:
@@ -178,7 +178,7 @@ Test = Condition | Tagged | ExpressionCondition
 
 
 def conditions(where: GraspFilter | None) -> list[Test]:
-    """Return a filter as a conjunction; InputError for an invalid expression, or values missing in the index."""
+    """Return the tests of a filter, all of which must be true; InputError for an invalid expression."""
     where = where or GraspFilter()
     found: list[Test] = []
     if where.job is not None:
@@ -199,7 +199,7 @@ def conditions(where: GraspFilter | None) -> list[Test]:
             found.append(Condition("pair", grasps.c[name], operator.eq, wanted))
     flags = {name: getattr(where, name) for name in ("valid", "success", "lift_hard")}
     found += [Condition("flag", grasps.c[name], is_, flag) for name, flag in flags.items() if flag is not None]
-    # Grasps without validation were not rejected.
+    # `valid=False` excludes grasps without validation.
     validated = True if where.valid is False else where.validated
     if validated is not None:
         found.append(Condition("flag", grasps.c.success, operator.ne if validated else operator.eq, None))
@@ -222,11 +222,11 @@ def sql_conditions(where: GraspFilter | None) -> list[ColumnElement[bool]]:
 def search(
     connection: Connection, where: GraspFilter | None, sort: GraspSort, size: int, start: tuple[Any, ...] | None
 ) -> list[Any]:
-    """Return the first `size` rows after `start`: metric, shard id and row of the previous grasp."""
+    """Return the first `size` rows after `start`, given by metric, shard id and row of the previous grasp."""
     wanted = conditions(where)
     few = _selective_group(connection, where, wanted)
     rows: list[Any] = []
-    # Databases sort NULL differently, so rows with and without the metric are two queries.
+    # Databases sort NULL differently, so rows with and without the metric need two queries.
     if start is None or start[0] is not None:
         rows = _with_metric(connection, wanted, few, sort, size, start)
     if len(rows) < size:
@@ -249,7 +249,7 @@ def _with_metric(
     by = grasps.c[sort.by]
     if few is not None and few != sort.by:
         return _sorted_rows(connection, [c.sql([few]) for c in wanted], sort, size, start)
-    # The index of the order may serve other conditions too: of its metric, or of hand and object.
+    # The index that gives the order also serves conditions on its metric and, for epsilon, on hand and object.
     served = [sort.by, "pair"] if sort.by == "epsilon" else [sort.by]
     inside = [c.sql(served) for c in wanted if c.group in served]
     outside = [c for c in wanted if c.group not in served]
@@ -276,7 +276,7 @@ def _sorted_rows(
     size: int,
     start: tuple[Any, ...] | None,
 ) -> list[Any]:
-    """Return the matching rows, sorted without the index of the order."""
+    """Return the matching rows, sorted without an index."""
     by = _without_index(grasps.c[sort.by])
     query = select(grasps).where(by.is_not(None), *tests)
     return list(connection.execute(_slice(query, (by, grasps.c.shard_id, grasps.c.row), sort, size, start)).mappings())
@@ -293,7 +293,7 @@ def _selective_group(connection: Connection, where: GraspFilter | None, wanted: 
 
 
 def number_of(connection: Connection, where: GraspFilter, group: str, wanted: Sequence[Test] = ()) -> int:
-    """Return the number of rows that match a group; for metrics, counting stops at the relevant limit."""
+    """Estimate the rows that match a group of conditions; for metrics, count at most `SORTED_AT_ONCE` + 1."""
     query: Select[Any]
     if group == "job":
         query = select(func.sum(tasks.c.count)).where(
@@ -345,7 +345,7 @@ def _without_index(column: ColumnElement[Any]) -> ColumnElement[Any]:
 
 
 def sql_condition(node: Node, grasps: Columns) -> ColumnElement[bool]:
-    """Return an expression in SQL that is never unknown, so `not` is a complement; InputError for missing values."""
+    """Translate an expression to SQL that is never NULL, so `not` inverts it; InputError: missing column."""
     if isinstance(node, Connective):
         return (or_ if node.word == "or" else and_)(*(sql_condition(part, grasps) for part in node.parts))
     if isinstance(node, Negation):
@@ -392,6 +392,6 @@ class GraspFilter(Model):
     neighbours: bool | None = None
     lift_hard: bool | None = None
     robust_weakest: str | None = None
-    """Axis of the first model in which the grasp fails."""
+    """Perturbed parameter of the first model in which the grasp fails."""
     at_least: dict[Metric, float] = Field(default_factory=dict)
     at_most: dict[Metric, float] = Field(default_factory=dict)

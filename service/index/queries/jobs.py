@@ -36,7 +36,7 @@ class Jobs(IndexPart):
         cursor: str | None = None,
         scope: ProjectScope = EVERYTHING,
     ) -> Page[JobView]:
-        """Return a page of jobs, the newest first; `prefix` has the first characters of their ids."""
+        """Return a page of jobs, the newest first; `prefix` is the beginning of their ids."""
         same = _equality_conditions({jobs.c.state: state, jobs.c.hand: hand, jobs.c.object: object})
         query, key = select(jobs).where(*in_scope(scope, jobs), *same), (jobs.c.created, jobs.c.id)
         query = query.where(jobs.c.id.startswith(prefix, autoescape=True)) if prefix else query
@@ -100,7 +100,7 @@ def _with_pending_tasks(stage: StageProgress, tasks: int) -> StageProgress:
 
 
 def _progress(connection: Connection, ids: Sequence[str]) -> dict[str, list[StageProgress]]:
-    # A succeeded task ended when its shard was made; both times are texts of one format.
+    # A shard that is older than its task was reused; both times are texts of one format.
     reused = and_(tasks.c.done, tasks.c.finished < tasks.c.created)
     query = (
         select(
@@ -146,7 +146,7 @@ def _task_view(row: Any) -> TaskView:
     return TaskView.model_validate({**row, **progress, "attempt": attempt})
 
 
-#: Most shards that are read: enough to show the reasons, and few enough for a fast page.
+#: Maximum number of shards to read: enough to show the reasons, and few enough for a fast page.
 MOST_SHARDS: Final = 1000
 
 

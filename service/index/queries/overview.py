@@ -139,7 +139,7 @@ class IndexStatus:
 
 
 def read_index(database: Database) -> IndexStatus:
-    """Return unfinished jobs up to `MOST_JOBS`, the oldest of each state, and shards of the last minute."""
+    """Count unfinished jobs, grasps of the last minute and damage; find the oldest job of each state."""
     since = datetime.now(UTC) - timedelta(seconds=RATE_WINDOW_S)
     counted, oldest = {}, {}
     with database.reading() as connection:
@@ -207,7 +207,7 @@ def _base(column: ColumnElement[Any]) -> ColumnElement[Any]:
 _USED: Final = ("grasps", "valid", "tasks", "gpu_seconds", "cpu_seconds")
 
 
-#: Most tasks read per stage, newest first: old measurements of a machine count less.
+#: Maximum number of tasks read per stage, newest first; older measurements are ignored.
 _NEWEST: Final = 2000
 
 

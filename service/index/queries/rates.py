@@ -1,4 +1,4 @@
-"""Seconds and bytes of a batch: measured on this service's finished batches if possible, else stored.
+"""Seconds and bytes of a batch: measured on finished batches of this service, else stored values.
 
 The nearest measurement counts: of the same hand and object, else of the same hand, else of any hand. Method, fidelity,
 validator and kind of device are always the same. `STORED` and `STORED_METHODS` have the stored values with their
@@ -22,14 +22,14 @@ from graspd.service.model.scene_spec import TOUCH
 
 @dataclass(frozen=True)
 class Rate:
-    """Cost of grasps of one recipe, and its origin."""
+    """Cost of grasps with the same options, and its origin."""
 
     seconds_per_try: float
     valid_yield: float
     bytes_per_grasp: float
     origin: str
     batches: int
-    """Finished batches of the measurement; 0: stored."""
+    """Finished batches of the measurement; 0: stored values."""
     spread: tuple[float, float]
     """Interval of the seconds, as factors."""
 
@@ -39,7 +39,7 @@ class Machine:
     """Speed of this machine relative to the stored numbers."""
 
     factor: float = 1.0
-    """Median over all batches of the ratio of the seconds here to the stored seconds."""
+    """Ratio of seconds here to stored seconds: median over all batches."""
     spread: tuple[float, float] = (1.0, 1.0)
     """Interval of single batches, as factors of the median."""
     batches: int = 0
@@ -75,11 +75,11 @@ MEASURED_SPREAD: Final = (0.8, 1.25)
 SCALED_SPREAD: Final = (0.5, 2.0)
 #: Interval of a stored rate on an unknown machine: a small shared machine was ten times as slow.
 STORED_SPREAD: Final = (1 / 3, 10.0)
-#: Origin of the stored numbers: CPU times and sizes of graspd 0.1, for a worker with two cores that is busy for nine
+#: Origin of the stored numbers: CPU times and sizes of graspd 0.1, for a worker that keeps two cores busy for nine
 #: tenths of the time; see docs/explanation/scaling.md.
 ORIGIN: Final = "stored default: 2 CPU cores, docs/explanation/scaling.md"
-#: Seconds per candidate, with postures, quality and verdict; valid yield of standard (1,785 of 2,542 candidates of the
-#: first matrix), also used for draft and fine.
+#: Seconds per candidate (with postures, quality and verdict) and valid yield. All have the yield of `standard`:
+#: 1,785 of 2,542 candidates.
 STORED: Final[dict[str, tuple[float, float]]] = {"draft": (0.13, 0.7), "standard": (0.16, 0.7), "fine": (0.24, 0.7)}
 #: Seconds per candidate and yield of other methods at their published budget: time and success of the planner from
 #: docs/results/chart.md, plus the cost of postures, quality and verdict.
@@ -91,7 +91,7 @@ STORED_METHODS: Final[dict[str, tuple[float, float]]] = {
 }
 _BYTES_PER_GRASP: Final = 1338.0
 STORED_SCENE: Final = StageRate(0.5, 240.0, ORIGIN, 0)
-#: Seconds and bytes of a scene for existing grasps.
+#: Seconds and bytes of a scene in which grasps are then planned; `STORED_SCENE` is for existing grasps.
 STORED_PLACE: Final = StageRate(0.5, 2200.0, ORIGIN, 0)
 #: Cost of a candidate in a scene relative to a free object, and its valid share: values of built-in hands and objects
 #: on tables, to within a factor of four.
@@ -104,7 +104,7 @@ STORED_PICTURE: Final = StageRate(2.1, 1.34e6, ORIGIN, 0)
 
 class Rates:
     def __init__(self, batches: Iterable[BatchCost], options: JobOptions, devices: Collection[str]) -> None:
-        """Group the batches of `synthesize` by these options and devices; empty: all devices."""
+        """Group the `synthesize` batches with these options on these devices (empty: all) by hand and object."""
         self._options = options
         self._groups: dict[Hashable, list[BatchCost]] = defaultdict(list)
         recipe = recipe_of(options)
@@ -149,7 +149,7 @@ class Rates:
 
 
 def candidates(rate: Rate, options: JobOptions) -> float:
-    """Return the number of candidates for a job."""
+    """Return the expected number of candidates of a job."""
     if options.want == "candidates":
         return float(options.grasps)
     most = options.grasps * options.budget
@@ -197,7 +197,7 @@ def _is_stored(request: JobOptions) -> bool:
 
 
 def _spread(values: list[float], least: tuple[float, float]) -> tuple[float, float]:
-    """Return the middle eight tenths of the values, divided by their median and not narrower than `least`."""
+    """Return the first and last decile of the values, divided by the median; not narrower than `least`."""
     if len(values) < 2 or (middle := median(values)) <= 0:
         return least
     tenths = quantiles(values, n=10, method="inclusive")
@@ -205,7 +205,7 @@ def _spread(values: list[float], least: tuple[float, float]) -> tuple[float, flo
 
 
 def _large_batches(batches: list[BatchCost]) -> list[BatchCost]:
-    """Return the costs of batches that are at least half full, if any: loading dominates small batches."""
+    """Return costs of batches at least half full, else of all batches: loading dominates small ones."""
     return [batch for batch in batches if 2 * batch.candidates >= BATCH_SIZE] or batches
 
 

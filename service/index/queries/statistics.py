@@ -36,7 +36,7 @@ class Distribution:
 
 @dataclass(frozen=True)
 class GraspKinds:
-    """Counts of grasp types and of approach cells; grasps without either are omitted."""
+    """Counts of grasp types and of approach cells; each omits grasps without a value."""
 
     types: dict[int, int]
     """Number of grasps of each `GraspType`."""

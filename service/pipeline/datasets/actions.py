@@ -42,7 +42,7 @@ from graspd.service.store.records import (
 )
 
 log = logging.getLogger(__name__)
-#: Most time for datasets in one round of the controller [s], because queue and lost workers must not wait long.
+#: Longest time for datasets in one round of the controller [s]: queue and lost workers must not wait long.
 BUDGET_S: Final = 0.5
 _CELLS_AT_ONCE: Final = 20
 
@@ -79,7 +79,7 @@ def create(
         if record.project != scope.project:
             # The message reveals nothing else: names are unique in the whole service.
             raise ConflictError(f"the name {record.name!r} is taken; take another name")
-        # Digests would differ: a newer graspd has more options, whose defaults an older one implied.
+        # Options are compared, not digests: a newer graspd has more options, whose defaults an older one implied.
         if not new and (other := _difference(record, hands, objects, shared)):
             raise ConflictError(f"there is another dataset named {record.name!r} ({other}); take another name")
         refuse_pending(services.store, "dataset", record.name)
@@ -149,7 +149,7 @@ def add_object_set(
     scope: ProjectScope = EVERYTHING,
     may_follow: Callable[[str, str], None] = lambda owner, project: None,
 ) -> ObjectSetView:
-    """Give objects a common name. Equal objects change nothing; others make a new version with the same owner.
+    """Give objects a common name. A change of its objects makes a new version with the same owner.
 
     `may_follow` receives owner and project of the set before a new version, and may raise. Errors as in `usable_asset`;
     InputError without objects.
@@ -222,7 +222,7 @@ def _difference(known: DatasetRecord, hands: list[Member], objects: list[Member]
 def _format_value(value: object) -> str:
     if isinstance(value, tuple) and value and isinstance(value[0], NamedNeighbour):
         return ", ".join(one.object for one in value)
-    return "a document of its own" if isinstance(value, SceneDocument) else repr(value)
+    return "custom" if isinstance(value, SceneDocument) else repr(value)
 
 
 def _member_names(members: Iterable[Member]) -> str:

@@ -1,6 +1,6 @@
-"""Documents of datasets: a user's request, the record derived from it, and its cost estimate.
+"""Models of datasets: a user's request, the record derived from it, and its cost estimate.
 
-The request has hands x objects and the options of each cell. No index is imported, so clients can read documents.
+The request has hands x objects and the options of each cell. No database is imported, so clients can use this module.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from graspd.service.model.renamed import original_request
 from graspd.service.model.states import Stage
 from graspd.service.model.version import STAGE_REVISIONS
 
-#: Most cells of a dataset: a record of this many cells has 4 MB.
+#: Maximum number of cells of a dataset; the record of so many cells has 4 MB.
 MAX_CELLS: Final = 100_000
 
 
@@ -131,7 +131,7 @@ class Estimate(View):
     candidates: int = Field(description="candidates to plan for the requested grasps")
     valid: int = Field(description="expected number of grasps of the kind in `counted`")
     counted: Literal["valid", "feasible"] = Field(
-        "valid", description="kind of grasps that `valid` counts: feasible ones without validation"
+        "valid", description="kind of grasps that `valid` counts; feasible: without validation"
     )
     tasks: int
     seconds: float

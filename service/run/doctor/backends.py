@@ -91,7 +91,7 @@ def _check_redis(settings: Settings, client: Redis, info: Mapping[str, Any]) -> 
         return warning(f"{line}: older than 6.2, the oldest tested version", "install Redis 6.2 or newer, or Valkey")
     parts = urlsplit(redis_url(settings))
     if parts.scheme != "unix" and parts.hostname not in _LOCAL and not parts.password:
-        fix = "requirepass in its configuration, or an ACL, and the password in GRASPD_REDIS_URL"
+        fix = "set requirepass or an ACL in its configuration, and the password in GRASPD_REDIS_URL"
         return warning(f"{line}: it requires no password, so any client can start tasks", fix)
     if seconds > _SLOW_REDIS_S:
         return warning(
@@ -159,7 +159,7 @@ _NONE_HERE: Final = (
     "there is no index here: GRASPD_INDEX_URL is unset and there is no index.sqlite; only api and controller need one"
 )
 _REBUILD: Final = (
-    "graspd admin index rebuild --check shows all of it; graspd admin index rebuild fixes it while the service runs"
+    "graspd admin index rebuild --check lists all; graspd admin index rebuild fixes them while the service runs"
 )
 _CROWDED: Final = 0.8
 #: Above this number of shards only names are compared.

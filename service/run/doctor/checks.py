@@ -1,4 +1,4 @@
-"""Checks of an installation, with fixes; parallel, with timeouts, so that a hanging part does not hide the others."""
+"""Checks of an installation, with fixes. Each has a timeout, so a hanging part hides no others."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Checks of the fleet: controller, capable workers, the API, and clocks.
 
-Leases use each process's own monotonic clock, so work continues with wrong clocks. Wrong clocks affect times shown and
-sorted, expiry of keys, the grace time of shards, and S3, which refuses requests off by fifteen minutes.
+Leases use each process's own monotonic clock, so work continues with wrong clocks. Wrong clocks affect displayed times,
+sorting by time, expiry of keys, the grace time of shards, and S3, which refuses requests off by fifteen minutes.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def _check_workers(beats: list[WorkerBeat], waiting: Counter[Stage]) -> Finding:
         )
     if ill := [beat for beat in beats if beat.state == "quarantined"]:
         fix = f"on {ill[0].host}: graspd doctor --only gpu,kernels,disk"
-        return bad(f"{len(ill)} workers are in quarantine, {ill[0].name}: {ill[0].reason}", fix)
+        return bad(f"{len(ill)} workers are in quarantine, such as {ill[0].name}: {ill[0].reason}", fix)
     served = {stage for beat in beats for stage in beat.stages}
     if alone := sorted(stage.value for stage in waiting if stage not in served):
         tasks = sum(number for stage, number in waiting.items() if stage not in served)
@@ -170,7 +170,7 @@ def _offsets(settings: Settings) -> Iterator[tuple[str, float]]:
 
 
 def _store_time(settings: Settings) -> float:
-    """Return the store's time of a new object; some stores have whole seconds only."""
+    """Return the offset of the store's clock [s], 0 if below a second: some stores have whole seconds."""
     store, key = open_store(settings.resolved_store_url), f"health/clock-{secrets.token_hex(8)}"
     before = time.time()
     try:

@@ -48,7 +48,7 @@ def test_a_file_says_supports_neighbours_and_the_targets_pose(tmp_path: Path) ->
         ({"supports": [{"kind": "box"}] * 33}, "supports"),
         ({**TABLE, "target": [0, 0, 0, 2, 0, 0, 0]}, "unit length"),
         ({**TABLE, "colour": "red"}, "colour"),
-        ([1, 2], "one object"),
+        ([1, 2], "one mapping"),
         ({**TABLE, "neighbours": [{"object": "mug", "pose": POSE}] * 9}, "neighbours"),
         ({**TABLE, "neighbours": [{"object": ""}]}, "object"),
         ({**TABLE, "neighbours": [{"object": "mug", "pose": [0, 0, 0, 2, 0, 0, 0]}]}, "unit length"),

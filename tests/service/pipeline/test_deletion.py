@@ -251,7 +251,7 @@ def test_a_job_is_restored_after_its_object(services: Services, collected: bool)
     delete_asset(services, AssetKind.OBJECT, "ball")
     if collected:
         collect_garbage(services)
-    with pytest.raises(ConflictError, match="graspd objects restore first"):
+    with pytest.raises(ConflictError, match="graspd objects restore"):
         restore(services, "job", job, permit=lambda _: None)
     collect_garbage(services)
     assert differences(services.index, services.store) == []
