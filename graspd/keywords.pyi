@@ -1,4 +1,4 @@
-"""Keywords that follow from the options; `python -m graspd.service.docs` writes them."""
+"""Keyword arguments of the options, written by `python -m graspd.service.docs`."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -78,7 +78,7 @@ def _cells(row: Row) -> tuple[str, str, str]:
 
 def keywords_stub() -> str:
     parts = [
-        '"""Keywords that follow from the options; `python -m graspd.service.docs` writes them."""\n',
+        '"""Keyword arguments of the options, written by `python -m graspd.service.docs`."""\n',
         "from collections.abc import Mapping, Sequence",
         "from pathlib import Path",
         "from typing import Any, Literal, TypedDict",
