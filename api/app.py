@@ -33,7 +33,7 @@ from graspd.service.queue.connection import redis_url
 from graspd.service.settings import Settings
 
 _log = logging.getLogger("graspd.api")
-#: Routers of all documents except assets and datasets, in the order of the OpenAPI document.
+#: Routers of all resources except assets and datasets, in the order of the OpenAPI document.
 _ROUTERS: Final = (
     jobs.router,
     grasps.router,
@@ -90,8 +90,8 @@ def create_app(settings: Settings, services: Services | None = None) -> FastAPI:
     problems.install(app, problem_page)
     pages.install(app, opened)
     for router in (*_ROUTERS, *map(asset_router, AssetKind), *datasets.routers, *pages.routers):
-        # Adds the routes built at import: `include_router` would rebuild them at the first request, and would silence
-        # warnings for the whole process, which is unsafe while another application is built.
+        # Adds the routes built at import. `include_router` would rebuild them at the first request. It would also
+        # silence warnings for the whole process, which is unsafe while another application is built.
         app.router.routes.extend(router.routes)
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
     _add_middleware(app, settings, keys, proxy, rates)
@@ -100,7 +100,7 @@ def create_app(settings: Settings, services: Services | None = None) -> FastAPI:
 
 
 def _add_middleware(app: FastAPI, settings: Settings, keys: KeyFile, proxy: Proxy, rates: Rates) -> None:
-    """Add middleware from the inside out: body limits, authentication and rates, same-origin check, request ids."""
+    """Add middleware, inner first: HEAD, body limits, authentication, rates, origin, request ids, prefix."""
     app.add_middleware(Head)
     uploads = frozenset({*(f"/v1/{kind.value}s" for kind in AssetKind), "/submit"})
     app.add_middleware(BodyLimit, upload_paths=uploads, upload_bytes=settings.max_upload_bytes)

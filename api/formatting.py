@@ -12,7 +12,7 @@ NONE: Final = "–"
 
 
 def metric(value: float | None) -> str:
-    """Format with three significant digits, without trailing zeros."""
+    """Format with about three digits, more from 1000 on; positive values below 0.001 as "< 0.001"."""
     if value is None or value != value:
         return NONE
     if value == 0:
@@ -93,7 +93,7 @@ _PLACES: Final = {"table": "on a table", "bin": "in a bin", "shelf": "on a shelf
 
 
 def scene_kind(kind: str) -> str:
-    """Describe the kind of scene of grasps; empty: a free object."""
+    """Describe the kind of a scene in words; empty for free grasps."""
     return _PLACES.get(kind, "")
 
 

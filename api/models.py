@@ -1,4 +1,4 @@
-"""Documents of the API that extend those of the index. Times are RFC 3339 in UTC; field names contain units."""
+"""API models that extend those of the index. Times are RFC 3339 in UTC; field names contain units."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class StageStatus(StageProgress):
     state: State
     progress: float = Field(ge=0, le=1, description="finished share; running tasks count with their progress")
     message: str = Field("", description="activity of a running task, or why a task waits")
-    rate_per_s: float | None = Field(None, description="tasks per second of all current workers")
+    rate_per_s: float | None = Field(None, description="tasks per second, by all current workers")
     eta_s: float | None = Field(None, description="expected time until the stage ends [s]")
 
 
@@ -46,13 +46,13 @@ class Job(Validated):
     owner: str = Field("", description="id of the key that submitted it; empty: none or unknown")
     project: str = Field("", description="its project; empty: the unnamed project")
     finished: str | None = None
-    reason: str | None = Field(None, description="why it failed")
+    reason: str | None = Field(None, description="why it failed, or found fewer grasps than requested")
     stages: list[StageStatus]
 
 
 @insert_fields(last=mean_fields())
 class MeanMetrics(BaseModel):
-    """Means over the valid grasps of a job; absent while there are none."""
+    """Means over a job's valid grasps (all stored ones if not validated); absent while there are none."""
 
     if TYPE_CHECKING:
 
@@ -63,11 +63,11 @@ class Diversity(BaseModel):
     """Diversity of a job's valid grasps, or of all its stored grasps if not validated."""
 
     grasps: int = Field(description="number of grasps analysed")
-    types: dict[str, int] = Field(description="number of power, precision and lateral grasps; none: undefined")
+    types: dict[str, int] = Field(description="number of grasps by type; `none`: undefined type")
     type_entropy_bits: float = Field(
         description="entropy of the types; 0: a single type; 1.58: three types in equal numbers"
     )
-    directions_used: int = Field(description="approach cells in use, on the sphere of directions in the object's frame")
+    directions_used: int = Field(description="approach cells with grasps; directions are in the object's frame")
     directions: int = Field(DIRECTION_CELLS, description="number of cells, all of equal area")
     direction_entropy_bits: float = Field(
         description="entropy of the directions; 0: a single cell; 5.58: all 48 cells in equal numbers"
@@ -90,7 +90,7 @@ class JobDetail(Job):
     choice: Choice | None = Field(None, description="how a chart resolved the fidelity auto, if requested")
     note: str | None = Field(None, description="why fewer grasps than requested were found; absent: not applicable")
     outcomes: dict[str, int] = Field(
-        {}, description="rejected candidates by outcome, of a job that found fewer grasps than wanted"
+        {}, description="rejected candidates by outcome, if the job found fewer grasps than requested"
     )
     rechecked: int = Field(0, description="valid grasps validated again under the unmodified DexGraspBench protocol")
     recheck_held: int = Field(0, description="rechecked grasps that held")
@@ -178,13 +178,13 @@ class Push(BaseModel):
 
 
 class GraspDetail(GraspView):
-    """One grasp with its postures and all data of its shard."""
+    """One grasp with its postures and its data in the shard."""
 
     hand_digest: str
     object_digest: str
     joint_names: list[str]
     postures: dict[str, Posture] = Field(description="pregrasp, grasp, squeeze")
-    thresholds_m: list[float] = Field(description="contact thresholds of the sweep")
+    thresholds_m: list[float] = Field(description="contact thresholds of `sweep`")
     sweep: dict[str, list[float | None]] = Field(description="metrics at each threshold")
     way: list[Waypoint] = Field(description="trajectory from the standoff, if any, to the squeeze or the lift")
     scene: GraspScene | None = Field(None, description="scene in which it was planned; None: around a free object")
@@ -258,14 +258,14 @@ class Part(BaseModel):
 
 
 class Health(BaseModel):
-    """Readiness, for each part."""
+    """Readiness of the service and of its parts."""
 
     ok: bool = Field(description="whether redis, index and store respond")
     parts: dict[str, Part]
     controller: bool = Field(
-        False, description="whether a controller sent a heartbeat recently; without one no task is queued"
+        False, description="whether a controller sent a heartbeat recently; without a controller no task is queued"
     )
-    workers: int = Field(0, ge=0, description="number of workers with a valid lease")
+    workers: int = Field(0, ge=0, description="number of workers with a recent heartbeat, except quarantined ones")
 
 
 class Worker(WorkerView):
@@ -276,7 +276,7 @@ class Worker(WorkerView):
 
 
 class Histogram(BaseModel):
-    """Distribution of one metric over valid grasps."""
+    """Distribution of one metric over the grasps of a job."""
 
     metric: str
     count: int

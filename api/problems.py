@@ -46,7 +46,7 @@ class FieldError(BaseModel):
 
     pointer: str = Field(description="JSON pointer into the body, or the name of the parameter")
     detail: str
-    type: str = Field(description="machine name of the rule that was broken")
+    type: str = Field(description="identifier of the broken rule")
 
 
 class Problem(BaseModel):
@@ -54,7 +54,7 @@ class Problem(BaseModel):
 
     model_config = ConfigDict(extra="allow")
 
-    type: str = Field(description="URI reference of the problem type; opens its description")
+    type: str = Field(description="URI reference of the problem type; its page describes it")
     title: str
     status: int
     detail: str = Field(description="what is wrong and the fix, in one line")
@@ -183,7 +183,7 @@ def request_id_of(request: Request) -> str | None:
 
 
 def install(app: FastAPI, page: Callable[[Request, dict[str, Any]], Response]) -> None:
-    """Convert every exception to a problem document; a browser gets it as a `page` for dashboard addresses."""
+    """Convert exceptions to problem documents; at dashboard addresses, browsers get a `page` instead."""
 
     def answer_any(request: Request, error: Exception) -> Response:
         is_api = request.url.path.startswith(("/v1/", "/healthz", "/readyz", "/metrics", "/openapi.json"))
@@ -207,7 +207,7 @@ def install(app: FastAPI, page: Callable[[Request, dict[str, Any]], Response]) -
 
 
 def responses(*statuses: int, others: dict[int | str, dict[str, Any]] | None = None) -> dict[int | str, dict[str, Any]]:
-    """Return OpenAPI entries of a route's problem documents, added to its `others`."""
+    """Return OpenAPI entries of a route: `others`, and a problem document for each status."""
     return (others or {}) | {
         status: {
             "description": HTTPStatus(status).phrase,

@@ -40,7 +40,7 @@ def files_of_upload(
     if kind is AssetKind.NETWORK:
         # An .npz is a ZIP itself, so it is not unpacked.
         if PurePosixPath(leaf).suffix.lower() not in MAIN_SUFFIXES[kind]:
-            raise InputError(f"{leaf} is no network; upload its .npz file as it is")
+            raise InputError(f"{leaf} is no network; upload an .npz file")
         check_size(size, leaf)
         files: MutableMapping[str, bytes] = {NETWORK_FILE: file.read()}
     elif PurePosixPath(leaf).suffix.lower() == ".zip":
@@ -71,7 +71,7 @@ def _main_file(kind: AssetKind, upload: str, files: Mapping[str, bytes]) -> str:
     found = [name for name in sorted(files) if PurePosixPath(name).suffix.lower() in suffixes]
     known = ", ".join(suffixes)
     if not found:
-        raise InputError(f"{upload} holds no {kind.value} file; one of {known} is needed, or a ZIP of its folder")
+        raise InputError(f"{upload} holds no {kind.value} file; upload one of {known}, or a ZIP of the folder")
     if len(found) > 1:
         names = ", ".join(found[:5])
         raise InputError(

@@ -8,7 +8,7 @@
     graspd.open("grasps.h5")
     graspd.Client("http://127.0.0.1:8000").submit("allegro", "mug", grasps=64).wait().grasps()
 
-Modules are imported on first use. Every error that graspd raises on purpose is a `graspd.GraspdError`.
+Modules are imported on first use. Errors of input, files, jobs and the service are `graspd.GraspdError`s.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
     __version__: str
 
-#: Module that defines a public name; all other public names are errors.
+#: Module that defines a public name; errors and `__version__` are not listed.
 _LIVES_IN: Final = {
     "synthesize": "graspd.synthesis",
     **dict.fromkeys(("open", "Grasps", "Grasp", "Postures"), "graspd.grasps"),

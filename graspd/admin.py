@@ -4,8 +4,6 @@ import typer
 
 app = typer.Typer()
 app.add_typer(
-    typer.Typer(
-        no_args_is_help=True, help="Maintenance: compile kernels, rebuild the index, repair the store, render."
-    ),
+    typer.Typer(no_args_is_help=True, help="Maintenance: compile kernels, rebuild the index, repair the store."),
     name="admin",
 )

@@ -1,4 +1,4 @@
-"""Root of the command line: mounts the command groups of three packages and imports each on first use."""
+"""Root of the command line: lists the commands of all packages and imports each module on first use."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ COMMANDS: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("worker", "graspd.commands.worker", "Administration", "Run workers, each on one device."),
     ("keys", "graspd.client.commands", "Administration", "Make, list and revoke API keys."),
     ("projects", "graspd.client.commands", "Administration", "List projects of keys and set their limits."),
-    ("admin", "graspd.admin", "Administration", "Maintenance: kernels, index, store, pictures."),
+    ("admin", "graspd.admin", "Administration", "Maintenance: kernels, index, store."),
 )
 
 JOINED: Final[tuple[tuple[str, str, str, str], ...]] = (
@@ -68,7 +68,7 @@ JOINED: Final[tuple[tuple[str, str, str, str], ...]] = (
     ("datasets", "card", "graspd.commands.exchange", "Write a dataset's card: contents, quality, biases, plots."),
 )
 
-#: Module that each package needs, and the extra that installs it: an image has only the packages it needs.
+#: Module that each package needs, and the extra that installs it: a container image has only the packages it needs.
 PACKAGES: Final[dict[str, tuple[str, str]]] = {
     "graspd.api": ("fastapi", "api"),
     "graspd.client": ("fastapi", "api"),
@@ -168,7 +168,7 @@ def escape_help(command: Any) -> None:
 
 
 def missing_extra(module: str) -> str | None:
-    """Return the extra that a module needs installed; None if the module can be imported now."""
+    """Return the extra that installs what a module needs; None if it is installed."""
     needed, extra = next((PACKAGES[name] for name in PACKAGES if f"{module}.".startswith(f"{name}.")), ("", ""))
     return extra if needed and find_spec(needed) is None else None
 

@@ -69,7 +69,7 @@ def html_of(grasps: Grasps) -> str:
     if not 0 < len(png) <= PICTURE_BYTES:
         return head + _table(grasps)
     data = base64.b64encode(png).decode()
-    return f'{head}<img alt="the best of them" style="max-width:100%" src="data:image/png;base64,{data}">'
+    return f'{head}<img alt="the best grasps" style="max-width:100%" src="data:image/png;base64,{data}">'
 
 
 def viewer_of(grasps: Grasps, *, host: str, port: int) -> Viewer:

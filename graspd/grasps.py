@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from graspd.worker.viewing import Viewer
 
 Array = NDArray[Any]
-#: Rows to select: a mask (N,), row numbers, or a function that makes either from the grasps.
+#: Rows to select: a mask (N,) or row numbers.
 Rows = NDArray[Any] | Sequence[int] | Sequence[bool]
 
 _METRICS: Final = {metric.name: metric for metric in GRASP_METRICS}
@@ -62,7 +62,7 @@ class Grasp:
     valid: bool
     """Whether it is valid, see `Grasps.is_valid`."""
     metrics: dict[str, float]
-    """Value of each metric; metrics per contact threshold at 5 mm."""
+    """Value of each metric; per-threshold metrics at 5 mm."""
 
     def __repr__(self) -> str:
         x, y, z = self.hand_pose[:3]

@@ -1,4 +1,4 @@
-"""Keyword arguments made from the options; `python -m graspd.service.docs` writes this file."""
+"""Keyword arguments of the options, written by `python -m graspd.service.docs`."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

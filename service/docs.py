@@ -1,4 +1,4 @@
-"""`python -m graspd.service.docs` rewrites tables of the docs and the stub of keyword arguments."""
+"""`python -m graspd.service.docs` rewrites the tables of the documentation and the type stubs of keywords."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def _cells(row: Row) -> tuple[str, str, str]:
 
 def keywords_stub() -> str:
     parts = [
-        '"""Keyword arguments made from the options; `python -m graspd.service.docs` writes this file."""\n',
+        '"""Keyword arguments of the options, written by `python -m graspd.service.docs`."""\n',
         "from collections.abc import Mapping, Sequence",
         "from pathlib import Path",
         "from typing import Any, Literal, TypedDict",

@@ -1,9 +1,9 @@
 """Authentication of a request by key, session cookie or proxy; permissions of the caller.
 
-Before the first key, the service is open to this machine only. Afterwards it stays closed, even if all keys are revoked
-or expired. A proxy in front of the service may authenticate people (OIDC): `Authorization: Basic user:secret`, which
-oauth2-proxy builds from `--basic-auth-password`, and the person's groups in X-Forwarded-Groups. Any client can send
-such headers, so both the connection's address and the secret must be the proxy's, and duplicate headers are refused.
+Before the first key, every user of this machine may use the service, and nobody else. Afterwards requests need a key,
+even if all keys are revoked or expired. A proxy may authenticate people (OIDC). It sends their groups in
+X-Forwarded-Groups, and `Authorization: Basic user:secret` (option `--basic-auth-password` of oauth2-proxy). Any client
+can send such headers, so the connection's address and the secret must be the proxy's, and no header may be duplicate.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from graspd.service.model.projects import EVERYTHING, PATTERN, ProjectScope
 from graspd.service.settings import Settings
 
 SESSION_COOKIE: Final = "graspd_session"
-#: Headers added by proxies; in an open service they reveal that a proxy forwards requests of others.
+#: Headers that proxies add; they reveal that a request may come from another machine.
 _OF_PROXIES: Final = ("x-forwarded-for", "x-forwarded-host", "forwarded", "via", "x-real-ip")
 
 caller: ContextVar[Key | None] = ContextVar("caller", default=None)
@@ -40,7 +40,7 @@ def caller_id() -> str:
 
 
 def project_scope() -> ProjectScope:
-    """Return the scope of the present caller: its key's project; all projects with `admin` or in an open service."""
+    """Return the projects that the caller sees: its own, or all with `admin` or while there are no keys."""
     key = caller.get()
     return EVERYTHING if key is None else ProjectScope(key.project, everything=key.scope.includes(Scope.ADMIN))
 
@@ -50,7 +50,7 @@ class ForeignResource(ApiError):
 
 
 def authorize(request: HTTPConnection, scope: Scope) -> Key | None:
-    """Return the key of a request; None while the service is open. Otherwise 401 or 403."""
+    """Return the key of a request, or None while no key is needed; raise ApiError 401 or 403."""
     keys: KeyFile = request.app.state.keys
     if keys.is_open:
         _refuse_strangers(request)
@@ -68,7 +68,7 @@ def authorize(request: HTTPConnection, scope: Scope) -> Key | None:
 
 
 def is_still_authorized(request: HTTPConnection, scope: Scope) -> bool:
-    """Check whether a long response may continue, since its key may have been revoked or expired."""
+    """Check whether a long response may continue; its key may have expired or been revoked meanwhile."""
     keys: KeyFile = request.app.state.keys
     if keys.is_open:
         return True
@@ -86,7 +86,7 @@ def may_change(owner: str, project: str = "") -> bool:
 
 
 def must_own(owner: str, what: str, project: str = "") -> None:
-    """Raise ForeignResource unless the key may change `what`, such as `job 1a2b`. Routes require `submit`."""
+    """Raise ForeignResource unless the key may change `what`, such as `job 1a2b`."""
     if not may_change(owner, project):
         key = caller.get()
         assert key is not None
@@ -106,7 +106,7 @@ def is_allowed(request: HTTPConnection, scope: Scope) -> bool:
 
 
 def _refuse_strangers(request: HTTPConnection) -> None:
-    """Restrict an open service to this machine: refuse other machines, and proxies, which may serve anyone."""
+    """Refuse requests from other machines, and from proxies, which may forward anyone's requests."""
     passed_on = next((name for name in _OF_PROXIES if name in request.headers), None)
     address = request.client.host if request.client else ""
     if passed_on is None and not _is_remote(address):
@@ -159,11 +159,11 @@ class Proxy:
 
     @property
     def is_on(self) -> bool:
-        """Whether a proxy authenticates people: then the service is closed to requests without a key."""
+        """Whether a proxy authenticates people; requests then need its credentials or a key."""
         return bool(self._secret)
 
     def find(self, scope: AsgiScope) -> Key | None:
-        """Return a key for the authenticated person, with the rights of their first group in the settings, or None."""
+        """Return a key with the rights of the first group in the settings that the person has, or None."""
         if not self.is_on or not self._is_from_proxy(scope):
             return None
         headers = Headers(scope=scope)

@@ -1,4 +1,4 @@
-"""Checks of API keys for `graspd doctor`: whether an exposed service is closed, and when keys expire."""
+"""Checks of API keys for `graspd doctor`: whether an exposed service has keys, and when they expire."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ SESSION_S: Final = 12 * 3600
 
 
 class Scope(StrEnum):
-    """Permission of a key, each including the one before: `submit` covers own resources, `admin` those of all keys."""
+    """Permission of a key; each includes those before. `submit` covers its project, `admin` all projects."""
 
     READ = "read"
     SUBMIT = "submit"
@@ -57,7 +57,7 @@ class ProjectLimits(BaseModel):
     grasps_in_flight: int | None = Field(None, ge=0, description="maximum grasps in unfinished jobs")
     grasps_per_day: int | None = Field(None, ge=0, description="requested grasps per day (UTC)")
     gpu_seconds_per_day: int | None = Field(
-        None, ge=0, description="GPU workers' time on its tasks per day (UTC), after which new jobs are refused [s]"
+        None, ge=0, description="GPU time of its tasks per day (UTC) [s]; once it is used up, new jobs are refused"
     )
 
 
@@ -76,7 +76,7 @@ class Key(BaseModel):
 
     @model_validator(mode="after")
     def _has_an_id(self) -> Self:
-        # Keys older than ids: during a rotation the old and the new secret have the same name and thus the same id.
+        # Keys stored before ids existed: both secrets of a rotation have the same name, and so get the same id.
         self.id = self.id or _sha256(f"name {self.name}")[:16]
         return self
 
@@ -94,7 +94,7 @@ class _Document(BaseModel):
 
 
 class KeyFile:
-    """File of the keys. With another means of authentication the service is `closed` even before the first key."""
+    """File of the keys. `closed`: requests need credentials even before the first key."""
 
     def __init__(self, path: Path, *, closed: bool = False) -> None:
         self.path = path
@@ -107,7 +107,7 @@ class KeyFile:
 
     @property
     def is_open(self) -> bool:
-        """Whether no key was ever made, so that all users of this machine may use the service."""
+        """Whether requests need no key: none was ever made, and the file is not `closed`."""
         return not self._closed and not self._read().keys
 
     @property
@@ -203,7 +203,7 @@ class KeyFile:
         return f"{claim}.{self._sign(claim)}"
 
     def find_session(self, cookie: str) -> Key | None:
-        """Return the valid key of a session, which ends when its key is revoked. None without a signing secret."""
+        """Return the key of a session if both are valid; None also if the file has no `session_secret`."""
         claim, _, signature = cookie.partition(".")
         if not self._read().session_secret or not hmac.compare_digest(signature.encode(), self._sign(claim).encode()):
             return None

@@ -1,4 +1,4 @@
-"""Quotas of a key, and of all keys of a project: grasps in unfinished jobs, and requests per day; idempotency keys.
+"""Quotas of keys and projects: grasps in unfinished jobs, jobs or grasps per day. Idempotency keys.
 
 Redis counts in one atomic step for all API processes; its loss resets quotas, but loses no job. From submission to end,
 a job counts with its requested grasps. The index is queried for ended jobs only if the quota would be exceeded, so a
@@ -66,7 +66,7 @@ if not known then redis.call('HINCRBY', KEYS[1], 'grasps', ARGV[2]) end
 redis.call('HSET', KEYS[1], ARGV[1], string.match(known or ARGV[2], '^%d+') .. ' ' .. ARGV[3] .. ' 0')
 """
 
-#: Drops jobs whose entries are unchanged since they were read: `job`, `entry`, ...
+#: Drops jobs whose entries are unchanged since they were read; ARGV: job, entry, job, entry, ...
 _DROP: Final = """
 for i = 1, #ARGV, 2 do
   local known = redis.call('HGET', KEYS[1], ARGV[i])
@@ -141,7 +141,7 @@ class _Holder:
 
 
 class Quotas:
-    """Counters of all keys and projects. `unfinished` returns the given ids of jobs that have not ended."""
+    """Counters of keys and projects; `unfinished` returns those of the given ids that have not ended."""
 
     def __init__(
         self,
@@ -160,7 +160,7 @@ class Quotas:
 
     @contextmanager
     def claim(self, key: Key | None, job: str, grasps: int, *, is_new: bool = True) -> Iterator[SubmissionClaim]:
-        """Count a job submitted or retried (not `is_new`) in this context, unless that fails or creates no job."""
+        """Count the job that this context submits or retries (not `is_new`); undo if it fails or makes no job."""
         claim = SubmissionClaim()
         if key is None:
             yield claim
@@ -218,7 +218,7 @@ class Quotas:
                     self._connection.decrby(holder.day, today)
 
     def _claim(self, holder: _Holder, job: str, grasps: int, number: str, today: int) -> str:
-        """Return how a job is counted: `shared` by another pending claim, `known`, `unknown` (no Redis), or empty."""
+        """Return `shared` (another claim is pending), `known`, `unknown` (no Redis), or empty (new job)."""
         met, amount = self._try_claim(holder, job, grasps, number, today)
         if met == "grasps":
             with self._log_outage(holder):
@@ -237,7 +237,7 @@ class Quotas:
         return met.decode(), int(amount)
 
     def _drop_ended(self, holder: _Holder) -> None:
-        """Drop ended jobs. Pending jobs, absent in the index, and jobs claimed again meanwhile stay."""
+        """Drop ended jobs, but neither jobs whose submission is pending nor jobs claimed again meanwhile."""
         found = [word.decode(errors="replace") for word in self._connection.eval(_ENTERED, 1, holder.held)]
         entries = dict(zip(found[::2], found[1::2], strict=True))
         ended = sorted(entries.keys() - set(self._unfinished(list(entries))))
@@ -263,7 +263,7 @@ DATASET_PREFIX: Final = "dataset:"
 
 
 def unfinished(index: Index, ids: Collection[str]) -> set[str]:
-    """Return the given jobs and datasets, named as in quotas, that have not ended."""
+    """Return those of the given jobs and datasets (`dataset:NAME`) that have not ended."""
     names = {one.removeprefix(DATASET_PREFIX) for one in ids if one.startswith(DATASET_PREFIX)}
     found = index.jobs.unfinished([one for one in ids if not one.startswith(DATASET_PREFIX)])
     return found | {DATASET_PREFIX + name for name in index.datasets.unfinished(names)}
@@ -277,7 +277,7 @@ class Idempotency:
     """Idempotency-Key (IETF draft): the same key with a different body is an input error.
 
     Identical requests give the same job even without a key, because a job's id depends on its content. Redis stores the
-    content of each key for a day, but no response; if Redis loses it, only this check is lost.
+    request's digest under each key for a day, but no response; if Redis loses it, only this check is lost.
     """
 
     def __init__(self, connection: Any) -> None:
@@ -285,7 +285,7 @@ class Idempotency:
 
     @contextmanager
     def claim(self, owner: str, key: str, request: JobRequest) -> Iterator[None]:
-        """Bind a key of an API key's `owner` to a request recorded in this context; a failure releases it."""
+        """Bind `owner`'s idempotency key to the request that this context records; a failure releases the key."""
         name = f"graspd:idempotency:{digest_bytes(f'{owner} {key}'.encode())}"
         content = digest_json(request.model_dump(mode="json")).encode()
         is_ours = self._bind(name, content)

@@ -72,7 +72,7 @@ class Assets:
         digest = self._mark(kind, name, files, "" if shared else project)
         known = self._find(kind, digest)
         if known is None and self._find(kind, digest, EVERYTHING):
-            raise ConflictError(f"this {kind.value} is private to another project; upload it without sharing it")
+            raise ConflictError(f"this {kind.value} is private to another project; upload it without `shared`")
         if known and (rename or known.verdict == "refuse"):
             return known
         if rename and self._holder(kind, name):
@@ -82,7 +82,7 @@ class Assets:
         said = {"owner": caller_id(), "project": project, "shared": shared, "self_test": self_test}
         asset = library.store_files(store, kind, name, files, said=said)
         if found is not None:
-            # A network's check precedes its record, because the record makes it effective.
+            # The check is stored first, because jobs can use the network once it is recorded.
             put_document(store, names.asset_check(kind, asset.digest), found)
         # With two simultaneous uploads under one name, the later one must find the record of the earlier one.
         with recording(self._services) as (connection, put):
@@ -96,7 +96,7 @@ class Assets:
         return facts_of(self.model(asset))
 
     def correct(self, name: str, corrections: HandCorrections, new_name: str = "") -> AssetView:
-        """Create a hand from the same files with corrected facts, and queue its check; default name: with a number."""
+        """Create a hand from the same files with corrected facts; the default name adds a number."""
         hand = self.one(AssetKind.HAND, name)
         facts = self.hand_facts(hand)
         archive = self._services.store.get(names.asset_files(AssetKind.HAND, hand.digest))

@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 
 
 class Datasets:
-    """Datasets in the caller's scope. Changes of another owner's raise ForeignResource; above a quota, QuotaError."""
+    """Datasets in the caller's scope; changes can raise ForeignResource (another owner) and QuotaError."""
 
     def __init__(self, services: Services, quotas: Quotas) -> None:
         self._services = services
@@ -168,7 +168,7 @@ class Comparison:
     pairs: list[Pair]
     """Ordered by hand; empty if a dataset has more than `MOST_CELLS` cells."""
     metrics: dict[Metric, list[Distribution | None]]
-    """Distributions over each dataset's counted grasps, in the same bins."""
+    """Distributions over each dataset's valid grasps (all, if it requests others too), in the same bins."""
 
 
 def _settings(one: DatasetView, other: DatasetView) -> Iterator[tuple[str, str, str]]:

@@ -1,4 +1,4 @@
-"""Server-sent events (streams end when their key becomes invalid), feed of ended jobs and datasets, webhooks."""
+"""Server-sent events, which end when their key does; feed of ended jobs and datasets; webhooks."""
 
 from __future__ import annotations
 
@@ -93,9 +93,7 @@ class Webhooks:
         """Add a webhook; return it with its secret, which cannot be shown again."""
         master = self._services.settings.webhook_secret
         if master is None:
-            raise ConflictError(
-                "webhooks are switched off; the operator sets GRASPD_WEBHOOK_SECRET for API and controller"
-            )
+            raise ConflictError("webhooks are off; the operator can set GRASPD_WEBHOOK_SECRET for API and controller")
         project = project_scope().project
         hook = Webhook(
             id=secrets.token_hex(16),

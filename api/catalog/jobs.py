@@ -1,4 +1,4 @@
-"""Jobs (submission within quotas, progress, rate, expected end, changes by their owners) and their shards."""
+"""Jobs and their shards: submission within quotas, progress, rate, expected end, changes by owners."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from graspd.service.telemetry import bind
 
 log = logging.getLogger(__name__)
 _PAGE: Final = 200
-#: Most waiting tasks for which the reason of waiting is determined.
+#: Number of waiting tasks that are searched for a reason to wait.
 _LOOKED_AT: Final = 20
 _ORDER: Final = {stage: place for place, stage in enumerate(Stage)}
 _SHARED: Final = Job.model_fields.keys() & JobView.model_fields.keys() - {"reason", "stages"}
@@ -81,7 +81,7 @@ def _shard(shard: ShardView) -> Shard:
 
 
 class Jobs:
-    """Jobs in the caller's scope. Changes of another owner's raise ForeignResource; above a quota, QuotaError."""
+    """Jobs in the caller's scope; changes can raise ForeignResource (another owner) and QuotaError."""
 
     def __init__(
         self, services: Services, quotas: Quotas, idempotency: Idempotency, grasps: Grasps, shards: Shards
@@ -105,8 +105,8 @@ class Jobs:
                 job, is_new = job_actions.enter(self._services, record)
                 claim.counts = is_new
                 log.info("job submitted" if is_new else "job existed already")
-        # An identical job may exist under a fidelity's name; a request with a target still gets the fidelity chosen for
-        # it.
+        # The identical job may have been requested with a named fidelity. A request with a target still gets the
+        # choice made for it.
         return self._detail(job).model_copy(update={"choice": record.choice or job.choice})
 
     def cancel(self, job_id: str) -> JobDetail:
@@ -254,7 +254,7 @@ def _status(stage: StageProgress, tasks: list[TaskView], paces: TaskRates) -> St
 
 
 def _rate(stage: StageProgress, running: list[TaskView], paces: TaskRates) -> float | None:
-    """Return batches per second, from the progress of running tasks, else from finished ones."""
+    """Return tasks per second, from the progress of running tasks, else from finished ones."""
     known = [pace for task in running if (pace := paces.of(task)) is not None]
     if known:
         return sum(known) * len(running) / len(known)

@@ -60,7 +60,7 @@ class Overview:
         self._lock = threading.Lock()
 
     def workers(self) -> list[Worker]:
-        """Return workers, live ones first, each with its present stage and the age of its lease."""
+        """Return workers, live ones first, each with its present stage and the time since its heartbeat."""
         known = self._services.index.overview.workers()
         doing = self._services.index.feed.outputs([worker.task_id for worker in known if worker.task_id])
         seen = self._tasks_in_scope(worker.task_id for worker in known if worker.task_id)
@@ -78,7 +78,7 @@ class Overview:
         ]
 
     def task_of(self, worker: Worker) -> TaskView | None:
-        """Return a worker's task; None for a check of an upload, which is not a task in the index."""
+        """Return a worker's task; None without one, and for the check of an upload (no task in the index)."""
         if worker.state != "busy" or not worker.task_id:
             return None
         try:
@@ -106,7 +106,7 @@ class Overview:
         return self._probes.health()
 
     def damage(self) -> tuple[int, list[Damage]]:
-        """Return the number of damaged or missing objects in the store, and the first of them if in scope."""
+        """Return the number of damaged or missing stored objects, and the first ones; none in a limited scope."""
         if not project_scope().everything:
             return 0, []
         return self._services.index.damage.known(limit=_DAMAGE_SHOWN)
@@ -166,7 +166,7 @@ class Probes:
         self._lock = threading.Lock()
 
     def health(self) -> Health:
-        """Return the state of the parts; ready if all three answer. Controller and workers do not count."""
+        """Return the state of Redis, index and store, which must answer, and of controller and workers."""
         with self._lock:
             now = time.monotonic()
             if self._known is None or now - self._known[0] > KEPT_S:

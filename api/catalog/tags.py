@@ -31,7 +31,7 @@ log = logging.getLogger(__name__)
 
 
 class Tags:
-    """Tags of the caller's project, each by its name or id. Changes of another owner's raise ForeignResource."""
+    """Tags of the caller's project, by name or id; changes can raise ForeignResource (another owner)."""
 
     def __init__(self, services: Services, grasps: Grasps) -> None:
         self._services = services
@@ -49,7 +49,7 @@ class Tags:
         return self._services.index.tags.of(grasps, scope=project_scope())
 
     def chosen(self, selection: Selection) -> list[Grasp]:
-        """Return the grasps of a selection, each once, in order; NotFoundError if one is out of scope."""
+        """Return the grasps of a selection, each once, by shard and row; NotFoundError if one is out of scope."""
         if selection.filter is not None:
             return self._grasps.members(selection.filter)
         named = sorted({(grasp.shard_id, grasp.row) for grasp in selection.grasps or ()})
@@ -111,7 +111,7 @@ class GraspExports:
         self._tags = tags
 
     def made(self, places: Sequence[Grasp], format: Format, said: Mapping[str, Any]) -> tuple[int, Iterator[bytes]]:
-        """Write a file of these grasps, all visible to the caller, described by `said`; return size and bytes."""
+        """Write these grasps, all in scope, and the selection `said` to a file; return its size and bytes."""
         file = TemporaryFile()  # noqa: SIM115 (it is closed once it is sent)
         try:
             {"csv": self._csv, "json": self._json, "zip": self._zip}[format](file, places, said)

@@ -98,7 +98,7 @@ _ROWS: Final = 60
 
 @dataclass(frozen=True)
 class Tile:
-    """One hand on one object.
+    """Cell of the matrix: one hand on one object.
 
     `made` counts grasps of status `standing`; `share` is the valid share of validated candidates. The checkbox sends
     `value`; the link is `href`.
@@ -186,7 +186,7 @@ def _state(cell: MatrixCell) -> str:
     return next((state for state in ("running", "queued", "failed") if getattr(cell, state)), "succeeded")
 
 
-#: Width and height of a cell with its gap [px], as in the style sheet: lines are drawn over the cells.
+#: Width and height of a cell with its gap [px], as in the style sheet; the lines over the cells depend on it.
 PITCH: Final = (40, 30)
 
 

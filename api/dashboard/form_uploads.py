@@ -1,8 +1,8 @@
 """Hand and object of a job's form: a known asset, or an uploaded file.
 
 The form shows exactly what the job will use. A refused file stays in the store, and the form refers to it: the next
-submission checks it again with the form's options. Each fix suggested by a refusal is a button, so the form needs no
-options of the command line.
+submission checks it again with the form's options. Each fix suggested by a refusal is a button, so no fix
+needs the command line.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def choose_asset(request: Request, assets: Assets, fields: FormData, kind: Asset
 
 
 def refusal_of(asset: AssetView) -> Refusal:
-    """Return an asset's refusal. Facts of an upload may be of any type."""
+    """Return an asset's refusal. Values in `facts` may come from the upload, so their type is checked."""
     facts = asset.facts
     lengths = facts.get("lengths_m")
     units = [
@@ -157,7 +157,7 @@ def _retry_upload(assets: Assets, kind: AssetKind, digest: str, fields: FormData
 
 
 def fix_options(fields: FormData, kind: AssetKind) -> dict[str, Any]:
-    """Return the options of the pressed button; values of null come from its field."""
+    """Return the options of the pressed button, with the value of its field in place of null."""
     said = json_object(text, "the option") if (text := _text(fields, f"{kind.value}_fix")) else {}
     for key in [key for key, value in said.items() if value is None and key in _ASKED]:
         label, given = _ASKED[key][0], _text(fields, f"{kind.value}_{key}").strip()

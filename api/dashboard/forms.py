@@ -73,7 +73,7 @@ class FormInput:
 
 
 def inputs_of(section: str = "", *, cells: bool = False) -> list[FormInput]:
-    """Return fields of a job's form, in one section or all; with `cells`, of a dataset's form."""
+    """Return the fields of a job's form (`cells`: of a dataset's form) in one section, or in all."""
     shown = [(row, row.form) for row in rows(JobOptions, "job") if row.form is not None]
     return [
         FormInput.of(row, form) for row, form in shown if section in ("", form.section) and (form.cells or not cells)
@@ -191,7 +191,7 @@ def _form(
     )
 
 
-#: Cache lifetime [s]: costs of batches change slowly, and a read of two thousand is slow for a page.
+#: Cache lifetime [s]: costs of batches change slowly, and reading two thousand of them is slow for a page.
 KEPT_S: Final = 60.0
 WORDS: Final = {
     "draft": "Fewest points and starts, for a first look.",

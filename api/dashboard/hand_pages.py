@@ -31,9 +31,9 @@ router = APIRouter(prefix="/hands", include_in_schema=False)
 def hands_page(
     request: Request, assets: AssetsOf, cursor: Annotated[str | None, Query(max_length=512)] = None
 ) -> HTMLResponse:
-    """Refused hands are included; their pages state the reason."""
+    """Show all hands, also refused ones; their pages state the reason."""
     page = assets.page(AssetKind.HAND, limit=PAGE_SIZE, cursor=cursor, refused=True)
-    # Facts contain data from the upload besides findings of the check, so they may be of any type.
+    # `facts` contains data from the upload besides findings of the check, so values may be of any type.
     numbers = {
         hand.digest: [
             len(told) if isinstance(told, list) else 0 for told in map(hand.facts.get, ("dofs", "fingertips"))

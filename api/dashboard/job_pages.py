@@ -121,7 +121,7 @@ class Pictures:
         with open_shard(self._fetch(key, sha256), name=key) as file:
             path = f"image/{channel}"
             if path not in file:
-                raise NotFoundError("the shard has no pictures; only views shards have pictures")
+                raise NotFoundError("the shard has no pictures of this channel; only views shards have pictures")
             pictures = file[path]
             if not 0 <= index < len(pictures):
                 raise NotFoundError(f"the shard has {len(pictures)} pictures; there is no picture {index}")

@@ -1,6 +1,6 @@
 """Pages of the whole service: home, workers, charts, failure maps, usage, deletions, problem types, and the session.
 
-Sign-in with a key sets a signed cookie, which is valid as long as the key is.
+Sign-in with a key sets a signed cookie. It is valid for at most 12 hours, and only while the key is valid.
 """
 
 from __future__ import annotations
@@ -234,7 +234,7 @@ def delete_tag(name: str, tags: TagsOf, typed: Typed = "") -> RedirectResponse:
 
 def _confirmed(typed: str, *names: str) -> None:
     if typed.strip() not in names:
-        raise InputError(f"nothing was deleted: to confirm it, type {names[-1]}")
+        raise InputError(f"nothing was deleted; to confirm the deletion, type {names[-1]}")
 
 
 def _deleted(id: str) -> RedirectResponse:
@@ -282,7 +282,7 @@ _HTTP_PROBLEMS: Final = {
     "unauthorized": (401, "A valid key is required."),
     "forbidden": (403, "The scope of the key is insufficient, or the request comes from a foreign web page."),
     "method-not-allowed": (405, "The address does not support this method."),
-    "unsupported-media-type": (415, "The body is compressed or otherwise encoded; only plain bodies are accepted."),
+    "unsupported-media-type": (415, "The body is compressed or otherwise encoded; send it unencoded."),
     "range-not-satisfiable": (416, "The byte range starts after the end of the file."),
     "misdirected-request": (421, "The service does not accept this host name while it has no keys."),
 }

@@ -27,7 +27,7 @@ NAVIGATION: Final = (
     ("/chart", "Chart"),
     ("/stability", "Stability"),
 )
-#: Pages shown only if there are API keys: usage is counted per key.
+#: Pages shown only if requests need a key: usage belongs to the projects of keys.
 _WITH_KEYS: Final = (("/usage", "Usage"),)
 
 
@@ -45,7 +45,7 @@ def environment() -> Environment:
 
 
 def render(request: Request, template: str, *, status: int = 200, **context: Any) -> HTMLResponse:
-    """Render a page: its navigation entry `page`, the stream `events` that updates it, or an interval `poll_s` [s]."""
+    """Render a page. `page`: navigation entry; `events`: stream of updates; `poll_s`: update interval [s]."""
     defaults = {"page": "", "events": "", "refresh_s": 0, "poll_s": 0, "health": request.app.state.overview.health()}
     context = defaults | context
     context |= {

@@ -25,7 +25,7 @@ _LEFT, _RIGHT, _TOP, _BOTTOM = 64, 24, 16, 46
 _LETTER, _LINE, _AWAY, _DOT = 6.9, 15.0, 12.0, 7.0
 #: Vertical offsets of a label from its point, in order of preference [px].
 _MOVES: Final = (0.0, 15.0, -15.0, 30.0, -30.0, 45.0, -45.0, 60.0, -60.0)
-#: Fidelity of methods without fidelities; their label is their name.
+#: Fidelity of methods that have none; their labels omit it.
 _NO_FIDELITY: Final = "as published"
 
 
@@ -38,7 +38,7 @@ class Axis:
     """Factor on the stored number."""
 
 
-#: Accuracies of grasps around free objects, and of grasps in scenes; the first one is the default.
+#: Accuracies of grasps around free objects, and of grasps in scenes; the first of each is the default.
 FREE: Final[dict[str, Axis]] = {
     "gsr": Axis("Success in MuJoCo"),
     "dexgraspbench": Axis("Success under the DexGraspBench protocol"),
@@ -56,7 +56,7 @@ IN_SCENES: Final[dict[str, Axis]] = {
 
 
 class Run(BaseModel):
-    """One method at one fidelity on one hand and object; in scenes, planned in the scene or filtered afterwards."""
+    """Run of a method at a fidelity on a hand and object; in a scene: planned there or filtered there."""
 
     method: str
     fidelity: str
@@ -89,7 +89,7 @@ class Run(BaseModel):
 
     @property
     def found(self) -> int | None:
-        """Number of valid grasps, in scenes of lifted grasps; None in charts of graspd 0.1."""
+        """Number of valid grasps, or of lifted grasps in a scene; None in charts of graspd 0.1."""
         return self.kept if self.lift_count is None else self.lift_count
 
     @property
@@ -118,7 +118,7 @@ class Measured(BaseModel):
 
 @dataclass(frozen=True)
 class Point:
-    """Method and fidelity, over the selected hands and objects."""
+    """Result of a method at a fidelity over the selected hands and objects."""
 
     method: str
     fidelity: str

@@ -38,7 +38,7 @@ _FREE: Final = ("/static/", "/healthz", "/readyz")
 class RateLimit(HttpMiddleware):
     """Finds the key of a request (`scope["state"]["key"]`) and enforces the limits of that key.
 
-    A request without a key counts against its address. An open service serves only one machine and has no limits.
+    A request without a key counts against its address. While there are no keys, there are no limits.
     Refusals are 429 with Retry-After; every counted response has RateLimit and RateLimit-Policy
     (draft-ietf-httpapi-ratelimit-headers-10).
     """
@@ -224,7 +224,7 @@ class Rates:
             return await self._connect().eval(script, len(keys), *keys, *arguments)
         except (RedisError, OSError, TimeoutError) as error:
             self._silent_until = time.monotonic() + _PAUSE_S
-            log.warning("limits are not counted while Redis does not answer: %s", error)
+            log.warning("requests are not limited while Redis does not answer: %s", error)
             return None
 
     def _connect(self) -> Any:
@@ -310,7 +310,7 @@ def _body_refusal(scope: Scope, limit: int, *, is_upload: bool) -> Exception | N
     """Return the reason to refuse a body before it is read; None: no reason."""
     given = dict(scope["headers"])
     if b"transfer-encoding" in given and b"content-length" in given:
-        # With two lengths, a proxy may have used the other one: the rest would be parsed as the next request.
+        # With two lengths, a proxy may use the other one, and the rest would be parsed as the next request.
         return ApiError(400, "Transfer-Encoding and Content-Length exclude each other")
     encoding = given.get(b"content-encoding", b"").decode("latin-1").strip().lower()
     if encoding not in ("", "identity") and scope["method"] not in SAFE_METHODS:

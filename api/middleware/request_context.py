@@ -58,7 +58,7 @@ class HttpMiddleware:
 
 
 class RequestContext(HttpMiddleware):
-    """Outermost middleware: sets the request id, times the request, reports unexpected errors as problems."""
+    """Sets the request id, times the request, and reports unexpected errors as problem documents."""
 
     def __init__(self, app: ASGIApp, *, metrics: Metrics) -> None:
         super().__init__(app)
@@ -111,7 +111,7 @@ class RequestContext(HttpMiddleware):
 
 
 def _method(scope: Scope) -> str:
-    """Return the method if HTTP defines it, else "other": arbitrary words must not become series names."""
+    """Return the method if HTTP defines it, else "other": arbitrary words must not become labels."""
     return scope["method"] if scope["method"] in _METHODS else "other"
 
 
@@ -133,7 +133,7 @@ class Head(HttpMiddleware):
             nonlocal is_over
             if message["type"] == "http.response.start":
                 await send(message)
-                # An endless stream needs the disconnect; a response with a length closes its files.
+                # A response without a length may be endless, so it ends now; others run on and close their files.
                 is_last = all(name.lower() != b"content-length" for name, _ in message["headers"])
             else:
                 is_last = not message.get("more_body", False)

@@ -34,11 +34,11 @@ from graspd.service.model.states import AssetKind
 from graspd.service.store.descriptions import HandCorrections
 
 _GLB: Final = "model/gltf-binary"
-#: Most uploads unpacked and packed at once in this process; each may need the size of one of its files in memory.
+#: Most uploads unpacked and packed at once in this process; each may need memory for one of its files.
 _AT_ONCE: Final = BoundedSemaphore(UPLOADS)
 _TURN_S: Final = 20.0
 
-_ZIPPED: Final = "Upload a file, or a ZIP of its folder. It is checked by a worker before the first job uses it."
+_ZIPPED: Final = "Upload a file, or a ZIP of its folder. A worker checks the asset before a job uses it."
 _ADDED: Final = {
     AssetKind.HAND: _ZIPPED,
     AssetKind.OBJECT: _ZIPPED,
@@ -86,11 +86,11 @@ def asset_router(kind: AssetKind) -> APIRouter:
         assets: AssetsOf,
         name: Annotated[Name | None, Form()] = None,
         options: Annotated[
-            str, Form(description='JSON object over the keys of asset.json, such as {"units": "mm"}', max_length=65536)
+            str, Form(description='JSON object with keys of asset.json, such as {"units": "mm"}', max_length=65536)
         ] = "",
         self_test: Annotated[
             bool,
-            Form(description="hands only: the check ends with 80 grasps of plain objects, which takes some minutes"),
+            Form(description="hands only: the check ends with 80 grasps of simple shapes, which takes some minutes"),
         ] = False,
         shared: Annotated[bool, Form(description="whether all projects may use it, not only the key's")] = False,
         rename: Annotated[
@@ -154,7 +154,7 @@ def store_upload(
     options: str = "",
     **said: bool,
 ) -> AssetView:
-    """Store an upload as an asset with immutable content, and its check task; until then it is a temporary file.
+    """Store an upload, so far a temporary file, as an immutable asset with a check task.
 
     `said`: `self_test`, `shared` and `rename`, as in `Assets.add`. The number of concurrent uploads is limited, which
     bounds their memory.
@@ -166,7 +166,7 @@ def store_upload(
 
 
 def store_correction(assets: Assets, name: str, corrections: HandCorrections, new_name: str | None) -> AssetView:
-    """Store a corrected hand and its check task; it counts as an upload."""
+    """Store a corrected hand and its check task; the limit on uploads applies."""
     with _upload_slot():
         return assets.correct(name, corrections, new_name or "")
 

@@ -48,7 +48,7 @@ def create_dataset(body: DatasetRequest, response: Response, datasets: DatasetsO
 
 @router.post("/estimate", dependencies=READ, responses=responses(400, 404))
 def estimate_dataset(body: Matrix, datasets: DatasetsOf) -> Estimate:
-    """Estimate a dataset's time for 1, 8 and 64 workers, storage and network. Nothing is recorded."""
+    """Estimate a dataset's storage, and its time and traffic for 1, 8 and 64 workers. Nothing is recorded."""
     return datasets.estimate(body)
 
 

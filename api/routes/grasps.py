@@ -85,7 +85,7 @@ def list_tags(tags: TagsOf) -> list[TagView]:
 
 @tag_router.post("", dependencies=SUBMIT, responses=responses(400, 404, 409))
 def give_tag(body: TagRequest, tags: TagsOf) -> TagChange:
-    """Give a tag to grasps, listed by name or by a filter; a new tag is created."""
+    """Give a tag to listed or filtered grasps; create the tag if it is new."""
     return tags.give(body.name, body)
 
 
@@ -97,7 +97,7 @@ def get_tag(name: TagName, tags: TagsOf) -> TagView:
 
 @tag_router.post("/{name}/remove", dependencies=SUBMIT, responses=responses(400, 404, 409))
 def take_tag_off(name: TagName, body: Selection, tags: TagsOf) -> TagChange:
-    """Remove a tag from grasps, listed by name or by a filter."""
+    """Remove a tag from listed or filtered grasps."""
     return tags.take_off(name, body)
 
 

@@ -1,4 +1,4 @@
-"""Workers, statistics, health, metrics; usage; deletions and restores; ends of jobs and datasets, and webhooks."""
+"""Workers, statistics, health, metrics, usage, deletions, restores, ended jobs and datasets, webhooks."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ async def healthz() -> dict[str, bool]:
 
 @router.get("/readyz", responses={503: {"model": Health, "description": "A part does not answer"}})
 def readyz(request: Request, overview: OverviewOf, response: Response) -> Health:
-    """Return the latency of Redis, index and store, whether a controller is alive, and live workers.
+    """Return the latency of Redis, index and store, the controller's state, and the number of workers.
 
     Details of a fault are included only for callers that may read.
     """
@@ -67,7 +67,7 @@ def readyz(request: Request, overview: OverviewOf, response: Response) -> Health
     responses=responses(others={200: {"content": {"text/plain": {}}}}),
 )
 def metrics(request: Request, overview: OverviewOf) -> Response:
-    """Return metrics as Prometheus text. A scrape succeeds even if a part is down, without its series."""
+    """Return metrics as Prometheus text. If a part is down, only its series are missing."""
     values: Metrics = request.app.state.metrics
     return Response(values.render(overview.snapshot()), media_type=CONTENT_TYPE)
 
@@ -83,13 +83,13 @@ def _day(said: object) -> object:
 
 
 Day = Annotated[date, BeforeValidator(_day)]
-Since = Annotated[Day | None, Query(description="first day (UTC); default: a month before the last")]
+Since = Annotated[Day | None, Query(description="first day (UTC); default: 30 days before the last day")]
 Until = Annotated[Day | None, Query(description="last day (UTC); default: today")]
 
 
 @usage_router.get("/v1/usage", dependencies=READ, responses=responses(400))
 def get_usage(usage: UsageOf, since: Since = None, until: Until = None) -> list[UsageDay]:
-    """Return each project's grasps and seconds per day, newest first; all projects with `admin`."""
+    """Return grasps and seconds per day of the key's project, newest first; with `admin`, of all projects."""
     return usage.days(since, until)
 
 
@@ -109,7 +109,7 @@ def get_usage_csv(usage: UsageOf, since: Since = None, until: Until = None) -> R
 
 deletion_router = APIRouter(tags=["deletions"])
 
-Name = Annotated[str, Path(max_length=64, description="its name, or its id")]
+Name = Annotated[str, Path(max_length=64, description="name or id of the resource")]
 
 
 @deletion_router.get("/v1/deletions", dependencies=READ)
@@ -123,7 +123,7 @@ def _add_restore(what: What) -> None:
         f"/v1/{what}s/{{name}}/restore", dependencies=SUBMIT, responses=responses(404, 409), name=f"restore_{what}"
     )
     def restore(name: Name, deletions: DeletionsOf) -> DeletionView:
-        """Restore a resource deleted within the grace time (`GRASPD_SHARD_GRACE_S`), unchanged."""
+        """Restore a deleted resource unchanged, within the grace time (`GRASPD_SHARD_GRACE_S`)."""
         return deletions.restore(what, name)
 
 
@@ -138,14 +138,14 @@ AfterEnd = Annotated[int, Query(ge=0, lt=2**62, description="`seq` of the last k
 
 
 class DeliveryPage(BaseModel):
-    """Page of ends, and the number to continue from."""
+    """Page of ended jobs and datasets, and the number to continue from."""
 
     items: list[EndView]
     next: int = Field(description="`since` of the next request")
 
 
 class WebhookRequest(BaseModel):
-    """Address to notify of ends."""
+    """Address to notify when jobs and datasets end, and the states to report."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -161,7 +161,7 @@ class CreatedWebhook(WebhookView):
 
 @event_router.get("/v1/events", dependencies=READ)
 def list_ends(webhooks: WebhooksOf, since: AfterEnd = 0, limit: Limit = 50) -> DeliveryPage:
-    """List ended jobs and datasets in order. Ends are stored for 30 days; each appears at least once."""
+    """List ended jobs and datasets, oldest first. Ends are stored for 30 days; each appears at least once."""
     items = webhooks.ends(since, limit=limit)
     return DeliveryPage(items=items, next=items[-1].seq if items else since)
 

@@ -106,7 +106,7 @@ def list_keys(json: JsonFlag = False) -> None:
         of = [key.project or "-"] if has_projects else []
         times = minute(key.created), minute(key.expires)
         rows.append((key.name, key.scope, *of, _state(key), *times, _key_limits(key.limits)))
-    empty = "no key; the service is open, but only to this machine"
+    empty = "no key; the service answers only this machine"
     print_rows(document, names, rows, whole=("state", "created", "expires"), empty=empty, json=json)
 
 
@@ -180,8 +180,7 @@ def limit_project(
     grasps_in_flight: Annotated[int | None, typer.Option(min=0, help="Grasps in unfinished jobs; 0: no limit.")] = None,
     grasps_per_day: Annotated[int | None, typer.Option(min=0, help="Requested grasps per day; 0: no limit.")] = None,
     gpu_seconds_per_day: Annotated[
-        int | None,
-        typer.Option(min=0, help="GPU seconds per day (UTC), after which new jobs are refused; 0: no limit."),
+        int | None, typer.Option(min=0, help="GPU seconds per day (UTC); above it, new jobs are refused; 0: no limit.")
     ] = None,
     json: JsonFlag = False,
 ) -> None:

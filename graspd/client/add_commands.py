@@ -1,6 +1,6 @@
 """`graspd hands add`, `objects add`, `networks add`: upload an asset or a set, and wait for its check.
 
-A hand is a folder, or a description with the files it needs, which are packed into one ZIP.
+A hand is a folder, or a model file with the files that it needs; they are packed into one ZIP.
 """
 
 from __future__ import annotations
@@ -54,14 +54,14 @@ def add_hand(
     licence: LicenceOption = None,
     source: SourceOption = None,
     self_test: Annotated[
-        bool, typer.Option("--self-test/--no-self-test", help="Run the self-test: hold and lift plain objects.")
+        bool, typer.Option("--self-test/--no-self-test", help="Run the self-test: hold and lift simple shapes.")
     ] = True,
     shared: SharedOption = False,
     wait: WaitOption = True,
     url: UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Upload a hand, wait for its check, and report guesses and the self-test on plain objects."""
+    """Upload a hand, wait for its check, and report guesses and the self-test on simple shapes."""
     options = hand_options(**options) | provenance(licence, source)
     with upload_of(file) as (upload, main):
         said = ({"file": main} if main else {}) | options
@@ -131,7 +131,7 @@ def _add(
 
 @contextmanager
 def upload_of(path: Path) -> Iterator[tuple[Path, str]]:
-    """Yield the file to send (the path, or a temporary ZIP), and the hand's description in it (empty: not chosen)."""
+    """Yield the file to send (`path` or a temporary ZIP), and the hand's main file in it (empty: unknown)."""
     alone = not path.is_dir() and (path.suffix.lower() not in SUFFIXES or not path.is_file())
     files, main = ({}, "") if alone else files_of_hand(path)
     if len(files) <= 1 and not path.is_dir():
@@ -179,7 +179,7 @@ def add_set(
     url: str | None,
     json: bool,
 ) -> None:
-    """Upload objects as a set and report it; list refused objects, then raise InputError."""
+    """Upload objects as a set and report it; raise InputError if objects were refused."""
     with open_client(url) as client:
         say = None if json else typer.echo
         told = upload_set(client, objects, name, prefix=prefix, options=options, shared=shared, wait=wait, say=say)

@@ -1,4 +1,4 @@
-"""HTTP client: exchanges documents of `api.models`; raises problem documents as exceptions."""
+"""HTTP client: exchanges the models of the API; raises its problem documents as exceptions."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class Client(AbstractContextManager["Client"]):
         return self._document(JobDetail, "GET", path_of("jobs", job_id))
 
     def jobs(self, *, state: State | None = None, prefix: str = "", limit: int = 50) -> Page[Job]:
-        """Return the newest jobs, at most `limit`, whose ids begin with `prefix`."""
+        """Return the newest jobs whose ids begin with `prefix`, at most `limit`."""
         return self._document(Page[Job], "GET", "/v1/jobs", params={"state": state, "prefix": prefix, "limit": limit})
 
     def cancel(self, job_id: str) -> JobDetail:
@@ -241,7 +241,7 @@ class Client(AbstractContextManager["Client"]):
         for wait in (*_WAITS_S, None):
             with _convert_errors(self.url):
                 answer = self._http.request(method, path, params=given or None, **options)
-            # Only the rate of requests recovers within a retry, not the other quotas.
+            # A retry helps only against the limit on the rate of requests, not against quotas.
             if wait is None or answer.status_code != 429 or RateError.slug not in answer.text:
                 break
             time.sleep(min(wait, float(answer.headers.get("retry-after", wait))))

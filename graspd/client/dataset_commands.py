@@ -84,7 +84,7 @@ class PlanRequest:
 def plan_request(
     spec: Path | None, *, name: str | None, hands: str | None, objects: str | None, options: dict[str, Any]
 ) -> PlanRequest:
-    """Combine spec and options, which take precedence; the name is empty if neither contains it."""
+    """Combine spec and options; options take precedence. The name is empty if neither contains it."""
     given = dict(options)
     if "options" in given:
         given["options"] = pairs(given["options"])
@@ -190,7 +190,7 @@ def create(
     _emit(json, estimate=found, dataset=dataset, refused=refused)
     if not json:
         if refused:
-            console.print(f"excluded, because refused: {', '.join(refused)}", soft_wrap=True)
+            console.print(f"refused, so not in the dataset: {', '.join(refused)}", soft_wrap=True)
         print_dataset(dataset, console)
         console.print(f"`graspd datasets status {asked.name}` shows each cell", style="dim")
     _check_success(dataset, asked=wait)
@@ -207,7 +207,7 @@ def estimate(
     *,
     options: dict[str, Any],
 ) -> None:
-    """Estimate the cost of a dataset: time for 1, 8 and 64 workers, storage, network."""
+    """Estimate the cost of a dataset: storage, and time and traffic for 1, 8 and 64 workers."""
     asked = plan_request(spec, name=None, hands=hands, objects=objects, options=options)
     with open_client(url) as client:
         files, matrix = _matrix(client, asked)

@@ -113,7 +113,7 @@ _SUMMARY: Final = (
 
 
 def job_summary(job: JobDetail) -> dict[str, Any]:
-    """Return the keys for scripts: job, state, grasps, valid, stages, mean, shards and others."""
+    """Return a job as JSON for scripts: job, state, grasps, valid, stages, mean, shards and others."""
     return {
         "job": job.id,
         "state": job.state.value,

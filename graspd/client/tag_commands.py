@@ -48,7 +48,7 @@ def add_tag(
     url: UrlOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Tag grasps; a new tag is created."""
+    """Tag grasps; create the tag if it is new."""
     body = {"name": tag, **_selection(grasps, where=where, job=job, dataset=dataset)}
     with open_client(url) as client:
         _report_change(client.send("POST", "/v1/tags", json=body).json(), "tagged with", json=json)

@@ -90,7 +90,7 @@ def clouds(
     noise: Annotated[str, typer.Option(help=f"Noise model of a depth camera: {', '.join(NOISES)}; or none.")] = "none",
     frame: Annotated[
         Frame | None,
-        typer.Option(help="Frame of the points: camera, table or object; default: camera, for fused views table."),
+        typer.Option(help="Frame of the points: camera, table or object; default: camera, with --fuse table."),
     ] = None,
     fuse: Annotated[bool, typer.Option("--fuse", help="Fuse all views of a scene into one cloud.")] = False,
     scene: Annotated[bool, typer.Option("--scene", help="Include table and neighbours.")] = False,

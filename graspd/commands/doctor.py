@@ -53,7 +53,7 @@ def gpu(settings: Settings, *, child: Child = run_child, has_driver: Callable[[]
         )
     gpus: list[dict[str, Any]] = found["gpus"]
     needed = f"the driver has CUDA {_version(found['driver'])}, Warp is built for {_version(found['toolkit'])}"
-    fix = "install driver R580 or newer; in containers the NVIDIA container toolkit, --gpus all; CUDA_VISIBLE_DEVICES"
+    fix = "install driver R580 or newer; containers need NVIDIA's toolkit and --gpus all; check CUDA_VISIBLE_DEVICES"
     if not gpus:
         if settings.device.startswith("cuda"):
             return bad(f"GRASPD_DEVICE is {settings.device}, and no GPU is found; {needed}", fix)
@@ -62,7 +62,7 @@ def gpu(settings: Settings, *, child: Child = run_child, has_driver: Callable[[]
         return good("none; work runs on the CPU")
     if settings.device.startswith("cuda") and settings.device not in [one["name"] for one in gpus]:
         return bad(
-            f"GRASPD_DEVICE is {settings.device}, there are {', '.join(one['name'] for one in gpus)}",
+            f"GRASPD_DEVICE is {settings.device}, but there are {', '.join(one['name'] for one in gpus)}",
             "set it to one of these, or auto",
         )
     line = ", ".join(

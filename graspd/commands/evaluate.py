@@ -49,7 +49,7 @@ def evaluate_command(
     ] = "dexgraspbench",
     level: Annotated[
         str,
-        typer.Option(help="Level of validation: dexgraspbench, standard or fast; of a lift: dexgraspbench or lift."),
+        typer.Option(help="Level of validation: dexgraspbench, standard or fast; for lifts: dexgraspbench or lift."),
     ] = "",
     hard: Annotated[
         bool, typer.Option("--hard", help="Use half the friction and a tenth of the torsional friction.")
@@ -226,7 +226,7 @@ def _foreign(whole: dict[str, Any], name: str) -> str:
     share = _cell(whole["foreign_share"], 2)
     return (
         f"{name}, fingertips within {whole['fingertips_mm']:.2f} mm: GSR {_cell(whole['foreign_gsr'], 2)}; "
-        f"{held['both']} of {held['both'] + held['nominal']} grasps that hold nominally also hold here ({share}); "
+        f"{held['both']} of {held['both'] + held['nominal']} grasps held by the first model also hold here ({share}); "
         f"agreement {_cell(whole['agreement'], 2)}"
     )
 

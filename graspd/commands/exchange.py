@@ -23,7 +23,7 @@ from graspd.worker.files.subsets import EveryOption, UnvalidatedOption, select_g
 
 app = CommandGroup(no_args_is_help=True)
 
-#: Formats of robots and their simulators; the first has two names.
+#: Formats of robots and their simulators; `moveit` and `urdf+yaml` are the same format.
 ROBOTS: Final = ("moveit", "urdf+yaml", "mujoco", "usd", "glb", "isaac", "csv")
 TRAINING: Final = ("dexlearn", "dexgraspnet2", "graspgen", "huggingface", "lerobot")
 EXPORTS: Final = ("images", "replicator", "webdataset", "dexgraspbench", *TRAINING, *ROBOTS)
@@ -111,9 +111,7 @@ def import_(
     licence: Annotated[str, typer.Option(help="Licence of the grasps, written into every file.")],
     origin: Annotated[str, typer.Option("--source", help="Source of the grasps: a URL or a citation.")],
     hand: Annotated[str | None, typer.Option(help="Hand: a URDF or a built-in.")] = None,
-    object_: Annotated[
-        str | None, typer.Option("--object", help="Mesh of the object at scale 1 of the source.")
-    ] = None,
+    object_: Annotated[str | None, typer.Option("--object", help="Mesh of the object at the source's scale 1.")] = None,
     robot: Annotated[str, typer.Option(help="multidex: name of the robot in the file.")] = "",
     name: Annotated[str, typer.Option(help="multidex, graspgen, huggingface, lerobot: name of the object.")] = "",
     number: Annotated[int, typer.Option(help="ddgc, dexgraspnet2: number of the object in the scene.")] = 0,

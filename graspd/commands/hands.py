@@ -35,7 +35,7 @@ def check(
     ],
     options: dict[str, Any],
     picture: Annotated[
-        Path | None, typer.Option(help="PNG of the hand: open, on approach, closing, and from three sides.")
+        Path | None, typer.Option(help="PNG of the hand from two sides: open, in its pre-shape, and closing.")
     ] = None,
     collision: Annotated[
         bool, typer.Option("--collision", help="Draw collision shapes instead of visual meshes.")
@@ -46,7 +46,7 @@ def check(
     self_test: Annotated[
         bool,
         typer.Option(
-            "--self-test/--no-self-test", help="Run the self-test: 64 grasps of plain objects, and 16 off a table."
+            "--self-test/--no-self-test", help="Run the self-test: 64 grasps of simple shapes, 16 lifts off a table."
         ),
     ] = True,
     json: JsonFlag = False,

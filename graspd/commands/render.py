@@ -63,7 +63,7 @@ def render(
         str, typer.Option(help="Channels besides rgb, depth and segmentation: distance, normals, occlusion, or all.")
     ] = "",
     cameras: Annotated[
-        Path | None, typer.Option(help="JSON file with intrinsics, places, or both, instead of sampled cameras.")
+        Path | None, typer.Option(help="JSON file with intrinsics, poses, or both, instead of sampled cameras.")
     ] = None,
     with_hand: Annotated[
         Path | None, typer.Option(help="Base shard, for additional pictures with the best grasp of each scene.")
@@ -265,7 +265,7 @@ def view(
     try:
         typer.echo(f"{grasps}: {viewer.url}")
         command = forwarding(viewer.server.get_port())
-        typer.echo(f"from another machine: {command}, then the same address; Ctrl-C ends it")
+        typer.echo(f"from another machine: run {command}, then open the same address; Ctrl-C ends the viewer")
         ended.wait()
     finally:
         viewer.close()

@@ -105,7 +105,7 @@ def stability(
     out: Annotated[Path | None, typer.Option(help="Folder for stability.json, stability.md and the maps.")] = None,
     source: Annotated[
         list[Path] | None,
-        typer.Option("--from", help="Draw and publish the maps of a stability.json without measuring; repeatable."),
+        typer.Option("--from", help="Use the maps of a stability.json instead of measuring; repeatable."),
     ] = None,
     publish: Annotated[bool, typer.Option("--publish", help="Publish to the store, for the dashboard.")] = False,
     data_dir: Annotated[Path | None, typer.Option(help="Data folder of graspd; default: GRASPD_DATA_DIR.")] = None,
@@ -216,16 +216,14 @@ def chart(
     work: Annotated[
         Path | None, typer.Option(help="With --scene: folder of results, in which a stopped run continues.")
     ] = None,
-    source: Annotated[
-        Path | None, typer.Option("--from", help="Draw and publish a chart.json without measuring.")
-    ] = None,
+    source: Annotated[Path | None, typer.Option("--from", help="Use a chart.json instead of measuring.")] = None,
     publish: Annotated[
         bool, typer.Option("--publish", help="Publish to the store, for the dashboard and `fidelity: auto`.")
     ] = False,
     data_dir: Annotated[Path | None, typer.Option(help="Data folder of graspd; default: GRASPD_DATA_DIR.")] = None,
     json: JsonFlag = False,
 ) -> None:
-    """Compare speed and accuracy: methods and fidelities on the same hands and objects, in MuJoCo."""
+    """Compare methods and fidelities on the same hands and objects: speed, and accuracy in MuJoCo."""
     from graspd.studies.chart.chart import settings_of
     from graspd.studies.chart.report import write
     from graspd.studies.chart.sweeps import knob_values

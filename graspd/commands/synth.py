@@ -1,4 +1,4 @@
-"""`graspd synth`: make the grasps of a job in one process, without queue or server."""
+"""`graspd synth`: make grasps as a job does, without queue or server."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def synth(
     """Generate, validate and measure grasps of one hand on one object as a job does; write an HDF5 file.
 
     A grasp in a scene is valid if approach, closing and lift touch nothing else and the lifted object is held.
-    Exit code 3: fewer grasps than requested. Ctrl-C saves the validated ones.
+    Exit code 3: fewer grasps than requested. Ctrl-C saves the validated grasps.
     """
     from graspd.worker.files.provenance import id_of_columns  # Help and completion need no engine.
     from graspd.worker.files.synthesis import synthesize_with

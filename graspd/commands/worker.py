@@ -23,20 +23,18 @@ app = CommandGroup(no_args_is_help=True)
 
 @app.command(epilog="graspd worker --workers 4 --stages synthesize,render")
 def worker(
-    device: Annotated[str | None, typer.Option(help="Device: cpu, cuda:0, ... or auto; GRASPD_DEVICE.")] = None,
+    device: Annotated[str | None, typer.Option(help="Device: cpu, cuda:0 or auto; default: GRASPD_DEVICE.")] = None,
     stages: Annotated[str | None, typer.Option(help="Stages to serve, separated by commas; default: all.")] = None,
     workers: Annotated[
         int, typer.Option(min=1, help="Worker processes; with device auto each takes the next GPU.")
     ] = 1,
-    threads: Annotated[int | None, typer.Option(min=0, help="CPU threads; 0: one per core; GRASPD_THREADS.")] = None,
+    threads: Annotated[int | None, typer.Option(min=0, help="CPU threads; 0: all; default: GRASPD_THREADS.")] = None,
     join: Annotated[
-        str | None, typer.Option(help="Batches of a task per launch of the planner, or auto; GRASPD_JOIN.")
+        str | None, typer.Option(help="Batches of a task per launch of the planner, or auto; default: GRASPD_JOIN.")
     ] = None,
     processes: Annotated[
         int | None,
-        typer.Option(
-            min=0, help="Processes for validation and metrics; 0: with a GPU, one per core; GRASPD_PROCESSES."
-        ),
+        typer.Option(min=0, help="Processes for validation and metrics; 0: automatic; default: GRASPD_PROCESSES."),
     ] = None,
     burst: Annotated[bool, typer.Option("--burst", help="Exit when no task waits.")] = False,
     idle: Annotated[int, typer.Option(min=0, help="With --burst: exit after this time without a task [s].")] = 0,

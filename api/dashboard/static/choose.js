@@ -1,5 +1,5 @@
 // Selection of cells of a matrix, or of grasps of a list. A heading selects its row or column, one box selects all, and
-// the bar shows the number. `data-choose` of a form is the name of its boxes.
+// a bar shows how many are selected. `data-choose` of a form is the name of its boxes.
 (() => {
   "use strict";
   const boxes = (form) => [...form.querySelectorAll(`input[name="${form.dataset.choose}"]`)];

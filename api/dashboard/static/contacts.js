@@ -30,7 +30,7 @@ export class DistanceField {
     }
   }
 
-  /** Signed by the sum of the normals at the closest point, weighted by face angles (Baerentzen and Aanaes 2005). */
+  /** Distance; its sign follows the normals at the closest point, weighted by face angles (Baerentzen and Aanaes 2005). */
   distance(point) {
     let best = Infinity;
     const closest = new Vector3(), away = new Vector3(), side = new Vector3();
@@ -69,7 +69,7 @@ export class DistanceField {
 const key = (i, j, k) => (i + 512) * 1048576 + (j + 512) * 1024 + (k + 512);
 const ap = new Vector3(), bp = new Vector3(), cp = new Vector3();
 
-/** Closest point of a triangle (Ericson, Real-Time Collision Detection, 5.1.5), and the face's angle there [rad]. */
+/** Write a triangle's closest point to `out` (Ericson, Real-Time Collision Detection, 5.1.5); return its angle there [rad]. */
 function closestOnTriangle(p, { a, b, c, ab, ac }, out) {
   ap.copy(p).sub(a);
   const d1 = ab.dot(ap), d2 = ac.dot(ap);

@@ -5,7 +5,7 @@ const TYPES = { 5120: Int8Array, 5121: Uint8Array, 5123: Uint16Array, 5125: Uint
 const WIDTHS = { SCALAR: 1, VEC3: 3 };
 const POINTS = 0;
 
-/** Document of a GLB file: `{extras, nodes: [{name, translation, rotation, extras, children, solid, collision, points}]}`. */
+/** Content of a GLB file: `{extras, nodes: [{name, translation, rotation, extras, children, solid, collision, points}]}`. */
 export function readGlb(buffer) {
   const view = new DataView(buffer);
   if (view.getUint32(0, true) !== 0x46546c67) throw new Error("the model is no binary glTF");
@@ -48,7 +48,7 @@ export function readGlb(buffer) {
 
 const loading = new Map();
 
-/** Document at a URL, fetched once. */
+/** Content of the GLB file at a URL, fetched once. */
 export function loadGlb(address) {
   if (!loading.has(address)) {
     const promise = fetch(address).then(async (answer) => {

@@ -1,5 +1,5 @@
-// Page of one grasp: hand and object in 3D, in the scene of the grasp if any, contacts by distance, and a slider along
-// the trajectory: standoff, pregrasp, grasp, squeeze, lift.
+// Page of one grasp: hand, object and scene in 3D, contacts coloured by distance, and a slider along the trajectory:
+// standoff, pregrasp, grasp, squeeze, lift.
 import { Vector3 } from "./vendor/three.min.js";
 import { loadGlb } from "./glb.js";
 import { Hand, Thing } from "./figures.js";

@@ -1,4 +1,4 @@
-// Live pages: each server event, at most once a second, fetches the page again and replaces the regions marked data-live.
+// Live pages: after a server event, the page is fetched again, and its regions marked data-live are replaced.
 // Without this script the pages have the same content, but do not change.
 (() => {
   "use strict";

@@ -58,7 +58,7 @@ function dots(points, radius) {
   return group;
 }
 
-/** All marks of a hand of a size [m]; `group` is in the hand's root frame. */
+/** All marks of a hand, scaled by its `size` [m]; `group` is in the hand's root frame. */
 export class Marks {
   constructor(hand, size) {
     this.hand = hand;

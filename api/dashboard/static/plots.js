@@ -1,4 +1,4 @@
-// Bar charts by uPlot over the SVG of the page: the same numbers, with the value under the pointer.
+// Bar charts by uPlot. They replace the page's SVG with the same numbers, and show the value under the pointer.
 (() => {
   "use strict";
   const made = new Map();

@@ -1,4 +1,4 @@
-// Surroundings of an object: tables, walls, boards and other objects; and viewpoints that they do not hide.
+// Surroundings of an object: tables, walls, boards and other objects; and viewpoints from which they do not hide it.
 import { BufferAttribute, BufferGeometry, Group, Mesh, MeshStandardMaterial, Quaternion, Vector3 } from "./vendor/three.min.js";
 import { loadGlb } from "./glb.js";
 import { Thing } from "./figures.js";
@@ -22,7 +22,7 @@ function mesh(position, normal, index, look) {
   return made;
 }
 
-/** Plane of a half-space as a disc below `middle`, transparent from below. */
+/** Plane of a half-space as a disc below `middle`, invisible from below. */
 function disc({ normal, offset }, middle) {
   const position = [0, 0, 0], normals = [0, 0, 1], index = [];
   for (let i = 0; i < CORNERS; i++) {

@@ -1,4 +1,4 @@
-// Selected files are uploaded and checked at once, so that the form shows the result before the submission. A refused file
+// Selected files are uploaded and checked immediately, so that the form shows the result before the submission. A refused file
 // disables the button until a change of its units or a fix passes the check. Without this script the form sends the files.
 (() => {
   "use strict";
@@ -10,7 +10,7 @@
   const button = form.querySelector("button.primary");
   const blocked = document.getElementById("blocked");
   const pause = (ms) => new Promise((done) => setTimeout(done, ms));
-  // A key with scope read has no button, regardless of uploads.
+  // With a key of scope read the button stays disabled, regardless of uploads.
   const readonly = button.disabled;
   const waiting = new Map();
 
@@ -98,7 +98,7 @@
         show("", `${file.name} (refused)`, "");
         say(error.message, "bad");
         if (error.page) said.innerHTML = error.page;
-        hold(thing, `${file.name} was refused: fix that, or select a known ${kind}.`);
+        hold(thing, `${file.name} was refused: fix it, or select a known ${kind}.`);
       }
     }
 

@@ -1,4 +1,4 @@
-// What the viewer uses of three.js, and nothing else. Bundled into three.min.js as vendor.json says.
+// The parts of three.js that the viewer uses; vendor.json has the command that bundles them into three.min.js.
 export {
   BufferAttribute, BufferGeometry, Color, DirectionalLight,
   DynamicDrawUsage, Group, HemisphereLight, InstancedMesh, Matrix4, Mesh, MeshBasicMaterial, MeshStandardMaterial,
