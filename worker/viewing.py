@@ -1,5 +1,5 @@
 """Viewer: a viser server that shows the grasps of one file, with a slider over the trajectory.
-Hand, object and scene are nodes. Metres; poses x y z, w x y z."""
+Hand, object and scene are nodes. Units are metres; poses are x y z, w x y z."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from graspd.worker.rendering.scenery import Supports, slab_poses, slabs, visible
 from graspd.worker.rendering.sheets import metric_at_threshold
 from graspd.worker.scenes.neighbours import Neighbours
 
-#: Hand points whose distance from the object is shown, and the largest distance shown [m].
+#: Number of hand points whose distance from the object is shown, and the largest distance shown [m].
 POINTS: Final = 3000
 NEAR_M: Final = 0.005
 _OBJECT: Final = (232, 184, 120)
@@ -318,7 +318,7 @@ def _figures(shard: Shard, row: int) -> str:
     if (shaken := arrays.get("quality/shake_margin")) is not None and np.isfinite(shaken[row]):
         rows.append(("shaken", "holds" if shaken[row] < 1 else "fails"))
     if (clearance := arrays.get("quality/clearance_m")) is not None:
-        rows.append(("nearest to the scene", f"{1e3 * float(clearance[row]):.1f} mm"))
+        rows.append(("clearance", f"{1e3 * float(clearance[row]):.1f} mm"))
     return "\n".join(["| | |", "| --- | --- |", *(f"| {name} | {value} |" for name, value in rows)])
 
 

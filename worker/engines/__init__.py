@@ -1,1 +1,1 @@
-"""Warp and MuJoCo, initialised without console output on a device."""
+"""Initialisation of Warp and MuJoCo without console output, and their devices."""

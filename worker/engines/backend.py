@@ -29,8 +29,8 @@ log = logging.getLogger(__name__)
 
 def _set_thread_defaults() -> None:
     """Give every thread its own default device, since Warp has one for the process.
-    A `ScopedDevice` would move another thread's arrays to its device and leave it as the default. Only this function
-    accesses Warp's internals; it is needed until every array names its device."""
+    A `ScopedDevice` would move another thread's arrays to its device and leave it as the default. This access to Warp's
+    internals is needed until every array names its device."""
     from warp._src.context import Runtime, runtime  # noqa: TID251
 
     first, own = runtime.default_device, threading.local()

@@ -1,4 +1,4 @@
-"""Defaults for the number of batches per launch and of processes that validate and measure."""
+"""Default numbers of batches per launch, and of processes that validate and measure."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def batches_at_once(device: str, join: int | None) -> int:
 
 
 def batches_that_fit(multiprocessors: int, free_bytes: int) -> int:
-    """Return a power of two, so that launches can be halved evenly; at least 1."""
+    """Return the number of batches that fit: at least 1, and a power of two, to halve launches evenly."""
     grasps = min(GRASPS_PER_MULTIPROCESSOR * multiprocessors, MEMORY_SHARE * free_bytes / BYTES_PER_GRASP)
     batches = max(1, min(MOST, int(grasps // BATCH_SIZE)))
     return 1 << (batches.bit_length() - 1)

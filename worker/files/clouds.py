@@ -59,7 +59,7 @@ _hands: LRUCache[Any, HandModel] = LRUCache(8)
 
 
 def hand_surface(shard: Shard, rows: NDArray[np.intp]) -> Floats:
-    """Return points (K, H, 3) on the hand's surface at contact of rows (K,) of a base shard, in the object's frame [m].
+    """Return hand surface points (K, H, 3) of the grasps `rows` (K,) of a base shard, object frame [m].
     Raises NotFoundError: the hand of the shard is not available here."""
     hand = _hand(shard)
     points = sample_surface(hand, POINTS)

@@ -1,4 +1,4 @@
-"""Balanced subsets of datasets: grasp types, approach directions, resting faces."""
+"""Subsets of datasets, balanced over grasp types, approach directions or resting faces."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from graspd.worker.quality.diversity import distinct, hand_points
 #: Categories over which grasps can be balanced.
 KINDS: Final = ("type", "direction", "face")
 _COLUMNS: Final = {"type": "quality/grasp_type", "direction": "quality/approach_cell"}
-#: Cosine of the angle below which down directions of two scenes, object frame, belong to one face: 20 degrees.
+#: Least cosine between the down directions of two scenes, in the object frame, that belong to one face: 20 degrees.
 _SAME_FACE: Final = float(np.cos(np.radians(20)))
 
 
@@ -29,7 +29,7 @@ class Balance:
     """Balanced selection; a `Chooser` of `worker.files.subsets` for the shards of one hand and object."""
 
     by: Sequence[str]
-    at_most: int = 0  # largest number per category; 0: number of the median category
+    at_most: int = 0  # largest number per category; 0: median number over the categories
     min_distance: float = 0.0  # least distance of two selected grasps [m], see `worker.quality.diversity`; 0: any
     seed: int = 0
     hand: str | None = None  # the hand's file if the shards do not lead to it; only distances need it

@@ -141,7 +141,7 @@ def options_of(attribute: object) -> dict[str, Any]:
     return said if isinstance(said, dict) else {}
 
 
-#: Neighbours are only displayed and kept clear of, not grasped.
+#: Bound of the simplification of neighbours [m]; neighbours are obstacles and are not grasped.
 NEIGHBOUR_FACE_ERROR_M: Final = 3e-4
 _MATTER: Final = {"object_mass_kg": MASS_KG, "object_friction": FRICTION}
 
@@ -276,7 +276,7 @@ def id_of_columns(columns: Columns) -> str:
 
 
 def source_attributes(source: Shard) -> dict[str, Attribute]:
-    """Return the attributes of a shard that name the shard of its scenes or grasps."""
+    """Return the attribute by which a shard names `source`, the shard of its scenes or grasps."""
     return {f"{source.kind}_shard": str(source.attributes.get("shard_id") or id_of_columns(source.arrays))}
 
 
@@ -306,8 +306,8 @@ def base_attributes(
     outcomes: Mapping[str, int] = MappingProxyType({}),
 ) -> dict[str, Attribute]:
     """Return the attributes of a base shard: joints, request, scene, candidates, settings of validation.
-    `candidates` counts up to the last selected one. `verdict_key` is the digest of all settings that affect verdicts;
-    None: not validated. `outcomes` are the numbers of rejected candidates."""
+    `candidates` is the number of candidates up to the last selected one. `verdict_key` is the digest of all settings
+    that affect verdicts; None: not validated. `outcomes` are the numbers of rejected candidates by reason."""
     said: dict[str, Attribute] = {
         "joint_names": list(hand.joint_names),
         "mu": request.friction,

@@ -73,7 +73,7 @@ EveryOption = Annotated[bool, typer.Option("--all", help="Select all grasps, inc
 
 
 def select_grasps(base: Shard, *, unvalidated: bool = False, every: bool = False) -> tuple[NDArray[np.bool_], str]:
-    """Select grasps (N,), and return a name for the selection.
+    """Return a mask (N,) of the selected grasps, and a name for the selection.
     Raises InputError: both options at once, or no such grasp; the message states what the shard contains."""
     if unvalidated and every:
         raise InputError("--unvalidated and --all exclude each other")

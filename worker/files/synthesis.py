@@ -1,4 +1,4 @@
-"""Grasps of a hand file on an object file as in a job, in this process: a base shard in memory."""
+"""Synthesis of grasps as in a job, without a service: from hand and object files to a shard in memory."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ class SynthesisResult:
 
     @property
     def narrow(self) -> str | None:
-        """Return the geometric reason for no valid grasp, with or without candidates; None if there is none."""
+        """Return the geometric reason why no grasp is valid; None if it is unknown or a grasp is valid."""
         return None if self.arrays["quality/valid"].any() else self.batches[0].narrow
 
     @property
@@ -201,7 +201,7 @@ def synthesize_grasps(
     cancelled: Callable[[], bool] | None = None,
     partial: bool = False,
 ) -> SynthesisResult:
-    """Make the grasps of a job in one process: `hand` and `obj` are files or built-in names, `place` is their scene.
+    """Make the grasps of a job; `hand` and `obj` are files or built-in names, `place` is their scene.
     `mesh` has options for the object's file. `join` is the number of batches of 32 in one launch of the planner; None:
     as many as fill a GPU. `processes` validate and measure; 1: this one only; 0: on a GPU the cores less one, else 1.
     Raises InputError: an invalid argument, or a scene without space. TaskCancelled: `cancelled` returned True; with

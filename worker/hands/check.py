@@ -1,4 +1,4 @@
-"""Check of an uploaded hand: accepted, accepted with repairs, or refused with the reason."""
+"""Check of an uploaded hand: accepted with notes, or refused with the reason."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from graspd.worker.hands.tree import build_tree, exceeded_limits, reduced_ranges
 
 #: Number of points that measure the outer surface.
 _SURFACE_POINTS = 512
-#: Entry of the guessed values for an approach direction of the palm that could equally be the opposite one.
+#: Entry of the guessed values if the palm may equally face the opposite way.
 TIED = "approach (a tie)"
 
 
@@ -32,9 +32,9 @@ def check_hand(
     options: Mapping[str, Any] | None = None,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> dict[str, Any]:
-    """Check these files with `load_hand`; `run` receives the link whose shapes are being made.
-    Return verdict (accept, repair or refuse), message (one line), repairs (changes), and facts: measured or guessed
-    values in SI units. A refusal that options fix also has `problem` and `options_suggested`, keys of `HandOptions`."""
+    """Check whether the files describe a usable hand; `run` receives the links in progress.
+    Return verdict (accept or refuse), message (one line), repairs (always empty), and facts: measured or guessed
+    values in SI units. If options can fix a refusal, facts have `problem` and `options_suggested` (`HandOptions`)."""
     try:
         source = HandSource.read(files, options, name=name, digest="0" * 32, run=run)
         robot, settings = source.robot, source.options
@@ -109,7 +109,7 @@ def _limits(robot: Robot, settings: HandOptions) -> list[str]:
 
 
 def _omitted_links(robot: Robot, hand: HandModel, settings: HandOptions) -> list[str]:
-    """Return a note on links left out when a hand was separated from its arm without an option."""
+    """Return notes on joints above the root: left out without an option, or taken as fixed with one."""
     chain = chain_to(robot, hand.root_link)
     above = [joint.name for joint in chain if joint.type != "fixed"]
     if settings.root:

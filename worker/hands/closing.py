@@ -10,25 +10,25 @@ from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, quat_r
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 
-#: Ratio from which a finger bends further one way than the other: 2, less a tolerance for rounded limits.
+#: Ratio of a joint's two limits above which they are asymmetric: 2, less a tolerance for rounded limits.
 FAR: Final = 1.99
 #: Shares of the range from open to closed at which fingertips are evaluated.
 _SHARES: Final = (0.25, 0.5, 0.75)
 #: Least cosine at which two joint axes count as parallel (45 degrees), and at which an axis and the approach do (37).
 _PARALLEL: Final = 0.707
 _ABOUT: Final = 0.8
-#: Least share of the largest tip motion by a joint of the finger at which a joint counts as moving the tip.
+#: A joint moves the tip if its tip motion exceeds this share of the largest one by a joint of the finger.
 _MOVING: Final = 0.05
-#: Limits are symmetric if their middle is within this share of the range from 0. Such a joint stays straight: with
-#: closing middle joints, hands (Shadow's thumb, D'Claw) lifted less.
+#: Limits are symmetric if their middle is within this share of the range from 0. Such a joint stays straight: Shadow
+#: (with its thumb) and D'Claw lifted less when such joints closed.
 _EVEN: Final = 0.02
 #: Gains below this share of the tip's path length are a tie. Joints that oppose a thumb have .35 and more.
 _TIE: Final = 0.2
 
 
 def closing_by_limits(hand: HandModel) -> Floats:
-    """Return closing (D,) from limits: joints with asymmetric limits close, those with symmetric ones spread; wrists:
-    0."""
+    """Return closing (D,) from limits: the sign of the larger limit if they are asymmetric, else 0.
+    Wrists have 0."""
     up, down = np.maximum(hand.upper, 0), np.maximum(-hand.lower, 0)
     closing = np.where(up > FAR * down, 1.0, np.where(down > FAR * up, -1.0, 0.0))
     carrying = set(shared_bodies(hand))
@@ -40,9 +40,9 @@ def closing_by_limits(hand: HandModel) -> Floats:
 
 def closing_by_tips(hand: HandModel) -> Floats:
     """Return closing (D,) in -1, 0, +1 for a hand with fingertips, palm and a first guess of its closing.
-    Joints of a finger that are parallel to its last one flex it, unless their limits are symmetric. All flex in the
-    direction that brings the tip to the other tips and to the palm. Another joint closes if it brings the tip to the
-    other tips and away from the palm. It spreads if it turns about the approach or has symmetric limits. A joint in
+    Joints that are parallel to a finger's last joint flex the finger, unless their limits are symmetric. All flex in
+    the direction that brings the tip to the other tips and to the palm. Another joint closes if it brings the tip to
+    the other tips and away from the palm. It spreads if it turns about the approach or has symmetric limits. A joint in
     line with its finger does neither."""
     limits, (flexing, opposing, ways) = closing_by_limits(hand), _gains(hand)
     postures = (hand.expand(closing_posture(hand, share)) for share in (0.0, 0.5))
@@ -73,9 +73,9 @@ def closing_by_tips(hand: HandModel) -> Floats:
 
 def _gains(hand: HandModel) -> tuple[Floats, Floats, Floats]:
     """Measure the effect of each dof on each fingertip over the dof's range from lower to upper limit.
-    Return three arrays (D, T) [m], summed over postures of the other dofs. First: decrease of the distance to the other
-    tips and to the palm. Second: decrease to the other tips plus increase from the palm. Third: length of the tip's
-    path."""
+    Return three arrays (D, T) [m], summed over postures of the other dofs. First: decrease of the distances to the
+    other tips and to the palm. Second: decrease of the distance to the other tips, plus motion along the palm's
+    approach. Third: length of the tip's path."""
     flexing, opposing, ways = np.zeros((3, hand.dofs, len(hand.fingertips)))
     for share in _SHARES:
         for dof in range(hand.dofs):

@@ -21,14 +21,14 @@ from graspd.worker.objects.memory_cache import cached_by_content
 
 #: Object heights, each with its own postures [m]; higher objects reach the pads.
 HEIGHTS_M: Final = (0.005, 0.008, 0.012, 0.018)
-#: Number of postures, candidates per posture, and random steps that improve them.
+#: Number of postures, and number of candidates per posture.
 POSTURES: Final = 120
 CROWD: Final = 20
 #: Least number of valid postures of a height; fewer are discarded.
 FEW: Final = 8
 #: Range of widths [m].
 WIDTHS_M: Final = (0.004, 0.12)
-#: Number of points of each fingertip, of points of each other body, and of the hand's points from which both are drawn.
+#: Numbers of points on each fingertip, on each other body, and on the whole hand, from which the former are drawn.
 _TIP_POINTS: Final = 120
 _OTHER_POINTS: Final = 20
 _DENSE: Final = 8000
@@ -38,14 +38,14 @@ REACHES: Final = 0.4
 WIDTH_M: Final = 0.02
 #: Least height of the rest of the hand above the plane [m].
 OVER_M: Final = 0.008
-#: Least cosine of the ends' facing, and largest cosine of the palm with the line between the ends.
+#: Limits on the line between the ends: least cosine with their normals, largest cosine with the palm's approach.
 FACING: Final = 0.8
 SQUARE: Final = 0.7
 
 
 def flat_pinches(hand: HandModel, height: float) -> Oppositions:
     """Return postures for objects of a height [m]; none for one finger, or for objects as high as the pads.
-    The palm's approach, projected perpendicular to `axis`, points at the plane, `middle` half the height above it."""
+    The component of the palm's approach perpendicular to `axis` points at the plane, half the height below `middle`."""
     known = [h for h in HEIGHTS_M if h >= height]
     return _cached_pinches(hand, known[0]) if known and len(hand.fingertips) > 1 else Oppositions.empty(hand)
 
@@ -85,14 +85,14 @@ class _Evaluation:
     """(N,) ratio of the ends' height above the plane to the largest height that reaches the object. The larger value of
     the opposing end and of the other ends' mean counts."""
     facing: Floats
-    """(N,) cosine between the surface within the height and the line between the ends; the lower value of both
+    """(N,) cosine of the surface normals within the height with the line between the ends; the lower value of both
     sides."""
     square: Floats
     over: Floats
     """(N,) height of the rest of the hand above the plane [m]."""
 
     def cost(self, wanted: Floats) -> Floats:
-        """Return the cost (N,) of postures relative to pinches of the widths `wanted` (N,)."""
+        """Return the cost (N,) of postures as pinches of the widths `wanted` (N,)."""
         short = np.maximum(0.0, self.short - 0.5)
         low = np.maximum(0.0, OVER_M + 0.005 - self.over) / WIDTH_M
         aside = 2 * np.maximum(0.0, self.square - 0.9 * SQUARE)
@@ -140,7 +140,7 @@ class _PinchSearch:
         place = quat_rotate(tips[..., 3:], self.tips) + tips[..., :3]
         normal = quat_rotate(tips[..., 3:], self.normals)
         down, axis, ends = np.tile(hand.palm.approach, (len(q), 1)), np.zeros((len(q), 3)), np.zeros((len(q), 0))
-        # The plane and its lowest points depend on each other.
+        # The plane and the points that touch it depend on each other.
         for _ in range(3):
             low = np.einsum("nfvi,ni->nfv", place, down).argmax(axis=2)
             end = np.take_along_axis(place, low[..., None, None], axis=2)[:, :, 0]

@@ -1,4 +1,4 @@
-"""Postures in which two parts of a hand face each other, for objects narrower than pads can grip, or wider.
+"""Postures in which two parts of a hand face each other: for objects too narrow or wide for its pads.
 
 An object of 10 mm is held between the sides of two fingers, or between a finger and the palm. An object as wide as the
 hand's span is held between the sides of fingertips. In both cases two surface points have normals along the line
@@ -23,7 +23,7 @@ from graspd.worker.objects.memory_cache import cached_by_content
 Ints = NDArray[np.intp]
 Size = Literal["small", "wide"]
 
-#: Gaps for small objects [m], and the factor by which gaps for wide objects exceed the widest opposition of pads.
+#: Gaps for small objects [m], and the factor by which gaps for wide objects exceed the widest gap of opposed pads.
 SMALL_M: Final = (0.006, 0.042)
 WIDER: Final = 1.06
 #: Number of surface points.
@@ -32,21 +32,21 @@ POINTS: Final = {"small": 256, "wide": 640}
 POSTURES: Final = 120
 CROWD: Final = 8
 CLIMBS: Final = 80
-#: Least cosine of both surfaces with the line between them. A smaller cosine costs as much as this difference of width
-#: [m]. Penetration of the hand into the cube between them has the same cost.
+#: Least cosine of both surface normals with the line between the points. Cost of a cosine lower by 1 [m], and cost per
+#: metre of penetration of the hand into the cube between the points.
 FACING: Final = {"small": 0.9, "wide": 0.8}
 TURNED_M: Final = 0.2
 DEEP: Final = 2.0
-#: Least closing motion of the hand on the object, by joints with at least this lever about it [m].
+#: Least motion by which the two points can approach each other, and least lever of a joint that counts [m].
 CLOSES_M: Final = 0.04
 LEVER_M: Final = 0.02
-#: Radius within which flat parts cover the tangent plane [m], and the cost of parts that do not cover it [m].
+#: Radius of the disc that a flat part covers on its tangent plane [m], and cost of a part that covers none of it [m].
 FLAT_M: Final = 0.006
 ROUND_M: Final = 0.003
 _DENSE: Final = 4000
 #: Largest cost of a usable posture [m].
 GOOD_M: Final = 0.006
-#: Distance by which wide objects may extend towards the fingertips beyond the contacts [m].
+#: Largest distance by which the cube extends beyond its contacts towards the palm [m].
 BEYOND_M: Final = 0.012
 #: Pairs per posture that are evaluated in detail, and postures that are compared at once.
 CLOSELY: Final = 8
@@ -57,14 +57,14 @@ _NEXT_TO: Final = 1e-9
 
 @cached_by_content(32)
 def postures_for_size(hand: HandModel, size: Size) -> Oppositions:
-    """Return postures for small or wide objects, cached in memory and on this machine."""
+    """Return postures for small or wide objects, cached in memory and on disk."""
     return Oppositions.cached(
         "spans", (hand.content, size), lambda: _search_postures(hand, size), sys.modules[__name__]
     )
 
 
 def largest_width(hand: HandModel) -> float:
-    """Return an upper bound of the widths in `postures_for_size` [m], without a search for postures."""
+    """Return an upper bound of the widths in `postures_for_size` [m], from `oppositions_of` alone."""
     return WIDER * oppositions_of(hand).widest + GOOD_M
 
 
@@ -102,14 +102,14 @@ class _BestPairs:
 
 
 class _PairSearch:
-    """Evaluates pairs of surface points of postures as grips."""
+    """Evaluates pairs of surface points as grips, in given postures."""
 
     def __init__(self, hand: HandModel, size: Size) -> None:
         self.hand, self.facing = hand, FACING[size]
         self.points = sample_surface(hand, POINTS[size])
         body = self.points.body
         holds = np.ones(len(body), bool) if size == "small" else np.isin(body, hand.fingertips)
-        # Sorted by body: the pairs of a body's points with those of later bodies are then one matrix product.
+        # Sorted by body, so that one matrix product compares a body's points with those of all later bodies.
         self.holding = np.flatnonzero(holds)[np.argsort(body[holds], kind="stable")]
         flat = _flatness(hand, self.points)[self.holding] if size == "small" else np.ones(len(self.holding))
         self.round = ROUND_M * (1 - np.minimum(flat[:, None], flat))
@@ -149,7 +149,7 @@ class _PairSearch:
         return axis[row, best], middle[row, best], width[row, best], cost[row, best]
 
     def _costs(self, held: Floats, normal: Floats, wanted: Floats) -> Floats:
-        """Compute the cost (n, pairs) of each pair, except for clearance, by matrix products.
+        """Compute the cost (n, pairs) of each pair by matrix products, without penetration and closing motion.
         The square of a width is rounded to 1e-17 m²."""
         square = np.einsum("npi,npi->np", held, held)
         own = np.einsum("npi,npi->np", held, normal)
@@ -203,7 +203,7 @@ class _PairSearch:
 
 
 def _flatness(hand: HandModel, points: SurfacePoints) -> Floats:
-    """Return the share (N,) of a small disc around each point, on its tangent plane, that its body covers."""
+    """Return the share (N,) of a disc on each point's tangent plane that the point's body covers."""
     dense = sample_surface(hand, _DENSE)
     flat = np.zeros(len(points))
     for body in np.unique(points.body):

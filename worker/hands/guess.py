@@ -28,22 +28,22 @@ from graspd.worker.objects.disk_cache import cached_step
 PRESHAPE_SHARE = 0.25
 #: Iterations over closing and palm, which depend on each other.
 LOOKS = 2
-#: Fingers are opposed if the sum of tip motions across the hand is below this share of their lengths. The share is 0
-#: for equal fingers around an axis, .3 to .55 for two against one, .75 and more for hands with a thumb.
+#: Fingers are opposed if the sum of tip motions across the hand is below this share of their total length. The share is
+#: 0 for equal fingers around an axis, .3 to .55 for two fingers against one, and .75 or more for hands with a thumb.
 OPPOSED = 0.65
-#: Tips are beside their fingers' bases if they are ahead of the bases by at most this share of the bases' spread.
+#: Tips are level with their fingers' bases if they are ahead of the bases by at most this share of the bases' spread.
 LEAST_AHEAD = 0.1
-#: Two unit estimates contradict each other if their sum is shorter than this. The direction is then unknown.
+#: Two estimated unit vectors contradict each other if their sum is shorter than this. The direction is then unknown.
 CONTRADICTING = 0.2
 #: Tips close along their dominant line if the motion across it is below this share of the motion along it.
 SIDEWAYS = 0.3
-#: Angle below which two lines coincide, and angle below which a line is the root axis [degrees].
+#: Angle below which two lines, or a line and a root axis, coincide [degrees].
 SAME_LINE = 1.0
 #: Angles within which lines and root axes may refine a rough and a precise direction [degrees].
 ROUGH, GOOD = 40.0, 10.0
 #: Largest number of joints whose axes are considered.
 _JOINTS = 64
-#: A wrist or rim higher than this above the palm between the fingers is not the palm [m].
+#: A wrist or rim that is higher than this above the surface between the fingers is not the palm [m].
 RIM_M = 0.02
 
 
@@ -57,7 +57,7 @@ def complete_hand(hand: HandModel, tree: Tree, options: HandOptions) -> HandMode
         seen = replace(hand, closing=_gripper_closing(hand, stated))
         if (jaws := find_jaws(seen)) is not None:
             return _gripper(seen, jaws, tree, options)
-        # Surfaces that come together identify sliding fingertips.
+        # Sliding dofs close in the direction that brings surfaces together.
         hand = replace(hand, closing=np.where(slide, seen.closing, hand.closing))
     for _ in range(LOOKS):
         hand = _with_palm(hand, tree, options)
@@ -104,7 +104,7 @@ def _approach_of_jaws(hand: HandModel, jaws: Jaws) -> Floats:
     ahead, axis = _unit(_pad_direction(hand, jaws)), jaws.axis[len(jaws.q) // 2]
     if (line := _joint_direction(hand, ahead, ROUGH, 2, axis)) is not None:
         return line
-    # A root frame that is not aligned with the closing line says nothing of the approach.
+    # A root frame that is not aligned with the closing line does not suggest an approach.
     return _snap_to_axis(ahead) if _angle(axis, _root_axis(axis)) < GOOD else ahead
 
 
@@ -143,10 +143,10 @@ def _fingertips(hand: HandModel, tree: Tree, options: HandOptions) -> tuple[int,
 
 def guess_approach(hand: HandModel) -> tuple[Floats, bool]:
     """Return the direction out of the palm, and whether both sides of the palm are equally likely.
-    Two estimates are added. The mean motion of the fingertips during closing points out of a human-like palm. The
-    position of the tips of the half-closed hand is ahead of a gripper's palm, but far along the fingers of a human-like
-    hand. Their sum has the smallest error. If fingers oppose each other, the tip motions cancel to a sideways residual
-    or rounding noise: see `_between_fingers`."""
+    Two estimates are added, since their sum has the smallest error. The mean motion of the fingertips during closing
+    points out of a human-like palm. The half-closed tips lie ahead of a gripper's palm, but far along the fingers of a
+    human-like hand. If fingers oppose each other, the tip motions cancel to a sideways residual or rounding noise: see
+    `_between_fingers`."""
     ways, ahead = _tip_motions(hand), _unit(_tips_ahead(hand))
     if _residual_motion(ways, ahead) < OPPOSED:
         return _between_fingers(hand)
@@ -172,7 +172,7 @@ def _tips_ahead(hand: HandModel) -> Floats:
 
 
 def _residual_motion(ways: Floats, ahead: Floats) -> float:
-    """Return the ratio of the length of the sum of tip motions across `ahead` to the sum of their lengths.
+    """Return the ratio |sum of motions| / sum of |motions| of the tips across `ahead`.
     The ratio is 0 if fingers close around an axis, 1 if all move the same way."""
     axis = _unit(ahead)
     across = ways - np.outer(ways @ axis, axis)
@@ -180,9 +180,8 @@ def _residual_motion(ways: Floats, ahead: Floats) -> float:
 
 
 def _between_fingers(hand: HandModel) -> tuple[Floats, bool]:
-    """Return the direction out of the palm of a hand with opposed fingers, and whether it is a tie.
-    The direction runs from finger bases to half-closed tips, perpendicular to a common closing line. Coplanar points
-    are a tie."""
+    """Return the direction out of the palm between opposed fingers, and whether its sign is a tie.
+    It runs from finger bases to half-closed tips, perpendicular to a common closing line. Coplanar points are a tie."""
     body = shared_bodies(hand)[-1]
     q = closing_posture(hand, 0.5)
     poses = body_poses(hand, IDENTITY_POSE, hand.expand(q))[0]
@@ -208,7 +207,8 @@ def _between_fingers(hand: HandModel) -> tuple[Floats, bool]:
 def _joint_direction(
     hand: HandModel, rough: Floats, within: float, least: int, beside: Floats | None = None
 ) -> Floats | None:
-    """Return a direction that at least `least` lines of the joints share, within `within` degrees of an estimate."""
+    """Return a direction within `within` degrees of `rough` that at least `least` lines share; else None.
+    Lines are the joint axes, `beside`, and their common normals."""
     body = hand.joint_body[:_JOINTS]
     pose = body_poses(hand, IDENTITY_POSE, hand.expand(np.clip(0.0, hand.lower, hand.upper)))[0, body]
     axes = quat_rotate(pose[:, 3:], hand.axis[body])
@@ -227,7 +227,7 @@ def _joint_direction(
 
 
 def _snap_to_axis(mean: Floats, within: float = ROUGH) -> Floats:
-    """Normalise a direction, and replace it by a root axis that is `within` so many degrees of it."""
+    """Return the nearest root axis if it is less than `within` degrees away; else the unit direction."""
     axis = _root_axis(mean)
     return axis if _angle(mean, axis) < within else _unit(mean)
 
@@ -286,7 +286,7 @@ def _palm(hand: HandModel, tree: Tree, options: HandOptions, approach: Floats) -
     height = float((corners @ approach).max())
     centre = through + (height - through @ approach) * approach
     if len(bases):
-        # Below the region that the half-closed fingers cover.
+        # A point below the region that the half-closed fingers cover.
         beneath = (bases.mean(axis=0) + tip_positions(hand, closing_posture(hand, 0.5)).mean(axis=0)) / 2
         surface = _exit_distance(parts, beneath, approach)
         if surface is not None and surface < height - RIM_M:
@@ -295,7 +295,7 @@ def _palm(hand: HandModel, tree: Tree, options: HandOptions, approach: Floats) -
 
 
 def _exit_distance(parts: Sequence[Floats], point: Floats, direction: Floats) -> float | None:
-    """Return the distance along `direction` at which a line through `point` leaves the last convex part.
+    """Return the coordinate along `direction` at which a line through `point` leaves the last convex part.
     Parts are (V, 3); None if the line meets no part."""
     ends = []
     for corners in parts:

@@ -30,10 +30,10 @@ _FITTED: Final = 40
 #: Largest distance of corresponding fingertips in models of one hand [m].
 TOLERANCE_M: Final = 1e-3
 #: Weight of a prior on fingertip positions in the other model, for hands with little motion: a gripper's jaws only
-#: translate. The prior moves no fingertip by a nanometre in any posture.
+#: translate. The prior moves every fingertip by less than a nanometre in all postures.
 _PRIOR: Final = 1e-3
-#: Largest number of evaluations of a fit to another hand. By then, a fit to the same hand has converged or is as good
-#: as needed.
+#: Largest number of evaluations of a fit. By then, a fit between models of the same hand has converged or is as good as
+#: needed.
 _LOOKS: Final = 15
 
 
@@ -144,8 +144,8 @@ def _body_centre(hand: HandModel, body: int) -> Floats:
 
 def _fit(where: Floats, poses: Floats, guess: Floats) -> tuple[Floats, Floats]:
     """Fit the pose (7,) of the other base, and positions (T, 3) of fingertips in the other model's body frames.
-    Given: fingertips (N, T, 3) in the own base frame, bodies (N, T, 7) in the other one, approximate positions (T,
-    3)."""
+    `where` are fingertips (N, T, 3) in the own base frame, `poses` bodies (N, T, 7) in the other base frame, `guess`
+    approximate positions (T, 3)."""
     from scipy.optimize import least_squares  # slow to load
 
     start = _align_points(apply(poses, guess), where)

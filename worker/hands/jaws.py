@@ -1,7 +1,7 @@
 """Jaws of a gripper and pads of a hand: surfaces that meet on closing, their opening and closing line.
 
-A gripper is a hand whose closing is one motion of at most two degrees of freedom that brings opposing surfaces, the
-pads, together. Everything follows from geometry, so a joint at 0 may be open or closed."""
+A gripper is a hand with at most two degrees of freedom, whose closing motion brings opposing surfaces (pads) together.
+Everything follows from geometry, so a joint at 0 may be open or closed."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ MAX_DOFS: Final = 2
 _POINTS: Final = 1600
 #: Two surfaces face each other if their normals are opposite to within 37 degrees.
 _FACING_COS: Final = 0.8
-#: One of them is then in front of the other. Largest lateral offset, in distances between sample points.
+#: Largest lateral offset of surfaces that face each other, in distances between sample points.
 _ASIDE: Final = 1.5
 #: Least speed at which facing surfaces approach each other, as a share of the fastest speed.
 _FAST: Final = 0.5
 #: A pad is the part of a jaw within this distance of the first contact [m].
 _PAD_DEPTH_M: Final = 0.003
-#: Shares of the limits at which the hand is checked for hidden surfaces.
+#: Shares of the joint ranges at which the hand is checked for hidden surfaces.
 _LOOKS: Final = (0.5, 0.02, 0.98)
 #: Surfaces move ahead if their speed along their normals is at least this share of the fastest point's speed.
 _LEADING: Final = 0.3
@@ -41,11 +41,11 @@ _LEADING: Final = 0.3
 _PAD_SHARE: Final = 0.4
 #: Number of postures between open and closed.
 _STEPS: Final = 17
-#: Pads face each other if the difference of their mean normals is longer than this: at most 120 degrees between them.
+#: Pads face each other if the difference of their mean normals is longer than this: normals at least 60 degrees apart.
 _TOWARDS: Final = 1.0
 #: Pads nearer than this touch [m].
 _TOUCH_M: Final = 2e-4
-#: Ratio of smallest to largest singular value of the ends' motions from which on these are not planar.
+#: Ratio of smallest to largest singular value of the ends' motions above which these are not planar.
 _IN_SPACE: Final = 0.2
 
 
@@ -82,7 +82,7 @@ class Jaws:
         return self.speed[np.argmin(apart, axis=1)]
 
     def at(self, width: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return dof values (n, D), middles (n, 3) and axes (n, 3) at the available widths nearest to (n,)."""
+        """Return dof values (n, D), middles and axes (n, 3) at the available widths nearest to `width` (n,)."""
         order = np.argsort(self.width, kind="stable")
         q, middle, axis = (
             np.column_stack([np.interp(width, self.width[order], column[order]) for column in array.T])
@@ -93,8 +93,8 @@ class Jaws:
 
 def closing_by_geometry(hand: HandModel) -> Floats:
     """Return the direction (D,) in which each dof brings opposing surfaces together: +1 or -1; 0: no direction.
-    The sign is that of a sum over postures, from all dofs at their lower limits to all at their upper limits. Each
-    summand is the area of facing surfaces times the speed at which they separate."""
+    The sign is opposite to that of a sum over postures, from all dofs at their lower limits to all at their upper
+    limits. Each summand is the area of facing surfaces times the speed at which they separate."""
     points = _points(hand)
     balance, total = np.zeros(hand.dofs), np.zeros(hand.dofs)
     for share in np.linspace(0.05, 0.95, 5):
@@ -120,7 +120,7 @@ def jaws_of(hand: HandModel) -> Jaws | None:
 
 def find_jaws(hand: HandModel, approach: Floats | None = None) -> Jaws | None:
     """Find the jaws of a hand with known `closing`; None if it has none.
-    A gripper has at most `MAX_DOFS` dofs, one of which closes it, and opposing surfaces on two sides."""
+    A gripper has at most `MAX_DOFS` dofs, at least one of which closes it, and opposing surfaces on two sides."""
     closing = np.flatnonzero(hand.closing)
     if not 1 <= len(closing) <= MAX_DOFS or hand.dofs > MAX_DOFS:
         return None
@@ -160,7 +160,7 @@ def _motion(hand: HandModel, points: SurfacePoints, q: Floats, dof: int) -> Floa
 
 
 def _normal_speed(motion: Floats, normal: Floats) -> Floats:
-    """Return the ratio (N,) of the points' speed along their normals, of either sign, to that of the fastest point."""
+    """Return the points' absolute speed (N,) along their normals, relative to the fastest point's speed."""
     return np.asarray(np.abs(np.einsum("ni,ni->n", motion, normal)) / np.abs(motion).max(initial=1e-12))
 
 
@@ -183,8 +183,8 @@ def _facing(place: Floats, normal: Floats, points: SurfacePoints, among: Ints) -
 
 
 def _is_centric(hand: HandModel, points: SurfacePoints, path: Floats) -> bool:
-    """Check whether three or more digits close around a place, as in a centric gripper.
-    Jaws and their linkages move in the plane of jaws and approach; digits around a place move in space."""
+    """Check whether three or more digits close around one point, as in a centric gripper.
+    Jaws and their linkages move in one plane; digits around a point do not."""
     ends = [body for body in set(points.body.tolist()) if body not in hand.parent]
     if len(ends) < 3:
         return False
@@ -226,7 +226,7 @@ def _pad_points(
     place: Floats, normal: Floats, points: SurfacePoints, every: Ints, faced: Floats
 ) -> tuple[Ints, Ints] | None:
     """Return the points of the two pads, or None if they are not on different bodies."""
-    # The line of the normals of most of the pads' area.
+    # Dominant direction of the normals, weighted by area.
     values, vectors = np.linalg.eigh((points.area[every, None] * normal[every]).T @ normal[every])
     line = vectors[:, int(np.argmax(values))]
     line = -sign_of(line) * line
@@ -253,7 +253,7 @@ def _on_pads(side: Ints, points: SurfacePoints, faced: Floats) -> Ints:
 def _measure_jaws(
     hand: HandModel, points: SurfacePoints, sides: tuple[Ints, Ints], path: Floats, approach: Floats | None
 ) -> Jaws | None:
-    """Measure widths, middles and axes of the pads on a path; None if they never face each other."""
+    """Measure widths, middles and axes of the pads on a path; None if closed pads do not face each other."""
     one, two = sides
     width, middle, axes = np.zeros(len(path)), np.zeros((len(path), 3)), np.zeros((len(path), 3))
     speed, facing = np.zeros((len(path), hand.dofs, 2)), np.zeros(len(path), bool)
@@ -295,7 +295,7 @@ def prismatic_dofs(hand: HandModel) -> NDArray[np.bool_]:
     return np.array([JointType.PRISMATIC in hand.joint_type[hand.dof == d] for d in range(hand.dofs)])
 
 
-#: A pad is the part of a fingertip within this share of the tip's largest speed, and thus of its length.
+#: A pad is the fastest part of a fingertip: this upper share of the tip's range of speeds, and thus of its length.
 PAD: Final = 0.5
 #: Least cosine of a pad's normals with its motion.
 _AHEAD: Final = 0.7
@@ -334,7 +334,7 @@ def pads_of(hand: HandModel) -> tuple[Pad, ...]:
 
 
 def fingertip_pad(hand: HandModel, tip: int) -> Pad:
-    """Return the pad of a fingertip: the end of its side that the last joint moves forward."""
+    """Return the pad of a fingertip: the end of the side that moves forward when the last joint closes."""
     points = sample_surface(hand, _PAD_POINTS)
     mine = points.body == tip
     place, normal = points.position[mine], points.normal[mine]
@@ -345,7 +345,7 @@ def fingertip_pad(hand: HandModel, tip: int) -> Pad:
     # A joint that turns the tip about itself moves no side forward; a joint nearer to the palm then decides.
     chosen = next((part for body in driven if (part := _leading_points(hand, tip, body, place, normal)).any()), None)
     if chosen is None:
-        # No joint decides, and the normals of a whole tip cancel: use the side that the palm faces.
+        # No joint decides, and the normals of a whole tip cancel: use the side that faces as the palm does.
         pose = body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0, tip]
         ahead = quat_rotate(quat_conjugate(pose[3:]), hand.palm.approach)
         chosen = normal @ ahead > _AHEAD

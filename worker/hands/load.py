@@ -98,7 +98,7 @@ def assemble(source: HandSource) -> HandModel:
 
 
 def mounting_of(source: HandSource, hand: HandModel) -> tuple[HandModel | None, str]:
-    """Return the links above the hand's root, None if there are none, and the reason for unreadable shapes.
+    """Return the model of the links above the hand's root, or None, and the reason if it cannot be built.
     A fault above a hand does not make the hand unusable."""
     tree = mounting_tree(source.robot, hand.root_link, source.options)
     if tree is None:
@@ -277,7 +277,7 @@ def files_from_path(path: str | Path) -> tuple[str, dict[str, bytes], dict[str, 
 
 def with_default_drives(hand: HandModel, stated: Collection[str], assumed: Sequence[str]) -> HandModel:
     """Replace the defaults of revolute joints by those of sliding joints and jaws, unless stated.
-    A dof that moves pads by v [m/rad or 1] along their line gets the limit f v. Its gain is k v^2, summed over the
+    A dof that moves pads by v [m/rad or 1] along their line gets the limit f |v| and the gain k v^2, summed over the
     pads. Each pad thus has the gain k [N/m] and the limit f [N], independent of the gearing."""
     slide, jaws = prismatic_dofs(hand), jaws_of(hand)
     if jaws is None and not slide.any():

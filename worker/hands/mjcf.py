@@ -70,7 +70,7 @@ class _Reader:
         self.notes = notes + coupled.notes
 
     def roots(self) -> list[int]:
-        """Return bodies on the world with moving parts below: other bodies belong to the environment."""
+        """Return the world's children with moving joints; its other children belong to the environment."""
         model = self.model
         moving = {
             chain_up(model, int(model.jnt_bodyid[j]))[-1]
@@ -133,7 +133,7 @@ class _Reader:
         moving = replace(
             still, type="prismatic" if slides else "revolute", axis=np.asarray(model.jnt_axis[joint], float)
         )
-        # A joint value counts from `ref`, its value in the pose of the file.
+        # In the pose of the file, the joint has the value `ref`.
         origin = compose(origin, joint_motion(moving, -float(model.qpos0[model.jnt_qposadr[joint]])))
         follows = self._mimics.get(joint)
         if isinstance(follows, float):

@@ -1,7 +1,7 @@
 """Drives and couplings of the joints of an MJCF model, from actuators, equalities, fixed tendons and closed loops.
 
 Couplings are linear in their drivers. A four-bar linkage is a tree with ends connected by `connect` constraints. The
-loops are solved over the drivers' ranges, and each passive joint is fitted by a line, with the resulting error."""
+loops are solved over the drivers' ranges. A line approximates each passive joint, and a note reports its error."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class Couplings:
                 self.follows[joint] = held[self.name(joint)] = float(np.clip(value, *self._range(joint)))
 
     def _couple(self, first: int, second: int, polynomial: Floats) -> None:
-        """Couple by first - first0 = p(second - second0); p of degree 4 is replaced by its best line."""
+        """Couple by first - first0 = p(second - second0); a nonlinear p is replaced by its best line."""
         if second < 0:
             self.follows[first] = self._rest(first) + float(polynomial[0])
             return
@@ -126,8 +126,8 @@ class Couplings:
 
     def _add_tendons(self) -> None:
         """Couple joints that share one actuated tendon and have no other drive.
-        Serial joints of one finger share the tendon according to contact. Parallel joints, the jaws of a gripper, bend
-        in the ratio of its pull on them. If jaws shared the tendon freely, the object could move from side to side."""
+        Serial joints of one finger share the tendon according to contact. Parallel joints (jaws of a gripper) move in
+        proportion to their coefficients. If jaws shared the tendon freely, the object could move from side to side."""
         alone = {pulled[0][0] for pulled in self._driven if len(pulled) == 1}
         for actuator, pulled in enumerate(self._driven):
             free = [(j, c) for j, c in pulled if j not in self.follows and j not in alone and abs(c) > 1e-9]
@@ -157,7 +157,7 @@ class Couplings:
         return float(self.model.qpos0[self.model.jnt_qposadr[joint]])
 
     def _add_loops(self, loops: list[int]) -> None:
-        """Add the joints that close the loops of the model."""
+        """Solve the loops of the model; record a fault for joints of a loop that cannot be solved."""
         for group in _groups(self.model, loops):
             joints = sorted({j for e in group for j in _loop_joints(self.model, e)})
             passive = [j for j in joints if j not in self._actuated and j not in self.follows]
@@ -171,13 +171,13 @@ class Couplings:
 
     def _follow(self, group: list[int], joints: list[int], passive: list[int]) -> None:
         """Add the mimics of the passive joints in a group of loops.
-        Raises HandError: the group has no single driver, or does not close over its driver's range, or a joint depends
-        on the driver nonlinearly."""
+        Raises HandError: a joint is no hinge or slide, the group has no single driver, it does not close over the
+        driver's range, or a joint depends on the driver nonlinearly."""
         held = ", ".join(map(self.name, joints))
         if round_ones := [j for j in joints if int(self.model.jnt_type[j]) not in _ONE_VALUE]:
             raise HandError(
-                f"the loop of {held} turns on {self.name(round_ones[0])}, which is no hinge or slide joint, and is not "
-                "solved; write equalities of joints instead of the loop"
+                f"the loop of {held} cannot be solved: {self.name(round_ones[0])} is no hinge or slide joint; "
+                "write equalities of joints instead of the loop"
             )
         drivers = [j for j in joints if j in self._actuated and j not in self.follows]
         # Without an actuator in the loop, the joint that follows a joint outside is the driver.
@@ -187,8 +187,8 @@ class Couplings:
         if len(drivers) > 1:
             many = " and ".join(map(self.name, drivers))
             raise HandError(
-                f"the loop of {held} has {len(drivers)} drivers ({many}), and only loops of one are solved; leave one "
-                "actuator in it, or write equalities of joints instead of the loop"
+                f"the loop of {held} has {len(drivers)} drivers ({many}), but only loops with one driver are solved; "
+                "leave one actuator in it, or write equalities of joints instead of the loop"
             )
         driver = self.name(drivers[0])
         values, followers = self._solve(group, drivers[0], passive)
@@ -253,7 +253,7 @@ def _ends(model: Any, loop: int) -> tuple[int, int]:
 
 
 def _loop_joints(model: Any, loop: int) -> list[int]:
-    """Return the joints between the ends and the body at which their chains branch."""
+    """Return the joints between a loop's ends and the body at which their chains branch."""
     chains = [chain_up(model, body) for body in _ends(model, loop)]
     common = set(chains[0]) & set(chains[1])
     return [
@@ -266,7 +266,7 @@ def _loop_joints(model: Any, loop: int) -> list[int]:
 
 
 def chain_up(model: Any, body: int) -> list[int]:
-    """Return the bodies from this one up to the body on the world."""
+    """Return the bodies from this one up to a child of the world."""
     found = []
     while body:
         found.append(body)
@@ -305,7 +305,7 @@ def _close_loops(
 
 
 def _anchors(model: Any, data: Any, loop: int) -> tuple[Floats, Floats]:
-    """Return the two points, in the world frame, that a connect constraint joins."""
+    """Return the two points that a connect constraint joins, in the world frame."""
     if model.eq_objtype[loop] == int(mujoco.mjtObj.mjOBJ_SITE):
         return data.site_xpos[int(model.eq_obj1id[loop])], data.site_xpos[int(model.eq_obj2id[loop])]
     points = []
@@ -316,10 +316,10 @@ def _anchors(model: Any, data: Any, loop: int) -> tuple[Floats, Floats]:
 
 def servos(model: Any, mimics: Mapping[int, Mimic | float], shared: Collection[int]) -> dict[int, tuple[float, float]]:
     """Return effort [N m or N] and stiffness [N m/rad or N/m] of each driven joint; 0: not stated.
-    An actuator of gear g on a length l pulls with g F dl/dq at joint q. A position servo of gain k holds the joint with
-    k (g dl/dq)^2. On a joint dl/dq is 1. On a fixed tendon it is the joint's coefficient plus the coefficients of its
-    followers, times their rates. If n joints share a tendon (`shared`), each gets n times the tendon's gain, so that
-    their series has the tendon's gain."""
+    An actuator of gear g on a length l pulls with g F dl/dq at joint q. A position servo of gain k gives the joint the
+    stiffness k (g dl/dq)^2. If the actuator drives the joint itself, dl/dq is 1. On a fixed tendon, it is the joint's
+    coefficient plus coefficient times rate of each follower. If n joints share a tendon (`shared`), each gets n times
+    the tendon's gain, so that their series has the tendon's gain."""
     found: dict[int, tuple[float, float]] = {}
     joint_of = {str(model.joint(j).name): j for j in range(model.njnt)}
     for actuator in range(model.nu):
@@ -342,7 +342,7 @@ def servos(model: Any, mimics: Mapping[int, Mimic | float], shared: Collection[i
 
 
 def commanded(model: Any) -> dict[int, tuple[float, float]]:
-    """Return the command range of a joint's position servo: g k (u - q) with u in its control range."""
+    """Return the range of equilibrium positions that each joint's position servo can command."""
     found = {}
     for actuator in range(model.nu):
         kind, gain = int(model.actuator_trntype[actuator]), _gain(model, actuator)
@@ -357,7 +357,7 @@ def commanded(model: Any) -> dict[int, tuple[float, float]]:
 
 
 def driven(model: Any, actuator: int) -> list[tuple[int, float]]:
-    """Return the joints that an actuator moves, with the rate at which its length changes with each."""
+    """Return the joints that an actuator moves, each with the derivative of the actuator's length."""
     kind, target = int(model.actuator_trntype[actuator]), int(model.actuator_trnid[actuator, 0])
     if kind in (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)):
         return [(target, 1.0)]

@@ -1,4 +1,4 @@
-"""Sanitiser of MJCF for MuJoCo's reader: one text that names no file, and the meshes that it needs.
+"""Sanitiser of MJCF for MuJoCo's reader: one text that names no file on disk, and its meshes.
 
 MuJoCo reads any file on disk that a model names. This module therefore inserts includes, renames meshes of the hand's
 files, and removes all parts that a hand does not need. Only the elements listed here reach MuJoCo."""

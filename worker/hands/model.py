@@ -1,7 +1,7 @@
 """Model of a hand for the engine: tree of rigid bodies, map from dofs to joints, convex pieces.
 
 Links joined by fixed joints are merged into one body, so every body except the root has one moving joint. The body
-frame is the frame of the link that the moving joint carries. The root frame is the frame of the named root link."""
+frame is the frame of the link that the moving joint carries. The root frame is the frame of `root_link`."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class ConvexPiece:
     pose: Floats
     """(7,) pose of the primitive's frame in the body frame; identity for hulls."""
     vertices: Floats
-    """(V, 3) corners of the solid (of a fine tessellation, for round kinds) in the body frame [m]."""
+    """(V, 3) corners of the solid in the body frame [m]; round kinds have a fine tessellation."""
     faces: Ints
     """(F, 3) outward triangles."""
     link: str
@@ -107,7 +107,7 @@ class HandModel:
     offset: Floats
     dof_names: tuple[str, ...]
     lower: Floats
-    """(D,) limits [rad or m], including the limits of mimicking joints."""
+    """(D,) limits [rad or m], narrowed by binding limits of followers."""
     upper: Floats
     effort: Floats
     """(D,) torque or force limit [N m or N]; positive."""
@@ -116,9 +116,9 @@ class HandModel:
     preshape: Floats
     """(D,) posture of the approach."""
     closing: Floats
-    """(D,) -1, 0 or +1: the direction in which the dof closes the hand; 0 for spreads."""
+    """(D,) -1, 0 or +1: the direction in which the dof closes the hand; 0: it does not close."""
     joint_names: tuple[str, ...]
-    """(J,) all moving joints of the URDF, mimicking ones included, in URDF order."""
+    """(J,) all moving joints, including followers, in the description's order."""
     joint_body: Ints
     """(J,) the body that each joint carries."""
     palm: PalmFrame
@@ -128,26 +128,26 @@ class HandModel:
     neighbours: frozenset[tuple[int, int]]
     """Pairs of bodies (a < b) whose contact is ignored: adjacent, or touching in every posture."""
     masses: Floats
-    """(L,) mass of each body [kg], from the URDF or, without a stated mass, from volume at 1000 kg/m^3."""
+    """(L,) mass of each body [kg]: the description's, else from volume at 1000 kg/m^3."""
     velocity: Floats = field(default_factory=lambda: np.zeros(0))
-    """(D,) speed limit [rad/s or m/s], including the limits of mimicking joints; 0 if not stated."""
+    """(D,) speed limit [rad/s or m/s], narrowed by the limits of followers; 0 if not stated."""
     arm: tuple[Joint, ...] = ()
-    """Joints, fixed ones too, from the root of the original robot to `root_link`, for export."""
+    """Moving and fixed joints from the original robot's root to `root_link`, for export."""
     visuals: Visuals = NO_VISUALS
     """Visual meshes."""
     frames: Mapping[str, tuple[int, Floats]] = field(default_factory=dict)
     """Body of each link, and the link's pose (7,) in the body's frame."""
     tendons: tuple[Tendon, ...] = field(default=(), metadata=TOLD_IF_SET)
-    """Drives of several dofs, each dof on at most one; the other dofs have their own drives."""
+    """Drives of several dofs; no dof is on two tendons. The other dofs have their own drives."""
     drag: Drag | None = field(default=None, metadata=TOLD_IF_SET)
-    """None: no drag in the validator, as in the protocol."""
+    """None: no drag in the validator, as in DexGraspBench's protocol."""
     mounting: HandModel | None = field(default=None, metadata=TOLD_IF_SET)
     """Links above the root that stay clear in scenes, see `worker.hands.mounting`.
     A tree of bodies and wrist joints that starts at the root."""
 
     @cached_property
     def content(self) -> str:
-        """Digest of the tree, the pieces and the numbers; `digest` is that of the source files."""
+        """Digest of all fields that `content_of` includes; `digest` is the digest of the source files."""
         return content_of(self)
 
     @cached_property

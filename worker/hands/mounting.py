@@ -29,7 +29,7 @@ WRIST_SHARES: Final = (0.5, 1.0)
 
 
 def mounting_tree(robot: Robot, root: str, options: HandOptions) -> Tree | None:
-    """Build the tree of links above the root, poses in the root link's frame; None if none has a shape."""
+    """Build the tree of links above the root, in the root link's frame; None if no link has a shape."""
     bodies = [Body(root)]
     links: dict[str, tuple[int, Floats]] = {}
     pose, way = IDENTITY_POSE.copy(), 0.0
@@ -71,7 +71,7 @@ def _of_wrist(joint: Joint) -> bool:
 
 
 def _rigid(robot: Robot, joint: Joint, pose: Floats, options: HandOptions) -> dict[str, Floats]:
-    """Return the poses of a joint's parent, as given, and of the links fixed to this parent except the joint's
+    """Return the poses of a joint's parent (`pose`) and of all links fixed to it, without the joint's
     child."""
     found, stack = {joint.parent: pose}, [joint.parent]
     while stack:

@@ -23,7 +23,7 @@ DEFAULT_STIFFNESS: Final = 5.0
 DEFAULT_LINEAR_STIFFNESS: Final = 2_000.0
 #: Default torque limit [N m] if the URDF gives none or 0: FRoGGeR's value for the Allegro hand.
 DEFAULT_EFFORT: Final = 0.7
-#: Default force limit [N] of sliding joints and each pad of a gripper: two such pads reach the force of a squeeze.
+#: Default force limit [N] of sliding joints and each pad of a gripper: two such pads reach the 50 N of a squeeze.
 DEFAULT_FORCE: Final = 25.0
 
 
@@ -87,7 +87,7 @@ def parse_options(files: Mapping[str, bytes], extra: Mapping[str, Any] | None = 
 
 
 def _hand_json(files: Mapping[str, bytes], urdf: object) -> dict[str, Any]:
-    """Return options from a hand collection's notes, unless the notes are on another file than `urdf`, if known."""
+    """Return options from a collection's `hand.json`; none if it describes another file than `urdf`."""
     if "hand.json" not in files:
         return {}
     options: dict[str, Any] = {}
@@ -111,6 +111,6 @@ def _hand_json(files: Mapping[str, bytes], urdf: object) -> dict[str, Any]:
 
 
 def _is_among(noted: str, files: Mapping[str, bytes], urdf: object) -> bool:
-    """Check whether notes refer to this URDF; notes in the same folder use its bare name."""
+    """Check whether `hand.json` names this URDF; only the file names are compared."""
     named = [name for name in files if PurePosixPath(name).name == PurePosixPath(noted).name]
     return bool(named) and PurePosixPath(str(urdf or noted)).name == PurePosixPath(noted).name

@@ -1,7 +1,7 @@
-"""Pinch postures: whether a hand's surfaces oppose one another, and opposed postures by width.
+"""Pinch postures: test whether a hand's surfaces can oppose one another; opposed postures by width.
 
-A hand holds between one finger, usually the thumb, and other fingers with pads that face it. Sampling and random steps
-find such postures for all feasible widths."""
+A hand holds an object between one finger, usually the thumb, and other fingers whose pads face it. Sampling and random
+steps find such postures for all feasible widths."""
 
 from __future__ import annotations
 
@@ -30,26 +30,26 @@ from graspd.worker.objects.memory_cache import cached_by_content
 POSTURES: Final = 160
 CROWD: Final = 25
 CLIMBS: Final = 100
-#: Limits on the line between the pads: its least cosine with the pads, its largest cosine with the palm, and its least
-#: distance in front of the palm [m].
+#: Limits on the line between the pads: least cosine with the pads' normals, largest cosine with the palm's approach,
+#: and least distance in front of the palm [m].
 FACING: Final = 0.75
 SQUARE: Final = 0.7
 AHEAD_M: Final = 0.02
 #: Least distance of opposed pads [m].
 THINNEST_M: Final = 0.002
-#: Difference of width that costs as much as one radian of facing [m].
+#: Difference of width [m] that costs as much as a decrease of `facing` by 1/3.
 WIDTH_M: Final = 0.02
-#: Spread about the pre-shape of dofs that do not close, and of fingers that close together, as shares of a range.
+#: Standard deviations as shares of a range: of dofs that do not close, and of dofs of fingers that close together.
 SIDEWAYS: Final = 0.15
 UNEVEN: Final = 0.06
-#: Number of surface points, and of random postures, in the test whether a hand can hold any object.
+#: Numbers of surface points and random postures in the test whether a hand can hold any object.
 _CHECKED_POINTS: Final = 512
 _CHECKED_AT_RANDOM: Final = 11
 #: Gap below which two surfaces hold nothing, and gap above which they hold no object that a hand can lift [m].
 _GAP_M: Final = (0.004, 0.3)
 #: Least cosine between a normal and the direction to the other surface: within 60 degrees.
 _TOWARD: Final = 0.5
-#: Least change of a gap [m]; a smaller change belongs to a rigid fork.
+#: Least change of the gap between two surfaces that close [m].
 _CLOSING_M: Final = 0.003
 
 
@@ -86,13 +86,13 @@ class Oppositions:
 
     @classmethod
     def cached(cls, kind: str, key: tuple[str, ...], make: Callable[[], Oppositions], *more: ModuleType) -> Oppositions:
-        """Load postures from this machine's cache; else compute them with this code and `more`, and cache them."""
+        """Load postures from the disk cache, else make and cache them; the key has the code of `more`."""
         return cls(**cached_arrays(kind, key, (*_code(), *more), lambda: vars(make())))
 
 
 @cached_by_content(32)
 def oppositions_of(hand: HandModel) -> Oppositions:
-    """Return the opposed postures of a hand, cached in memory and on this machine; hands with one finger have none."""
+    """Return the opposed postures of a hand, cached in memory and on disk; none for hands with one finger."""
     return Oppositions.cached("oppositions", (hand.content,), lambda: _oppositions(hand))
 
 
@@ -137,7 +137,7 @@ class _PadGaps:
     middle: Floats
     width: Floats
     facing: Floats
-    """(N,) cosine of the pads with the line between them; the lower value of both sides."""
+    """(N,) cosine of the pads' normals with the line between the pads; the lower value of both sides."""
     square: Floats
     """(N,) cosine of the palm's approach with the line between the pads; 0: perpendicular."""
     ahead: Floats
@@ -164,14 +164,14 @@ class _PadGaps:
         )
 
     def cost(self, wanted: Floats) -> Floats:
-        """Return the cost (N,) of postures relative to oppositions of the widths `wanted` (N,)."""
+        """Return the cost (N,) of postures as oppositions of the widths `wanted` (N,)."""
         near = np.maximum(0.0, AHEAD_M + 0.01 - self.ahead) / WIDTH_M
         aside = 2 * np.maximum(0.0, self.square - 0.9 * SQUARE)
         return np.asarray(-3 * np.minimum(self.facing, 0.95) + np.abs(self.width - wanted) / WIDTH_M + near + aside)
 
 
 def improve_postures(hand: HandModel, one: int, q: Floats, cost: Callable[[Floats], Floats]) -> Floats:
-    """Improve postures (N, D) by random steps of decreasing size with respect to their `cost` (N,)."""
+    """Decrease the `cost` (N,) of postures (N, D) by random steps of decreasing size."""
     rng = np.random.default_rng(one)
     finger, rank = _ranks(hand)
     best = cost(q)
@@ -187,7 +187,7 @@ def improve_postures(hand: HandModel, one: int, q: Floats, cost: Callable[[Float
 
 
 def random_postures(hand: HandModel, one: int, count: int) -> Floats:
-    """Return (count, D): dofs of one finger at random; joints of equal rank in the other fingers close together."""
+    """Return postures (count, D): one finger is random; dofs of equal rank in others close together."""
     rng = np.random.default_rng(one)
     finger, rank = _ranks(hand)
     opened = np.where(hand.closing >= 0, hand.lower, hand.upper)
@@ -201,7 +201,7 @@ def random_postures(hand: HandModel, one: int, count: int) -> Floats:
 
 
 def _ranks(hand: HandModel) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return (D,) the finger of each dof, -1 if several share it, -2 if it drives none.
+    """Return the finger (D,) of each dof: -1 if several fingers share the dof, -2 if it drives none.
     Also return the number of joints of that finger between the dof and the tip."""
     finger, rank = np.full(hand.dofs, -2, np.intp), np.zeros(hand.dofs, np.intp)
     for number, tip in enumerate(hand.fingertips):
@@ -213,7 +213,7 @@ def _ranks(hand: HandModel) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 
 def require_opposing(hand: HandModel) -> None:
-    """Refuse a hand that cannot hold any object, before planning; cached in memory and on this machine.
+    """Refuse a hand that cannot hold any object, before planning; cached in memory and on disk.
     Raises HandError: no two of its surfaces face each other and close; the message states the fix."""
     if _can_hold(hand):
         return

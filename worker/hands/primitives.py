@@ -157,7 +157,7 @@ def hull_planes(vertices: Floats, faces: Ints) -> tuple[Floats, Floats]:
     return normals, np.einsum("ij,ij->i", normals, vertices[faces[keep, 0]])
 
 
-#: Cosine of normals from which on two triangles count as one flat face: 0.1 degrees.
+#: Least cosine between the normals of two triangles that count as one flat face: 0.1 degrees.
 COPLANAR: Final = 1 - 1.5e-6
 
 

@@ -19,7 +19,7 @@ MAX_LINKS: Final = 256
 MAX_SHAPES: Final = 1024
 #: Largest distance of a part from its parent [m]; larger numbers are a unit mistake.
 MAX_LENGTH_M: Final = 10.0
-#: Limit in each direction of a prismatic joint without limits [m]: such a joint may be in a scene, not in a hand.
+#: Limit in each direction of a prismatic joint without limits [m]; a hand must not move by such a joint.
 UNLIMITED_M: Final = 10.0
 MOVING: Final = ("revolute", "continuous", "prismatic")
 #: URDF joint types of a floating base.
@@ -63,7 +63,7 @@ class Mimic:
 
 @dataclass(frozen=True)
 class Joint:
-    """A joint; the axis has length 1, limits of moving joints are finite and ordered."""
+    """A joint with a unit axis; limits of moving joints are finite and ordered."""
 
     name: str
     type: str
@@ -76,7 +76,7 @@ class Joint:
     effort: float = 0.0
     """[N m or N]; 0: not stated."""
     mimic: Mimic | None = None
-    """Mimic relation. Own limits of a URDF follower are ignored, as in ROS: most published limits of followers are
+    """Mimic relation. A URDF follower's own limits are ignored, as in ROS: most published limits of followers are
     wrong."""
     velocity: float = 0.0
     """Limit [rad/s or m/s]; 0: not stated."""
@@ -119,8 +119,8 @@ def build_robot(
     tendons: Mapping[str, Mapping[str, float]] | None = None,
 ) -> Robot:
     """Build a robot from links and joints with checked values.
-    Raises HandError: duplicate names, joints that form no tree, mimics that form no chain, or nothing moves or can
-    touch. LimitError: more links or shapes than a hand has."""
+    Raises HandError: duplicate names, joints that form no tree, empty limits, no moving joint, or no collision shape.
+    LimitError: more links or shapes than a hand has."""
     link_of, joint_of = _by_name(links, f"{filename}: duplicate link"), _by_name(joints, f"{filename}: duplicate joint")
     if len(link_of) > MAX_LINKS or sum(len(link.shapes) for link in link_of.values()) > MAX_SHAPES:
         raise LimitError(f"{filename}: more than {MAX_LINKS} links or {MAX_SHAPES} collision elements")
@@ -194,7 +194,7 @@ def _check_limits(joints: Iterable[Joint], filename: str) -> None:
 
 
 def _checked_mimic(joint: Joint, joints: dict[str, Joint], filename: str) -> Joint:
-    """Return the joint, with a fault if it follows no moving joint."""
+    """Return the joint, with a fault if it follows itself or no moving joint."""
     seen, at = {joint.name}, joint
     while at.mimic is not None:
         target = joints.get(at.mimic.joint)

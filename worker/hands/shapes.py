@@ -1,5 +1,5 @@
 """Collision shapes of a robot as convex pieces.
-Primitives stay exact. A mesh becomes one hull, or several hulls where one would cover surface that can touch.
+Primitives stay exact. A mesh becomes one hull, or several hulls if one would enclose surface that can touch objects.
 
 The error of a mesh's pieces is the depth of the mesh surface beneath them, along the shortest free direction outward.
 The ninth decile over the visible outer surface counts."""
@@ -28,7 +28,7 @@ from graspd.worker.objects.topology import face_areas, on_faces
 
 #: A hull of V corners has at most 2 V - 4 triangles: 96 here. Every plane costs time in each distance query.
 MAX_HULL_VERTICES: Final = 50
-#: A link longer than this [m] is a mesh in millimetres without a scale.
+#: A longer mesh [m] probably has millimetres without a scale.
 MAX_PIECE_M: Final = 2.0
 
 Hulls = dict[tuple[str, tuple[float, ...]], list[tuple[Floats, Ints]]]
@@ -85,8 +85,8 @@ def _hulls(points: Floats, faces: Ints) -> list[tuple[Floats, Ints]]:
 
 def reduce_hull(points: Floats, limit: int = MAX_HULL_VERTICES) -> tuple[Floats, Ints]:
     """Compute a convex hull of points (N, 3) with at most `limit` corners and the volume of the full hull.
-    Corners are added one by one at the largest distance to the full hull, then scaled about their centroid until the
-    volumes agree. The surface error has both signs, with half the size of an inscribed hull's error."""
+    The corner farthest from the current hull is added repeatedly; then all are scaled about their centroid until the
+    volumes agree. The surface error has both signs and half the size of an inscribed hull's error."""
     made = cached_step("reduced hull", [points, np.array(limit)], lambda: _reduce(points, limit))
     return made["0"], made["1"]
 
@@ -214,7 +214,7 @@ class _OpenSurface:
         self._sees = np.array([~_hits(self._points, direction, corners) for direction in _DIRECTIONS])
 
     def error(self, parts: tuple[Floats, ...]) -> float:
-        """Return the ninth decile of the open surface's distances to the outside of the union of the parts [m]."""
+        """Return the ninth decile of the open surface's depth in the union of the parts [m]."""
         reached = self._sees.any(axis=0)
         if not reached.any():
             return 0.0
@@ -245,7 +245,7 @@ def _hits(points: Floats, direction: Floats, corners: Floats) -> NDArray[np.bool
 
 
 def _exit_distances(part: Floats, points: Floats) -> Floats:
-    """Return the distance (D, P) from points along directions out of a part's hull; 0 outside of it."""
+    """Return the distance (D, P) at which rays from points leave a part's hull; 0 for points outside."""
     normals, offsets = hull_planes(*hull(part))
     inside = offsets - points @ normals.T
     rates = _DIRECTIONS @ normals.T

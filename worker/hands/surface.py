@@ -35,7 +35,7 @@ def sample_surface(hand: HandModel, count: int, *, seed: int = 0) -> SurfacePoin
     gets the area of its Voronoi cell among the candidates, so the areas sum to the exterior area. Parts inside another
     piece have no points. Equal arguments give the same points, bit for bit. Raises HandError: the hand has no outer
     surface."""
-    # Shapes of a hand are known before its closing.
+    # The key has no closing and no palm: these are found from such points.
     return _cached_samples(
         _Shapes(hand.pieces, body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0]), count, seed
     )
@@ -170,7 +170,7 @@ def farthest_points(points: Floats, count: int) -> NDArray[np.intp]:
     for i in range(1, count):
         last = points[chosen[i - 1]]
         np.minimum(nearest, squares - 2 * (points @ last) + last @ last, out=nearest)
-        # Rounding may place the point itself slightly above another point, but it must not be chosen twice.
+        # Rounding may leave a chosen point a small distance, but it must not be chosen twice.
         nearest[chosen[i - 1]] = -1.0
         chosen[i] = int(np.argmax(nearest))
     return chosen

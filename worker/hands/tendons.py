@@ -15,7 +15,7 @@ from graspd.worker.hands.robot import Robot
 
 #: Coefficients below this count as zero.
 LEAST_PULL: Final = 1e-6
-#: The outer joints of a Shadow finger: one tendon pulls J1 and J2. Its URDFs cannot state this.
+#: The outer joints of a Shadow finger: one tendon pulls J1 and J2. A URDF cannot state this.
 _SHADOW: Final = re.compile(r"(?P<prefix>.*?)(?P<finger>FF|MF|RF|LF)J1")
 _SHADOW_FINGERS: Final = frozenset({"FF", "MF", "RF"})
 
@@ -23,7 +23,7 @@ _SHADOW_FINGERS: Final = frozenset({"FF", "MF", "RF"})
 @dataclass(frozen=True)
 class Tendon:
     """A drive of several dofs: its length is the sum of coefficient times joint value.
-    At a pull F each joint gets the torque c F at any value: the drive moves only the sum."""
+    A pull F exerts the torque c F on each joint at any joint value, so the drive controls only the sum."""
 
     name: str
     dofs: tuple[int, ...]
@@ -31,7 +31,7 @@ class Tendon:
 
     def gain(self, stiffness: Floats) -> float:
         """Compute the drive's gain [N m/rad of length] from its dofs' gains (D,), in series: 1 / sum(c^2 / k).
-        A command of q + c F / k to each joint, for a torque c F, then commands the pull F of the tendon."""
+        If each joint is commanded to q + c F / k, for a torque c F, the tendon then pulls with F."""
         parts = zip(self.dofs, self.coefficients, strict=True)
         return 1.0 / sum(c * c / float(stiffness[d]) for d, c in parts)
 
@@ -41,8 +41,8 @@ class Tendon:
 
 
 def actuators(tendons: tuple[Tendon, ...], dofs: int) -> Floats:
-    """Return lengths (A, D) of the drives from the dofs' values, in dof order; a tendon is at the place of its first
-    dof."""
+    """Return the matrix (A, D) from dof values to lengths of the drives, in dof order.
+    A tendon has the place of its first dof."""
     rows = np.eye(dofs)
     others: list[int] = []
     for tendon in tendons:
@@ -68,7 +68,7 @@ def tendons_of(
 
 
 def shadow_tendons(robot: Robot) -> dict[str, dict[str, float]]:
-    """Return the tendons of a Shadow hand by its joint names and their order: J1 + J2 of each finger but the thumb."""
+    """Return the tendons of a hand with Shadow's joint names and order: J1 + J2 of all but the thumb."""
     found: dict[str, dict[str, float]] = {}
     fingers = set()
     for name, joint in robot.joints.items():
@@ -85,14 +85,14 @@ def shadow_tendons(robot: Robot) -> dict[str, dict[str, float]]:
 
 def check_tendons(robot: Robot, stated: Mapping[str, Mapping[str, float]]) -> None:
     """Check stated tendons.
-    Raises HandError: one names an unknown joint, pulls fewer than two, or shares one with another tendon."""
+    Raises HandError: a tendon names an unknown joint, pulls fewer than two joints, or shares one with another."""
     seen: set[str] = set()
     for name, pulls in stated.items():
         for joint in pulls:
             if joint not in robot.joints or robot.joints[joint].type == "fixed":
                 raise HandError(f"tendon {name!r} pulls {joint!r}, which is no moving joint of the hand")
             if joint in seen:
-                raise HandError(f"joint {joint!r} is on two tendons; one drive can move it")
+                raise HandError(f"joint {joint!r} is on two tendons; only one drive can move it")
             seen.add(joint)
         if sum(abs(c) > LEAST_PULL for c in pulls.values()) < 2:
             raise HandError(f"tendon {name!r} pulls fewer than two joints; leave it out")

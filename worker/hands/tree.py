@@ -18,7 +18,7 @@ from graspd.worker.hands.tendons import check_tendons
 
 #: Share of its range that a drive may lose without a note to the user.
 _TOLD_CUT: Final = 0.01
-#: Largest position of a follower [rad], [m].
+#: Largest travel and offset of a follower: of a revolute joint [rad], of a prismatic joint [m].
 _MOST: Final = (200 * math.pi, MAX_LENGTH_M)
 #: A joint with a smaller range is fixed [rad or m].
 LEAST_RANGE: Final = 1e-5
@@ -96,7 +96,7 @@ def build_tree(robot: Robot, options: HandOptions) -> Tree:
         raise HandError(f"no moving joint is left: the limits of {shown} leave one value; fill them in")
     if not moving:
         if options.fix or options.drop:
-            raise HandError("no moving joint is left; fix or drop less")
+            raise HandError("no moving joint is left; fix or drop fewer joints")
         raise HandError.with_fixes(
             f"no moving joint is left; nothing below {root!r} moves", "name another --root", {"root": None}
         )
@@ -206,7 +206,7 @@ def _limits_bind(joint: Joint, drive: Mimic, robot: Robot, options: HandOptions)
 
 
 def exceeded_limits(robot: Robot, tree: Tree, options: HandOptions) -> list[str]:
-    """Return notes on joints that follow another joint beyond their own limits, which do not bind them."""
+    """Return the joints that follow another joint beyond their own limits, which do not bind them."""
     found = []
     for name in tree.joint_names:
         joint, drive = robot.joints[name], tree.drives[name]
@@ -268,7 +268,7 @@ def joint_motion(joint: Joint, value: float) -> Floats:
     return motion
 
 
-#: Largest reach of a finger from the branching of its hand's fingers [m]; legs and arms exceed it.
+#: Largest reach of a finger from the link at which the fingers branch [m]; legs and arms exceed it.
 MAX_FINGER_M = 0.35
 #: Largest reach of a hand from its first joint [m].
 MAX_HAND_M = 0.5
@@ -319,7 +319,7 @@ def hand_links(tree: _JointTree, root: str) -> list[str]:
 
 
 class _JointTree:
-    """The joints of a robot with moving joints at or below them."""
+    """Joint tree of a robot: which joints move or carry moving joints, and how far they reach."""
 
     def __init__(self, robot: Robot, options: HandOptions) -> None:
         self.robot, self.options = robot, options

@@ -1,7 +1,7 @@
 """Reader of URDF and XML from untrusted sources. It checks every value; later code relies on these checks.
 
-The common URDF libraries accept reversed limits, NaN, unknown mimics and several roots, and resolve mimic chains
-wrongly; this reader refuses each with a message."""
+The common URDF libraries accept reversed limits, NaN, unknown mimics and several roots; this reader refuses them with a
+message. Those libraries also resolve mimic chains wrongly."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from graspd.service.store.hand_files import text_of
 from graspd.worker.hands.robot import MAX_LENGTH_M, MOVING, UNLIMITED_M, Joint, Link, Mimic, Robot, Shape, build_robot
 
 MAX_BYTES: Final = 4 * 2**20
-#: Largest number of visual elements that are drawn.
+#: Largest number of visual elements per link that are drawn.
 MAX_VISUALS: Final = 1024
 Colour = tuple[float, float, float]
 
@@ -254,7 +254,7 @@ _MAX_PREFIXES: Final = 100
 
 def parse_xml(data: bytes, name: str, what: str = "", root: str = "", *, limit_bytes: int) -> Element:
     """Return the root element without its namespace.
-    Raises HandError: it is empty, not XML, or has another root element than `root`, with which a `what` begins.
+    Raises HandError: it is empty, not XML, or has another root element than `root`; the message calls it `what`.
     LimitError: larger than the limit."""
     if len(data) > limit_bytes:
         raise LimitError(f"{name}: {len(data)} bytes of XML; at most {limit_bytes} are taken")

@@ -94,7 +94,7 @@ def thin_mesh(mesh: VisualMesh, times: float) -> VisualMesh:
 
 
 def merge_and_thin(vertices: Floats, faces: Ints, share: Callable[[int], float]) -> tuple[Floats, Ints]:
-    """Merge equal vertices, and drop the share of the faces that `share` gives for their number, if it is positive."""
+    """Merge equal vertices, then drop the share of faces that `share` returns for their number."""
     # Both are slow to load and not needed for cached results.
     import fast_simplification
     import trimesh
@@ -132,7 +132,7 @@ def _meshes(item: PlacedShape, files: Mapping[str, bytes], base: str, soups: dic
 
 
 def _mesh_files(mesh: str, files: Mapping[str, bytes]) -> Nearby:
-    """Return the hand's files that a mesh and its libraries name, up to a limit."""
+    """Return a lookup of the hand's files that a mesh and its material libraries name, up to `MAX_NAMES`."""
     naming = [mesh]
     asked = 0
 
@@ -160,8 +160,8 @@ def _file_of(item: PlacedShape, files: Mapping[str, bytes], base: str) -> str:
 
 
 def find_mesh(filename: str, files: Mapping[str, bytes], base: str, link: str) -> str:
-    """Return the name in `files` of a URDF's mesh, see `read_reference`; else the only file of that name, ignoring
-    case.
+    """Return the name in `files` of a URDF's mesh, see `read_reference`.
+    Without an exact match: the only file with the same end of its path, else a path that differs in case.
     Raises HandError: it is missing, or lies outside the upload."""
     try:
         reference = read_reference(filename, base)

@@ -1,6 +1,6 @@
 """Robot from its description in any format; xacro is expanded in an isolated child process.
 
-Expressions in xacro are Python. The child receives all files of the hand in memory, then loses access to files, network
+Expressions in xacro are Python. The child receives the hand's text files in memory, then loses access to files, network
 and commands: see `worker.hands.xacro_child`."""
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _READ: Final = (".xacro", ".urdf", ".xml", ".yaml", ".yml")
 
 
 def expand(files: Mapping[str, bytes], main: str, arguments: Mapping[str, str]) -> bytes:
-    """Expand a xacro file with values of its `<xacro:arg>` to a URDF.
+    """Expand a xacro file to a URDF, with values of its `<xacro:arg>`.
     Includes and `$(find PACKAGE)` are searched among the hand's files only. Raises HandError: the file cannot be
     expanded, or refers to files outside the hand's folder. OSError: the child was killed or hung; the file is not at
     fault."""

@@ -164,7 +164,7 @@ def _package(package: str, names: list[str], texts: dict[str, str]) -> str | Non
     if below:
         return below[0]
     manifests = [name for name in names if posixpath.basename(name) == "package.xml"]
-    # A package may have been packed without the folder of its name.
+    # An upload may lack the folder that is named after the package.
     return "" if not manifests else None
 
 

@@ -22,11 +22,11 @@ FAR = 10
 def check_object(
     files: Mapping[str, bytes], name: str, *, face_error_m: float = REPORT_ERROR_M, **options: Any
 ) -> dict[str, Any]:
-    """Check these files with `load_object`; options that are not None override `asset.json`.
+    """Check whether the files describe a usable object; options that are not None override `asset.json`.
     Return verdict (accept, repair or refuse), message (one line), repairs (changes), and facts (measurements in SI
-    units). A refusal that options fix also has `problem`, the fault, and `options_suggested`: keys of `ObjectOptions`,
-    with None for a value to choose. A refusal for its size has `units_suggested`, the likeliest first, and `lengths_m`,
-    the longest extent in each unit [m]."""
+    units). If options can fix a refusal, facts have `problem` and `options_suggested`: keys of `ObjectOptions`, with
+    None for a value to choose. If the size is wrong, facts have `units_suggested`, the likeliest first, and
+    `lengths_m`, the longest extent in each unit [m]."""
     try:
         settings = parse_options(files, options)
         main = main_file(files, settings)

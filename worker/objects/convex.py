@@ -1,4 +1,4 @@
-"""Convex pieces of a mesh by CoACD (Wei et al. 2022), in a separate process, which runs this module with SECONDS."""
+"""Convex pieces of a mesh by CoACD (Wei et al. 2022), which runs in a child process (`_decompose`)."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def coacd_parts(vertices: Floats, faces: NDArray[Any], options: Mapping[str, Any
     """Compute the corners (V, 3) of each convex piece with the arguments of `coacd.run_coacd`; none if CoACD fails.
     CoACD holds the interpreter lock, so it runs in a child and delays no heartbeat. The limit is one of CPU time [s]: a
     busy machine gives the same pieces as an idle one. Raises WorkLimitExceeded: CoACD needs more CPU time. OSError:
-    CoACD could not start or was killed; other pieces in their place would have another shape."""
+    CoACD could not start or was killed; without this error, the object would silently get another shape."""
     given = io.BytesIO()
     np.savez(given, vertices=vertices, faces=faces, options=np.array(json.dumps(dict(options))))
     command = [sys.executable, "-m", "graspd.worker.objects.convex", str(cpu_s)]

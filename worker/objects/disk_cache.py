@@ -40,8 +40,8 @@ def cached_arrays(
     fits: Callable[[Arrays], bool] = lambda _: True,
 ) -> Arrays:
     """Load arrays from a folder of the user's cache, or compute and cache them; both give the same bits.
-    All inputs that determine the arrays are in `terms`, besides the code of some modules. Errors of `make` are not
-    cached. Loaded arrays that do not `fit` are recomputed."""
+    `terms` and the modules `code` must contain everything that determines the arrays. Errors of `make` are not cached.
+    Loaded arrays for which `fits` returns False are recomputed."""
     file = _file(kind, terms, code)
     if (held := _read(file)) is not None and fits(held):
         return held
@@ -53,7 +53,7 @@ def cached_arrays(
 @contextmanager
 def caching_steps(kind: str, terms: tuple[str | int, ...], code: tuple[ModuleType, ...]) -> Iterator[None]:
     """Cache the results of `cached_step` inside this context in one entry, and load them the next time.
-    Use it for small steps of a large computation whose library is slow to load. The terms only distinguish entries."""
+    Use it for small steps that need a library that is slow to load. The terms only distinguish entries."""
     file = _file(kind, terms, code)
     known = _read(file) or {}
     now = dict(known)
@@ -115,7 +115,7 @@ def _revision(files: tuple[str, ...]) -> str:
 
 #: A model's name does not affect its content.
 _NAMES: Final = frozenset({"name", "digest"})
-#: Metadata of a field that is ignored while it has its default.
+#: Metadata of a field that `content_of` ignores while it has its default.
 TOLD_IF_SET: Final = MappingProxyType({"told_if_set": True})
 
 

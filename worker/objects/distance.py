@@ -10,7 +10,7 @@ from graspd.worker.objects.topology import Indices, face_vectors, on_faces
 
 #: Least number of pieces of a mesh, so that pieces are small relative to the mesh.
 _PIECES = 10_000
-#: Number of nearest pieces checked first, doubled until the result is proven.
+#: Number of nearest pieces checked first, quadrupled until the result is proven.
 _CANDIDATES = 12
 _CHUNK = 256
 _MAX_VERTICES = 30_000
@@ -29,7 +29,7 @@ class MeshDistance:
         self._tree = cKDTree(centres)
 
     def __call__(self, points: Floats, enough: float = 0.0) -> Floats:
-        """Return the distance (N,) of points (N, 3) to the surface [m]; below `enough` an upper bound."""
+        """Return distances (N,) of points (N, 3) to the surface [m]; those below `enough` are upper bounds."""
         found = np.full(len(points), np.inf)
         todo, k = np.arange(len(points)), min(_CANDIDATES, len(self._face))
         while len(todo):

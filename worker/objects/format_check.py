@@ -1,4 +1,4 @@
-"""Files in place of expected ones: pointers, error pages, archives with the suffix of a mesh."""
+"""Detection of files that are not what their suffix says: pointers, error pages, archives."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A binary glTF 2.0 document under construction: triangles and points, opened by any glTF tool."""
+"""Writer of binary glTF 2.0 documents with triangles and points."""
 
 from __future__ import annotations
 

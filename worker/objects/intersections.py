@@ -33,15 +33,15 @@ _CHUNK: Final = 200_000
 
 
 def crossings(vertices: Floats, faces: Indices) -> Indices | None:
-    """Find pairs (P, 2) of intersecting faces without a common vertex; None: too many faces.
-    Broad phase: faces cut into pieces of equal size, pieces with overlapping balls, then faces with overlapping boxes.
-    Narrow phase: an edge of one face through the interior of the other."""
+    """Find pairs (P, 2) of intersecting faces without a common vertex; None: too many faces or near pairs.
+    The broad phase cuts faces into small pieces, and keeps faces whose pieces' balls and whose boxes overlap. The
+    narrow phase keeps pairs in which an edge of one face passes through the interior of the other."""
     from scipy.spatial import cKDTree
 
     if len(faces) > MAX_FACES:
         return None
     corners = vertices[faces]
-    # Well above the edge length of an even mesh of so many faces: only long faces are cut.
+    # Pieces may be much longer than the edges of an even mesh of so many faces: only long faces are cut.
     centres, radius, owner = small_pieces(corners, 4, max(len(faces), 2000))
     tree = cKDTree(centres)
     if tree.count_neighbors(tree, 2 * radius) > 2 * MAX_PAIRS:
@@ -61,7 +61,7 @@ def crossings(vertices: Floats, faces: Indices) -> Indices | None:
 
 def _distinct(pairs: NDArray[np.int64], count: int) -> NDArray[np.int64]:
     """Return unordered pairs (P, 2) of numbers below `count` once each, in ascending order.
-    Encoded as one number per pair, they sort many times faster than as rows."""
+    Pairs encoded as one number sort many times faster than rows."""
     keys = np.unique(pairs.min(axis=1) * np.int64(count) + pairs.max(axis=1))
     return np.stack(np.divmod(keys, count), axis=1)
 
@@ -99,7 +99,7 @@ def _edges_pass(edges_of: Floats, triangles: Floats, depth: float) -> NDArray[np
 
 def untangle(vertices: Floats, faces: Indices) -> Mesh | None:
     """Return the solid in which doubly enclosed volume counts once; None if this is not safe.
-    The mesh is halved until no piece intersects itself, and the pieces are united; no vertex moves. It is safe if the
+    The mesh is halved until no piece intersects itself, and the pieces are united; no vertex moves. This is safe if the
     result is closed and free of crossings, and all of its surface lies on the old surface."""
     whole = mesh_geometry.to_manifold(vertices, faces)
     pieces = None if whole is None else _split_recursively(whole, _HALVINGS)

@@ -1,7 +1,7 @@
 """Geometry of closed meshes: exact mass properties, corner normals, float64 booleans by manifold3d.
 
-An object has two frames with the same axes. Poses are stored in the file's frame; the engine works in the centred
-frame, in the middle of the mesh's bounding box. Results therefore have the same bits for every origin of the file."""
+An object has two frames with the same axes. Poses are stored in the file's frame. The engine works in the centred frame
+at the middle of the mesh's bounding box. Results therefore have the same bits for every origin of the file."""
 
 from __future__ import annotations
 
@@ -158,8 +158,8 @@ def _apart(low: Floats, high: Floats, i: int) -> Floats:
     return np.asarray(np.linalg.norm(np.maximum(0, np.maximum(low[i] - high[i + 1 :], low[i + 1 :] - high[i])), axis=1))
 
 
-#: Digits of the longest extent to which coordinates are rounded, so that no sliver collapses; and least number of
-#: digits of a mesh of decimals.
+#: Number of digits of the longest extent to which coordinates are rounded, so that no sliver collapses. Least number
+#: for a mesh of decimal coordinates.
 DIGITS: Final = 9
 LEAST_DIGITS: Final = 5
 
@@ -207,7 +207,7 @@ def shift_frame(pose: ArrayLike, by: ArrayLike) -> Floats:
 
 
 def to_centre(pose: ArrayLike, centre: ArrayLike) -> Floats:
-    """Convert poses (..., 7) of the file's frame to the centred frame, at `centre` (3,) in it.
+    """Convert poses (..., 7) of the file's frame to the centred frame; `centre` (3,) is its origin there.
     The result is on a grid, so that the round trip gives the same bits."""
     return moved(shift_frame(pose, centre), np.zeros(3))
 

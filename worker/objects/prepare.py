@@ -75,7 +75,7 @@ def main_file(files: Mapping[str, bytes], options: ObjectOptions) -> str:
 
 @lru_cache(maxsize=8)
 def _prepared(main: str, data: bytes, options_json: str, face_error_m: float) -> ObjectModel:
-    """Prepare with caches by content: batches of a job share an object, and repeated commands use few objects."""
+    """Prepare, cached in memory and on disk: batches of a job and repeated commands share an object."""
     terms = [Path(main).suffix.lower(), options_json, repr(face_error_m), hashlib.sha256(data).hexdigest(), revision()]
     file = user_cache.folder("objects") / f"{digest_json(terms)}.npz"
     if (held := user_cache.load(file)) is not None:
@@ -93,7 +93,7 @@ def repaired_mesh(main: str, data: bytes, options: ObjectOptions) -> RepairedMes
 
 @lru_cache(maxsize=2)
 def _repaired(main: str, data: bytes, options_json: str) -> RepairedMesh:
-    """Repair with a cache: the result does not depend on the bound of the simplification."""
+    """Repair, cached: the result is reused for every value of `face_error_m`."""
     soup = read_mesh(main, data)
     try:
         return repair(soup, ObjectOptions.model_validate_json(options_json))
@@ -193,8 +193,8 @@ FEW_FACES: Final = 64
 MANY_FACES: Final = 40_000
 #: The search ends when two targets differ by less than this factor.
 STEP: Final = 1.12
-#: Number of surface samples, besides the vertices, at which trials must stay within the second value's share of the
-#: bound.
+#: Number of surface samples besides the vertices at which each trial is compared, and the share of the bound within
+#: which it must stay there.
 SAMPLES: Final = 4000
 MARGIN: Final = 0.9
 #: Number of samples at which the deviation of the returned mesh is measured.
@@ -205,17 +205,17 @@ PATIENCE: Final = 3
 
 def simplify(vertices: Floats, faces: Indices, error_m: float, *, closed: bool = True) -> tuple[Floats, Indices, float]:
     """Find the coarsest mesh whose surface lies within `error_m` of the given one, both ways.
-    Quadric edge collapse (Garland & Heckbert 1997) reduces the mesh to a bisected number of faces. Each trial is
-    measured. For closed meshes it must be an oriented 2-manifold with as many shells as the original. If no trial
-    passes, manifold3d's edge collapse is used; if that gains nothing, the mesh stays unchanged. Return vertices, faces
-    and the measured deviation [m]."""
+    Quadric edge collapse (Garland & Heckbert 1997) reduces the mesh; bisection finds the number of faces. Each trial is
+    measured. For closed meshes it must be an oriented 2-manifold with as many shells as the original. If no trial of a
+    closed mesh passes, manifold3d's edge collapse is used. If that gains nothing, the mesh stays unchanged. Return
+    vertices, faces and the measured deviation [m]."""
     if error_m <= 0 or len(faces) <= FEW_FACES:
         return vertices, faces, 0.0
     limit = MARGIN * error_m
     original = ReferenceMesh(vertices, faces, closed)
     if len(faces) > MANY_FACES:
-        # A mesh within a fifth of the error is quick to compare with. By the triangle inequality the rest of the error
-        # remains.
+        # A mesh within a fifth of the error is quick to compare with. By the triangle inequality, four fifths remain
+        # for the trials.
         start = _simplified(original, MANY_FACES, limit / 5)
         if start is not None:
             original, limit = ReferenceMesh(*start, closed), limit * 4 / 5
@@ -239,7 +239,7 @@ def simplify(vertices: Floats, faces: Indices, error_m: float, *, closed: bool =
 
 
 class ReferenceMesh:
-    """Reference for the comparison of trials; repeated queries are cached."""
+    """Original mesh with which trials are compared, and its search structure."""
 
     def __init__(self, vertices: Floats, faces: Indices, closed: bool) -> None:
         self.vertices, self.faces, self.closed = vertices, faces, closed
@@ -327,7 +327,7 @@ def to_bytes(obj: ObjectModel) -> bytes:
 
 
 def from_bytes(data: bytes, *, name: str, digest: str) -> ObjectModel:
-    """Load an object from `to_bytes`; else ValueError, KeyError, OSError, EOFError or BadZipFile."""
+    """Load what `to_bytes` wrote; raise ValueError, KeyError, OSError, EOFError or BadZipFile."""
     with np.load(io.BytesIO(data), allow_pickle=False) as stored:
         plain = json.loads(stored["plain"].tobytes())
         arrays = {field: stored[field] for field in _ARRAYS}

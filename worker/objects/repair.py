@@ -41,7 +41,7 @@ DEBRIS: Final = 1e-6
 COARSE_M: Final = 1e-4
 #: Mean wall thickness [m] below which a warning is given: a thinner wall can pass between hand points.
 THIN_M: Final = 2.5e-3
-#: Points, besides the vertices, at which the repaired surface is compared with the original.
+#: Number of points besides the vertices at which the repaired surface is compared with the original.
 _SAMPLES: Final = 4000
 
 

@@ -25,7 +25,7 @@ def merge_vertices(vertices: Floats, faces: Indices, tolerance: float) -> tuple[
     vertices, faces = vertices[used], faces.reshape(-1, 3)
     cells = np.round((vertices - vertices.min(axis=0)) / tolerance).astype(np.int64)
     _, first, inverse = np.unique(cells, axis=0, return_index=True, return_inverse=True)
-    # Keep the file's order: vertices in the order of sorted cells would be shuffled.
+    # Keep the file's order of vertices instead of the order of the sorted cells.
     order = np.argsort(first, kind="stable")
     rank = np.empty(len(first), dtype=np.int64)
     rank[order] = np.arange(len(first))
@@ -138,7 +138,7 @@ def _by_edge(faces: Indices) -> tuple[Indices, Indices, Indices]:
 
 
 def pair_faces(faces: Indices) -> tuple[Indices, Indices, Mask]:
-    """Return the two faces at each manifold edge, (M,) and (M,), and a mask (M,) of edges with equal windings."""
+    """Return the two faces at each manifold edge, (M,) and (M,), and a mask (M,): their windings agree."""
     order, starts, counts = _by_edge(faces)
     pairs = starts[counts == 2]
     one, two = order[pairs], order[pairs + 1]
@@ -158,7 +158,7 @@ def parts_of_graph(one: Indices, other: Indices, count: int) -> NDArray[np.int32
 
 
 def components(faces: Indices) -> Indices:
-    """Return the number (F,) of each face's connected component (by shared vertices)."""
+    """Return the index (F,) of each face's connected component (by shared vertices)."""
     n = int(faces.max()) + 1
     rows = np.concatenate([faces[:, 0], faces[:, 1]])
     columns = np.concatenate([faces[:, 1], faces[:, 2]])
@@ -169,7 +169,7 @@ def components(faces: Indices) -> Indices:
 
 def unify_winding(faces: Indices) -> tuple[Indices, bool]:
     """Flip faces so that neighbours agree; return whether that was possible (not on a Moebius strip).
-    Each face is two nodes, as it is and flipped; an edge joins nodes that agree. A component of this graph is one
+    A graph has two nodes for each face, as it is and flipped; an edge joins nodes that agree. A component is one
     consistent choice. A face connected with its own flipped copy belongs to a non-orientable surface."""
     count = len(faces)
     one, two, agree = pair_faces(faces)

@@ -24,7 +24,7 @@ FIT_M: Final = 0.001
 
 def fitting_pairs(hand: HandModel, obj: ObjectModel) -> Pairs | None:
     """Return pairs of opposite points that fit between the jaws of a hand; None if the hand is no gripper.
-    Raises InputError: no pair fits; the message names the joint and its opening."""
+    Raises InputError: no pair fits; the message states the opening."""
     jaws = jaws_of(hand)
     if jaws is None:
         return None
@@ -43,7 +43,7 @@ def fitting_pairs(hand: HandModel, obj: ObjectModel) -> Pairs | None:
 #: Number of surface points from which rays are cast; standard deviation of the rays' tilt from the normal [rad].
 _POINTS: Final = 768
 _TILT: Final = 0.08
-#: Least cosine of the angle between a line and the surface normal at its exit: 20 degrees.
+#: Least cosine of the angle between a ray and the surface normal at its exit: 20 degrees.
 _OPPOSITE_COS: Final = 0.94
 #: Least thickness that can be held [m].
 _THINNEST_M: Final = 5e-4

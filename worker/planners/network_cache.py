@@ -1,5 +1,5 @@
-"""Cache of proposal networks in this process, by digest: a method's option names a network without a file.
-The digest belongs to a local file or to the service's asset."""
+"""Cache of proposal networks in this process. A method's option names a network by its digest.
+The digest is that of a local file or of an asset of the service."""
 
 from __future__ import annotations
 

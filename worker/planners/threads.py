@@ -50,7 +50,7 @@ def split_batch(count: int, run: ExecutionContext, *, least: int = 1) -> list[ra
 
 
 def run_parts(parts: list[range], work: Callable[[range], T]) -> list[T]:
-    """Run `work` on every part, each in its own thread; return the results in order.
+    """Run `work` on every part, each in its own thread; return the results in the order of the parts.
     A part that exceeds a GPU's memory is halved, repeatedly if needed, down to single grasps. Halves run in sequence,
     so there may be more results than parts."""
     if len(parts) == 1:

@@ -80,5 +80,5 @@ def _portable(error: Exception) -> Exception:
 
 
 if __name__ == "__main__":
-    # Imported by its full name: pickles name their module, which `__main__` is not.
+    # The module is imported by its full name, since pickles refer to this name and not to `__main__`.
     import_module("graspd.worker.pool.child").serve(Connection(int(sys.argv[-1])), sys.argv[1:-1])

@@ -1,9 +1,9 @@
 """Pool of processes on this machine, one core each; `worker.pool.child` is the process itself.
 
 Threads share Python's lock: work that holds it for a tenth of its time does not fill 16 cores. Processes are started
-fresh, since a CUDA context and the threads of an engine do not survive a fork. They end when the end of the parent
-closes their pipes. The library's `ProcessPoolExecutor` would import the program that calls `graspd.synthesize` once
-more in each process."""
+fresh, since a CUDA context and the threads of an engine do not survive a fork. They end when the parent ends, which
+closes their pipes. Python's `ProcessPoolExecutor` would import the program that calls `graspd.synthesize` once more in
+each process."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ from graspd.worker.pool.child import WorkItem
 log = logging.getLogger(__name__)
 #: Modules for the work of a worker; not imported here, so that a worker starts before its engine.
 MODULES: Final = ("graspd.worker.validation.validator", "graspd.worker.quality.table")
-KEPT: Final = 8  # number of shared data cached per process: two for a pair that is validated and measured
+KEPT: Final = 8  # number of shared inputs cached per process: two for a pair that is validated and measured
 _LOOK_S: Final = 0.1  # interval of checks for a stop [s]
 _PATIENCE_S: Final = 20.0  # time after which a process that still works on an abandoned item is ended [s]
 _NO_GPU: Final = {"CUDA_VISIBLE_DEVICES": ""}  # processes compute on the CPU and take no GPU memory
 
 
 class ProcessLost(GraspdError):
-    """A process of the pool ended during an item; a fresh one has replaced it."""
+    """A process of the pool ended during an item; the next item gets a fresh one."""
 
     slug, title = "process-lost", "A process of the pool ended during its work"
 
@@ -49,7 +49,7 @@ class _Request:
     key: str
     shared: Any
     done: Callable[[int], None]
-    dropped_at: float | None = None  # time at which the last caller stopped waiting
+    dropped_at: float | None = None  # time at which the caller stopped waiting
 
     @cached_property
     def pickled(self) -> bytes:
@@ -93,7 +93,7 @@ class Pool(AbstractContextManager["Pool"]):
         cancelled: Callable[[], bool] = lambda: False,
         done: Callable[[int], None] = lambda number: None,
     ) -> list[Any]:
-        """Compute `work(shared, part)` for all parts, in their order; `work` is importable, without side effects.
+        """Return `work(shared, part)` for all parts in order; `work` is importable, without side effects.
         Each process receives the pickled `shared` once, under its `key`. `done` receives the number of each finished
         part, in another thread. An error of a part abandons the other parts. Raises ProcessLost: a process ended during
         a part. TaskCancelled: `cancelled` returned True, or the pool was closed."""
@@ -206,7 +206,7 @@ class _Place:
 
 
 def start_child(command: Sequence[str], **options: Any) -> tuple[Connection, subprocess.Popen[bytes]]:
-    """Start a process with a pipe, whose other end is the last command-line argument. Raises OSError."""
+    """Start a process with a pipe; its last argument is the file descriptor of its end. Raises OSError."""
     ours, theirs = Pipe()
     with theirs:
         process = subprocess.Popen(

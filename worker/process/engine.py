@@ -2,8 +2,8 @@
 
 Over a pipe the worker (`worker.process.main`) first sends a `Setup`, then orders of the form (name, argument).
 `service` compares store and Redis. `check` is answered by `ready`, `task` by `done` and then `idle`; `end` ends the
-process. An answer may be an error, `refused`. `stop` with a reason is accepted at any time. The engine also sends
-`facts` for the list of workers (including progress) and `event`. It does not access Redis."""
+process. Any answer may instead be `refused`, an error. `stop` with a reason is accepted at any time. The engine also
+sends `facts` for the list of workers (including progress) and `event`. It does not access Redis."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Engine:
         table: Mapping[Stage, StageFunction] | None = None,
         check: Check | None = None,
     ) -> None:
-        """`table` has the function of each stage, `check` tests their engines; the real ones by default."""
+        """`table` has the function of each stage (default: `stage_table`), `check` tests their engines."""
         self._connection, self._setup = connection, setup
         self._table, self._check = table, check
         self._speaking = threading.Lock()
@@ -191,7 +191,7 @@ class TaskResources:
         return batches_at_once(self._device.resolve(), None if join == "auto" else int(join))
 
     def pool(self, stage: str) -> Pool | None:
-        """Return the pool that validates and measures, if this stage uses one; waits for its size."""
+        """Return the pool that validates and measures, or None; block until its size is known."""
         if stage != Stage.SYNTHESIZE:
             return None
         if self._pool is not None:
@@ -232,7 +232,7 @@ def resident_mb(pid: int | None = None) -> float:
 
 
 def main(table: Mapping[Stage, StageFunction] | None = None, check: Check | None = None) -> None:
-    """Run the process. Signals to end are handled by the worker: this process ends with it."""
+    """Run the process. It ignores signals to end: the worker handles them, and ends this process."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     mark_process()

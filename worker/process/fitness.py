@@ -1,11 +1,11 @@
-"""Fitness of a worker: an unfit one returns tasks, to save their attempts, and goes into quarantine.
+"""Fitness of a worker: an unfit worker returns tasks, which lose no attempt, and goes into quarantine.
 
 A worker is unfit in two cases. Its engine fails the check, before the first task or after a task failed for another
 reason than its input. Or several different tasks fail here in a row, while other workers completed two of them.
 
 A worker in quarantine is listed with the reason and gets no tasks. It repeats its check after increasing pauses and
-resumes when the check passes. If it does not pass, or cannot find the fault, the process ends and a fresh one starts
-with a check."""
+resumes when the check passes. If the check never passes, or cannot find the fault, the process ends and a fresh one
+starts with a check."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from graspd.worker.process.selfcheck import EngineError
 log = logging.getLogger(__name__)
 Check = Callable[[Collection[Stage]], None]  # check of the engine for some stages; raises EngineError
 PAUSES_S: Final = (2.0, 5.0, 10.0, 20.0)  # pauses before the checks of a worker in quarantine [s]
-#: Number of tasks that failed here and succeeded elsewhere, from which on a worker is unfit.
+#: Least number of tasks that failed here and succeeded elsewhere at which a worker is unfit.
 _DONE_ELSEWHERE: Final = 2
 _REMEMBERED: Final = 16
 _LOSSES_BYTES: Final = 2**16
@@ -37,7 +37,7 @@ _OF_THE_TASK: Final = (InputError, TaskRefused, DamagedError)
 
 
 def first_loss(task: str) -> bool:
-    """Check whether this is the first loss of a GPU or pool process over a task on this machine.
+    """Check whether a task loses a GPU or pool process for the first time on this machine.
     The first loss is no failed attempt of the task. Later losses count, so that a task that causes them ends."""
     file = user_cache.folder("gpus") / f"{hashlib.sha256(task.encode()).hexdigest()[:32]}.lost"
     if user_cache.load(file) is not None:

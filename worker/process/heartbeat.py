@@ -19,8 +19,8 @@ from graspd.service.queue.rq_queue import list_worker, unlist_worker
 from graspd.service.telemetry import HeartbeatFile
 
 log = logging.getLogger(__name__)
-#: Interval of heartbeats if three fit a lease [s]. A cancelled task must stop within two seconds, and each heartbeat
-#: reads the key of cancellations.
+#: Longest interval of heartbeats [s]. A cancelled task must stop within two seconds, and the worker looks for
+#: cancellations at this interval.
 BEAT_S: Final = 0.8
 _SHORTEST_INTERVAL_S: Final = 0.1  # least interval between two updates [s]
 _ANSWER_S: Final = 3.0  # longest wait for a response of Redis [s]

@@ -57,7 +57,7 @@ class Link:
 
     @property
     def is_stopped(self) -> bool:
-        """Check whether a signal such as SIGSTOP stopped the engine: it exists but makes no progress."""
+        """Check whether the engine makes no progress: a signal such as SIGSTOP stopped it, or it ended."""
         return self._process is not None and is_stopped(self._process.pid)
 
     def kill(self) -> None:

@@ -40,7 +40,7 @@ from graspd.worker.stages.context import StopReason
 
 log = logging.getLogger(__name__)
 _PATIENCE: Final = 60  # reconnection attempts of a worker, for about a minute: longer than a restart of Redis
-_WORKER_TTL_S: Final = 20  # time that RQ waits for a task before its maintenance [s]: its `worker_ttl` less 15
+_WORKER_TTL_S: Final = 20  # RQ's `worker_ttl` [s]: RQ waits this time less 15 s for a task before its maintenance
 #: RQ's maintenance is off: see docs/adr/0003-silence-is-measured-by-one-clock.md.
 _NEVER_S: Final = 10**9
 _REFUSED_PAUSE_S: Final = 0.5
@@ -81,7 +81,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
         self._await("service")
 
     def admit(self) -> bool:
-        """Wait for the engine's check before the first task; False if it must end. Raises EngineLost."""
+        """Wait for the engine's check before the first task; False if the worker must end. Raises EngineLost."""
         self._engine.send("check")
         return bool(self._await("ready"))
 
@@ -129,7 +129,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
                 self._engine.send("stop", reason)
                 told = reason
             if elapsed > self._limit_s + STUCK_AFTER_S:
-                log.error("the engine does not stop, and is ended")
+                log.error("the engine does not stop; it is killed")
                 self._engine.kill()
             if time.monotonic() >= due:
                 beat()
@@ -226,7 +226,7 @@ def run_worker(
     max_tasks: int | None = None,
     start: StartEngine = start_engine,
 ) -> bool:
-    """Run tasks until a stop is requested; with `burst` until none came for `idle_s` [s], with `max_tasks` that many.
+    """Run tasks until a stop is requested, `max_tasks` are done, or (`burst`) none came for `idle_s` [s].
     Return False if the worker ended because of a failure. Raises InputError: there is no such device. BusyError: Redis
     and store belong to different services. QueueUnavailable, StoreUnavailable: at the start."""
     does_all = not burst and max_tasks is None
@@ -245,7 +245,7 @@ def run_worker(
         worker = GraspWorker(queue, engine, heart, stages=stages, name=name, limit_s=settings.task_timeout_s)
         worker.check_service()
         heart.start()
-        # It holds no task yet, so a signal may end it at once. RQ sets its own handler later.
+        # The worker holds no task yet, so a signal may end it at once. RQ sets its own handler later.
         signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
         if not worker.admit():
             return False
@@ -264,6 +264,6 @@ def run_worker(
         engine.close()
         heart.stop()
         queue.close()
-    # RQ's loop also ends this way after an unexpected error.
+    # RQ's loop also returns after an unexpected error.
     is_done = not does_all and (worker.found_none or worker.tasks_done >= (max_tasks or math.inf))
     return worker.engine_is == "outgrown" or (worker.engine_is == "fit" and (is_done or worker.told_to_stop))

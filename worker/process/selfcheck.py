@@ -1,6 +1,6 @@
 """Self-check of a worker: whether its engine loads and gives plausible results.
 
-Each stage's engine runs on a ball: a grasp is validated and measured, a drop simulated, a picture rendered. This also
+Each stage's engine runs on a ball: it validates and measures a grasp, simulates a drop, or renders a picture. This also
 loads or compiles the kernels, so the first task does not wait for them."""
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def _check_scene(run: ExecutionContext) -> None:
     from graspd.worker.scenes import drop
 
     height = drop(_ball(), count=1, seed=0)["scene/object_pose"][0, 2]
-    # The pose is that of the ball's frame, with its centre as origin. The ball rests on the table within its facets.
+    # The origin of the ball's frame is its centre. Because of its facets, the height differs from the radius.
     _expect(abs(height - _RADIUS_M) < 0.1 * _RADIUS_M, f"a ball comes to rest at a height of {height:.3g} m")
 
 

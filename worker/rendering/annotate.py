@@ -41,7 +41,7 @@ def parse_channels(words: Iterable[str]) -> tuple[str, ...]:
     wanted = {word.strip() for word in words if word.strip()}
     if unknown := sorted(wanted - {*EXTRA_CHANNELS, ALL}):
         meant = did_you_mean(unknown[0], EXTRA_CHANNELS)
-        raise InputError(f"unknown channel {unknown[0]!r}; choose of {', '.join(EXTRA_CHANNELS)}, or {ALL}{meant}")
+        raise InputError(f"unknown channel {unknown[0]!r}; choose from {', '.join(EXTRA_CHANNELS)}, or {ALL}{meant}")
     return tuple(name for name in EXTRA_CHANNELS if name in wanted or ALL in wanted)
 
 

@@ -21,8 +21,8 @@ FIELD_OF_VIEW: Final = np.radians(40.0)
 BASELINE_M: Final = 0.06
 ELEVATION: Final = (np.radians(18.0), np.radians(62.0))  # elevation of a sampled camera above the table [rad]
 FILL: Final = (0.7, 1.0)  # share of the smaller field of view that the object's bounding ball fills
-NEAREST_M: Final = 0.25  # at smaller distances one picture of a stereo pair may cut the object off [m]
-AIM_JITTER: Final = 0.15  # largest distance of the optical axis from the object's centre, in bounding radii
+NEAREST_M: Final = 0.25  # least distance from the object [m]: nearer, a picture of a stereo pair may cut it off
+AIM_JITTER: Final = 0.15  # largest offset of the aim from the object's centre along each axis, in bounding radii
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ def sample_hemisphere(
 
 
 def stereo_pair(extrinsics: Floats, baseline: float) -> tuple[Floats, Floats]:
-    """Return left and right eye of a rectified pair; the right one is `baseline` [m] along camera +x."""
+    """Return left and right eye of a rectified pair, `baseline` [m] apart along the camera's x axis."""
     left, right = extrinsics.copy(), extrinsics.copy()
     left[0, 3] += 0.5 * baseline
     right[0, 3] -= 0.5 * baseline

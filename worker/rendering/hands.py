@@ -66,7 +66,7 @@ def hand_parts(hand: HandModel) -> tuple[MovingSolid, ...]:
 
 
 def drawn_parts(hand: HandModel, *, mounted: bool) -> tuple[MovingSolid, ...]:
-    """Return the drawn solids of a hand; if `mounted`, with the links above its root (bodies renumbered)."""
+    """Return the drawn solids of a hand; if `mounted`, also those of `hand.mounting` (own body numbers)."""
     above = hand.mounting if mounted else None
     return hand_parts(hand) + (() if above is None else hand_parts(above))
 

@@ -57,8 +57,8 @@ def grasp_pictures(
     samples: int = SAMPLES,
 ) -> NDArray[np.uint8]:
     """Render N grasps, root poses (N, 7) in the object frame and joints (N, J), from A sides: (N, A, H, W, 3) sRGB.
-    Azimuths [rad] are about the object's z axis; 0 looks across the direction in which the palm approaches. The hand's
-    convex pieces frame the picture of this size [px]. Raises TaskCancelled: `run.cancelled()` returned True."""
+    Azimuths [rad] are about the object's z axis; 0 looks across the direction in which the palm approaches. Object and
+    hand fill the picture of `size` [px]. Raises TaskCancelled: `run.cancelled()` returned True."""
     hand_pose = moved(np.atleast_2d(np.asarray(hand_pose, float)), np.negative(obj.centre))
     obj = obj.centred
     joints = np.atleast_2d(np.asarray(joint_positions, float))
@@ -119,7 +119,7 @@ def studio_shot(
     toward_lamp: Floats = TOWARD_LAMP,
 ) -> CameraShot:
     """Return cameras (V, 4, 4) in studio light that turns with azimuths (worlds,) [rad], so that no side is dark.
-    `world` (V,) is the world of each camera; by default its own."""
+    `world` (V,) is the world of each camera; by default, camera k is in world k."""
     return CameraShot(
         world=(np.arange(len(angles)) if world is None else world).astype(np.int32),
         extrinsics=cameras,
@@ -136,7 +136,7 @@ def studio_shot(
 def side_of(hand: HandModel, bodies: Floats) -> float:
     """Return the azimuth of a camera that looks across the palm's direction of approach [rad]."""
     towards = quat_rotate(bodies[0, 3:], hand.palm.approach)
-    # For a vertical approach of the palm, its own x axis is used.
+    # For a vertical approach of the palm, the x axis of the hand's root is used.
     flat = towards[:2] if np.hypot(*towards[:2]) > 0.2 else quat_rotate(bodies[0, 3:], np.array([1.0, 0, 0]))[:2]
     return float(np.arctan2(flat[1], flat[0]) + 0.5 * np.pi)
 

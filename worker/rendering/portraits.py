@@ -42,8 +42,8 @@ _COLUMNS: Final = 3
 #: Share of the motion from open to closed at which a hand is shown closing.
 _CLOSING_SHARE: Final = 0.6
 _ARROW: Final = Appearance(hexadecimal("#dd7432"), roughness=0.5)
-_ARROW_SHARE: Final = 0.4  # length of the arrow over the largest extent of the hand
-#: Views towards the palm [rad]: from the side on which the approach points right, and from the opposite side.
+_ARROW_SHARE: Final = 0.4  # ratio of the arrow's length to the largest extent of the hand
+#: Azimuths of the views [rad]: the approach points mainly right in the first, and towards the camera in the second.
 _HAND_AZIMUTHS: Final = tuple(np.radians([32.0, 122.0]).tolist())
 _OBJECT_AZIMUTHS: Final = tuple(np.radians([-50.0, 40.0, 130.0]).tolist())
 

@@ -1,4 +1,4 @@
-"""Setup of a render before its cameras: random properties of each scene, and stages for tracing.
+"""Setup of a render: cameras, materials and lights of each scene, and its tracers.
 
 Materials and lights are random within plausible ranges."""
 
@@ -43,11 +43,11 @@ from graspd.worker.rendering.scenery import (
 )
 from graspd.worker.rendering.tracer import Tracer
 
-#: Draws of a camera. The first that sees the second value's share of the object past the supports is used, else the
-#: best.
+#: Largest number of further draws of a camera. The first draw that sees at least this share of the object past the
+#: supports is used, else the best.
 _DRAWS: Final = 32
 _SEEN: Final = 0.8
-#: Depth of things that a pass does not show [m].
+#: Height at which hidden solids are out of every picture [m].
 _AWAY_M: Final = -50.0
 _NOWHERE: Final = np.zeros((0, 3))
 _stages: LRUCache[tuple[object, ...], Tracer] = LRUCache(4)

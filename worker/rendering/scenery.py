@@ -86,7 +86,7 @@ Supports = Sequence[HalfSpace | BoxSupport]
 
 TABLE_SIZE: Final = (1.2, 0.9, 0.04)  # a half-space is drawn as a slab whose top is its plane [m]
 TABLE: Final = (HalfSpace(),)  # default support of objects
-_FAR_M: Final = 0.35  # depth of a slab below the origin, or below a lower object [m]
+_FAR_M: Final = 0.35  # distance of an object from the origin, along a plane, above which its slab is centred at it [m]
 
 
 def slabs(supports: Supports) -> list[Box]:

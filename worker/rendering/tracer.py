@@ -48,7 +48,7 @@ class Tracer:
     """Solids in many worlds. Build once, then `place` and `shoot` repeatedly."""
 
     def __init__(self, solids: Sequence[Solid | Box], device: str) -> None:
-        """`solids`: the P solids of each world, same in every world; `device`: of Warp."""
+        """`solids`: the P solids that every world has; `device`: name of the Warp device."""
         backend.start()
         self.device = device
         shapes: NDArray[Any] = np.zeros(len(solids), _PLACED.numpy_dtype())
@@ -83,8 +83,8 @@ class Tracer:
 
     def shoot(self, shot: CameraShot, run: ExecutionContext = DEFAULT_CONTEXT) -> Pictures:
         """Trace all cameras.
-        The threads of `run` share the rows of each picture; a GPU takes many pictures at once. `run` receives finished
-        pictures and is polled before each launch. Raises TaskCancelled: `run.cancelled()` returned True."""
+        The threads of `run` share the rows of each picture; a GPU takes many pictures at once. `run` receives the
+        number of finished pictures. Raises TaskCancelled: `run.cancelled()` returned True; polled before launches."""
         cuda = wp.get_device(self.device).is_cuda
         threads = 1 if cuda else min(run.cores, shot.height)
         count, pixels = len(shot.world), len(shot.world) * shot.height * shot.width
@@ -157,7 +157,7 @@ class LightPass:
 
     shift: tuple[float, float]  # offset of the ray from the pixel's centre [px]
     toward: Floats  # (3,) unit direction to the light
-    lamp_weight: float  # weights with which the mean over all passes is one lamp and one sky
+    lamp_weight: float  # weights such that the mean over all passes is one lamp and one sky
     sky_weight: float
 
 

@@ -1,4 +1,4 @@
-"""Pictures and animations of grasps along their trajectories, with one camera per grasp on a good side."""
+"""Pictures and animations of grasps along their trajectories, from the sides that show most."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ from graspd.worker.scenes.neighbours import Neighbours
 #: Postures of a strip, where a grasp has them.
 STRIP: Final = ("standoff", "pregrasp", "grasp", "lift")
 FREE_STRIP: Final = ("pregrasp", "grasp", "squeeze")
-#: Candidate sides: number around, and their heights above the horizon [rad].
+#: Candidate sides: number of azimuths, and heights above the horizon [rad].
 _AROUND: Final = 16
 _HEIGHTS: Final = tuple(np.radians([20.0, 35.0, 52.0]).tolist())
 _APART: Final = np.radians(50.0)  # least angle between two sides of one grasp, if possible [rad]
@@ -101,7 +101,7 @@ def trajectory_pictures(
 
 
 class _Stage:
-    """One tracer for all grasps: the frames of one grasp are its worlds."""
+    """One tracer for all grasps: its worlds are the frames of one grasp."""
 
     def __init__(
         self,
@@ -163,8 +163,8 @@ class _Stage:
 
     def _best_sides(self, world: int, near: Floats, first: float, count: int) -> list[tuple[float, float]]:
         """Return azimuth and height [rad] of the sides that show most, apart from one another.
-        The score sums the visible parts of object and hand, counted in labels, each divided by its largest value of all
-        sides. Ties go to the side that looks across the palm's approach."""
+        The score sums the square roots of the visible areas of object and hand. Each area is relative to its largest
+        value over all sides. A small bonus favours sides that look across the palm's approach."""
         sides = [(first + 2 * np.pi * a / _AROUND, h) for h in _HEIGHTS for a in range(_AROUND)]
         centre = 0.5 * (near.min(axis=0) + near.max(axis=0))
         far = 1.15 * float(np.linalg.norm(near - centre, axis=1).max()) / np.sin(FIELD_OF_VIEW / 2)
@@ -175,7 +175,7 @@ class _Stage:
         seen = self.tracer.shoot(replace(glance, shaded=False), self.run.quiet()).shape
         thing = len(self.boxes)
         first_of_hand = thing + 1 + len(self.others)
-        # A forearm may be out of view.
+        # Links above the hand's root, such as a forearm, do not count.
         fingers = (seen >= first_of_hand) & (seen < first_of_hand + len(drawn_bodies(self.hand)))
         shares = [(seen == thing).sum(axis=(1, 2)), fingers.sum(axis=(1, 2))]
         score = sum(np.sqrt(share / max(1, share.max())) for share in shares)
@@ -196,7 +196,7 @@ KINDS: Final[dict[str, dict[str, Any]]] = {
     ".webp": {"format": "WEBP", "quality": 82, "method": 4},
     ".png": {"format": "PNG", "default_image": False},
 }
-_PALETTE_OF: Final = 9  # pictures whose colours make the palette of a GIF
+_PALETTE_OF: Final = 9  # number of pictures whose colours make the palette of a GIF
 
 
 def animation_kind(suffix: str) -> str:

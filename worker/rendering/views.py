@@ -29,7 +29,7 @@ Arrays = dict[str, NDArray[np.generic]]
 
 @dataclass(frozen=True)
 class Extras:
-    """Options of a render beyond an object alone from sampled cameras, in colour, depth and segmentation."""
+    """Additions to a render: channels, given cameras, neighbours, a hand, supports."""
 
     channels: Sequence[str] = ()  # of `service.model.domain.EXTRA_CHANNELS`
     cameras: GivenCameras = SAMPLED  # given intrinsics and poses instead of sampled ones
@@ -55,7 +55,7 @@ def render(
     samples: int = SAMPLES,
     extras: Extras = NO_EXTRAS,
 ) -> Arrays:
-    """Render every scene from sampled or given cameras, all in one launch per pass.
+    """Render every scene from sampled or given cameras.
     Raises InputError: a count or size is out of range. TaskCancelled: `run.cancelled()` returned True.
 
     Args:
@@ -65,13 +65,13 @@ def render(
         stereo: a rectified left and right picture per placement.
         width, height: picture size [px].
         seed: of cameras, materials and lights; same seed, same pixels. Scene s depends on (seed, s) alone.
-        run: receives finished pictures; polled before each pass. Pixels do not depend on its threads.
+        run: receives the number of finished pictures; polled before each launch. Pixels do not depend on its threads.
         baseline_m: distance of the eyes.
         samples: rays per pixel.
-        extras: further channels, given cameras, other objects, a hand.
+        extras: further channels, given cameras, neighbours, a hand, supports.
 
     Returns:
-        Columns of a views shard with V = S * views * (2 if stereo else 1) pictures, by scene, placement and eye.
+        Columns of a views shard with V = S * views * (2 if stereo else 1) pictures, sorted by scene, placement and eye.
         Labels come from the ray through the pixel's centre; in `image/depth` the table is a surface like any other."""
     poses = np.asarray(object_pose, float).reshape(-1, 7)
     plan = CameraPlan(views, width, height, baseline_m if stereo else None, extras.cameras)

@@ -91,7 +91,7 @@ def _neighbour(store: Store, name: str, digest: str) -> ObjectModel:
 
 
 def cache_network(store: Store, message: TaskMessage) -> None:
-    """Cache the network that a task's method takes, if any, under the digest in the method's options.
+    """Cache the network that a task's method uses, if any, under the digest in the method's options.
     Raises NotFoundError, InputError: it is not in the store, or does not match its digest."""
     if not (digest := message.request.network):
         return
@@ -104,7 +104,7 @@ def cache_network(store: Store, message: TaskMessage) -> None:
 
 
 def neighbour_attributes(message: TaskMessage) -> dict[str, Attribute]:
-    """Return a shard's attributes for the objects beside its own; empty if there are none."""
+    """Return a shard's attributes for the neighbours of its object; empty if there are none."""
     beside = message.request.beside
     if not beside:
         return {}
@@ -120,7 +120,7 @@ def _cached(key: Hashable, load: Callable[[], Any]) -> Any:
 
 
 def prepared_object(store: Store, digest: str, *, name: str, face_error_m: float) -> ObjectModel:
-    """Load an object as `load_object` does, from the store if it was prepared to this bound before.
+    """Load an object as `load_object` does; reuse a stored one with the same `face_error_m`.
     Raises MeshError: the mesh cannot be used. StoreUnavailable."""
     # A change of a prepared mesh changes its grasps, and with them the revision of their stage.
     terms = {"face_error_m": face_error_m, "revision": STAGE_REVISIONS["synthesize"]}

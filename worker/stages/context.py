@@ -90,8 +90,8 @@ def shard_of(
     message: TaskMessage, output: Output, *, device: str, seconds: float, worker: str, lost: ShardManifest | None = None
 ) -> tuple[ShardManifest, bytes]:
     """Build the shard of a stage: its manifest and its HDF5 bytes.
-    The new file keeps time and worker of `lost`, the manifest of the file that it replaces. Raises InputError: the
-    columns do not fit the schema."""
+    The new file keeps times and package version of `lost`, the manifest of the file that it replaces. Raises
+    InputError: the columns do not fit the schema."""
     kind = SHARD_KINDS[message.stage]
     request = message.request
     attributes: dict[str, Attribute] = {

@@ -1,5 +1,5 @@
-"""Self-test of a hand: grasps of three plain objects of suitable size. Grasps are validated free at level standard, and
-lifted off a table."""
+"""Self-test of a hand: grasps of a sphere, a box and a cylinder of suitable size.
+Free grasps are validated at level standard; other grasps lift the objects off a table."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ TABLE_SCENES: Final = 2
 OF_OPENING: Final = 0.55
 OF_REACH: Final = 0.5
 WIDTH_M: Final = (0.012, 0.08)
-STRONG_N: Final = 1000.0  # sum of normal forces of a second squeeze [N]: for the payload, actuators reach their limits
-#: A servo that goes from zero to its limit within less fingertip motion presses with arbitrary force [m].
+STRONG_N: Final = 1000.0  # sum of normal forces of the squeeze for the payload [N]: actuators reach their limits
+#: A servo that reaches its torque limit within less fingertip motion than this [m] presses with arbitrary force.
 SOFT_M: Final = 0.0015
 log = logging.getLogger(__name__)
 
@@ -71,7 +71,7 @@ class SelfTest:
     table: float
     table_n: int
     best: BestGrasp | None = None  # None: no grasp held
-    lost: float = 0.0  # share of failed grasps that lost the object during closing; in other ones the pushes move it
+    lost: float = 0.0  # share of failed grasps that lost the object during closing; the others fail under the pushes
     give_m: float = math.inf  # fingertip motion within which its stiffest servo goes from zero to its limit [m]
     limit: Limit | None = None  # payload on a table at full actuator force; None: it lifts nothing
 
@@ -126,7 +126,7 @@ def self_test(
     hand: HandModel, run: ExecutionContext = DEFAULT_CONTEXT, *, grasps: int = GRASPS, on_table: int = TABLE_GRASPS
 ) -> SelfTest:
     """Test grasps of a sphere, a box and a cylinder with the defaults of `JobOptions`, in equal numbers.
-    Then test grasps of the same objects on a table. A time limit would change the verdict on a busy machine.
+    Then test grasps of the same objects on a table. There is no time limit: a busy machine gives the same verdict.
     Raises InputError: a hand finds no start around one of the objects. TaskCancelled."""
     width = fitting_width(hand)
     held: dict[str, list[bool]] = {}

@@ -48,7 +48,7 @@ def run(message: IngestMessage, context: TaskContext) -> None:
         from graspd.worker.hands.load import load_hand
         from graspd.worker.stages.hand_self_test import self_test_facts
 
-        # A hand that holds no grasp of a plain object is a result, not an error.
+        # A hand that holds none of the test objects is a result, not an error.
         load = partial(load_hand, files, name=message.name, digest=message.digest)
         found["facts"]["self_test"] = self_test_facts(load, context.run)
     if model:
@@ -75,8 +75,8 @@ def check_in_child(
     memory_bytes: int = MEMORY_LIMIT_BYTES,
     cpu_s: int = CPU_LIMIT_S,
 ) -> tuple[dict[str, Any], bytes]:
-    """Check a hand or object; return the result, or a refusal that states how the check crashed.
-    The model for viewers (glTF) is empty after a refusal, or if making it would take too long.
+    """Check an upload; return the result (a refusal if the check crashed) and the model for viewers.
+    The model (glTF) is empty after a refusal, for a network, or if making it would take too long.
     Raises OSError: the check was killed, or the disk is full. TaskCancelled: the task should stop."""
     with tempfile.TemporaryDirectory(prefix="graspd-ingest-") as folder:
         source, target, errors = (Path(folder) / file for file in ("files.zip", "check.json", "errors.txt"))
@@ -158,7 +158,7 @@ def _child(kind: str, name: str, source: str, target: str, memory_bytes: str, cp
 
         found = check_hand(files, name)
     elif AssetKind(kind) is AssetKind.NETWORK:
-        # The API checks networks; its result was lost or damaged.
+        # The API checks networks: a check here replaces its lost or damaged result.
         found = check_network(files, name)
     else:
         from graspd.worker.objects.check import check_object
@@ -168,7 +168,7 @@ def _child(kind: str, name: str, source: str, target: str, memory_bytes: str, cp
     if found["verdict"] != "refuse" and kind != AssetKind.NETWORK and time.process_time() < _MODEL_CPU_S:
         from graspd.worker.stages.models import model_of
 
-        # The result is kept even if its picture fails.
+        # The result is kept even if its model cannot be made.
         with contextlib.suppress(Exception):
             model = model_of(AssetKind(kind), name, files)
             if len(model) <= _MODEL_BYTES:

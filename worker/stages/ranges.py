@@ -20,7 +20,7 @@ from graspd.worker.stages.context import Output
 
 #: Axes along which the rows of batches are concatenated; columns with another axis are common to all.
 _ROWS: Final = ("N", "S", "K")
-#: Columns that only some batches of a job have, with the value in the rows of the others.
+#: Columns that only some batches of a job have, each with the fill value for the other batches.
 _OF_SOME: Final = {"quality/recheck": np.int8(-1)}
 
 

@@ -53,7 +53,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
 
 
 def _drawn(base: Shard, message: TaskMessage, context: TaskContext) -> DrawnHand | None:
-    """Select the best valid grasp of each scene; None if there is no grasp at all."""
+    """Select the best valid grasp of each scene; None if no scene has one."""
     hand = hand_of(context.store, message)
     among = validity.selection(base.arrays, unvalidated=message.request.validation == "none")
     rows = best_in_scenes(base.arrays, among)

@@ -1,4 +1,4 @@
-"""Stage scene: before grasps that are planned in scenes; otherwise after the grasps, with their clearance."""
+"""Stage scene: makes scenes in which grasps are then planned, or transfers free grasps to scenes."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def _before_grasps(message: TaskMessage, context: TaskContext) -> Output:
     Raises SceneError: they do not fit, penetrate each other, or do not come to rest."""
     hand, obj = hand_of(context.store, message), object_of(context.store, message)
     place = message.request.place
-    # The first batch equals the scenes of `graspd synth` with the same seed.
+    # The first batch has the same scenes as `graspd synth` with the same seed.
     seed = batch_seed(message) if message.batch else message.request.seed
     others = neighbours_of(context.store, message)
     context.check()
@@ -70,7 +70,7 @@ def _before_grasps(message: TaskMessage, context: TaskContext) -> Output:
 
 
 def _after_grasps(message: TaskMessage, context: TaskContext, base: Shard, rows: range) -> Output:
-    """Drop the object `request.scenes` times; transfer the base shard's grasps, numbered within `rows`."""
+    """Drop the object `request.scenes` times; transfer the base shard's grasps `rows`, numbered from 0."""
     hand, obj = hand_of(context.store, message), object_of(context.store, message)
     context.check()
     scenes = drop(obj, count=message.request.scenes, seed=batch_seed(message))

@@ -40,9 +40,9 @@ _OF_SCENES: Final = ("scene/object_pose", "scene/rest_probability", "scene/neigh
 
 
 def run(message: TaskMessage, context: TaskContext) -> Output:
-    """Plan and validate `message.count` valid grasps within the job's budget.
-    Raises SceneError: no hand reaches into the scenes, the first batch finds no grasp, or the method cannot plan in
-    them. LoadError: a job's first batch finds none because the payload is far too small."""
+    """Plan and validate `message.count` grasps within the job's budget.
+    Raises SceneError: the hand does not reach into the scenes, the method cannot plan in them, or the first batch finds
+    no grasp. LoadError: a job's first batch finds none because the payload is far too small."""
     hand, obj = hand_of(context.store, message), object_of(context.store, message)
     cache_network(context.store, message)
     columns = _scene_columns(message, context)
@@ -63,7 +63,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
             empty_on=(NoStartFound,) if scenes else (),
         )
     except InputError as error:
-        # Errors of hand and object have their own classes; the classes below mean that no hand reaches into the scene.
+        # Errors of hand and object have their own classes; those below mean that the hand does not reach into scenes.
         if scenes and type(error) in (InputError, NoStartFound):
             raise SceneError(str(error)) from None
         raise

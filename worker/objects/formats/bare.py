@@ -111,7 +111,7 @@ class _Ascii:
 
 
 class _Binary:
-    """Reader of all rows of fixed width at once, and of rows with lists one by one."""
+    """Reads rows of equal width at once, and other rows one by one."""
 
     def __init__(self, body: bytes, order: str) -> None:
         self._body = body

@@ -19,7 +19,7 @@ from graspd.worker.objects.formats.obj import Nearby, colour_of, no_files
 from graspd.worker.objects.formats.soup import Soup, soup_of, triangulate, walk
 
 Element = ElementTree.Element
-#: Vertices (V, 3), triangles (F, 3) and the symbol of the material of a primitive.
+#: Vertices (V, 3), triangles (F, 3) and material symbol of a primitive.
 _Primitive = tuple[np.ndarray, np.ndarray, str]
 
 

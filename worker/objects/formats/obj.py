@@ -1,4 +1,4 @@
-"""Wavefront OBJ: positions, polygons, and colours of vertices, materials or their pictures' mean."""
+"""Wavefront OBJ: positions, polygons, and colours from vertices, materials or the mean of textures."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def _material_colours(
 
 
 def _face_colours(shades: list[list[bytes]], faces: np.ndarray) -> np.ndarray | None:
-    """Return (F, 3), NaN without a colour; quantised coarsely, since each colour is drawn as a part."""
+    """Return colours (F, 3), NaN: none; quantised coarsely, since each colour is drawn as a part."""
     if all(shade is _NO_COLOUR for shade in shades) or (faces >= len(shades)).any() or (faces < 0).any():
         return None
     known = np.array(shades, dtype="S40").astype(float).reshape(-1, 3)

@@ -29,7 +29,7 @@ class Soup:
     """(F, 3) sRGB colour of each face, 0 .. 1, NaN if not stated; None: no face has one."""
 
     def by_colour(self) -> list[tuple[tuple[float, float, float] | None, NDArray[np.intp]]]:
-        """Return each colour with the indices of its faces; None for those without."""
+        """Return each colour with the indices of its faces; None: faces without a colour."""
         if self.colours is None:
             return [(None, np.arange(len(self.faces)))]
         # NaN is not equal to itself; no colour is below 0.
@@ -107,9 +107,9 @@ def check_face_count(count: int) -> None:
 
 Ints = NDArray[np.int64]
 
-#: Limit on the sum of squared corner numbers of re-entrant polygons; triangulation needs up to 2 ns per unit.
+#: Limit on the sum of squared corner counts of re-entrant polygons; triangulation needs up to 2 ns per unit.
 MAX_SQUARES: Final = 10**9
-#: Least area, relative to the polygon's, of a triangle that counts as against the polygon's winding.
+#: Least ratio of areas, triangle to polygon, at which a triangle of opposite winding counts.
 _AGAINST: Final = 1e-9
 
 

@@ -62,8 +62,8 @@ def passes_through(lower: wp.vec3f, upper: wp.vec3f, origin: wp.vec3f, inverse: 
 
 @wp.func
 def box_distance(half: wp.vec3f, origin: wp.vec3f, direction: wp.vec3f):
-    """Return the distance to the first face of a box, or from inside to the exit face, and its axis.
-    The axis is that of the face's normal; -1: no hit."""
+    """Return the distance to the first face of a box, or from inside to the exit face; -1: no hit.
+    Also return the axis of the face's normal."""
     inverse = inverse_of(direction)
     a = wp.cw_mul(-half - origin, inverse)
     b = wp.cw_mul(half - origin, inverse)
