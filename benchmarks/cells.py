@@ -1,8 +1,8 @@
 """Cached candidates of a hand on an object with their verdicts and metrics, shared by the studies of quality.
 
-A cell is a pair of hand and object with a number of grasps of one revision of synthesize, planned as in a job. Its
-folder caches all results, so an interrupted study resumes. Studies with equal numbers of grasps share grasps and
-verdicts."""
+A cell is a pair of hand and object, with a number of grasps and a revision of synthesize. Grasps are planned as in a
+job. A cell's folder caches all results, so an interrupted study resumes. Studies with equal numbers of grasps share
+grasps and verdicts."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ POSTURES = ("grasp", "pregrasp", "squeeze")
 
 @dataclass
 class Cell:
-    """Standard candidates of one hand on one object."""
+    """Candidates of one hand on one object at fidelity standard."""
 
     folder: Path
     hand_name: str
@@ -118,7 +118,7 @@ class Cell:
 
 
 def planned(hand: HandModel, obj: ObjectModel, *, count: int, seed: int, fidelity: str = "standard") -> GraspSet:
-    """Plan candidates of a free object as in a job, with its rollout, about the centre of the object.
+    """Plan candidates of a free object as in a job: with rollouts, and around the object's centre.
     Positions are rounded to the job's grid."""
     rollout = rollout_on(DEFAULT_CONTEXT, hand, obj.centred, lambda: decompose(obj.centred), in_scenes=False)
     found = synthesize(hand, obj.centred, PlanRequest(count, FIDELITIES[fidelity], seed, rollout=rollout))

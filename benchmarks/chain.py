@@ -7,10 +7,10 @@ BEFORE and AFTER are checkouts of graspd; DATA_DIR holds hands/. One thread runs
 so other load changes the ratios little. Nothing is stored or sent: docs/results/service.md has these costs.
 
 With --service, a job of a built-in hand and object runs through a whole service of each checkout: submitted over HTTP,
-planned, validated, measured, stored, indexed. A small job loads everything first. Processor time is that of all
-processes of the service. With --pictures, jobs have the options of examples/million/million.toml: per batch, six
-pictures of the object at rest on a table, and eight rechecks. Version 0.2 gives every object a mass of 0.1 kg: compare
-with it by `--after '{"mass": 0.1}'`, and grasps on tables by `--job '{"scene": "table", "scenes": 4}'`.
+planned, validated, measured, stored, indexed. A small untimed job first fills the caches. Processor time is that of all
+processes of the service. With --pictures, jobs have the options of examples/million/million.toml: eight rechecks, and
+per batch six pictures of the object at rest on a table. Version 0.2 gives every object a mass of 0.1 kg: for
+comparisons with it, use `--after '{"mass": 0.1}'`. `--job '{"scene": "table", "scenes": 4}'` plans on tables.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ PILOT: Final = {"scenes": 2, "views": 3, "rechecks": 8, "budget": 4}
 def environment_of(root: Path) -> dict[str, str]:
     """Return an environment in which a program uses the code of a checkout, not the installed one."""
     environment = {key: value for key, value in os.environ.items() if not key.startswith("GRASPD_")}
-    # Allow bytecode caches: without them each process would compile all modules, unlike a user's.
+    # Allow bytecode caches, as users do; without them each process would compile all modules.
     environment.pop("PYTHONDONTWRITEBYTECODE", None)
     return environment | {"PYTHONPATH": str(root)}
 
@@ -192,12 +192,12 @@ def main() -> None:
     parser.add_argument("--pictures", action="store_true", help="with --service: also pictures, as in the pilot")
     parser.add_argument("--job", type=json.loads, default={}, help="with --service: further options of the jobs")
     parser.add_argument("--after", dest="after_job", type=json.loads, default={}, help="the same, for AFTER only")
-    parser.add_argument("--grasps", type=int, help="of each pair, in batches of 32: 64 candidates, or 256 valid ones")
+    parser.add_argument("--grasps", type=int, help="grasps of each pair, a multiple of 32; default: 64; --service: 256")
     parser.add_argument("--pairs", nargs="*", default=["allegro:mug", "shadow:bottle"])
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
     if not given.service and given.data is None:
-        parser.error("without --service the folder of hands is needed")
+        parser.error("without --service, DATA_DIR is needed")
     found = compare_services(given) if given.service else compare_stages(given)
     if given.json:
         given.json.write_text(json.dumps(found, indent=1) + "\n")

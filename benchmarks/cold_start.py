@@ -4,8 +4,8 @@ usage: python -m benchmarks.cold_start CHECKOUT ... [--hand allegro] [--object m
            [--no-service | --command]
 
 An untimed run first fills the user's cache, for example with kernels. Wall time depends on other load. Runs of the
-checkouts therefore alternate, and the table has the least time besides the median. CPU time, of all processes together,
-depends little on other load. The cost of a seed's first grasp depends on whether the first candidates hold."""
+checkouts therefore alternate, and the command's table has the least time besides the median. CPU time, of all
+processes together, depends little on other load. A seed costs more if its first candidate does not hold."""
 
 from __future__ import annotations
 

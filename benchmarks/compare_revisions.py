@@ -3,17 +3,17 @@
     python -m benchmarks.compare_revisions BEFORE AFTER [--work FOLDER] [--methods fast_graspd,autograsp] [--no-job]
 
 BEFORE and AFTER are folders with a checkout each (`git worktree add`, or `git archive REVISION | tar -x -C FOLDER`).
-Both use the running Python, so its environment must suit both. The program compares
+Both run in the current Python environment, which must suit both. The program compares
 
 - the OpenAPI document: removed or changed parts are differences, added parts are listed;
 - the help of every command, line by line;
 - shards of `graspd synth` for every built-in hand, on the CPU: arrays bit for bit with type, shape, chunks and
 compression, and all attributes except those of the run (date, seconds);
-- the store of a small job through the whole service (`graspd demo`). Compared are names, shards as above, JSON records
-without times, sizes and checksums, and all other objects byte for byte.
+- the store of a small job through the whole service (`graspd demo`): names; shards as above; JSON records, except
+times, sizes and checksums; other objects byte for byte.
 
-Fields added to a record are listed and are not differences. The output also has lines and modules of each package. Exit
-code 1: a difference exists."""
+Fields added to a record are listed and are not differences. The output also counts lines and modules of each package.
+Exit code 1: a difference exists."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ ROOMS: Final = (
 )
 #: Attributes of a shard that depend on the run, not on its result.
 OF_THE_RUN: Final = {"seconds", "created"}
-#: Fields of a record that depend on the run. Checksums cover times; shards are compared by their attributes.
+#: Fields of a record that depend on the run; checksums cover times, and attributes are compared in shards.
 PASSING: Final = {"created", "origin", "at", "seconds", "sha256", "checksum", "size_bytes", "worker", "attributes"}
 #: Folders of a store with random identities of each service.
 DRAWN: Final = {"marks", "service"}
@@ -136,7 +136,7 @@ def text_differences(before: str, after: str) -> list[str]:
 
 
 def shard_differences(before: Path, after: Path) -> list[str]:
-    """Yield differences of two shards: datasets bit for bit, and attributes except those of the run."""
+    """Return differences of two shards: datasets bit for bit, and attributes except those of the run."""
     if before.read_bytes() == after.read_bytes():
         return []
     with h5py.File(before) as one, h5py.File(after) as two:

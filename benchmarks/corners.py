@@ -36,10 +36,10 @@ PLACES: Final = {
 WALL: Final = (0.02, 0.15)
 HEAD = """# Lifts beside walls and among neighbours
 
-`python -m benchmarks.corners DATA`: shares of {grasps} candidates on a box of 50 x 60 x 80 mm that are clear of
-obstacles, that lift, and that lift at half friction, by the gap to the obstacles. Seed {seed}, density 700 kg/m3.
-*Slot*: walls on both sides along x, as high as the box. *Neighbours*: boxes of the same size on all four sides. No
-grasp lifts if the gaps on every axis are narrower than a fingertip (Allegro 24 mm, Barrett 19 mm, Shadow 15 mm).
+`python -m benchmarks.corners DATA`: {grasps} candidates on a box of 50 x 60 x 80 mm for each hand, place and gap.
+Columns are shares that are clear of obstacles, that lift, and that lift at half friction. Seed {seed}, density 700
+kg/m3. *Slot*: walls on both sides along x, as high as the box. *Neighbours*: boxes of the same size on all four sides.
+No grasp lifts if the gaps on every axis are narrower than a fingertip (Allegro 24 mm, Barrett 19 mm, Shadow 15 mm).
 
 """
 

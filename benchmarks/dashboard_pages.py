@@ -4,7 +4,7 @@ usage: python -m benchmarks.large_index --data-dir DIR
        python -m benchmarks.dashboard_pages --data-dir DIR [--repeats 20] [--paint]
 
 Times are in milliseconds, for sequential requests to a warm server with the index in DIR. `cpu` is the processor time
-of a request including the client, which is independent of other load. With --paint the table also has the time from
+of a request including the client; it depends little on other load. With --paint the table also has the time from
 opening a page in headless Chromium to its first contentful paint, over loopback."""
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def say(line: str) -> None:
 
 
 def pages(services: Services) -> list[str]:
-    """Return one address for each kind of page that the index can show."""
+    """Return addresses of pages of every kind that the index can show."""
     jobs = [job.id for job in services.index.jobs.page(limit=3).items]
     pairs = services.index.overview.matrix()[:1]
     found = ["/", "/?state=failed", "/datasets", *(f"/jobs/{job}" for job in jobs), "/grasps", "/grasps?view=table"]

@@ -20,7 +20,7 @@ NEAR_MM = (5, 10, 20)
 
 
 def line(cell: Cell) -> tuple[str, list[int]]:
-    """Return a table row, and the numbers of pairs closer than each of `NEAR_MM` and of all pairs."""
+    """Return a table row and numbers of pairs: those closer than each of `NEAR_MM`, then all."""
     grasp = cell.grasps.grasp
     rows, others = np.triu_indices(len(grasp), 1)
     apart = 1e3 * distances(hand_points(cell.hand, grasp), rows, others)

@@ -31,11 +31,11 @@ from graspd.worker.validation.validator import validate
 #: Largest numbers of objects per hand, and of failed grasps per object.
 WORST, SHOWN = 3, 3
 EDGE = 260
-#: A body is a shell if its volume over half its surface is less [mm]; convex pieces are at most 0.85 mm too thick.
+#: A body is a shell if volume / (surface / 2) is less than this [mm]; convex pieces are at most 0.85 mm too thick.
 THIN_MM = 8.0
-#: An object is wide for a hand if its pads open to less than this multiple of its least extent.
+#: An object is wide for a hand whose pads open to less than this multiple of the object's least extent.
 ROOMY = 1.25
-#: Excess of penetration in MuJoCo over the mesh, relative to held grasps, from which on it counts as a cause [mm].
+#: Penetration in MuJoCo minus that on the mesh is a cause if it exceeds that of held grasps by this [mm].
 PUSHED_MM = 0.3
 
 
@@ -135,12 +135,10 @@ def main() -> None:
         "# Remaining failures\n",
         f"{args.grasps} candidates on each of {len(args.objects or []) or 'all'} objects at fidelity `standard`, seed "
         f"{SEED}, validated at level `standard` (revision {STAGE_REVISIONS['synthesize']} of synthesize). For each "
-        "hand, "
-        f"up to {WORST} objects with most failures are shown. Pictures show the moment of contact: up to three failed "
-        "grasps, then one that holds. Their *margin* is the worst motion over its limit. Figures of a pair are medians "
-        "over failed grasps; those in brackets are medians over held grasps. Made by `python -m benchmarks.failures "
-        "DATA "
-        "--objects ...`.\n",
+        f"hand, the page shows at most {WORST} objects, those with most failures. Pictures show the moment of contact: "
+        "up to three failed grasps, then one that holds. *Margin*: largest ratio of a motion to its limit. Numbers "
+        "below a table are medians over failed grasps; those in brackets are medians over held grasps. Made by "
+        "`python -m benchmarks.failures DATA --objects ...`.\n",
     ]
     told: list[dict[str, Any]] = []
     drawn: set[Path] = set()

@@ -1,21 +1,21 @@
 #!/usr/bin/env bash
-# Time from `git clone` to the first grasps of one's own hand, for docs/how-to/hands.md: each step with its seconds.
+# Time of each step from `git clone` to the first grasps of one's own hand, for docs/how-to/hands.md.
 # usage: benchmarks/first_grasp.sh REPOSITORY HAND [OBJECT]
 #   REPOSITORY  what to clone: an address or a folder
 #   HAND        a URDF, xacro or MJCF, its folder, or a ZIP; or PACKAGE:PATH, a file of a package that pip finds
 #   OBJECT      a mesh or a built-in object (block)
-# Everything happens in an empty folder that is HOME as well: no cache of pip, of kernels or of objects is there.
+# All steps run in an empty folder, which is also HOME: there are no caches of pip, kernels or objects.
 set -euo pipefail
 repository=${1:?usage: first_grasp.sh REPOSITORY HAND [OBJECT]}; hand=${2:?usage: first_grasp.sh REPOSITORY HAND [OBJECT]}
 object=${3:-block}
 work=$(mktemp -d); trap 'rm -rf "$work"' EXIT
-# What says where packages come from is no cache.
+# Keep the configuration of pip, which may name a package index.
 [ -z "${PIP_CONFIG_FILE:-}" ] && [ -f "$HOME/.config/pip/pip.conf" ] && export PIP_CONFIG_FILE="$HOME/.config/pip/pip.conf"
 export HOME=$work XDG_CACHE_HOME=$work/cache PIP_NO_CACHE_DIR=1
 unset VIRTUAL_ENV PYTHONPATH
 TIMEFORMAT='%R %U %S'
 began=$(date +%s.%N)
-# Clock time and processor time of each step: on a busy machine the second tells more.
+# Wall time and processor time of each step; processor time depends less on other load.
 step() { # name command ...
     local name=$1 took; shift
     took=$({ time "$@" > "$work/said" 2>&1; } 2>&1) || [ $? = 3 ] || { cat "$work/said" >&2; exit 1; }

@@ -4,10 +4,10 @@ usage: python -m benchmarks.fleet [--workers 64 512 4096] [--seconds 20] [--task
                                   [--sqlite] [--s3] [--json FILE]
 
 Each number of workers has two runs. In the first run, all workers hold tasks, send heartbeats and report progress;
-`--rate` tasks end per second. The age of the oldest event that is not in the index, and the time to read all leases are
-measured. In the second run, tasks take no time; the number of tasks per second through controller and index is
-measured. All processes share this machine, so the processor time of each part is also counted.
-`benchmarks.fleet_workers` simulates the workers."""
+`--rate` tasks end per second. It measures the age of the oldest event that is not in the index, and the time to read
+all leases. In the second run, tasks take no time; it measures the number of tasks per second through controller and
+index. All processes share this machine, so the processor time of each part is also counted. `benchmarks.fleet_workers`
+simulates the workers."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Result:
     events: float
     """Events per task in the second run."""
     objects: float
-    """Objects of the store that the controller reads per task: manifests."""
+    """Manifests in the store per task; the controller reads each once."""
 
 
 class Machine:
@@ -225,7 +225,6 @@ def _answers(services: Services) -> bool:
 
 
 def _started(stack: ExitStack, command: Sequence[str], environment: dict[str, str]) -> int:
-    # The benchmark may run at low priority, but the measured services must not.
     process = subprocess.Popen(command, env=os.environ | environment, stdout=subprocess.DEVNULL)
     stack.callback(process.wait)
     stack.callback(process.terminate)

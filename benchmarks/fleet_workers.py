@@ -4,7 +4,7 @@ usage: python -m benchmarks.fleet_workers WORKERS TASK_S      (settings from the
 
 A worker that holds a task sends heartbeats and progress. After `TASK_S` seconds it writes the manifest of its shard and
 reports the end of the task. Manifests are copies of one real manifest under other names. Shards are not written,
-because no controller reads them. Commands of many workers share a pipeline, because a thousand interpreters do not fit
+because no controller reads them. One process with shared pipelines replaces a thousand interpreters, which do not fit
 on the measured machine. The load on Redis is the same."""
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ usage: python -m benchmarks.forearm DATA_DIR [--hand shadow/shadow_hand_right.ur
            [--grasps 16] [--scenes 4] [--seed 31] [--scene table] [--beside 048_hammer ...] [--json OUT]
        DATA_DIR holds hands/ and objects/
 
-Candidates of each object are planned and validated as `graspd synth --want candidates --threads 1` does. Then yourdfpy,
+Candidates of each object are planned and validated as by `graspd synth --want candidates --threads 1`. Then yourdfpy,
 which shares no code with graspd, places the collision meshes of all links above the root. Wrist angles are the stored
 ones, or 0. Results on approach, grasp and lift are the lowest height of the meshes' vertices, and the common volume
 with supports or neighbours, by manifold3d. Seconds are CPU time of planning and validation per candidate."""
@@ -55,7 +55,7 @@ class Upstream:
             self.links.append(root)
 
     def at(self, joints: dict[str, float]) -> list[trimesh.Trimesh]:
-        """Their collision meshes in the frame of the root."""
+        """Return the collision meshes of the links in the frame of the root."""
         self.robot.update_cfg(joints | dict.fromkeys(set(self.robot.actuated_joint_names) - set(joints), 0.0))
         scene, found = self.robot.collision_scene, []
         to_root = np.linalg.inv(self.robot.get_transform(self.root, collision_geometry=True))

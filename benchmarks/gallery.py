@@ -46,9 +46,9 @@ class Entry:
     """Path below the sources; empty: built in."""
     options: dict[str, Any] = field(default_factory=dict)
     said: str = ""
-    """Options of the command line."""
+    """The options in words, for the page."""
     sides: tuple[float, float] = SIDES
-    """Direction of the camera."""
+    """Directions of the camera [rad]."""
 
 
 _AIRO = ("airo-models, MIT", "airo_models/grippers")
@@ -99,7 +99,7 @@ HANDS = (
         "robotiq-2f-140",
         "Robotiq 2F-140",
         "robotiq_gripper_140.xml",
-        "`couplings` of its linkage in `asset.json`: the published tendons turn the pads inwards",
+        "`asset.json` has `couplings` of the linkage: the published tendons turn the pads inwards",
         couplings=_LINKAGE_140,
     ),
     _of(_SUITE, "robotiq-3f", "Robotiq 3-Finger Adaptive", "robotiq_gripper_s.xml"),
@@ -120,8 +120,8 @@ HANDS = (
         "pr2",
         "PR2",
         "pr2_gripper.xml",
-        "in `asset.json` `couplings`, as one motor moves all four joints, and `stiffness` 20 N m/rad instead of 1,000, "
-        "with which it throws the object out",
+        "`asset.json` has `couplings`, because one motor moves all four joints, and `stiffness` 20 N m/rad: at 1,000 "
+        "the hand throws the object out",
         couplings=_LINKAGE_PR2,
         stiffness=20.0,
     ),
@@ -130,8 +130,7 @@ HANDS = (
         "jaco",
         "Kinova Jaco, three fingers",
         "jaco_three_finger_gripper.xml",
-        "in `asset.json` `stiffness` 5 N m/rad instead of 20, at which its 0.3 N m are reached within 1 mm of a "
-        "fingertip's way",
+        "`asset.json` has `stiffness` 5 N m/rad: at 20 the limit of 0.3 N m is reached within 1 mm of fingertip motion",
         stiffness=5.0,
     ),
     _of(_SUITE, "inspire", "Inspire RH56", "inspire_right_hand.xml"),
@@ -226,8 +225,8 @@ def page(done: dict[str, Any]) -> str:
     lines = [
         "# Gallery of hands",
         "",
-        "Real hands and grippers, read from the files in which they are published. Each was tested as",
-        "by `graspd hands check HAND`: 64 candidates on a sphere, a box and a cylinder of suitable size,",
+        "Real hands and grippers, built in or read from their published files. Each was tested by",
+        "`graspd hands check HAND`: 64 candidates on a sphere, a box and a cylinder of suitable size,",
         f"validated at level *standard*. A hand is *ready* if at least {100 * READY:.0f} % hold. The picture shows the",
         "best candidate from two sides.",
         "",

@@ -1,4 +1,4 @@
-"""Check of the CUDA kernels without a GPU: each compiles for each architecture within the limits of registers.
+"""Check CUDA kernels without a GPU: registers, stack and spills of each kernel on each architecture.
 
 usage: python -m benchmarks.gpu_check [--arch 80 --arch 90 --arch 100] [--json OUT]       (make gpu-check)
 

@@ -7,7 +7,7 @@ work=$(mktemp -d); trap 'rm -rf "$work"' EXIT
 mkdir -p "$out"
 picture() { # prefix hand mesh name
     cp "$3" "$work/$4.stl" # the sheet's title is the mesh's name
-    graspd synth --hand "$2" --object "$work/$4.stl" -n 8 --seed 4 -o "$work/$4.h5" || [ $? = 3 ] # fewer were found
+    graspd synth --hand "$2" --object "$work/$4.stl" -n 8 --seed 4 -o "$work/$4.h5" || [ $? = 3 ] # 3: fewer grasps than wanted
     graspd pictures "$work/$4.h5" --hand "$2" --object "$work/$4.stl" --three-sides --count 4 --size 200 \
         -o "$out/$1-$4.png"
 }

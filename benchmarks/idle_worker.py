@@ -2,7 +2,7 @@
 
 usage: python -m benchmarks.idle_worker BEFORE AFTER [--runs 3]
 
-Memory is the private pages of the processes, the least of the runs. Runs of both checkouts alternate."""
+Memory counts private pages; the table has the run with the least in total. Runs of both checkouts alternate."""
 
 from __future__ import annotations
 

@@ -4,8 +4,8 @@ usage: python -m benchmarks.learned --network NET.npz [OTHER.npz ...] [--data DA
            [--many 32] [--seeds 5] [--starts 4 ...] [--out FOLDER]
        DATA_DIR holds objects/; without it objects are files or names of built-in ones
 
-Grasps are planned on a table at fidelity standard and validated. Both methods get the same scenes, seeds and convex
-pieces, alternately, on one thread. Times are processor time, including validator and metrics, without one-time
+Grasps are planned on a table at fidelity standard and validated. Both methods run alternately on one thread, with the
+same scenes, seeds and convex pieces. Times are processor time, including validator and metrics, without one-time
 preparation of a pair. Choose objects that were not in a network's training set. Hands are the built-in ones."""
 
 from __future__ import annotations
@@ -122,10 +122,10 @@ def page(rows: Sequence[dict[str, Any]], networks: dict[str, str], command: str)
         "# Seeds from a network",
         "",
         f"graspd {PACKAGE_VERSION}, `{command}`: a table, fidelity *{FIDELITY.name}*, validated by lifts, one thread. "
-        "Rows of a pair were measured alternately.",
+        "Methods of a pair ran alternately.",
         "",
-        f"- *CPU s to the first*: processor time until one grasp is valid, median over {seeds} seeds, including those "
-        f"that stopped after {BUDGET:g} candidates.",
+        f"- *CPU s to the first*: processor time until one grasp is valid or {BUDGET:g} candidates are tested, "
+        f"median over {seeds} random seeds.",
         f"- *Valid share* and *valid per CPU s*: of one batch of {many} candidates.",
         "- Times include planning, validation and metrics, but not loading.",
         "",

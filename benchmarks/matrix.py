@@ -2,9 +2,9 @@
 
     python -m benchmarks.matrix DATA --data-dir /tmp/matrix --out docs/results/matrix.md
 
-DATA holds `hands/*/*.urdf` and `objects/*/clean.stl`. At a third of the work every process is killed with -9; then the
-same two commands, `graspd up` and `graspd datasets create`, resume. The page has the result of each cell, the repeated
-work, and the error of the estimate."""
+DATA holds `hands/*/*.urdf` and `objects/*/clean.stl`. At a third of the work every process is killed with SIGKILL; then
+the same two commands, `graspd up` and `graspd datasets create`, resume. The page has the result of each cell, the
+repeated work, and the error of the estimate."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _POLL_S: Final = 2.0
 
 @dataclass
 class ExecutionContext:
-    """A service that can be killed, and its measurements."""
+    """A service that can be killed and started again."""
 
     folder: Path
     environment: dict[str, str]
@@ -101,7 +101,7 @@ class ExecutionContext:
 
 @dataclass
 class Kept:
-    """State that a resumed run needs from its start."""
+    """Measurements that a resumed run needs from earlier ones."""
 
     estimate_s: float = 0.0
     killed_at: float = 0.0
@@ -203,14 +203,14 @@ def page(found: DatasetView, cells: list[CellView], facts: dict[str, str], optio
         f"`python -m benchmarks.matrix DATA --data-dir DIR --out docs/results/matrix.md {options}`",
         "",
         f"graspd {PACKAGE_VERSION}, {platform.machine()}, {available_cores()} CPU cores, {found.created[:10]}. URDFs",
-        "and meshes were used unchanged, without options. At a third of the work every process was killed with -9;",
-        "then the same commands resumed the work.",
+        "and meshes were used unchanged, without options. At a third of the work every process was killed with",
+        "SIGKILL; then the same commands resumed the work.",
         "",
         "| what | |",
         "| --- | --- |",
         *(f"| {name} | {value} |" for name, value in facts.items()),
         "",
-        "Each cell: valid grasps of those wanted, valid share of candidates, worker seconds per valid grasp.",
+        "Each cell: valid and wanted grasps, valid share of candidates, worker seconds per valid grasp.",
         "",
         f"| object | {' | '.join(found.hands)} |",
         "| --- " * (len(found.hands) + 1) + "|",

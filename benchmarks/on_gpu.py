@@ -156,7 +156,7 @@ def main() -> None:
     parser.add_argument("--batches", type=int, nargs="+", default=[32, 256, 1024])
     parser.add_argument("--grasps", type=int, default=64, help="grasps of each pair for the comparison of quality")
     parser.add_argument("--json", type=Path, help="file for all figures, rewritten after each step")
-    parser.add_argument("--page", type=Path, help="the report")
+    parser.add_argument("--page", type=Path, help="file for the report")
     wanted = parser.parse_args()
     device = Device(wanted.device).resolve()
     result: dict[str, Any] = {

@@ -1,12 +1,12 @@
-"""Error and CPU time of the payload against full tests of each mass, and ratio of its bound to the payload.
+"""Error and CPU time of payloads, compared with full tests of each mass; ratio of bound to payload.
 
 usage: python -m benchmarks.payload DATA_DIR [--hands allegro ...] [--objects 025_mug ...] [--grasps 8] [--scenes 4]
            [--seed 1500] [--free] [--page OUT.md]
        DATA_DIR holds hands/ and objects/; --free: six pushes instead of a lift off a table
 
 Grasps are valid for objects of their published masses. The full test repeats the validator's rise and hold, or each of
-its pushes, for each mass of a bisection to 3 %. The bound is the largest load capacity of a pair's grasps over their
-largest payload, squeezed with 50 to 1000 N."""
+its pushes, for each mass of a bisection to 3 %. The ratio is the largest load capacity of a pair's grasps divided by
+their largest payload, with squeezes of 50 to 1000 N."""
 
 from __future__ import annotations
 
@@ -46,10 +46,10 @@ HEAD: Final = """# Payload of grasps: error and cost
 
 `python -m benchmarks.payload DATA{option}`: payload of valid grasps, compared with full tests of each mass.
 
-- *Ratio*: payload over the payload by full tests; *error*: deviation of the ratio from 1.
+- *Ratio*: payload divided by the payload of full tests; *error*: deviation of the ratio from 1.
 - *CPU ms*: mean time per grasp, of the payload and of the full tests.
-- *Bound*: largest load capacity of a pair's grasps over their largest payload, squeezed as planned and with 100 to
-  1000 N; smallest value over the pairs.
+- *Bound*: largest load capacity of a pair's grasps divided by their largest payload; smallest value of the pairs.
+  Squeezes are as planned and of 100 to 1000 N.
 
 {grasps} grasps wanted per pair of hand and object; objects {objects}; seed {seed}.
 
@@ -126,11 +126,11 @@ def main() -> None:
 
 
 def of_pair(given: Any, hand: HandModel, name: str, mass: float) -> tuple[Floats, Floats, Floats, float]:
-    """Return for each valid grasp of a pair the payload over the payload by full tests, and the CPU time of both [ms].
-    The last value is the bound of all grasps over their largest payload."""
+    """Return for each valid grasp of a pair the ratio of payload to full tests, and both CPU times [ms].
+    The last value is the bound of all grasps divided by their largest payload."""
     grasps, obj, placed = valid_grasps(given, hand, given.data / "objects" / name / "clean.stl", mass)
     around = (placed.supports,) if placed is not None else ()
-    # The weld of a root that is not fixed yields, which moves the object and the hand.
+    # A root on a weld yields, so that hand and object move.
     whole = LIFTING if placed is None else MujocoOptions()
     scenes = [scene_of(hand, obj, decompose(obj), physics, *around) for physics in (LIFTING, whole)]
     tests: list[LiftPayload | PushPayload]

@@ -1,11 +1,11 @@
 """Agreement of the prefilter with level standard, and its speed.
 
 usage: python -m benchmarks.prefilter DATA_DIR [--work DIR] [--device cuda:0] [--hands ...] [--objects ...]
-[--grasps 48] [--speed 256 1024] [--worlds 256 1024] [--out docs/results/prefilter] DATA_DIR holds hands/ and objects/.
-The prefilter and level standard validate the same candidates; agreement refers to the prefilter's clear verdicts.
-`--speed N` times N grasps in pools of `--worlds`: grasps of the first cell of each hand, moved at random by up to 0.1
-mm. Prints Markdown; `--out` receives .json and .md. Interrupted runs resume (see cells.py), but the prefilter's
-verdicts are not cached."""
+           [--grasps 48] [--speed 256 1024] [--worlds 256 1024] [--out docs/results/prefilter]
+DATA_DIR holds hands/ and objects/. The prefilter and level standard validate the same candidates; agreement refers to
+the prefilter's clear verdicts. `--speed N` measures the time for N grasps in pools of `--worlds`. The grasps are those
+of the first cell of each hand, repeated with shifts of up to 0.1 mm. Prints Markdown; `--out` receives .json and .md.
+Interrupted runs resume (see cells.py), but the prefilter's verdicts are not cached."""
 
 from __future__ import annotations
 
@@ -117,14 +117,14 @@ def speeds(cell: Cell, device: str, counts: list[int], worlds: list[int]) -> Ite
 
 ABOUT = """\
 Verdicts of the prefilter, compared with level *standard*. A verdict is clear if its margin to the
-limits is large and no contacts overflowed their memory."""
+limits is large and the memory of contacts did not overflow."""
 AGREEMENT = (
     "| hand | grasps | held at level standard | agreement of all verdicts | clear verdicts "
     "| agreement of clear verdicts (95 %) | false accepts, false rejections | overflows |\n| --- | --: | --: | --: | "
     "--: | --- | --- | --: |"
 )
 SPEED = (
-    "| hand | object | worlds | grasps | grasps/s | world steps/s | ms a tick |\n"
+    "| hand | object | worlds | grasps | grasps/s | world steps/s | ms per launch |\n"
     "| --- | --- | --: | --: | --: | --: | --: |"
 )
 

@@ -4,11 +4,11 @@ usage: python -m benchmarks.processes DATA_DIR [--grasps 256] [--hand allegro] [
 
 DATA_DIR holds hands/. A way is a number of threads (t) or processes (p). Candidates of a pair are planned once, then
 validated and measured in each way, with running processes and compiled models. The table has wall and processor time
-per candidate over all processes, and the memory of a process. It also shows whether results equal those of one thread
-bit for bit.
+per candidate over all processes, and the memory of a process. It also shows whether results equal those of the first
+way bit for bit.
 
-Two runs of `py-spy record -f raw`, with and without `--gil`, give the share of time in which one thread holds Python's
-lock: the ratio of their samples. Options are `--ways 1t --only validate` or `table`."""
+`py-spy record -f raw`, with and without `--gil`, can record this program with `--ways 1t --only validate` or `table`.
+The ratio of the samples is the share of time in which one thread holds Python's lock."""
 
 from __future__ import annotations
 

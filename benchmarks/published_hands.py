@@ -34,7 +34,7 @@ from graspd.worker.planners.fast_graspd.antipodal_starts import crossings_of
 from graspd.worker.scenes.placement import scenes_of
 from graspd.worker.stages.hand_self_test import TABLE_READY, self_test_facts
 
-#: Hands besides those of the gallery; DIR has LEAP in the folders of MuJoCo Menagerie.
+#: Hands besides those of the gallery. LEAP is from MuJoCo Menagerie, in the folder leap of DIR.
 _SKILL, _MATE = "mani_skill/assets/robots", "dexmate_urdf/robots/hands/f5d6_hand"
 MORE = (
     Entry("leap", "LEAP", "MuJoCo Menagerie, MIT", "leap/right_hand.xml"),
@@ -105,7 +105,7 @@ def main() -> None:
 
 
 def lift_share(hand: HandModel, folder: Path, grasps: int) -> float | None:
-    """Return the share of candidates that lift an object off a table; None if it does not fit, see `FITTING`."""
+    """Return the share of candidates that lift an object off a table; None: it does not fit or is refused."""
     obj, jaws = object_from_path(folder / "clean.stl"), jaws_of(hand)
     widest = oppositions_of(hand).widest if jaws is None else jaws.opening
     if np.mean(crossings_of(obj).width <= widest) < FITTING:
@@ -140,13 +140,13 @@ def page(done: dict[str, Any]) -> str:
         "`python -m benchmarks.published_hands DIR --data DATA`: self-test of each hand as published, and lifts of "
         "objects "
         "that the self-test does not use.\n\n"
-        "- *Free*, *table*: shares of the self-test's candidates that hold, and that lift.\n"
+        "- *Free*: share of the self-test's candidates that hold; *table*: share that lift.\n"
         f"- Columns with an object: share of {grasps} candidates that lift it off a table, fidelity *standard*, seed "
         f"{SEED}; *mean*: over the objects.\n"
         f"- *Too wide*: the hand opens wide enough for less than {FITTING:.0%} of the antipodal pairs.\n"
-        f"- *Agrees*: the hand is ready and lifts {TABLE_READY:.0%} or more on average, or neither; {agreeing} of "
+        f"- *Agrees*: the verdict is *ready* and the mean at least {TABLE_READY:.0%}, or neither; {agreeing} of "
         f"{len(done)} agree.\n\n"
-        f"{earlier} of the rows are from revisions before today's; the JSON has their keys.\n\n"
+        f"{earlier} of the rows are from earlier revisions, as their keys in the JSON show.\n\n"
         f"| hand | from | dofs | verdict | free | table | {' | '.join(OBJECTS)} | mean | agrees | self-test [s] |\n"
         f"| --- | --- | --: | --- | --: | --: | {'--: | ' * len(OBJECTS)}--: | --- | --: |\n" + "\n".join(rows) + "\n"
     )

@@ -46,7 +46,7 @@ from graspd.worker.validation.validator import validate
 
 Floats = NDArray[np.float64]
 
-#: Thresholds of the published pick: height lost [m] and turn [rad].
+#: Thresholds of the published pick: height error [m] and rotation [rad].
 FALLEN_M, TURNED = 0.075, np.radians(30)
 DENSITY = 150.0
 #: Number of negative controls of each kind per object.
@@ -70,7 +70,7 @@ class Terms:
 
 
 PUBLISHED = Terms(from_grasp=True, light=True, friction=0.5, force=15.0, published_limits=True, slowly=True)
-#: Changes of conditions. Lifts have one of them, all of them, or all but one.
+#: Changes of conditions. Lifts have none, one, all, or all but one of them.
 CHANGES: dict[str, dict[str, Any]] = {
     "150 kg/m^3 instead of 0.1 kg": {"light": True},
     "failure at 7.5 cm of height or 30 degrees": {"published_limits": True},
@@ -326,11 +326,11 @@ def main() -> None:
 
 
 ABOUT = (
-    "Grasps published with FRoGGeR for an Allegro hand, each with the published result of a pick. The tests below "
+    "Grasps of an Allegro hand were published with FRoGGeR, each with the result of a pick. The tests below "
     "repeat "
-    "them in graspd's validator: six pushes, or lifts off a table under several conditions. In the last table a cell "
-    "is "
-    "the share of grasps whose verdict agrees with the published pick."
+    "them in graspd's validator: six pushes, or lifts off a table under several conditions. Test columns of the last "
+    "table "
+    "have the share of grasps whose verdict agrees with the published pick."
 )
 SHOWN = (
     "six pushes, level standard",

@@ -1,9 +1,8 @@
-"""Samples per second of the readers against plain HDF5: `python -m benchmarks.readers SHARDS [--json]`.
+"""Samples per second of readers compared with h5py: `python -m benchmarks.readers SHARDS [--json]`.
 
 SHARDS is a folder with base, scene and views shards, for example `demo-out/shards`. Each reader makes five warm passes,
-alternating with the other readers. The best pass counts, by wall time and by processor time. Ratios are to plain h5py
-with the same samples and the same number per read. Single pictures in random order are compared with plain h5py in
-bulk."""
+alternating with the other readers. The best pass counts, by wall time and by processor time. Ratios are relative to
+h5py alone with the same samples per read. Single pictures in random order are compared with h5py in bulk."""
 
 from __future__ import annotations
 
@@ -30,7 +29,7 @@ PICTURE = ("image/rgb", "image/depth", "image/segmentation", "camera/intrinsics"
 
 @dataclass(frozen=True)
 class Trajectory:
-    """A reader: a pass that counts its samples, and the name of the plain reader for comparison."""
+    """A reader: a pass that counts its samples, and the name of the h5py reader for comparison."""
 
     work: Callable[[], int]
     against: str
@@ -121,7 +120,7 @@ def loaders(shards: Shards) -> dict[str, Trajectory]:
 
     from graspd.service.readers.torch_data import Samples, ShuffledShards, collate
 
-    torch.set_num_threads(1)  # under other load, threads of one copy would wait for one another
+    torch.set_num_threads(1)  # under other load, threads that copy one tensor would wait for each other
     found = {}
     for processes in (0, 2):
         streams = [

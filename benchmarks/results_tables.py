@@ -1,7 +1,7 @@
-"""Quality of standard candidates of the three hands on all objects, under the unmodified DexGraspBench protocol.
+"""Quality of candidates of three hands on all objects, under the unmodified DexGraspBench protocol.
 
 usage: python -m benchmarks.results_tables DATA_DIR [--work DIR] [--hands allegro ...] [--objects NAME ...] [--out DIR]
-DATA_DIR holds hands/ and objects/. Writes quality-HAND.json and quality-HAND.md to `--out`. An
+DATA_DIR holds hands/ and objects/. Fidelity is standard. Writes quality-HAND.json and quality-HAND.md to `--out`. An
 interrupted run resumes: `--work` caches every pair of hand and object (see cells.py). A run takes some core-hours."""
 
 from __future__ import annotations
@@ -165,10 +165,10 @@ def markdown(hand: str, rows: list[dict[str, Any]], total: dict[str, Any], comma
             "Medians over the grasps of an object; the last row has rates over all grasps and means of the medians.",
             "",
             "- *GSR*: share of grasps that hold; *hard*: the same at half friction.",
-            f"- *robust*: mean share of {ROBUST_MODELS} perturbed models in which a grasp holds that holds at level "
-            "*standard*.",
-            "- *SGS*: held grasps per second of planning and validation at level *standard*; seconds are CPU time over "
-            "two cores.",
+            f"- *robust*: share of {ROBUST_MODELS} perturbed models in which a grasp holds; mean over grasps held at "
+            "level *standard*.",
+            "- *SGS*: held grasps per second of planning and validation at level *standard*; a second is two CPU "
+            "seconds.",
             "- *PD*, *SPD*: penetration and self-penetration [mm]; *CDC*: contact distance consistency [mm].",
             "- *CA*: contact area [cm²]; *CA*, *ε* and *Vol* have a contact threshold of 5 mm and μ = 1; *IV*: "
             "intersection [cm³].",
@@ -176,12 +176,12 @@ def markdown(hand: str, rows: list[dict[str, Any]], total: dict[str, Any], comma
             "",
             f"Means over the best {TOP} grasps of each object by ε, as in table 2 of the Fast-Grasp'D paper, which "
             "also "
-            "has YCB objects:",
+            "uses YCB objects:",
             "",
             "| | graspd | Fast-Grasp'D |",
             "| --- | --: | --: |",
             *versus,
-            f"| held under the DexGraspBench protocol | {total['top_held']:.2f} | - |",
+            f"| held under the unmodified protocol | {total['top_held']:.2f} | - |",
             "",
         ]
     )

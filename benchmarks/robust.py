@@ -1,9 +1,9 @@
 """Robustness of verdicts: effect of each error of a hand's model on success.
 
 usage: python -m benchmarks.robust DATA_DIR [--work DIR] [--hands allegro ...] [--objects NAME ...] [--out FOLDER]
-DATA_DIR holds hands/ and objects/. Standard candidates are validated at level standard. Held candidates are validated
-again in models that differ along one axis (`--draws` models each), along all axes at once, and as in a job. `--out`
-receives robust.json and robust.md. Interrupted runs resume (see cells.py)."""
+DATA_DIR holds hands/ and objects/. Candidates at fidelity standard are validated at level standard. Held candidates are
+validated again in models that differ along one axis (`--draws` models each), along all axes at once, and as in a job.
+`--out` receives robust.json and robust.md. Interrupted runs resume (see cells.py)."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def kinds(cell: Cell, draws: int) -> dict[str, list[Callable[[np.random.Generato
 
 
 def study(cell: Cell, draws: int) -> dict[str, Any]:
-    """Return for one cell, per row, how many held grasps hold again, and the cost of validation as in a job."""
+    """Return for each row of a cell how many held grasps hold again, and the cost as in a job."""
     pieces = decompose(cell.obj)
     held = np.array(cell.verdicts("standard", False)["success"]) == 1
     around = Models(cell.hand, cell.obj, pieces, MujocoOptions())
@@ -138,7 +138,7 @@ def page(done: list[dict[str, Any]], objects: list[str], draws: int) -> str:
     lines = [
         "# Robustness of verdicts",
         "",
-        f"Made by `python -m benchmarks.robust`. Standard candidates on {', '.join(objects)}, "
+        f"Made by `python -m benchmarks.robust`. Candidates at fidelity *standard* on {', '.join(objects)}, "
         f"{done[0]['candidates'] // len(objects)} on each. Those that hold at level *standard* in the nominal model "
         f"({held}) were validated again in models with one difference. Each grasp was tested in {draws} random models "
         "per difference, but once in each kind of collision shapes and couplings. Cells: share that still holds, with "
@@ -152,8 +152,8 @@ def page(done: list[dict[str, Any]], objects: list[str], draws: int) -> str:
     lines += [f"| {name} | {' | '.join(_cell(one['rows'].get(name)) for one in done)} |" for name in names]
     lines += [
         "",
-        f"Validation as by `--robust`: {ROBUST_MODELS} models per grasp, each with one difference, in random order. "
-        "*First failure*: differences in the first model in which a grasp failed, with numbers of grasps.",
+        f"Validation as with `--robust`: {ROBUST_MODELS} models per grasp, each with one difference, in random order. "
+        "*First failure*: difference of the first model in which a grasp failed, with the number of such grasps.",
         "",
         "| | " + " | ".join(hands) + " |",
         f"| --- |{' --- |' * len(hands)}",

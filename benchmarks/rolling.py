@@ -1,4 +1,4 @@
-"""Rest poses that roll or topple if the surface changes by 1 mm: by geometry, and in simulation of changed pieces.
+"""Rest poses in which a surface change of 1 mm makes objects roll or topple: geometry and simulation.
 
 usage: python -m benchmarks.rolling DATA_DIR [--objects 011_banana ...] [--variants 8] [--page OUT.md]
        DATA_DIR holds objects/
@@ -27,7 +27,7 @@ from graspd.worker.validation.decomposition import decompose
 from graspd.worker.validation.model import FRICTION, MujocoOptions, add_object
 
 SEED, DROPS, SECONDS = 5, 64, 0.8
-HEAD: Final = """# Rest poses that roll or topple
+HEAD: Final = """# Rest poses in which objects roll or topple
 
 `python -m benchmarks.rolling DATA`: resting faces of each object after {drops} drops. A turn is a rotation of the
 object.
@@ -87,7 +87,7 @@ def turns(obj: ObjectModel, pose: Floats, variants: int) -> Floats:
 
 
 def turn(obj: ObjectModel, pieces: Sequence[Floats], pose: Floats) -> float:
-    """Return the angle with these pieces [rad]."""
+    """Return the angle by which the object rotates from the pose with these pieces [rad]."""
     physics, friction, spec = MujocoOptions(), [*FRICTION, 1e-4], mujoco.MjSpec()
     option: Any = spec.option
     option.timestep, option.impratio, option.noslip_iterations = physics.timestep, 10.0, physics.noslip_iterations

@@ -99,8 +99,8 @@ def page(done: dict[str, dict[str, dict[str, Any]]], count: int) -> str:
             "# Candidates selected by rollouts",
             "",
             f"`python -m benchmarks.rollouts DATA --out docs/results`: {count} candidates of each hand on each "
-            f"of {objects} objects without a scene, seed {SEED}, validated at level *standard*. One run has both "
-            "selections.",
+            f"of {objects} objects without a scene, seed {SEED}, validated at level *standard*. One run measures "
+            "both selections.",
             "",
             "- *By merit*: selects the candidate with the best contact balance; *by rollout*: the first that holds "
             "in a "

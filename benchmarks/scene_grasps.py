@@ -4,11 +4,11 @@ usage: python -m benchmarks.scene_grasps DATA_DIR [--work W] [--hands allegro ..
            [--per-face 0] [--filtered 0] [--touch 0] [--seed 404] [--json OUT] [--page OUT.md]
        DATA_DIR holds hands/ and objects/
 
-Scenes have the object on a table, on each stable resting face on which at least 3 % of drops end. Each pair has at
-least `--grasps` grasps and at least `--per-face` per face. Free grasps are placed into the same scenes and validated
-alike; at least `--filtered` per pair, because few of them lift. A second is one of CPU time of one thread, so other
-load changes the ratios little. W caches the results of each pair: an interrupted run resumes, and runs with different
-hands may run at the same time."""
+Scenes: the object on a table, on each stable resting face that at least 3 % of drops reach. Each pair has at least
+`--grasps` grasps and at least `--per-face` per face. Free grasps are placed into the same scenes and validated alike;
+each pair has at least `--filtered` of them, because few lift. Seconds are CPU time of one thread, so other load changes
+the ratios little. W caches the results of each pair: an interrupted run resumes, and runs with different hands may run
+at the same time."""
 
 from __future__ import annotations
 
@@ -187,16 +187,16 @@ def page(results: dict[str, list[dict[str, Any]]]) -> str:
     lines = [
         "# Grasps planned in scenes",
         "",
-        f"graspd {PACKAGE_VERSION}, `{COMMAND}`: real URDFs, fidelity *{FIDELITY.name}*, seed {SEED}. Scenes: a table, "
-        "with each stable resting face on which at least 3 % of drops end.",
+        f"graspd {PACKAGE_VERSION}, `{COMMAND}`: real URDFs, fidelity *{FIDELITY.name}*, seed {SEED}. Scenes: the "
+        "object on a table, on each stable resting face that at least 3 % of drops reach.",
         "",
         "- Shares are of all candidates unless stated otherwise; seconds are CPU time of planning.",
-        "- *Faces in reach*: faces with an antipodal pair of points 4 mm clear of the table, less than 30 degrees from",
-        "  level, and not wider than the opposed fingers open.",
+        "- *Faces in reach*: faces with an antipodal pair of points at least 4 mm above the table and tilted by less",
+        "  than 30 degrees. The pair must fit into the opening of the fingers.",
         "- *Free, filtered*: grasps of a free object, placed into the same scenes.",
         "- *CPU time / free*: CPU time per grasp, relative to free grasps.",
         "- *valid/s / filtered*, *valid/s / free*: valid grasps per second, relative to filtered and to free grasps.",
-        "  With >, no filtered grasp lifts; the ratio is then a lower bound, computed with one lifted grasp.",
+        "  *>*: no filtered grasp lifts; the ratio is a lower bound, computed with one lifted grasp.",
     ]
     for name, rows in results.items():
         lines += ["", f"## {name}", "", table(rows)]

@@ -35,7 +35,7 @@ from graspd.worker.scenes import Neighbours, drop, drop_together, transfer
 SIZE: Final = (300, 225)
 #: Rays per pixel, for pictures of high quality.
 SAMPLES: Final = 32
-#: Number of grasps per scene, of scenes, and of rounds until one grasp is clear of the table.
+#: Numbers of grasps per round and of scenes, and largest number of rounds until a grasp is clear.
 GRASPS: Final = 32
 SCENES: Final = 24
 ROUNDS: Final = 4

@@ -1,9 +1,9 @@
-"""Obstacles of grasps planned in bins, on shelves and among neighbours, by phase of the trajectory.
+"""Obstructed grasps in bins, on shelves and among neighbours, by phase of the trajectory.
 
     python -m benchmarks.scene_trajectories [--count 24] [--json]
 
-Prints Markdown. The approach is a straight line of 10 cm. The last column counts grasps with only the approach not
-clear. A curved approach could save at most these grasps."""
+Prints Markdown. The approach is a straight line of 10 cm. The last column counts grasps that are obstructed only on
+the approach. A curved approach could save at most these."""
 
 from __future__ import annotations
 

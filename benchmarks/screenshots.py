@@ -1,10 +1,10 @@
-"""Pictures of every page of the dashboard for its documentation, of a real service with real grasps.
+"""Pictures of every page of the dashboard for the documentation, from a real service with real grasps.
 
 usage: python -m benchmarks.screenshots [--data-dir DIR] [--out docs/images]
 
 Starts the service, gives it work (some minutes on two cores), publishes the charts of the docs, and photographs each
-page at the width of a laptop or a phone, light or dark. With --data-dir the service and its work are kept, and the
-next call takes pictures of what is there.
+page at the width of a laptop or a phone, light or dark. With --data-dir the results are kept, and the next call uses
+them again.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data-dir", type=Path)
     parser.add_argument("--out", type=Path, default=REPOSITORY / "docs" / "images")
-    parser.add_argument("--only", default="", help="names of pictures, with commas between")
+    parser.add_argument("--only", default="", help="names of pictures, comma-separated")
     given = parser.parse_args(arguments)
     if missing := [str(file.relative_to(REPOSITORY)) for file in (*CHARTS, MAPS) if not file.is_file()]:
         parser.error(
@@ -68,11 +68,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def work(client: httpx.Client, supervisor: Supervisor) -> dict[str, str]:
-    """Jobs of every kind: finished with views, a dataset, one attempt that lost its worker, one that runs."""
+    """Submit a dataset and two jobs, and kill a worker once; return the ids of the jobs and a grasp."""
     viewed = client.post("/v1/jobs", json=VIEWED).raise_for_status().json()["id"]
     if not client.get("/v1/datasets/kitchen-1").is_success:
         until(lambda: client.get(f"/v1/jobs/{viewed}").json()["state"] == "running", "a job runs", seconds=WORK_S)
-        # What a lost worker leaves: its task runs again, and the attempt keeps the reason.
+        # Lose a worker: its task runs again, and the lost attempt keeps the reason.
         os.kill(supervisor.pids["worker-0"], 9)
     client.post("/v1/datasets", json=DATASET).raise_for_status()
     until(lambda: client.get("/v1/datasets/kitchen-1").json()["state"] == "succeeded", "the dataset", seconds=WORK_S)
@@ -93,7 +93,7 @@ def work(client: httpx.Client, supervisor: Supervisor) -> dict[str, str]:
 
 
 def photograph(address: str, places: dict[str, str], folder: Path, only: set[str]) -> None:
-    """Every page; a full page where its end is worth seeing."""
+    """Photograph each page: its visible part, or the full page where `whole` is true."""
     from playwright.sync_api import sync_playwright
 
     pictures: list[tuple[str, str, str, tuple[int, int], str, bool]] = [
@@ -132,15 +132,15 @@ def photograph(address: str, places: dict[str, str], folder: Path, only: set[str
             page.wait_for_selector(ready, timeout=SHOWN_MS)
             page.wait_for_timeout(3000)
             if whole:
-                # What is drawn as it comes into view must have come there once.
+                # Scroll through the page once, because some parts are drawn when they come into view.
                 for share in range(11):
                     page.evaluate(f"scrollTo(0, {share / 10} * document.body.scrollHeight)")
                     page.wait_for_timeout(700)
                 page.evaluate("scrollTo(0, 0)")
-            if whole:  # bars that stick to the window's edge would cover what lies there
+            if whole:  # sticky bars would cover parts of the page
                 page.evaluate("document.querySelectorAll('.act, .reading').forEach(b => b.style.position = 'static')")
             picture = Image.open(io.BytesIO(page.screenshot(full_page=whole))).convert("RGB")
-            # 256 colours are a fifth of the bytes; an octree keeps the few pixels of a legend.
+            # 256 colours take a fifth of the bytes; an octree keeps colours with few pixels, as in a legend.
             picture = picture.quantize(256, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
             picture.save(folder / f"dashboard-{name}.png", optimize=True)
             context.close()

@@ -6,8 +6,8 @@ usage: python -m benchmarks.second_lift DATA_DIR [--hands allegro ...] [--object
 
 The model has real gravity, MuJoCo's default contacts at 1 ms, CoACD pieces of another threshold, and the hand on a
 stiff vertical slide. The hand closes and squeezes in 1 s, rises 10 cm in 1 s and holds for 2 s. A grasp lifts if the
-object is then above 5 cm. Lost grasps are repeated with MuJoCo's noslip
-solver, without which friction creeps."""
+object has then risen by more than 5 cm. Lost grasps are repeated with MuJoCo's noslip solver, without which friction
+creeps."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ from graspd.worker.hands.model import HandModel, JointType
 SEED: Final = 1400
 HEAD: Final = """# A second lift of valid grasps
 
-`python -m benchmarks.second_lift DATA`: second lift test of grasps that are valid for an object of its published mass
-on a table. It has real gravity, MuJoCo's default contacts at 1 ms, other convex pieces and a stiff vertical slide. It
-lifts for 1 s and holds for 2 s at friction 0.6. *Share*: part of the valid grasps that lift again. *Noslip*: lost
-grasps that lift with four iterations of MuJoCo's noslip solver, without which friction creeps. {grasps} grasps wanted
-per pair of hand and object, {scenes} scenes, seed {seed}.
+`python -m benchmarks.second_lift DATA`: second lift test of valid table grasps of objects with published masses. It has
+real gravity, MuJoCo's default contacts at 1 ms, other convex pieces and a stiff vertical slide. It lifts for 1 s and
+holds for 2 s at friction 0.6. *Share*: share of the valid grasps that lift again. *Noslip*: number of lost grasps that
+lift with four iterations of MuJoCo's noslip solver, without which friction creeps. {grasps} grasps wanted per pair of
+hand and object, {scenes} scenes, seed {seed}.
 
 """
 FRICTION: Final = "0.6 0.01 0.0001"
@@ -78,8 +78,7 @@ def line(hand: str, obj: str, mass: str, counts: NDArray[np.intp]) -> str:
 
 
 def again(given: Any, name: str, hand: HandModel, obj: str, mass: float) -> NDArray[np.intp]:
-    """Return the number of valid grasps of a pair, of those that this test lifts, and of lost ones that
-    lift with noslip."""
+    """Return counts of a pair: valid grasps, grasps that lift here, lost grasps that lift with noslip."""
     mesh_file = given.data / "objects" / obj / "clean.stl"
     request = JobOptions(
         grasps=given.grasps, rechecks=0, seed=given.seed, scene="table", scenes=given.scenes, mass=mass
@@ -101,7 +100,7 @@ def again(given: Any, name: str, hand: HandModel, obj: str, mass: float) -> NDAr
 
 
 def lift_model(hand: HandModel, mesh: trimesh.Trimesh, mass: float) -> Any:
-    """Compile the test of a hand and an object with this mass [kg]; meshes are given as text."""
+    """Compile the test of a hand and an object with this mass [kg]; meshes are inline."""
     root = ET.Element("mujoco")
     ET.SubElement(root, "compiler", angle="radian")
     ET.SubElement(root, "option", timestep="0.001", integrator="implicitfast", cone="elliptic", impratio="10")
@@ -128,7 +127,7 @@ def lift_model(hand: HandModel, mesh: trimesh.Trimesh, mass: float) -> Any:
             ratio = hand.multiplier[b] / hand.multiplier[first]
             shift = hand.offset[b] - ratio * hand.offset[first]
             poly = said([shift, ratio, 0, 0, 0])
-            # Gears and tendons are as stiff as the smallest time step allows.
+            # Gears and tendons are nearly as stiff as the time step allows.
             stiff = {"solref": ".004 1", "solimp": ".99 .999 .001"}
             ET.SubElement(equality, "joint", joint1=f"j{b}", joint2=f"j{first}", polycoef=poly, **stiff)
         else:
@@ -168,12 +167,12 @@ def lift_model(hand: HandModel, mesh: trimesh.Trimesh, mass: float) -> Any:
 
 
 def lifts(model: Any, hand: HandModel, made: Any, row: int) -> bool:
-    """Return whether the object is above 5 cm at the end."""
+    """Return whether the object has risen by more than 5 cm at the end."""
     data = mujoco.MjData(model)
     pose = np.asarray(made["scene/object_pose"][made["grasp/scene_index"][row]], float)
     base = compose(pose, np.asarray(made["grasp/hand_pose"][row], float))
     start = compose(pose, np.asarray(made["pregrasp/hand_pose"][row], float))
-    # The slide only rises, so the palm moves from pregrasp to grasp before the fingers close.
+    # The slide only rises, so the pose of body b0 moves the palm from pregrasp to grasp.
     model.body("b0").pos[:], model.body("b0").quat[:] = start[:3], start[3:]
     ways = [hand.reduce(np.asarray(made[f"{name}/joint_positions"][row], float)) for name in WAYS]
     data.qpos[model.joint("object").qposadr[0] :][:7] = pose

@@ -36,7 +36,7 @@ class Service:
             return json.load(answer)
 
     def job(self, **wanted: Any) -> dict[str, Any]:
-        """Submit a job and wait until its results are in the index; return its document."""
+        """Submit a job and wait until it has succeeded; return its JSON."""
         asked = urllib.request.Request(
             self.url + "/v1/jobs", json.dumps(wanted).encode(), {"Content-Type": "application/json"}
         )

@@ -1,4 +1,4 @@
-"""Success of candidates in the validator and their quality, per hand and object, as Markdown.
+"""Success of candidates by hand and object, and their quality by hand, as Markdown.
 
 usage: python -m benchmarks.success DATA_DIR [GRASPS [HAND ...]]     DATA_DIR holds hands/ and objects/
 The validator is MuJoCo with the DexGraspBench protocol, level `standard` (see worker/validation)."""

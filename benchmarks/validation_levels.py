@@ -1,9 +1,9 @@
 """Cost of the validator's levels, and their agreement with the unmodified DexGraspBench protocol.
 
-usage: python -m benchmarks.validation_levels DATA_DIR [--work DIR] [--hands allegro ...] [--objects NAME ...] [--out
-FILE] DATA_DIR holds hands/ and objects/. Prints Markdown; `--out` writes the same as JSON. Interrupted runs resume (see
-cells.py). Valid grasps per second are for two cores: held grasps over half the CPU time, which depends less on other
-load than wall time."""
+usage: python -m benchmarks.validation_levels DATA_DIR [--work DIR] [--hands allegro ...] [--objects NAME ...]
+           [--out FILE]
+DATA_DIR holds hands/ and objects/. Prints Markdown; `--out` writes the same as JSON. Interrupted runs resume (see
+cells.py). Valid grasps per second are for two cores: held grasps divided by half the CPU time."""
 
 from __future__ import annotations
 

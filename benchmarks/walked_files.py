@@ -1,4 +1,4 @@
-"""Number of product files with a called function in `graspd synth -n 1`, a POST of a job, and a page of grasps.
+"""Count source files with functions called by `graspd synth -n 1`, POST /v1/jobs and GET /grasps.
 
 usage: python -m benchmarks.walked_files
 

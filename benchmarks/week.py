@@ -11,8 +11,8 @@ The reactions to interruptions are those that `tests/system` tests on real proce
 
 - A node with notice returns its task. The work on it is lost, but no attempt.
 - A killed node loses the work and an attempt. Its task waits for `GRASPD_LEASE_S` and the next check of the controller.
-- A node that is cut off for longer continues, while another node does the same task. The work of one of them is lost,
-because the store refuses the second result (create-only).
+- A node that is cut off for longer than its lease continues, while another node does the same task. The work of one
+is lost, because the store refuses the second result (create-only).
 - During an outage of the controller, workers take waiting tasks. During one of Redis, each ends its task and waits.
 - During an outage of the store, a task that ends is returned and its work is lost. Later tasks are returned unstarted.
 """
@@ -65,7 +65,7 @@ class Rates:
     redis_away_s: float = 60.0
     store_outages_per_week: float = 2.0
     store_away_s: float = 300.0
-    """An availability of 99.9 % in a week in total, as stated by object stores."""
+    """Two outages a week give an availability of 99.9 %, as object stores state."""
 
 
 HARSH: Final = Rates(
@@ -112,7 +112,7 @@ class Told:
 
 @dataclass
 class _Node:
-    """A node that has worked since `since`, `into` seconds into a task of `task_s`."""
+    """A node that at time `since` is `into` seconds into a task of `task_s` seconds."""
 
     since: float = 0.0
     task_s: float = 0.0

@@ -28,7 +28,7 @@ STUDIES = {"motion": 32, "shape": 24, "drops": 32, "pictures": 0, "scenes": 24}
 
 
 def studies(data: Path | None, count: dict[str, int]) -> dict[str, Callable[[], dict[str, Any]]]:
-    """Return the studies by name, as functions that run them; all use the same grasps."""
+    """Return the studies by name, as functions that run them; `motion` and `drops` share grasps."""
     hand = hand_of(data)
     names = OBJECTS if data else BUILT_IN
     subjects = [Subject(hand, object_of(data, name), count["motion"]) for name in names]

@@ -103,7 +103,7 @@ def engines() -> dict[str, tuple[MujocoOptions, Callable[[Scene], None] | None, 
 
 
 def validated(subjects: list[Subject]) -> tuple[list[Row], list[Bools], float]:
-    """Return each variant's rate, agreement and cost relative to level standard, then the verdicts of that level."""
+    """Return each variant's rate, agreement and cost ratio; then verdicts and CPU time of level standard."""
     rows: list[Row] = []
     reference: list[Bools] = []
     spent = 0.0

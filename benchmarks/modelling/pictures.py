@@ -26,7 +26,7 @@ MANY, RAYS = 96, SAMPLES_DEFAULT
 
 def study(data: Path | None, name: str, width: int = 160) -> dict[str, Any]:
     """Return costs relative to `RAYS` rays, and root mean square differences of colours.
-    The reference of other numbers of rays has `MANY` rays; the reference of other settings has `RAYS`."""
+    Other numbers of rays are compared with `MANY` rays, other settings with `RAYS` rays."""
     obj, full = object_of(data, name), object_of(data, name, 0.0)
     poses = drop(obj, count=SCENES, seed=SEED)["scene/object_pose"]
     plan = CameraPlan(VIEWS, width, width * 3 // 4, None)
@@ -83,7 +83,7 @@ def _row(name: str, pictures: Pictures, reference: Pictures, ratio: float) -> Ro
 
 
 def depth_error_mm(setting: Setting, pictures: Pictures, vertices: Any, faces: Any) -> dict[str, float]:
-    """Return distances of the object's pixels, unprojected by depth, K, E and object pose, from a mesh."""
+    """Return distances of the object's unprojected pixels from a mesh: median, 99th percentile [mm]."""
     shot = setting.shot
     points = Cameras(shot.width, shot.height, shot.intrinsics, shot.extrinsics).unproject(pictures.depth)
     local = [

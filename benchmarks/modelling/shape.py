@@ -1,4 +1,4 @@
-"""Influence of the resolution of object and hand, measured on the unsimplified object with other points."""
+"""Influence of mesh faces and hand points; penetration is measured on the unsimplified object."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
 
 
 def study(data: Path | None, objects: list[str], count: int) -> dict[str, Any]:
-    """Return success, penetration and CPU time of a setting; all settings have the same seeds."""
+    """Return success, penetration and CPU time of each setting; all settings have the same seeds."""
     hand = hand_of(data)
     true = {name: object_of(data, name, 0.0) for name in objects}
     scenes = {}

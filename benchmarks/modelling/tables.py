@@ -8,7 +8,7 @@ Row = dict[str, Any]
 TITLES: Final = {
     "engines": "Validation with changed models, compared with level standard",
     "predictors": "Predictors of the verdict",
-    "pads": "Contact by the distance that counts as contact",
+    "pads": "Contact area and ε by contact threshold",
     "shape": "Resolution of object and hand",
     "drops": "Drops with convex pieces, compared with drops of the convex hull",
     "scenes": "Lift test with changed models",
@@ -38,7 +38,7 @@ def tables(found: dict[str, Any]) -> dict[str, str]:
         )
     if "drops" in found:
         out["drops"] = _table(
-            "object|pieces|same face from the same release|distance of face shares|the same for two seeds|cost",
+            "object|pieces|same face from the same release|variation distance of faces|the same for two seeds|cost",
             map(_drop, found["drops"]["drops"]),
         )
     if "scenes" in found:

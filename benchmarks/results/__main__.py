@@ -3,9 +3,9 @@
 usage: python -m benchmarks.results [--quick] [--data DIR] [--sources DIR] [--before CHECKOUT] [--only NAME ...]
        python -m benchmarks.results --list | --stale | --pages | --enter NAME ...
 
-Results go to docs/, those of quick runs (`--quick`) to results-quick/; results/MANIFEST.json there records each study
-when it ends. `--enter` records files of docs/ that were made by other means, from their contents and the git history.
-The exit code is 1 if a study failed, or if `--stale` found a stale study."""
+Results go to docs/; with `--quick`, to results-quick/. When a study ends, results/MANIFEST.json of that folder records
+it. `--enter` records existing files of docs/ from their contents and the git history. The exit code is 1 if a study
+failed, or if `--stale` found a stale study."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ def digests(study: Study, docs: Path) -> dict[str, str]:
 
 
 def faults(docs: Path, records: Mapping[str, dict[str, Any]]) -> list[str]:
-    """Return disagreements: files without a record, different digests, missing files."""
+    """Return disagreements: files without a record, different digests, missing files, unknown studies."""
     held = {path: digest for record in records.values() for path, digest in record["files"].items()}
     found = [f"{path}: not recorded" for path in sorted(there(docs) - held.keys())]
     for path, digest in held.items():
@@ -133,6 +133,6 @@ def _git(*arguments: str) -> str:
 
 
 def revision_of_today() -> str:
-    """Return the current commit, with `+` if files differ from it."""
+    """Return the current commit, with `+` if files outside docs/ differ from it."""
     changed = _git("status", "--porcelain", "--untracked-files=no", "--", ":!docs")
     return (_git("rev-parse", "--short", "HEAD") or "unknown") + ("+" if changed else "")

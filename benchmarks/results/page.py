@@ -27,14 +27,14 @@ def index(records: Mapping[str, dict[str, Any]]) -> str:
         "# Where figures come from",
         "",
         "`make results DATA=DIR` makes all files here and in `docs/images`, study by study. Some studies also need "
-        "`SOURCES=DIR` (packages with published hands) or `BEFORE=DIR` (an earlier checkout). With `QUICK=1` it makes "
-        "small runs in `results-quick/`. A study with current files is skipped. `python -m benchmarks.results --list` "
-        "shows the commands. Raw numbers (JSON, CSV, SVG) are not in git; `--again --only NAME` makes those of a "
-        "study.",
+        "`SOURCES=DIR` (packages with published hands) or `BEFORE=DIR` (an earlier checkout). `QUICK=1` makes small "
+        "runs in `results-quick/`. A study with current files is skipped. `python -m benchmarks.results --list` shows "
+        "the commands. Raw numbers (JSON, CSV, SVG) are not in git; the options `--again --only NAME` make those of "
+        "one study.",
         "",
         "State *older*: the algorithms of the named stages have changed since the measurement, so new figures may "
-        "differ. A dash: the study does not depend on a stage. Date, version and commit are those of the run "
-        "([manifest](MANIFEST.json)). *Or earlier*: no run is recorded; the commit is that of the files.",
+        "differ. A dash: no stage is named for the study. Date, version and commit are those of the run "
+        "([manifest](MANIFEST.json)). *Or earlier*: no run is recorded; the commit last changed one of the files.",
         "",
         "| study | what | files | date | version | commit | state |",
         "| --- | --- | --- | --- | --- | --- | --- |",
@@ -94,7 +94,7 @@ def first_table(file: Path) -> str:
 
 
 def cited(page: Path) -> Iterator[str]:
-    """Yield paths under docs/ of the results that a page links to, shows or copies; folders without a slash."""
+    """Yield paths (without final slash) under docs/ of the results that a page links to, shows or copies."""
     text = page.read_text()
     for path in _CITED.findall(text):
         yield path.rstrip("/")

@@ -58,7 +58,7 @@ def _trajectory_pictures(hand: str, obj: str, scene: str) -> tuple[str, str]:
 class Study:
     """A study; `files` are globs under the folder of the docs.
     A study without `quick` has no quick run. A study without `run` is a page written by hand. `stages` are the stages
-    whose revisions affect its figures; times depend on all code and have no stages."""
+    whose revisions affect its figures; studies of times have none, because times depend on all code."""
 
     name: str
     about: str
@@ -91,7 +91,7 @@ STUDIES: Final = (
     ),
     Study(
         "bench-points",
-        "grasps per second over hand points and faces",
+        "grasps per second by hand points and faces",
         ("results/bench-points/bench.json", "results/bench-points/bench.md"),
         (
             f"graspd bench --hand {_ALLEGRO} --object {_mesh('025_mug')} --fidelity standard --batch 32 --threads 2 "
@@ -217,7 +217,7 @@ STUDIES: Final = (
     ),
     Study(
         "success",
-        "success and quality by hand and object, in one table",
+        "success by hand and object, quality by hand",
         ("results/success.md",),
         ("python -m benchmarks.success DATA 32",),
         ("python -m benchmarks.success DATA 1 Barrett",),
@@ -333,7 +333,7 @@ STUDIES: Final = (
     ),
     Study(
         "weight",
-        "what an install weighs and how long imports take",
+        "sizes of installs and times of imports",
         ("results/weight.*",),
         ("python -m benchmarks.weight --json OUT/results/weight.json",),
         ("python -m benchmarks.weight --json OUT/results/weight.json --runs 1 --no-wheel",),
@@ -370,7 +370,7 @@ STUDIES: Final = (
     ),
     Study(
         "service",
-        "what the service costs around the engine",
+        "cost of the service besides the engine",
         ("results/service-tables.md",),
         (
             "python -m benchmarks.large_index --data-dir WORK/large-index",
@@ -380,7 +380,7 @@ STUDIES: Final = (
         stages=(),
         prints="results/service-tables.md",
     ),
-    Study("service-page", "cost of the service with test conditions", ("results/service.md",), (), stages=()),
+    Study("service-page", "cost of the service: figures and conditions", ("results/service.md",), (), stages=()),
     Study(
         "matrix",
         "four hands on fourteen objects, with a crash in the middle",
@@ -407,7 +407,7 @@ STUDIES: Final = (
         needs=(SERVICE, TORCH),
     ),
     Study(
-        "predictor-page", "success of these networks, with test conditions", ("results/predictor.md",), (), stages=ALL
+        "predictor-page", "success of these networks: figures and conditions", ("results/predictor.md",), (), stages=ALL
     ),
     Study(
         "learned",
@@ -432,7 +432,7 @@ STUDIES: Final = (
     ),
     Study(
         "scene-ways",
-        "obstacles of grasps in scenes, by phase",
+        "obstructed grasps in scenes, by phase of the trajectory",
         ("results/scene-ways.md",),
         ("python -m benchmarks.scene_trajectories",),
         ("python -m benchmarks.scene_trajectories --count 1",),
@@ -479,7 +479,7 @@ STUDIES: Final = (
     ),
     Study(
         "rolling",
-        "rest poses that topple or roll",
+        "rest poses in which objects roll or topple",
         ("results/rolling.md",),
         ("python -m benchmarks.rolling DATA --page OUT/results/rolling.md",),
         ("python -m benchmarks.rolling DATA --objects 025_mug --variants 2 --page OUT/results/rolling.md",),
@@ -533,7 +533,7 @@ STUDIES: Final = (
     ),
     Study(
         "pilot",
-        "the card of a dataset of 10,080 grasps",
+        "card of the dataset pilot: 10,080 grasps",
         (
             "results/pilot/README.md",
             "results/pilot/card.json",
@@ -559,7 +559,7 @@ STUDIES: Final = (
     ),
     Study(
         "tables",
-        "the card of ten thousand grasps on tables",
+        "card of the dataset tables: 10,506 grasps",
         (
             "results/tables/README.md",
             "results/tables/card.json",
@@ -607,7 +607,7 @@ STUDIES: Final = (
     ),
     Study(
         "demo",
-        "the pictures of README",
+        "pictures in the README",
         ("images/demo-*.png",),
         (
             "graspd demo --out WORK/demo",
@@ -623,7 +623,7 @@ STUDIES: Final = (
     ),
     Study(
         "lift",
-        "animation of README: a hand lifts a mug",
+        "animation in the README: a hand lifts a mug",
         ("images/lift.webp",),
         (
             f"graspd synth --hand {_ALLEGRO} --object {_mesh('025_mug')} --scene table --faces all --scenes 8 -n 24 "

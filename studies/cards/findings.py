@@ -109,9 +109,9 @@ def _table(card: Row) -> Iterator[str]:
     if not found["grasps"]:
         return
     told = (
-        f"**{_percent(1 - found['of_grasps']['share'])} of the valid grasps are not clear of the table in any scene** "
-        f"({found['clear']:,} of {found['grasps']:,} are clear, in {_percent(found['of_pairs']['share'])} of all pairs "
-        "of grasp and scene), because grasps are planned around a free object, from all directions."
+        f"**{_percent(1 - found['of_grasps']['share'])} of the valid grasps are not clear of the table in any scene**: "
+        "grasps are planned around a free object, from all directions. "
+        f"{found['clear']:,} of {found['grasps']:,} are clear, in {_percent(found['of_pairs']['share'])} of all pairs."
     )
     rows = {name: row["of_grasps"]["share"] for name, row in found["by_object"].items() if row["of_grasps"]}
     worst = sorted(rows, key=rows.__getitem__)[:3]
@@ -160,8 +160,8 @@ def _directions(card: Row) -> Iterator[str]:
         low, high = (end(row["evenness"] for row in some.values()) for end in (min, max))
         yield (
             f"Hands approach from nearly all directions, but not uniformly. Of {rows['cells']} directions of equal "
-            f"area, at most {some[most]['empty']} are empty per object ({most}). By object, the spread equals that of "
-            f"{_percent(low)} to {_percent(high)} of the directions used uniformly."
+            f"area, at most {some[most]['empty']} are empty per object ({most}). By object, grasps are spread as if "
+            f"{_percent(low)} to {_percent(high)} of the directions were used uniformly."
         )
 
 

@@ -104,7 +104,7 @@ def start_map(hand: HandModel, obj: ObjectModel, *, count: int, say: Say) -> Sta
         "the planner's own starts retreat until they are free of contact; the merit rejects hands without contact "
         "balance, the gate rejects penetration",
         "tests/studies/test_stability.py::test_a_start_that_is_too_far_is_flagged",
-        reach="0 m: the planner draws the starts",
+        reach="only 0 m, because the planner draws the starts",
     )
 
 
@@ -131,7 +131,7 @@ def rate_map(
         "hands jump past the object or penetrate it",
         "the schedule fixes rates and weights; hands with numbers that are not finite are rejected, others validated",
         "tests/worker/test_certified.py::test_hands_that_are_no_numbers_are_dropped_and_counted",
-        reach="Adam at 1 and 1: rates and weights are no options of a job; `optimizer: gd` uses those of the paper",
+        reach="Adam with factors 1: rates and weights are no options of a job; `optimizer: gd` uses those of the paper",
     )
 
 
@@ -150,7 +150,7 @@ def length_map(hand: HandModel, obj: ObjectModel, *, lengths: Sequence[int], say
         f"Long runs of the fine phase, {hand.name} on {obj.name}",
         "iterations",
         "measure",
-        _MEASURE + "; the largest deviation of a quaternion's norm from 1",
+        _MEASURE + "; drift: largest deviation of a quaternion's norm from 1",
         _BOUNDS + "; drift: 1e-5, 1e-3",
         reachable(cells, lambda cell: True),
         "rotations of poses become invalid, or hands drift away",

@@ -97,10 +97,10 @@ def gradient_map(sizes: Sequence[float], gaps: Sequence[float], *, repeats: int)
         "Gradient of the float32 kernels against float64 differences",
         "radius of the object [m]",
         "spread of the gaps over the step",
-        "sine of the angle between the gradients, median of some contact sets",
+        "sine of the angle between the gradients, median over contact sets",
         f"weak: {ANGLE[0]:g}; broken: {ANGLE[1]:g}",
         reachable(cells, lambda cell: True),
-        "the descent wanders: the loss does not fall, even with more iterations",
+        "the loss does not fall, even with more iterations",
         "a descent that does not improve stops after `patience` iterations; the best of several starts is selected by "
         "the balance of forces, not by the loss",
         "tests/studies/test_stability.py::test_gradients_agree_at_the_sizes_of_hands_and_their_objects",

@@ -222,7 +222,7 @@ def stiffness_map(stiffnesses: Sequence[float], masses: Sequence[float], time_st
         "contact stiffness [N/m]",
         "time step [s]",
         _BALL_MEASURE,
-        "as in the first map; the line is dt = 2 sqrt(m / k), above which one contact alone is unstable",
+        "bounds as in the first map; the line is dt = 2 sqrt(m / k), above which one contact alone is unstable",
         cells,
         "soft contacts allow penetration, stiff ones throw the object; the range between them narrows with dt",
         "only `graspd2022` uses penalty forces, and only for a static balance without time steps",
@@ -251,7 +251,7 @@ def contact_count_map(counts: Sequence[int]) -> StabilityMap:
         "more points on the same finger push harder; losses and gradients grow with the sampling",
         "summed Jacobi is not offered; the direct solver weights points by the area that they represent",
         "tests/studies/test_stability.py::test_summed_jacobi_overshoots_with_the_number_of_contacts",
-        reach="the offered solvers, with any number of contacts, which is the number of touching hand points",
+        reach="the offered solvers, with any number of contacts (touching hand points)",
     )
 
 

@@ -118,7 +118,7 @@ def scene_map(
         measure,
         "weak: below 0.5; broken: 0",
         reachable(cells, lambda cell: True),
-        "few or no valid grasps: `clear_share` and `lift_share` of `graspd synth --json` show which of the two is low",
+        "few or no valid grasps; `clear_share` or `lift_share` of `graspd synth --json` is low",
         guard,
         f"tests/studies/test_stability.py::{study.guard_test}",
         reach=f"all: {study.reach}",
