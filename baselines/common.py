@@ -1,7 +1,7 @@
-"""Common parts of the baselines: hand and object on a device, free starts, inner surfaces, grasp sets.
+"""Common parts of the baselines: hand and object on a device, collision-free starts, inner surfaces, grasp sets.
 
-Baselines use flat triangles of the object (no Phong smoothing). Starts, postures around the grasp and quality come from
-the same code as `fast_graspd`, so that only the search is compared."""
+Baselines use flat triangles of the object (no Phong smoothing). Pregrasp, squeeze and quality come from the same code
+as in `fast_graspd`, and so do starts that a publication does not define."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def cached_search(make: Callable[..., T], pair: Pair, *options: object) -> T:
 
 
 def load_pair(hand: HandModel, obj: ObjectModel, device: str, *kernels: ModuleType) -> Pair:
-    """Return the pair on a device; also load the caller's kernel modules, in one thread only."""
+    """Return hand and object on a device; load the caller's kernel modules, in one thread at a time."""
     pair = pair_of(hand, obj, GROUND, device)
     with _lock:
         for module in kernels:

@@ -1,1 +1,1 @@
-"""Conversion of grasps: importers return postures in our frames; exporters write our shards."""
+"""Conversion of grasps: importers return postures in graspd's frames; exporters convert graspd's shards."""

@@ -1,6 +1,6 @@
 """Hands in DexGraspBench's layout: MJCF model with position actuators, configuration, map of joints.
 
-The model's world frame is the frame of our root link, so `qpos` begins with our pose of it. Bodies are named
+The model's world frame is the frame of graspd's root link, so `qpos` begins with this link's pose. Bodies are named
 `root_<link>` and `f<number of the finger>_<link>`: the evaluator finds fingers by the prefix of a body's name."""
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _COLOUR: Final = (0.87, 0.45, 0.2, 1.0)
 
 
 def write_hand(hand: HandModel, config: str, root: Path) -> Path:
-    """Write model and configuration (`hand=...` of the evaluator) of a hand; return the model, relative to `root`."""
+    """Write a hand's model and configuration file; return the model's path, relative to `root`."""
     folder = Path("assets") / "hand" / config
     (root / folder / "meshes").mkdir(parents=True, exist_ok=True)
     for number, piece in enumerate(hand.pieces):
@@ -49,7 +49,7 @@ def body_names(hand: HandModel) -> tuple[str, ...]:
 
 
 def _finger(hand: HandModel, body: int) -> str:
-    """Return the finger of a body: the child of the root above the body."""
+    """Return the finger of a body, numbered by the child of the root that leads to the body."""
     while hand.parent[body] > 0:
         body = int(hand.parent[body])
     return f"f{np.flatnonzero(hand.parent == 0).tolist().index(body)}"
@@ -183,25 +183,25 @@ _FOLDERS: Final = (GRASPS, COLLECTED, "evaluation", "succgrasp")
 
 @dataclass(frozen=True)
 class HandMapping:
-    """Map between our joints and `qpos`: pose of the model's root (7,), then joints in its own order."""
+    """Map between graspd's joints and `qpos`: the model's root pose (7,), then joints in the model's order."""
 
     hand: str
     root_link: str
     config: str
-    """Configuration of the benchmark that names the model: `hand=...`."""
+    """Value of the benchmark's option `hand`: the configuration that names the model."""
     model: str
     root_in_model: tuple[float, ...]
-    """(7,) pose of our root link in the frame whose pose begins `qpos`; m, w x y z."""
+    """(7,) pose of graspd's root link in the frame of the model's root; m, w x y z."""
     joints: tuple[tuple[str, str], ...]
     """(model's joint, URDF's joint) in the order of `qpos`; angles are the same."""
     links: tuple[tuple[str, str], ...] = ()
 
     def qpos(self, hand: HandModel, root: Floats, joints: Floats) -> Floats:
-        """Return `qpos` (7 + J,) from our root's pose (7,) and our joints (J,)."""
+        """Return `qpos` (7 + J,) from graspd's root pose (7,) and joints (J,)."""
         return np.concatenate([compose(root, invert(np.array(self.root_in_model))), joints[self._order(hand)]])
 
     def posture(self, hand: HandModel, qpos: Floats) -> tuple[Floats, Floats]:
-        """Return our root's poses (N, 7) and our joints (N, J) from (N, 7 + J)."""
+        """Return graspd's root poses (N, 7) and joints (N, J) from `qpos` (N, 7 + J)."""
         joints = np.empty_like(qpos[:, 7:])
         joints[:, self._order(hand)] = qpos[:, 7:]
         return compose(qpos[:, :7], np.array(self.root_in_model)), joints
@@ -222,7 +222,7 @@ class HandMapping:
 
 
 def mapping_of(file: Path) -> HandMapping | None:
-    """Load the mapping in the parent of a grasp file's folder; None if there is none."""
+    """Load the mapping of the experiment to which a grasp file belongs; None if there is none."""
     for above in file.resolve().parents:
         if above.name in _FOLDERS:
             return _read(above.parent / FILE)
@@ -256,9 +256,9 @@ _ALLEGRO_URDFS: Final = (
         for part in ("rotation" if finger == "thumb" else "abduction", "proximal", "middle", "distal")
     ),
 )
-#: Rotation of their Allegro palm in the model's world frame: quaternion 0 1 0 1.
+#: Pose of the palm of DexGraspBench's Allegro hand in the model's world frame: a rotation alone.
 _ALLEGRO_ROOT: Final = (0.0, 0.0, 0.0, 0.0, 0.5**0.5, 0.0, 0.5**0.5)
-#: Position of their Shadow palm above the wrist, which is omitted.
+#: Pose of the palm of DexGraspBench's Shadow hand, above the wrist, which is omitted.
 _SHADOW_ROOT: Final = (0.0, 0.0, 0.034, 1.0, 0.0, 0.0, 0.0)
 
 

@@ -1,9 +1,9 @@
 """Objects and scenes in DexGraspBench's layout, and grasps on a table in the format of its tabletop test.
 
-Files of an object are its mesh, convex pieces, facts, and scenes, in which it floats at scale 1 or stands on a table.
-Poses in the files of a table are in its frame, z up, with its top at z = 0. The evaluator has only a floor there.
-Grasps on a table have two more fields, for arms. `approach_qpos` (W, 7 + J) leads from the standoff to the pregrasp
-with the hand open. `lift_qpos` (7 + J,) is the raised squeeze. The evaluator raises a hand without arm itself."""
+Files of an object are its mesh, convex pieces, measurements, and scenes. In a scene the object floats at scale 1 or is
+on a table. Poses on a table are in the table's frame: z up, top at z = 0, where the evaluator has a floor. Grasps on a
+table have two more fields, for arms. `approach_qpos` (W, 7 + J) leads the open hand from the standoff to the pregrasp.
+`lift_qpos` (7 + J,) is the raised squeeze. The evaluator raises a hand without arm itself."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ Row = dict[str, Any]
 
 #: Folder of scenes with a table, and part of the name of an experiment.
 TABLETOP: Final = "tabletop"
-#: Tolerance of equal poses, and of a floor's height at z = 0 [m, and in quaternions].
+#: Tolerance of equal positions [m] and quaternions, and of the table's height at z = 0 [m].
 SAME: Final = 1e-9
 #: Folder of a set of objects in a checkout of DexGraspBench.
 SET: Final = Path("assets") / "object" / "graspd"
@@ -63,7 +63,7 @@ def write_object(obj: ObjectModel, name: str, root: Path) -> tuple[Path, Path]:
 
 
 def _facts(obj: ObjectModel, solid: float) -> dict[str, Any]:
-    """Return mass, density, bounds and centre of mass; at density 1 the pieces have the mass `solid`."""
+    """Return mass, density, bounds and centre of mass; the mass is the pieces' volume `solid` at density 1."""
     _, extents = trimesh.bounds.oriented_bounds(obj.hull_vertices)
     return {
         "gravity_center": obj.centre_of_mass.tolist(),
@@ -127,7 +127,7 @@ def tabletop_fields(mapping: HandMapping, hand: HandModel, grasps: GraspSet, row
 
 
 def tables_at(obj_pose: Floats) -> PlacedGrasps:
-    """Return tables, which fingertips may touch, for object poses (N, 7); equal poses share one."""
+    """Return a table for each of the object poses (N, 7); equal poses share one. Fingertips may touch it."""
     _, first, index = np.unique(np.round(obj_pose / SAME), axis=0, return_index=True, return_inverse=True)
     order = np.argsort(first)
     number = np.empty(len(order), np.intp)

@@ -2,7 +2,7 @@
 
 Fields: `obj_path`, `obj_scale`, `obj_pose` (7,), and `pregrasp_qpos`, `grasp_qpos`, `squeeze_qpos` (7 + J,) each: root
 position, root quaternion w x y z, joints. Root and object share one world frame. Root and joint order belong to the
-model that a benchmark's configuration names. A mapping beside the grasps relates them to root and joint order of
+model that a benchmark's configuration names. A mapping file of the experiment relates them to root and joint order of
 graspd. Grasps on a table have more fields, see `bench_scene`."""
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ NAME: Final = "graspd"
 
 
 def read(path: Path, *, hand: str, obj: str) -> list[ImportedGrasps]:
-    """Read a file or folder: one set per scale, separate sets for tables. Without a mapping, joints are those of
-    `hand`."""
+    """Read a file or folder: one set of free grasps, and one of grasps on tables, for each scale.
+    Without a mapping, joints are in the order of `hand`."""
     # Descriptions of scenes are also pickled dictionaries.
     files = [path] if path.is_file() else [f for f in sorted(path.rglob("*.npy")) if "scene_cfg" not in f.parts]
     if not files:
@@ -76,10 +76,10 @@ def write(
     folder: Path,
     placed: PlacedGrasps | None = None,
 ) -> list[Path]:
-    """Write grasps with all files of DexGraspBench's evaluator: the folder completes its checkout.
+    """Write grasps and all files that DexGraspBench's evaluator needs, to be copied over its checkout.
     The object has scale 1. It is at the origin or, for `placed` grasps, on its table, as in the tabletop test; both are
-    separate experiments. The hand is written as a model of our own, whose files are returned. If the benchmark has a
-    model of the same hand, the grasps are also written for that model."""
+    separate experiments. Grasps are written for a model of the hand that is made here, and for the benchmark's own
+    model of the same hand, if any. Return the files of grasps for the first model."""
     if placed is not None:
         check_table(placed)
     name = plain_name(obj.name)
@@ -112,11 +112,11 @@ def write(
 
 
 def models_of(hand: HandModel, folder: Path) -> list[HandMapping]:
-    """Return mappings for our hand model, written below `folder`, and for the benchmark's model if it has one."""
+    """Write a model of the hand below `folder`; return mappings to it and to the benchmark's own, if any."""
     config = f"{NAME}_{plain_name(hand.name)}"
     model = write_hand(hand, config, folder)
     built: Any = mujoco.MjModel.from_xml_path(str(folder / model))
-    # In MuJoCo's order, that of `qpos`.
+    # MuJoCo's order of joints is the order in `qpos`.
     joints = tuple((built.joint(number).name,) * 2 for number in range(built.njnt))
     links = tuple(zip(body_names(hand), hand.body_names, strict=True))
     ours = HandMapping(hand.name, hand.root_link, config, model.as_posix(), tuple(IDENTITY_POSE), joints, links)
@@ -129,7 +129,7 @@ def experiment(placed: PlacedGrasps | None) -> str:
 
 
 def postures(mapping: HandMapping, hand: HandModel, grasps: GraspSet, row: int, pose: Floats | None) -> Row:
-    """Return the `..._qpos` of a grasp, at the origin or with the object at `pose` (7,) on a table."""
+    """Return the `..._qpos` of a grasp whose object is at the origin, or at `pose` (7,) on a table."""
     record: Row = {}
     for name in POSTURES:
         found: Posture = getattr(grasps, name)

@@ -3,28 +3,28 @@
 Zhang et al., DexGraspNet 2.0, CoRL 2024. Below `data/`, NNNN is a scene and VVVV is a view of the scene:
 
     scenes/scene_NNNN/realsense/
-        depth_gt/VVVV.png           16 bits, steps of one metre over `factor_depth`, 0: nothing
-        label_gt/VVVV.png           0: table and background, 1: the object, 2, ...: others
+        depth_gt/VVVV.png           16 bits, in steps of 1 / `factor_depth` [m]; 0: no surface
+        label_gt/VVVV.png           0: table and background, 1: the object, 2, ...: neighbours
         meta/VVVV.mat               `intrinsic_matrix`, `factor_depth`, `cls_indexes`, `poses` (3, 4, 1)
-        camera_poses.npy            (256, 4, 4) camera of a view in that of view 0
-        cam0_wrt_table.npy          (4, 4) camera of view 0 in the table's frame
+        camera_poses.npy            (256, 4, 4) camera pose of each view in the camera frame of view 0
+        cam0_wrt_table.npy          (4, 4) camera pose of view 0 in the table's frame
     dex_grasps_new/scene_NNNN/HAND/OBJECT.npz
-        `translation` (N, 3), `rotation` (N, 3, 3): root link in the camera of view 0; `point` (N, 3): point of
-            the object's surface that the grasp aims at, in the same frame; and each joint by its name (N,)
+        `translation` (N, 3), `rotation` (N, 3, 3): root link in the camera frame of view 0; `point` (N, 3):
+            surface point of the object that the grasp aims at, in the same frame; each joint (N,) by its name
     dex_graspness_new/scene_NNNN/realsense/VVVV.npy
-        (P, 1) f4 graspness of the P points of its loader for the view, in pixel order
+        (P, 1) f4 graspness of the P points that its loader makes of the view, in pixel order
 
-Its loader puts pixel (u, v) at u, v; graspd has pixel centres at +0.5. The intrinsics account for this.
+Its loader puts the centre of pixel (u, v) at u, v, but graspd at u + 0.5, v + 0.5. The intrinsics account for this.
 
 Graspness is a distance-weighted number of grasps that aim at a point. Values follow src/preprocess/dex_graspness.py,
-and clouds follow src/utils/pc.py, both of zcyqyq/DexTouch-sim2real at 7824d859a8da1d942bc38709a9d217dfb548db5d. An
-object is 1,000 points of its surface:
+and clouds follow src/utils/pc.py, both of zcyqyq/DexTouch-sim2real at 7824d859a8da1d942bc38709a9d217dfb548db5d. 1,000
+surface points represent an object:
 
     grasp g aims from the palm at the middle between its thumb and its other fingers
-    seen    points ahead within 30 degrees of that line, at most 20 mm farther along it than the first of them
-    p_g     the seen point with the least angle / 10 degrees + height / 15 mm
-    value   of a point: the sum over all grasps of 10^(-150 d), d its distance from p_g [m]. It is not
-        normalised; their loader computes the logarithm of value + 0.001
+    seen    points ahead within 30 degrees of that line, at most 20 mm beyond the first of them along the line
+    p_g     the seen point with the least angle / 10 degrees + distance beyond the first / 15 mm
+    value   of a point: sum over all grasps of 10^(-150 d); d is the point's distance from p_g [m]. Values are
+        not normalised; their loader computes the logarithm of value + 0.001
     pixel   on the object: the value of the nearest point; elsewhere 0
 
 Their code uses thumb and middle finger of a LEAP hand, and the centre of its palm's box. This module uses any hand's
@@ -82,28 +82,28 @@ SAMPLES: Final = 1000
 #: Half the opening of a grasp's view cone [rad], and its depth beyond the first point [m].
 CONE: Final = np.pi / 6
 BAND_M: Final = 0.02
-#: Angle [rad] and height beyond the first point [m] that halve the weight of a seen point.
+#: Angle [rad] and distance beyond the first point [m] that each add 1 to the cost of a seen point.
 ANGLE_HALF: Final = np.pi / 18
 HEIGHT_HALF_M: Final = 0.015
 #: Powers of ten by which a grasp's weight falls per metre from its aim point [1/m].
 FALL_PER_M: Final = 150.0
 #: Largest distance of a pixel from the point whose value it takes [m].
 REACH_M: Final = 0.015**0.5
-#: Points farther from the box around all objects are not in the cloud [m].
+#: Largest distance of the cloud's points from the box around all objects [m].
 OUTLIER_M: Final = 0.02
-#: Grasps that are evaluated at once: some 6 MB per array.
+#: Number of grasps that are evaluated at once: some 6 MB per array.
 _AT_ONCE: Final = 256
 
 
 def surface_samples(obj: ObjectModel) -> Floats:
-    """Sample (`SAMPLES`, 3) even surface points of an object, in its frame [m]; equal for equal objects."""
+    """Sample evenly spread surface points (`SAMPLES`, 3) [m]; equal objects have equal points."""
     many = sample_faces(obj.vertices, obj.faces.astype(np.int64), OVERSAMPLING * SAMPLES)[0]
     return many[farthest_points(many, SAMPLES)]
 
 
 @dataclass(frozen=True)
 class SceneGraspness:
-    """Graspness of one scene's object, from all its grasps there."""
+    """Graspness of the object in a scene, from all its grasps in this scene."""
 
     samples: Floats
     """(S, 3) points of the object's surface, in its frame [m]."""
@@ -121,16 +121,16 @@ class SceneGraspness:
     def of_view(
         self, depth: Floats, labels: NDArray[np.uint8], intrinsics: Floats, camera: Floats, object_pose: Floats
     ) -> NDArray[np.float32]:
-        """Return the graspness (N, 1) of the loader's cloud of a picture, row by row; 0 on neighbours.
+        """Return the graspness (N, 1) of the points that the loader makes of a picture; 0 on neighbours.
         `depth` (H, W) [m] is 0 without a surface. `labels` (H, W) are 0 for background and 1 for the object of the
-        grasps, which has at least one pixel. `intrinsics` are (3, 3) [px]. `camera` (4, 4) and `object_pose` (7,) are
-        in the table's frame."""
+        grasps; at least one label is not 0. `intrinsics` are (3, 3) [px]. `camera` (4, 4) and `object_pose` (7,) are in
+        the table's frame. Points are in pixel order."""
         cloud = back_projected(depth, intrinsics)
         inside = in_workspace(cloud, depth, labels, camera)
         found = np.zeros(np.count_nonzero(inside), np.float32)
         mine = labels[inside] == 1
         points = apply(invert(object_pose), cloud[inside][mine])
-        # A point without a neighbour within reach gets an index past the last one.
+        # Without a sample within reach, the index is past the last sample.
         nearest = cKDTree(self.samples).query(points, distance_upper_bound=REACH_M)[1]
         found[mine] = np.append(self.values, 0)[nearest]
         return found[:, None]
@@ -159,7 +159,7 @@ def _fingertips(hand: HandModel, grasps: Posture) -> Floats:
 
 
 def pointed_at(palm: Floats, line: Floats, samples: Floats) -> NDArray[np.intp]:
-    """Return (K,) aim points' indices in `samples` (S, 3), seen from `palm` along unit `line` (K, 3) [m]."""
+    """Return indices (K,) of aim points in `samples` (S, 3), seen from `palm` along `line` (K, 3) [m]."""
     found = np.empty(len(palm), np.intp)
     for first in range(0, len(palm), _AT_ONCE):
         some = slice(first, first + _AT_ONCE)
@@ -184,7 +184,7 @@ def sum_graspness(samples: Floats, pointed: NDArray[np.intp]) -> Floats:
 
 
 def back_projected(depth: Floats, intrinsics: Floats) -> Floats:
-    """Return (H, W, 3) points of a picture in its camera [m], bit for bit as in the loader: their number must agree."""
+    """Return the points (H, W, 3) of a picture in the camera's frame [m], bit for bit as in the loader."""
     u, v = np.meshgrid(np.arange(depth.shape[1]), np.arange(depth.shape[0]))
     x = (u - intrinsics[0, 2]) * depth / intrinsics[0, 0]
     y = (v - intrinsics[1, 2]) * depth / intrinsics[1, 1]
@@ -193,8 +193,8 @@ def back_projected(depth: Floats, intrinsics: Floats) -> Floats:
 
 def in_workspace(cloud: Floats, depth: Floats, labels: NDArray[np.uint8], camera: Floats) -> NDArray[np.bool_]:
     """Return a mask (H, W) of pixels whose points (H, W, 3) the loader keeps.
-    Such pixels have a depth and lie in the box around all labelled pixels, on the table. As in the loader, labelled
-    pixels without depth extend the box, at the camera."""
+    Such pixels have a depth, and their points are near the box around all labelled points, in the table's frame. As in
+    the loader, labelled pixels without depth extend the box to the camera."""
     whole = np.concatenate([cloud.reshape(-1, 3), np.ones((depth.size, 1))], axis=1)
     there = np.einsum("ab,nb->na", camera, whole)[:, :3]
     objects = there[labels.reshape(-1) > 0]
@@ -204,19 +204,19 @@ def in_workspace(cloud: Floats, depth: Floats, labels: NDArray[np.uint8], camera
 
 
 CAMERA: Final = "realsense"
-#: Views of a scene, from which its loader samples.
+#: Number of views of each scene; the loader samples among them.
 VIEWS: Final = 256
 #: Steps per metre in a depth picture: 16 bits reach 6.5 m.
 FACTOR: Final = 10000
-#: Numbers of scenes: split `train_1` with the scenes of `part`, and split `val` with `test`.
+#: Scene numbers: for training those of `train_1` and `part`, for held-out objects those of `val` and `test`.
 TRAIN: Final = (range(90), range(1000, 8500))
 HELD_OUT: Final = (range(90, 100), range(100, 190))
-#: Keys of a file of grasps that are no joints.
+#: Keys of a file of grasps that do not name joints.
 _PLACE: Final = ("translation", "rotation", "point")
 _OURS: Final = ("pregrasp_qpos", "squeeze_qpos", "success", "row")
 #: Argument names of NumPy's writer.
 _NUMPYS: Final = ("file", "args", "kwds", "allow_pickle")
-#: A `meta` file has two kilobytes; unpacked it is at most a thousand times as large [bytes].
+#: Largest size of a `meta` file [bytes]; real ones have 2 kB. Unpacked, a file is at most 1,000 times as large.
 _LARGEST_META: Final = 64 * 2**10
 #: Largest unpacked size of a file's members [bytes]; files of grasps of one object are far smaller.
 LARGEST: Final = 2**30
@@ -227,7 +227,7 @@ _MEMBERS: Final = 1024
 def write(
     lots: Sequence[ExportPart], pictures: Pictures, folder: Path, out: frozenset[str], noise: DepthNoise | None = None
 ) -> ExportSummary:
-    """Write each scene that has pictures and grasps, planned in it or transferred to it."""
+    """Write each scene that has pictures and grasps; grasps are planned in it or transferred to it."""
     top = folder / "data"
     if top.exists():
         raise InputError(f"{top} exists already; give another folder as --output")
@@ -239,7 +239,7 @@ def write(
             raise InputError(
                 "no grasp is valid and clear in the scenes of the pictures; plan grasps in scenes: synth --scene"
             )
-        raise InputError("no picture shows a scene with grasps; put views beside the grasps: graspd render")
+        raise InputError("no picture shows a scene with grasps; render views into the grasps' folder: graspd render")
     done = ExportSummary({"grasps": 0, "scenes": len(scenes), "views": 0, "files": len(scenes)})
     numbers = {held: _numbers(held, scenes, known, out) for held in (False, True)}
     samples: dict[str, Floats] = {}
@@ -301,7 +301,7 @@ def _write_scene(
             "poses": pose_to_matrix(pose)[:3, :, None],
         }
         scipy.io.savemat(path / "meta" / f"{view:04}.mat", meta)
-        if labels.any():  # its loader skips empty views, which have no workspace
+        if labels.any():  # the loader skips empty views, which have no workspace
             found = graspness.of_view(steps / FACTOR, labels, intrinsics, first @ poses[view], pose)
             np.save(values / f"{view:04}.npy", found)
     # The loader samples among 256 views, so further views repeat the same files.
@@ -335,7 +335,7 @@ def _write_grasps(look: PictureReference, lot: ExportPart, folder: Path, graspne
     point = apply(in_camera, graspness.samples[graspness.pointed])
     arrays: dict[str, Any] = {"translation": matrices[:, :3, 3], "rotation": matrices[:, :3, :3], "point": point}
     arrays |= {name: some["grasp"].joint_positions[:, k] for k, name in enumerate(names)}
-    # Its loader ignores these arrays; they are needed to import the grasps unchanged.
+    # The loader ignores these arrays; they are needed to import the grasps unchanged.
     for name in ("pregrasp", "squeeze"):
         arrays[f"{name}_qpos"] = np.concatenate([placed[name], some[name].joint_positions], axis=1)
     arrays |= {"success": lot.verdict[look.rows], "row": look.rows}
@@ -344,8 +344,8 @@ def _write_grasps(look: PictureReference, lot: ExportPart, folder: Path, graspne
 
 
 def read(path: Path, *, hand: str, obj: str, number: int = 0) -> list[ImportedGrasps]:
-    """Read `dex_grasps_new/SCENE/HAND/OBJECT.npz` in its folder `data` with the scene's `meta`; object frame.
-    `number` is the index of the object in the scene, from 0."""
+    """Read grasps of `data/dex_grasps_new/SCENE/HAND/OBJECT.npz`, in the object's frame.
+    The scene's `meta` has the object's pose; `number` is the index of the object in the scene, from 0."""
     found = load_npz(path)
     try:
         count = len(found["translation"])
@@ -408,11 +408,11 @@ def _object_pose(path: Path, number: int) -> Floats:
 
 
 def load_npz(path: Path) -> dict[str, NDArray[Any]]:
-    """Load the arrays of a `.npz` file without objects that unpacks to at most `LARGEST`."""
+    """Load a `.npz` file's arrays; refuse pickled objects, and files that unpack to more than `LARGEST`."""
     try:
         with zipfile.ZipFile(path) as archive:
             members = archive.infolist()
-        # A member is never unpacked beyond this size.
+        # A member is never unpacked beyond its `file_size`.
         if len(members) > _MEMBERS or sum(member.file_size for member in members) > LARGEST:
             raise InputError(f"{path} unpacks to more than {LARGEST >> 20} MiB or to more than {_MEMBERS} arrays")
         with np.load(path, allow_pickle=False) as found:

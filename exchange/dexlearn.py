@@ -1,6 +1,6 @@
-"""DexLearn's folder: collected grasps with a list per file, splits, scenes, and partial clouds.
+"""DexLearn's folder: files with several grasps each, splits, scenes, and partial point clouds.
 
-The folder overlays a checkout of DexLearn (Chen et al., baselines of BODex and Dexonomy), all in one `assets/`:
+Copy the folder over a checkout of DexLearn (Chen et al., baselines of BODex and Dexonomy). Files in `assets/`:
 
     grasp/NAME/succ_collect/TYPE/OBJECT/.../*.npy   `..._qpos` (K, 7 + J), `scene_path`, `scene_scale` (K,)
     object/graspd/valid_split/{train,test}.json     names of objects
@@ -34,7 +34,7 @@ from graspd.worker.grasps import GraspSet
 #: Folder of each `quality/grasp_type`; the number before the underscore is a network's input.
 TYPES: Final = ("0_any", "1_power", "2_precision", "3_lateral")
 VISION: Final = SET / "vision_data" / "azure_kinect_dk"
-#: Points of a network's input, sampled from a cloud with repetition.
+#: Number of points in a network's input, which are sampled from a cloud with repetition.
 POINTS: Final = 1024
 _FREE: Final = -1
 
@@ -42,7 +42,7 @@ _FREE: Final = -1
 def write(
     lots: Sequence[ExportPart], pictures: Pictures, folder: Path, out: frozenset[str], noise: DepthNoise | None = None
 ) -> ExportSummary:
-    """Write grasps, free or on tables, and the clouds of their cameras."""
+    """Write grasps, free or on tables, and the point clouds of their pictures."""
     if (folder / SET).exists():
         raise InputError(f"{folder} holds objects of an export already; give another folder as --output")
     for lot in lots:
@@ -52,9 +52,7 @@ def write(
     clouds, bare = _clouds(pictures, lots, scenes, folder, noise)
     done = ExportSummary({"grasps": 0, "scenes": len({*scenes.values()}), "clouds": clouds, "files": 0})
     if not clouds:
-        done.notes.append(
-            "there are no pictures and so no clouds; training needs views beside the grasps: graspd render"
-        )
+        done.notes.append("there are no pictures and so no clouds; render views into the grasps' folder: graspd render")
     elif bare:
         done.counts["scenes"] -= bare
         done.notes.append(f"no picture shows {bare} of the scenes; their grasps are left out")
@@ -73,7 +71,7 @@ def write(
 
 #: Scene file below the folder, by shard and scene; free grasps have the scene file of their object.
 _Scenes = dict[tuple[str, int], Path]
-#: Rows of a lot that share scene and type.
+#: Grasps of one shard that share scene file and grasp type.
 _Part = tuple[ExportPart, Path, int, NDArray[np.intp]]
 
 
@@ -110,13 +108,13 @@ def _clouds(
         written[scene] += 1
     bare = set(scenes.values()) - set(written)
     for scene in bare if written else ():
-        # Its test samples a cloud of every scene in the folder.
+        # DexLearn's test samples a cloud of every scene in the folder.
         (folder / scene).unlink()
     return written.total(), len(bare)
 
 
 def points_of(pictures: Pictures, look: PictureReference, noise: DepthNoise | None, *, on_table: bool) -> Floats:
-    """Return (P, 3) object points of a picture, in the table's frame, or the object's without a table [m]."""
+    """Return the object's points (P, 3) in a picture [m]; without a table, in the object's frame."""
     view = CloudView(pictures[look.index], noise, np.random.default_rng(look.index))
     points = view.points(*view.pixels(whole=False))
     return points if on_table else apply(invert(look.object_pose), points)
@@ -145,7 +143,7 @@ def _write_group(
 def _rows_of(
     lot: ExportPart, scenes: _Scenes, folder: Path, *, seen: bool
 ) -> Iterator[tuple[Path, int, NDArray[np.intp]]]:
-    """Yield the lot's rows by scene file and type; skip scenes without a picture if others have a picture."""
+    """Yield the lot's rows by scene file and type; with `seen`, skip scenes without a cloud."""
     index = np.full(len(lot.grasps), _FREE) if lot.placed is None else np.asarray(lot.placed.index)
     types = np.asarray(lot.shard.arrays.get("quality/grasp_type", np.zeros(len(index))), np.intp)
     for scene in sorted({int(index[row]) for row in lot.rows}):
@@ -177,7 +175,7 @@ def _record(mapping: HandMapping, lot: ExportPart, rows: NDArray[np.intp], scene
     poses = [None if lot.placed is None else np.asarray(lot.placed.object_pose[lot.placed.index[row]]) for row in rows]
     each = [postures(mapping, lot.hand, grasps, int(row), pose) for row, pose in zip(rows, poses, strict=True)]
     record |= {f"{name}_qpos": np.array([one[f"{name}_qpos"] for one in each]) for name in POSTURES}
-    # DexLearn ignores it; it is needed to import the grasps unchanged.
+    # DexLearn ignores this pose; it is needed to import the grasps unchanged.
     record["obj_pose"] = np.array([IDENTITY_POSE if pose is None else pose for pose in poses])
     return record | {"succ_flag": lot.verdict[rows], "row": np.asarray(rows)}
 

@@ -1,11 +1,11 @@
 """GraspGen's data: a JSON record per object in tar files, with an index, object lists and meshes.
 
-Murali et al., GraspGen, ICRA 2026. Files that are written and read:
+Murali et al., GraspGen, ICRA 2026. Files:
 
     grasps/GRIPPER/shard_000.tar         members UUID.grasps.json; uuid_index.json: {UUID: number of the shard}
     splits/GRIPPER/{train,valid}.txt     a UUID per line
     objects/UUID.obj                     and map_uuid_to_path.json: {UUID: file}
-    grippers/GRIPPER.yaml                width, depth, and frame of its convention: z approaches, x closes
+    grippers/GRIPPER.yaml                width, depth, and GraspGen's frame: z along the approach, x across the jaws
 
 A record has `object` {file, scale} and `grasps` {`transforms` (N, 4, 4), `object_in_gripper` (N,) true or false}. A
 transform is the pose of the gripper's base link in the object's frame, with the mesh multiplied by `scale`. GraspGen's
@@ -44,7 +44,7 @@ from graspd.worker.simulation.data import HandState
 MEMBER: Final = "grasps.json"
 INDEX: Final = "uuid_index.json"
 POSTURES: Final = ("pregrasp", "grasp", "squeeze")
-#: Objects in a tar file.
+#: Number of objects in a tar file.
 PER_SHARD: Final = 64
 #: Largest size of a record that is read [bytes]; 2,000 grasps have half a megabyte.
 LARGEST: Final = 256 * 2**20
@@ -52,12 +52,12 @@ LARGEST: Final = 256 * 2**20
 FEWEST: Final = 5
 #: Tolerance of a published rotation matrix, since matrices are printed with six digits or more.
 _ROTATION: Final = 1e-3
-#: Hands that are closed at once.
+#: Number of hands that are closed at once.
 _AT_ONCE: Final = 256
 
 
 def write(lots: Sequence[ExportPart], folder: Path, out: frozenset[str]) -> ExportSummary:
-    """Write all validated grasps of each hand, also failed ones; `valid.txt` lists held-out objects."""
+    """Write all validated grasps of each hand, including failed ones; `valid.txt` lists held-out objects."""
     if (folder / "grasps").exists():
         raise InputError(f"{folder} holds grasps already; give another folder as --output")
     done = ExportSummary({"grasps": 0, "good": 0, "objects": 0, "files": 0})
@@ -74,7 +74,7 @@ def write(lots: Sequence[ExportPart], folder: Path, out: frozenset[str]) -> Expo
 
 
 def uuid_of(lot: ExportPart) -> str:
-    """Return the object's name in the data. WebDataset ends a key at the first dot."""
+    """Return the object's name without dots, because WebDataset ends a key at the first dot."""
     return lot.name.replace(".", "-")
 
 
@@ -127,9 +127,9 @@ def _record(hand: HandModel, lots: list[ExportPart]) -> dict[str, Any]:
 
 
 def convention(hand: HandModel) -> dict[str, Any]:
-    """Return the YAML of a gripper: clear width [m], reach along its approach [m], and frame.
-    The frame is that of GraspGen's convention in the base link's frame, as [[x, y, z], [x, y, z, w]]. For a hand with
-    more than two jaws, x is the direction across the approach with the largest distance of its open fingertips."""
+    """Return values of a gripper's YAML file: opening [m], reach along the approach [m], and frame.
+    The frame is that of GraspGen's convention in the base link's frame, as [[x, y, z], [x, y, z, w]]. For a hand
+    without jaws, x is the direction across the approach with the largest distance of open fingertips."""
     z, jaws = hand.palm.approach, jaws_of(hand)
     if jaws is not None:
         widest = int(np.argmax(jaws.width))
@@ -203,7 +203,7 @@ def _found(path: Path, uuid: str) -> tuple[str, dict[str, Any]]:
     found: tuple[str, dict[str, Any]] | None = None
     for file in files:
         try:
-            # Not compressed, so that a member is as large as its space in the file.
+            # Only uncompressed files, in which a member is as large as its space in the file.
             with tarfile.open(file, "r:") as tar:
                 for member in tar:
                     key, _, what = Path(member.name).name.partition(".")
@@ -230,7 +230,7 @@ def _parsed(what: str, data: bytes) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise InputError(f"{what} is no JSON: {error}") from None
     if not isinstance(record, dict):
-        raise InputError(f"{what} is no record of GraspGen: it holds no object")
+        raise InputError(f"{what} is no record of GraspGen: it is no JSON object")
     return record
 
 

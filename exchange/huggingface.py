@@ -4,7 +4,7 @@
     pictures/{train,test}-00000.parquet   one picture per row: colour, depth, labels, camera, grasps in its frame
     README.md                             description of the files
 
-Columns, units and frames are those of `GRASPS` and `PICTURES`; docs/how-to/exchange/huggingface.md is the reference."""
+`GRASPS` and `PICTURES` list the columns; docs/how-to/exchange/huggingface.md describes them with units and frames."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ from graspd.worker.rendering.export import PNG_STEP_M
 from graspd.worker.rendering.sheets import metric_at_threshold
 
 POSTURES: Final = ("pregrasp", "grasp", "squeeze")
-#: Kinds of scenes of planned grasps, as in the rows.
+#: Values of column `scene_kind` that `read` supports.
 FREE: Final = "free"
 TABLE: Final = "table"
-#: Columns of grasps, by the words of `parquet.type_of`.
+#: Columns of grasps, with types as names for `parquet.type_of`.
 GRASPS: Final = {
     "hand": "text",
     "object": "text",
@@ -72,14 +72,14 @@ PICTURES: Final = {
     "hand_poses": "float64[7][]",
     "joint_positions": "float64[][]",
 }
-#: Pictures in a row group.
+#: Number of pictures in a row group.
 _PICTURES_AT_ONCE: Final = 50
 
 
 def write(
     lots: Sequence[ExportPart], pictures: Pictures, folder: Path, out: frozenset[str], noise: DepthNoise | None = None
 ) -> ExportSummary:
-    """Write both tables, of training and of held-out objects (split `test`)."""
+    """Write both tables, each with splits `train` and `test`; held-out objects are in `test`."""
     parquet.arrow()
     if (folder / "grasps").exists():
         raise InputError(f"{folder} holds a table of grasps already; give another folder as --output")
@@ -186,7 +186,7 @@ def _picture(sample: Mapping[str, Any], name: str, depth: Floats) -> dict[str, A
 
 
 def png(pixels: NDArray[Any]) -> dict[str, Any]:
-    """Return a picture for Hugging Face's readers."""
+    """Return a picture as a PNG file, in the form that Hugging Face's readers expect."""
     data = io.BytesIO()
     Image.fromarray(np.ascontiguousarray(pixels)).save(data, format="PNG", compress_level=1)
     return {"bytes": data.getvalue(), "path": None}

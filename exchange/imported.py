@@ -37,7 +37,7 @@ class Origin:
 
 @dataclass(frozen=True)
 class ImportedGrasps:
-    """Grasps of one hand on one object, all three postures."""
+    """Grasps of one hand on one object, each with its three postures."""
 
     hand: HandModel
     obj: ObjectModel
@@ -46,12 +46,12 @@ class ImportedGrasps:
     """Name of the object in the source, and scale factor of its mesh there."""
     scale: float = 1.0
     published: NDArray[np.int8] | None = None
-    """(N,) success as published: 1, 0, -1 unknown."""
+    """(N,) published success: 1 held, 0 failed, -1 unknown."""
     placed: PlacedGrasps | None = None
 
 
 def add_postures(hand: HandModel, obj: ObjectModel, grasp: Posture) -> GraspSet:
-    """Add our postures before and after contact to grasps, for sources without them."""
+    """Add pregrasp and squeeze, as graspd computes them, to grasps of a source that lacks both."""
     return GraspSet(grasp, pregrasp(hand, obj, grasp), squeeze(hand, obj, grasp), np.full(len(grasp), np.nan))
 
 
@@ -77,7 +77,7 @@ def joints_by_name(hand: HandModel, names: Sequence[str], values: Any, *, what: 
 
 
 def scaled_object(path: str | Path, scale: float = 1.0) -> ObjectModel:
-    """Load a mesh or built-in object times `scale`; with a scale, units of the file are metres and not guessed."""
+    """Load a mesh or built-in object, scaled. Unless `scale` is 1, the unit is metres and not guessed."""
     if scale == 1.0:
         return object_from_path(path)
     plain = object_from_path(path, options={"units": "m"})

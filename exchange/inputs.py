@@ -18,7 +18,7 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.environment import PlacedGrasps
 
-#: JSON files beside shards that contain no grasps.
+#: JSON files without grasps in folders of shards.
 BESIDE_SHARDS: Final = ("snapshot.json", "subset.json", "card.json", "clouds.json")
 
 
@@ -35,14 +35,14 @@ class Case:
     seconds: float | None = None
     """Time to make the grasps, if known [s]."""
     validated: bool = False
-    """Whether this time includes validation."""
+    """Whether `seconds` includes validation."""
     published: NDArray[np.int8] | None = None
-    """(N,) success as published: 1, 0, -1 unknown."""
+    """(N,) published success: 1 held, 0 failed, -1 unknown."""
     placed: PlacedGrasps | None = None
 
     @property
     def centred(self) -> Case:
-        """The case relative to the object's centre, so that measurements do not depend on the file's origin."""
+        """The case relative to the object's centre, so that measurements do not depend on the mesh's origin."""
         return replace(
             self,
             obj=self.obj.centred,

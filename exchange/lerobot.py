@@ -1,15 +1,15 @@
 """A LeRobot data set (v3.0): the trajectory of a grasp as an episode, with a picture taken before the motion.
 
-    meta/info.json, meta/stats.json                       features, numbers, statistics of each feature
+    meta/info.json, meta/stats.json                       features and counts; statistics of each feature
     meta/tasks.parquet, meta/episodes/chunk-000/...       texts of the tasks; position of each episode's frames
     data/chunk-CCC/file-FFF.parquet                       frames, with pictures as PNG
 
 A frame is a waypoint of the trajectory, from the standoff to the squeeze. `observation.state` is the present posture;
-`action` is the next posture, in the last frame the lift. A posture has the root's position [m] and quaternion w x y z
-in the table's frame, then all moving joints [rad or m]. `observation.environment_state` is the object's rest pose in
-the same frame. Waypoints have no times, so `fps` only numbers them.
+`action` is the next posture; in the last frame it is the lift. A posture has the root's position [m] and quaternion w
+x y z in the table's frame, then all moving joints [rad or m]. `observation.environment_state` is the object's rest pose
+in the same frame. Waypoints have no times: `timestamp` is the frame's number over `fps`.
 
-The importer `lerobot` reads trajectories of data sets from graspd, in the object's frame."""
+The importer `lerobot` reads only data sets that graspd exported; it returns postures in the object's frame."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ FPS: Final = 10
 STATE, ACTION = "observation.state", "action"
 OBJECT, PICTURE = "observation.environment_state", "observation.images.scene"
 EPISODE: Final = "episode_index"
-#: Additional columns in the list of episodes.
+#: Column of verdicts in the list of episodes.
 VERDICT: Final = "graspd/verdict"
-#: Columns of each frame, independent of the features.
+#: Times and indices that LeRobot stores for each frame.
 NUMBERS: Final = {
     "timestamp": "float32",
     "frame_index": "int64",
@@ -49,7 +49,7 @@ NUMBERS: Final = {
     "index": "int64",
     "task_index": "int64",
 }
-#: Episodes in a file, and files in a folder.
+#: Number of episodes in a file, and of files in a folder.
 _EPISODES: Final = 100
 _FILES: Final = 1000
 _QUANTILES: Final = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
@@ -66,21 +66,21 @@ _INDEXED: Final = {
 
 
 def write(lots: Sequence[ExportPart], pictures: Pictures, folder: Path, out: frozenset[str]) -> ExportSummary:
-    """Write an episode for each grasp whose scene has a picture (of several, in turn); held-out objects come last."""
+    """Write an episode per grasp in a pictured scene (pictures round-robin); held-out objects come last."""
     parquet.arrow()
     if (folder / "meta").exists():
         raise InputError(f"{folder} holds a data set already; give another folder as --output")
     if len({lot.hand.digest for lot in lots}) > 1:
         raise InputError(
-            "a LeRobot data set has one robot, but these grasps are of several hands; export each hand by itself"
+            "a LeRobot data set has one robot, but these grasps are of several hands; export each hand separately"
         )
     ways = [lot for lot in sorted(lots, key=lambda lot: lot.name in out) if lot.placed is not None]
     if not ways:
-        raise InputError("grasps of free objects have no approach; plan grasps in a scene: --scene table")
+        raise InputError("free grasps have no approach; plan grasps in a scene: --scene table")
     seen = {(some[0].base, some[0].scene): some for some in by_scene(pictures)}
     episodes = [(lot, row, look) for lot in ways for row, look in _pictured_rows(lot, seen)]
     if not episodes:
-        raise InputError("no picture shows the scene of a grasp; put views beside the grasps: graspd render")
+        raise InputError("no picture shows the scene of a grasp; render views into the grasps' folder: graspd render")
     tasks = {name: k for k, name in enumerate(dict.fromkeys(lot.name for lot, _, _ in episodes))}
     writer = _Writer(folder, ways[0], pictures, tasks)
     for first in range(0, len(episodes), _EPISODES):
@@ -102,7 +102,7 @@ def _pictured_rows(
 
 
 def postures_of(lot: ExportPart, row: int) -> Floats:
-    """Return (W, 7 + J) root and joints along a grasp's trajectory, in the frame of its table."""
+    """Return a grasp's trajectory (W, 7 + J) of root poses and joints, in the table's frame."""
     assert lot.placed is not None
     rest = np.asarray(lot.placed.object_pose[lot.placed.index[row]], float)
     way = trajectory_of(lot.shard, row)
@@ -117,7 +117,7 @@ class _Writer:
         self._values: dict[str, list[NDArray[Any]]] = {}
 
     def file(self, episodes: Sequence[tuple[ExportPart, int, PictureReference]]) -> None:
-        """Write a file, each episode as a row group."""
+        """Write a file with one row group per episode."""
         number = len(self.episodes) // _EPISODES
         width = 7 + len(self.hand.joint_names)
         moving = {STATE: f"float32[{width}]", ACTION: f"float32[{width}]"}
@@ -221,7 +221,7 @@ def task_of(name: str) -> str:
 
 
 def _statistics(values: NDArray[Any], *, picture: bool) -> dict[str, Any]:
-    """Compute statistics of frames (F, n), for pictures of pixels (P, 3), as (n,) and (3, 1, 1)."""
+    """Compute statistics of frames (F, n), each (n,), or of pixels (P, 3), each (3, 1, 1)."""
     values = np.asarray(values, float)
     found = {
         "min": values.min(axis=0),
@@ -234,14 +234,14 @@ def _statistics(values: NDArray[Any], *, picture: bool) -> dict[str, Any]:
     return shaped | {"count": [len(values)]}
 
 
-#: Postures at the end of a trajectory: pregrasp, grasp, squeeze, lift.
+#: Number of postures at the end of a trajectory: pregrasp, grasp, squeeze, lift.
 _STOPS = 4
 #: Largest size of `info.json` [bytes].
 _LARGEST = 2**22
 
 
 def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[ImportedGrasps]:
-    """Read the grasps on one object, on tables, with trajectories if all have equal numbers of waypoints."""
+    """Read one object's grasps on tables, with their approaches if all have equally many waypoints."""
     names = _names(path)
     task = _task(path, object_name)
     ways, rest, numbers = _trajectories(path, task)

@@ -1,4 +1,4 @@
-"""Check of an export before it completes: a library of the target opens every file."""
+"""Check of an export before it completes: a library for each file's format opens the file."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def _depth(path: Path) -> None:
         file.channels()
 
 
-#: By the suffix of a file's name: the library, and a function that opens a file.
+#: Library and function that open a file, by the suffix of the file's name.
 READERS: Final[dict[str, tuple[str, Callable[[Path], Any]]]] = {
     ".xml": ("mujoco", lambda path: import_module("mujoco").MjModel.from_xml_path(str(path))),
     ".urdf": ("an XML parser", ElementTree.parse),
@@ -105,7 +105,7 @@ READERS: Final[dict[str, tuple[str, Callable[[Path], Any]]]] = {
     ".json": ("json", lambda path: json.loads(path.read_bytes())),
     ".jsonl": ("json", lambda path: [json.loads(line) for line in path.read_text().splitlines()]),
     ".csv": ("csv", _rows),
-    # Our own files, just written: DexGraspBench's are pickled dictionaries.
+    # Safe, since graspd has just written the file. DexGraspBench's files are pickled dictionaries.
     ".npy": ("NumPy", lambda path: np.load(path, allow_pickle=True)),
     ".npz": ("NumPy", np.load),
     ".h5": ("h5py", _hdf5),

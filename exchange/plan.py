@@ -46,8 +46,8 @@ class ExportPart:
 
 
 def held_out(kinds: Mapping[str, str], share: float) -> frozenset[str]:
-    """Return the objects of a share of the families, ordered by hash: at least one family but not all; none if there is
-    only one."""
+    """Return the objects of a share of the families, which are chosen by hash.
+    At least one family is chosen and one is not; a single family is not chosen."""
     order = sorted(set(kinds.values()), key=lambda kind: hashlib.sha256(kind.encode()).digest())
     chosen = order[: min(max(1, round(share * len(order))), len(order) - 1)]
     return frozenset(name for name, kind in kinds.items() if kind in chosen)
@@ -64,7 +64,7 @@ class PictureReference:
     """Id of the views shard."""
     scene: int
     extrinsics: Floats
-    """(4, 4) table to camera."""
+    """(4, 4) transformation from the table's frame to the camera's."""
     object_pose: Floats
     """(7,) object pose in the table's frame."""
     rows: NDArray[np.intp]
@@ -72,7 +72,7 @@ class PictureReference:
 
 
 def pictures_without_pixels(pictures: Pictures) -> Iterator[PictureReference]:
-    """Yield the pictures without their pixels; only the left one of a stereo pair."""
+    """Yield references to the pictures; of a stereo pair, only the left picture."""
     for index, place in enumerate(pictures.places):
         camera = pictures.columns_of(place, ("camera/extrinsics", "camera/eye"))
         if camera["camera/eye"] == RIGHT:
@@ -89,7 +89,7 @@ RIGHT: Final = 2
 
 
 def by_scene(pictures: Pictures) -> list[list[PictureReference]]:
-    """Group pictures by views shard and scene, in order."""
+    """Group pictures by views shard and scene, in the order of the pictures."""
     scenes: dict[tuple[str, int], list[PictureReference]] = defaultdict(list)
     for look in pictures_without_pixels(pictures):
         scenes[look.shard, look.scene].append(look)

@@ -1,10 +1,10 @@
 """Readers of published grasp sets: DDGC, DexGraspNet, MultiDex (GenDexGrasp), `reference-grasps/1`.
 
 Lundell et al., DDGC, RA-L 2021. Each object of the scene has a list of grasps. A grasp has position and quaternion x y
-z w of the hand in the object's frame, and eight joint angles, positive towards closing. The angles are spread, medial
-and distal of finger 1, the same of finger 2, then medial and distal of finger 3.
+z w of the hand in the object's frame, and eight joint angles, positive towards closing. These are the spread, medial
+and distal angles of finger 1, the same of finger 2, then the medial and distal angle of finger 3.
 
-DexGraspNet's layout: a `.npy` for each object, a list of dictionaries with `qpos` by joint name and `scale`.
+DexGraspNet's layout: a `.npy` file per object with a list of dictionaries: `scale`, and `qpos` by joint name.
 
 Wang et al., DexGraspNet, ICRA 2023. `qpos` has the root's translation WRJTx, y, z [m] and its rotation WRJRx, y, z:
 Euler angles about the fixed axes x, y, z in turn [rad]. Joints are `robot0:FFJ3` ... of the MuJoCo Shadow hand, whose
@@ -51,11 +51,11 @@ ROLES: Final = tuple(
 
 
 def read_ddgc(path: Path, *, hand: str, obj: str, number: int = 0) -> list[ImportedGrasps]:
-    """Read `barrett_translation_K.npy`, with `barrett_representation_K.npy` beside it: object `number` of the scene.
+    """Read grasps on object `number` of `barrett_translation_K.npy` and `barrett_representation_K.npy`.
     Joint names of the Barrett hand contain the finger (1, 2, 3) and the phalanx (spread or prox, med, dist)."""
     beside = path.with_name(path.name.replace("translation", "representation"))
     if beside == path or not beside.is_file():
-        raise InputError(f"{path} needs its barrett_representation_K.npy beside it")
+        raise InputError(f"{path} needs its barrett_representation_K.npy in the same folder")
     places, joints = (list(load_npy(file)) for file in (path, beside))
     if number >= len(places) or len(places) != len(joints):
         raise InputError(
@@ -82,7 +82,7 @@ def _names(hand: HandModel) -> list[str]:
 
 
 def _signs(hand: HandModel, names: list[str]) -> Floats:
-    """Return signs: -1 where the hand's joint closes towards negative angles."""
+    """Return the sign of each joint's closing: -1 if it closes towards negative angles, else 1."""
     order = [hand.joint_names.index(name) for name in names]
     ends = np.array([hand.expand(limit[None])[0][order] for limit in (hand.lower, hand.upper)])
     return np.where(ends.max(axis=0) > -ends.min(axis=0), 1.0, -1.0)
@@ -94,7 +94,7 @@ _MUJOCO: Final = "robot0:"
 
 
 def read_dexgraspnet(path: Path, *, hand: str, obj: str) -> list[ImportedGrasps]:
-    """Read the `.npy` of an object: one set for each scale."""
+    """Read an object's `.npy` file into one set of grasps for each scale."""
     found = load_npy(path)
     rows = list(found) if isinstance(found, list | np.ndarray) else []
     if not rows or not all(isinstance(row, dict) and "qpos" in row for row in rows):
@@ -135,7 +135,7 @@ def _urdf_name(name: str, hand: HandModel) -> str:
 
 def read_multidex(path: Path, *, hand: str, obj: str, robot: str, object_name: str) -> list[ImportedGrasps]:
     """Read the grasps of one robot (`allegro`) on one object (`contactdb+mug`) in `cmap_dataset.pt`.
-    torch loads tensors and plain values only."""
+    torch loads only tensors and basic types of Python."""
     rows = [row for row in _metadata(path) if len(row) >= 3 and row[-1] == robot and row[-2] == object_name]
     if not rows:
         raise InputError(f"{path} has no grasp of {robot!r} on {object_name!r}")
@@ -150,7 +150,7 @@ def read_multidex(path: Path, *, hand: str, obj: str, robot: str, object_name: s
 
 
 def rotation_of_columns(columns: Floats) -> Floats:
-    """Return quaternions (N, 4) of rotations by their first two columns (N, 6), orthogonalised evenly."""
+    """Return quaternions (N, 4) of rotations from their first two columns (N, 6), both corrected equally."""
     x, y = (_unit(part) for part in (columns[:, :3], columns[:, 3:]))
     middle, across = _unit(x + y), _unit(x - y)
     x, y = _unit(middle + across), _unit(middle - across)
@@ -202,7 +202,7 @@ def read_reference(path: Path, *, hand: str | None = None, obj: str | None = Non
 
 
 def friction(path: Path) -> float | None:
-    """Return the Coulomb coefficient of the file's metrics."""
+    """Return the Coulomb coefficient of the file's metrics; None if it is not stated."""
     value = _stored(path).get("contact_model", {}).get("mu")
     return None if value is None else float(value)
 
@@ -213,5 +213,5 @@ def _stored(path: Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         raise InputError(f"{path} is no JSON file: {error_text(error)}") from None
     if not isinstance(found, dict):
-        raise InputError(f"{path} is no file of reference grasps: it holds no object")
+        raise InputError(f"{path} is no file of reference grasps: it is no JSON object")
     return found

@@ -32,8 +32,8 @@ def write_scored(
     ordinal: int = 0,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Path:
-    """Validate and measure a set of grasps and write it as a base shard, its object's mesh beside it.
-    Grasps in scenes are tested by a lift; the hand's trajectory is replanned, as for our own grasps."""
+    """Validate and measure a set of grasps; write a base shard and the object's mesh to `folder`.
+    Grasps in scenes are tested by a lift along a trajectory that is planned here."""
     name = plain_name(found.name)
     path = folder / f"{plain_name(found.hand.name)}-{name}-{ordinal:03}.h5"
     if path.exists():

@@ -1,8 +1,8 @@
 """Export of shards as training folders of other projects: grasps, pictures, splits by object family.
 
-Families compare the distribution of distances between two random surface points (D2 of Osada et al., "Shape
-distributions", 2002), divided by their root mean square. Rotated, moved, mirrored, scaled and remeshed copies have the
-same distribution."""
+Objects of a family have similar distributions of the distance between two random surface points (D2 of Osada et al.,
+"Shape distributions", 2002). Distances are divided by their root mean square. Rotated, moved, mirrored, scaled and
+remeshed copies have the same distribution."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ class TrainingExportOptions:
 
 
 def export_training(source: Path, format_: str, wishes: TrainingExportOptions, folder: Path) -> ExportSummary:
-    """Write the grasps of a folder of shards in a training format.
-    Writers take grasps (`lots`), pictures of their scenes, held-out objects (`out`) and the noise of a depth camera."""
+    """Write the grasps of all shards in a folder in a training format.
+    All writers take grasps (`lots`) and held-out objects (`out`); some take pictures and a depth camera's noise."""
     if not 0 < wishes.held_out < 1:
         raise InputError(f"--held-out is {wishes.held_out:g}; give a share of the objects between 0 and 1")
     shards = open_shards(source)
@@ -84,21 +84,21 @@ def _export_parts(shards: Shards, format_: str, wishes: TrainingExportOptions) -
 
 
 def _exported_rows(shard: Shard, format_: str, wishes: TrainingExportOptions) -> np.ndarray:
-    """Return (N,) exported grasps. GraspGen, which has labels, gets valid and failed grasps."""
+    """Return a mask (N,) of exported grasps. GraspGen's format has labels, so it gets failed grasps too."""
     if format_ != "graspgen":
         return select_grasps(shard, unvalidated=wishes.unvalidated, every=wishes.every)[0]
     validated = validity.validated(shard.arrays)
     if wishes.unvalidated or not validated.any():
-        raise InputError(f"{format_} needs a verdict on each grasp: make them without --validation none")
+        raise InputError(f"{format_} needs a verdict on each grasp: make grasps without --validation none")
     return validated
 
 
-#: Pairs of points, and stored quantiles of their distances.
+#: Number of point pairs, and compared quantiles of their distances.
 PAIRS: Final = 40_000
 QUANTILES: Final = np.linspace(0.01, 0.99, 50)
-#: Root mean square difference of the quantiles, with distances of about 1, below which two shapes count as one. 14
-#: scanned objects were turned, mirrored, scaled and simplified to 3 mm: copies differ by at most 0.0043. The two most
-#: similar objects differ by 0.0095. Too large families hardly affect a split; too small ones leak.
+#: Two shapes count as one below this root mean square difference of their quantiles. 14 scanned objects were turned,
+#: mirrored, scaled and simplified to 3 mm: copies differ by at most 0.0043. The two most similar objects differ by
+#: 0.0095. Too large families hardly affect a split. Too small families put copies into both of its parts.
 SAME: Final = 0.006
 
 
@@ -115,7 +115,7 @@ def shape_signature(obj: ObjectModel) -> Floats:
 
 
 def object_families(objects: Mapping[str, ObjectModel]) -> dict[str, str]:
-    """Return each object's family: the least digest of the files of all transitively similar objects."""
+    """Return each object's family, named by the least digest of all transitively similar objects."""
     names = sorted(objects, key=lambda name: objects[name].digest)
     found = np.array([shape_signature(objects[name]) for name in names]).reshape(len(names), len(QUANTILES))
     family: dict[str, str] = {}

@@ -28,7 +28,7 @@ _COLUMNS: Final = ("image/rgb", "image/depth", "image/segmentation", "camera/int
 def write(
     shards: Shards, folder: Path, *, pictures_a_file: int = 1000, valid: bool = True, unvalidated: bool = False
 ) -> list[Path]:
-    """Write `pictures-NNNNNN.tar` of views shards with their scene and base shards; `Pictures` selects the grasps."""
+    """Write the pictures of views shards to `pictures-NNNNNN.tar`; `Pictures` selects their grasps."""
     pictures = Pictures(
         shards, _COLUMNS, grasp_quality=("quality/epsilon", "quality/success"), valid=valid, unvalidated=unvalidated
     )

@@ -1,6 +1,6 @@
 """Throughput of the planner over fidelities, batches, threads, hand points and object faces: table, JSON and plot.
 
-Iterations are timed launch by launch, batches by kernel time and host time."""
+Batches are timed as a whole, iterations launch by launch. Host time is measured apart from kernels."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from graspd.worker.simulation.launches import kernel_seconds
 from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.record import record_iteration
 
-#: Largest number of grasps per launch for which host time is reported.
+#: Largest number of grasps per launch with which host time is measured.
 LARGE: Final = 1024
 
 
@@ -49,10 +49,10 @@ def bench(
     joins: Sequence[int],
     say: Callable[[str], None],
 ) -> dict[str, Any]:
-    """Run each fidelity x batch x joins x threads once; `say` receives a line per run.
+    """Time each combination of fidelity, batch, joins and threads; `say` receives a line per combination.
     `load` loads the object at a fidelity's simplification error bound [m]; `joins` are numbers of batches per launch.
     The median of `repeats` timed calls is reported, after an untimed call. A GPU ignores `threads`. Return `device`,
-    `runs[]` with the keys of the command line's contract, `start` with cold and warm seconds, `kernels`, and
+    `runs[]` with a row per combination, `start` with seconds to the first and the next grasp, `kernels`, and
     `host_ms_per_grasp`: None on a GPU, where waiting threads are busy."""
     first = fidelities[0]
     nominal = load(first.face_error_m)

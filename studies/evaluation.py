@@ -39,7 +39,7 @@ Protocol = Literal["dexgraspbench", "displacement", "lift"]
 
 #: Contact threshold of contact area, epsilon and volume [m]: the paper's.
 THRESHOLD_M: Final = 0.005
-#: Keys of the row, and their metrics of a grasp.
+#: Keys of the row, and the metrics of grasps whose medians they contain.
 COLUMNS: Final = {
     "pd_mm": "penetration_depth_mm",
     "spd_mm": "self_penetration_depth_mm",
@@ -82,10 +82,10 @@ def evaluate(
       reason_foreign.
 
     Raises:
-        InputError: protocol lift on grasps of a free object, or with a level that it lacks.
+        InputError: protocol lift on grasps of a free object, or dexgraspbench with an unknown level.
     """
     if protocol == "lift" and case.placed is None:
-        raise InputError(f"{case.name} has grasps around a free object: `graspd synth --scene` makes some to lift")
+        raise InputError(f"{case.name} has free grasps, but a lift test needs a scene: graspd synth --scene")
     case = case.centred
     if level == "dexgraspbench":
         case = replace(case, obj=case.obj.for_dexgraspbench)
@@ -186,7 +186,7 @@ def _lift_rates(verdicts: LiftVerdicts, clear: NDArray[np.bool_]) -> dict[str, A
 
 
 def _in_models(found: Robustness, verdicts: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return shares of a row; add to each verdict its share and first failing axis, None if not tested."""
+    """Return a row's shares; add to each verdict its share (None: not tested) and first failing axis."""
     tried = np.isfinite(found.share)
     for one, share, weakest in zip(verdicts, found.share, found.weakest, strict=True):
         known = math.isfinite(share)

@@ -67,7 +67,7 @@ def object_to_pieces(
     # Data out:
     near_inout: wp.array2d(dtype=wp.float32),
 ):
-    """Lower the distances to those of object samples within `margin`, for object edges. Over (B, P)."""
+    """Lower the distances by object samples within `margin`, which find object edges. Over (B, P)."""
     b, piece = wp.tid()
     if active_in[b] == 0:
         return

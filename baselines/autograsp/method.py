@@ -1,7 +1,7 @@
 """GraspIt!'s autograsp: random collision-free start, approach to the object, closing of the fingers until contact.
 
 GraspIt! closes joints in small steps and moves back after a collision. Here step lengths follow from distances. The
-result is equal, contact within `TOUCH_M`, and no step tunnels through the object."""
+result is the same: contact within `TOUCH_M`. No step tunnels through the object."""
 
 from __future__ import annotations
 

@@ -70,9 +70,8 @@ def propose(
     energy_out: wp.array2d(dtype=wp.float32),
 ):
     """Step down the gradient, redraw each contact with probability 1/2, reset energies. Launch over B.
-    The published code divides by the root mean square over its batch. Here each grasp has its own root mean squares, so
-    that grasps of a batch are independent. They are those of translation, rotation and joints (columns 0 to 2 of
-    `moment`)."""
+    The published code divides by the root mean square over its batch. Here each grasp has its own root mean squares of
+    translation, rotation and joints (columns 0 to 2 of `moment`), so that grasps of a batch are independent."""
     b = wp.tid()
     it = iteration_in[0]
     size = step_size(it)
@@ -120,7 +119,8 @@ def force_closure(
     energy_out: wp.array2d(dtype=wp.float32),
     wrench_inout: Wrenches,
 ):
-    """Compute E_fc = |sum (n, x cross n)|^2 and E_dis = sum |d|; constant normals. Columns 0, 1. Over B."""
+    """Compute E_fc = |sum (n, x cross n)|^2 and E_dis = sum |d|: columns 0 and 1. Launch over B.
+    Gradients treat normals as constant."""
     b = wp.tid()
     f = wp.vec3(0.0)
     t = wp.vec3(0.0)
@@ -156,7 +156,7 @@ def penetration(
     energy_inout: wp.array2d(dtype=wp.float32),
     wrench_inout: Wrenches,
 ):
-    """Compute E_pen, the depths of object samples in hand pieces, column 2. Launch over (B, P)."""
+    """Compute E_pen, the sum of depths of object samples in hand pieces: column 2. Launch over (B, P)."""
     b, piece = wp.tid()
     body = pieces_in.body[piece]
     q = piece_rotation(pieces_in, piece, b, body_q_in)
@@ -198,7 +198,7 @@ def self_penetration(
     energy_inout: wp.array2d(dtype=wp.float32),
     wrench_inout: Wrenches,
 ):
-    """Compute E_spen = sum of max(0, gap - distance) over key point pairs, column 3. Over (B, pairs)."""
+    """Compute E_spen, the sum of max(0, gap - distance) over pairs: column 3. Launch over (B, pairs)."""
     b, pair = wp.tid()
     i = first_in[pair]
     j = second_in[pair]
@@ -223,7 +223,7 @@ def limits(
     energy_out: wp.array2d(dtype=wp.float32),
     gradient_inout: wp.array2d(dtype=wp.float32),
 ):
-    """Compute E_joints, the sum of violations of the limits, column 4. Launch over B."""
+    """Compute E_joints, the sum of violations of the limits: column 4. Launch over B."""
     b = wp.tid()
     total = float(0.0)
     for d in range(q_in.shape[1]):
@@ -251,7 +251,7 @@ def total_energy(terms: wp.array2d(dtype=wp.float32), b: wp.int32):
 
 @wp.func
 def accepted(rise: wp.float32, t: wp.float32, uniform: wp.float32):
-    """Apply Metropolis: return 1 if the energy falls, else with probability exp(-rise / t)."""
+    """Return 1 if the energy falls, else 1 with probability exp(-rise / t) and 0 otherwise (Metropolis)."""
     if rise < 0.0:
         return 1
     if uniform < wp.exp(-rise / t):

@@ -1,6 +1,6 @@
 """Differentiable force closure: DexGraspNet's starts around the convex hull, then annealed descent.
 
-All hands are returned; `info` lists those that the published code would accept."""
+All hands are returned; `info["passed"]` marks those that the published code would accept."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ POSTURE: Final = 0.1
 
 
 class DfcOptions(Options):
-    steps: int = Field(6000, ge=1, le=100_000, description="proposals of each hand")
+    steps: int = Field(6000, ge=1, le=100_000, description="annealing steps per hand")
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ INFINITE: Final = 1e30
 
 
 def key_points(hand: HandModel) -> tuple[Ints, Floats, Ints, Ints]:
-    """Return bodies (K,), piece centres (K, 3), and pairs that repel each other: pairs that are not close at rest."""
+    """Return bodies (K,), centres (K, 3), and repelling pairs (two index arrays) of the hand's pieces."""
     body = np.array([piece.body for piece in hand.pieces], np.int32)
     place = np.array([piece.vertices.mean(axis=0) for piece in hand.pieces])
     rest = apply(body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0][body], place)

@@ -74,7 +74,7 @@ def multipliers(
     pull_out: wp.array2d(dtype=vec6),
     residual_out: wp.array2d(dtype=wp.float32),
 ):
-    """Compute the tasks' residuals |wanted + sum F| [N], multipliers, pull on forces. Launch over (B, M).
+    """Compute the tasks' residuals |wanted + sum F| [N], multipliers, and pulls on forces. Over (B, M).
     The modified differential method of multipliers (Platt & Barr 1988) enforces residual <= tolerance."""
     b, j = wp.tid()
     if active_in[b] == 0:

@@ -108,7 +108,7 @@ FORCE_RATE: Final = 1e-2
 RATES: Final = (1e-3, 2e-3, 3e-3)
 BETAS: Final = (0.9, 0.999)
 WARMUP: Final = 200
-#: Initial distance of the dilated object from the hand, and distance of hands from their nearest free place [m].
+#: Initial distance of the dilated object from the hand, and retreat of hands from their collision-free starts [m].
 APART_M: Final = 0.01
 BACKOFF_M: Final = 0.05
 CHUNK: Final = 25
@@ -121,7 +121,7 @@ def schedule(steps: int) -> Schedule:
     at = np.arange(steps)
     dilation = MAX_DILATION * np.clip(1.0 - at / max(0.5 * steps, 1.0), 0.0, 1.0)
     rates = np.minimum(at / WARMUP, 1.0)[:, None] * np.array(RATES)
-    # Self-collisions use the same stiffness, squared like the other forces.
+    # Self-collisions use the same stiffness, squared as in the loss of the other forces.
     own = np.full(steps, STIFFNESS**2)
     zero = np.zeros(steps)
     return Schedule(dilation, zero, zero, own, rates)
@@ -185,13 +185,13 @@ class _Batch:
         return out
 
     def residual(self) -> Floats:
-        """Return (n,) largest residuals of the moving tasks; 1: no contact force."""
+        """Return (n,) largest relative residuals of the tasks with a moving object; 1: no contact force."""
         return self.gap.numpy()[:, 1:].max(axis=1).astype(float) / float(np.linalg.norm(self.wanted[1]))
 
 
 def distance_grid(obj: DeviceObject, cells: int) -> Any:
     """Return a `Surface` from the mesh with `cells` cells along the longest side of the padded box.
-    Distances are exact at the corners; the array is on the object's device."""
+    Distances are exact at the cells' corners; the array is on the object's device."""
     model = obj.model
     low = model.vertices.min(axis=0) - model.centre_of_mass - PAD_M
     high = model.vertices.max(axis=0) - model.centre_of_mass + PAD_M

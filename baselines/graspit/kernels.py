@@ -21,7 +21,7 @@ from graspd.worker.simulation.kernels.surface import Surface, field_distance
 
 wp.set_module_options({"enable_backward": False})
 
-#: Initial value of the counter k: with 70,000 steps a planner makes 40,000 moves.
+#: Initial value of the counter k: a chain that ends at 70,000 makes 40,000 moves.
 FIRST_STEP = 30_000
 VARIABLES = wp.constant(8)
 T0 = wp.constant(1e6)
@@ -211,7 +211,7 @@ def contact_energy(problem: Problem, b: wp.int32, body_p: wp.array2d(dtype=wp.ve
 
 @wp.func
 def legal(problem: Problem, b: wp.int32, x: vec8, body_p: wp.array2d(dtype=wp.vec3), body_q: wp.array2d(dtype=wp.quat)):
-    """Return 1 if a state has no self-collision and no contact; its body poses stay in the arrays."""
+    """Return 1 if a state has no collision; its body poses stay in the arrays."""
     if clashes(problem, x) == 1:
         return 0
     place(problem, b, x, body_p, body_q)
@@ -329,7 +329,7 @@ def anneal(
     body_p_out: wp.array2d(dtype=wp.vec3),
     body_q_out: wp.array2d(dtype=wp.quat),
 ):
-    """Run rounds of a chain until their number or `last` is reached. Launch over the chains."""
+    """Run `rounds` rounds of a chain, fewer if its step reaches `last`. Launch over the chains."""
     b = wp.tid()
     x = state_inout[b]
     e = energy_inout[b]

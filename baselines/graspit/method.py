@@ -3,10 +3,10 @@
 Virtual contacts are a few points of a hand: two on each link's inner side, and some on the palm. GraspIt! has files of
 them for its own hands; here they are computed for any hand.
 
-GraspIt! has two eigengrasps for each of two hands here. Barrett: spread; closing of all fingers. Human hand: flexion of
-the knuckles with a little of the distal joints; knuckles against distal joints. It has none for Allegro or Shadow. In
-this module a hand with one closing dof per finger uses Barrett's eigengrasps. Any other hand uses the human hand's, by
-the position of each joint along its finger."""
+GraspIt! has two eigengrasps for the Barrett hand: spread, and closing of all fingers. It has two for its human hand:
+flexion, mainly of the knuckles, and knuckles against distal joints. It has none for Allegro or Shadow. In this module a
+hand with one closing dof per finger uses Barrett's eigengrasps. Any other hand uses the human hand's, by the position
+of each joint along its finger."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ class GraspitOptions(Options):
     steps: int = Field(
         70_000, gt=FIRST_STEP, le=1_000_000, description=f"step at which annealing ends; it counts from {FIRST_STEP}"
     )
-    keep: int = Field(1, ge=1, le=20, description="grasps taken from the list of best states of each chain")
+    keep: int = Field(1, ge=1, le=20, description="grasps taken from each chain's list of best states")
 
 
 @dataclass(frozen=True)
@@ -144,14 +144,14 @@ METHOD: Final = Method(
     uses=("face_error_m",),
     quick={"steps": FIRST_STEP + 400},
 )
-#: Bounds of the palm's position about the centre of mass [m], and its largest jump (GraspIt!'s, in mm there).
+#: Bounds of the palm's position about the centre of mass [m], and its largest jump: GraspIt!'s values, there in mm.
 PLACE: Final = ((-0.25, 0.25), (-0.25, 0.25), (-0.25, 0.35))
 PLACE_JUMP: Final = 0.15
-#: theta, phi, alpha: axis and angle of the rotation; phi is periodic.
+#: Bounds of theta and phi (axis) and alpha (angle) of the rotation; phi is periodic.
 ANGLES: Final = ((0.0, np.pi), (-np.pi, np.pi), (0.0, np.pi))
 ANGLE_JUMPS: Final = (np.pi / 5, np.pi / 2, np.pi / 2)
 PHI: Final = 4
-#: Grid size per amplitude of the self-collision test, and tolerated overlap [m]: real hand models have some at rest.
+#: Grid points per amplitude in the self-collision test, and tolerated overlap [m], since hand models overlap at rest.
 CLASH_GRID: Final = 49
 CLASH_M: Final = 2e-3
 #: Number of uniform draws for a legal start, and of rounds between two checks for cancellation.
@@ -183,7 +183,7 @@ def clash_grid(pair: Pair, eigen: Eigengrasps) -> NDArray[np.int32]:
 
 
 def _sorted(best: Floats, energy: Floats, begun: Floats) -> Floats:
-    """Return states (chains * keep, 8), best first; missing states are copies of the chain's best, or its start."""
+    """Return states (chains * keep, 8), best first; missing ones repeat the chain's last one, or its start."""
     out = np.empty_like(best)
     for c, (states, energies) in enumerate(zip(best, energy, strict=True)):
         found = [k for k in np.argsort(energies, kind="stable") if energies[k] < NOT_YET / 2]

@@ -77,7 +77,7 @@ METHOD: Final = Method(
     files={"network": cache_file},
 )
 
-#: Retreat steps along the approach for a hand in collision [m].
+#: Tried retreats along the approach of a hand in collision [m].
 RETREATS: Final = (0.0, 0.01, 0.02, 0.035, 0.055, 0.08)
 #: Number of proposals per grasp, computed at once and divided among its starts.
 PROPOSALS: Final = 32
@@ -149,14 +149,14 @@ def table_height(supports: Sequence[Obstacle]) -> float:
     Raises SceneError: there is no table, that is, no half-space below a horizontal plane."""
     heights = [float(o.planes[0, 3]) for o in supports if len(o.planes) == 1 and o.planes[0, :3] @ UP > UPRIGHT]
     if not heights:
-        raise SceneError("method learned proposes grasps of things on a table; this scene has none, choose fast_graspd")
+        raise SceneError("method learned needs an object on a table, but this scene has no table; choose fast_graspd")
     return max(heights)
 
 
 def _clear(
     model: Model, drawn: HandState, away: Floats, scene: NDArray[np.intp], placed: PlacedGrasps
 ) -> tuple[HandState, Floats]:
-    """Return for each start (n) the free hand with the fewest retreat steps, and its depth (n,) [m]; inf if none.
+    """Return the collision-free hand of each start (n) that retreats least, and its depth [m]; inf if none.
     A hand that lacks clearance from obstacles is raised first."""
     count, probe = len(scene), Probe(model, len(scene), room=ROOM)
     draws = len(drawn.pivot) // count
@@ -187,8 +187,8 @@ def _clear(
     return best, depth
 
 
-#: Cameras as in the pictures of a job: elevation above the table [rad]; half of the field of view [rad]; its share
-#: filled by the object's bounding ball; nearest distance of the ball [m].
+#: Cameras as in the pictures of a job: elevation above the table [rad]; half of the field of view [rad]; share of the
+#: field that the object's bounding ball fills; least distance to the ball [m].
 ELEVATION: Final = (np.radians(18.0), np.radians(62.0))
 HALF_FIELD: Final = np.radians(20.0)
 FILL: Final = (0.7, 1.0)
@@ -231,7 +231,7 @@ class SurfaceView:
         return np.asarray(self._middle(pose) + distance * toward)
 
     def cloud(self, pose: Floats, camera: Floats, count: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
-        """Return visible points and normals (count, 3) of the object at `pose` (7,), drawn from one per pixel."""
+        """Sample points and normals (count, 3) from each pixel's nearest point; the object is at `pose` (7,)."""
         points, normals = quat_rotate(pose[3:], self.points) + pose[:3], quat_rotate(pose[3:], self.normals)
         rays = points - camera
         facing = np.flatnonzero((normals * rays).sum(axis=1) < 0)

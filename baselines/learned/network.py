@@ -80,7 +80,7 @@ def propose(
     Args:
         network: network of the hand.
         points: (P, 3) visible points of the object, in a frame with z up [m].
-        normals: (P, 3) unit, toward the camera.
+        normals: (P, 3) unit normals, toward the camera.
         table_height: z of the table [m].
         count: number of proposals.
         rng: source of the noise.
@@ -163,7 +163,7 @@ def decode(rows: ArrayLike, anchor: ArrayLike) -> Proposals:
 
 @dataclass(frozen=True)
 class _Layer:
-    """A linear layer, split as in `_MULTIPLICATIONS`."""
+    """A linear layer, split as the comment on `_MULTIPLICATIONS` describes."""
 
     weight: Floats32
     """(T, inputs, outputs of a part) transposed weight in T parts; the last part is padded with zeros."""

@@ -1,4 +1,4 @@
-"""Input of the writers of robots' formats, and their common functions."""
+"""Input of the writers of robot formats, and functions that these writers share."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Carrier:
 
     arm: Arm
     base: Floats
-    """(7,) base in the frame of the grasps."""
+    """(7,) pose of the base in the frame of the grasps."""
     world: ArmScene
     paths: list[list[Path]]
     """Motions of each grasp; joints are the arm's, then the hand's."""
@@ -54,7 +54,7 @@ class Bundle:
 
     @property
     def prims(self) -> tuple[str, str]:
-        """Names of the object's and the hand's prims below `/World`, beside `scene`."""
+        """Names of the object's and the hand's prims below `/World`; neither is `scene`."""
         _, thing, hand = prim_names(["scene", self.found.obj.name, self.found.hand.name])
         return thing, hand
 
@@ -82,5 +82,5 @@ def dump_yaml(file: pathlib.Path, value: Any) -> pathlib.Path:
 
 
 def numbers(values: Any) -> list[float]:
-    """Return plain rounded floats: a nanometre, a nanoradian; never a negative zero."""
+    """Return floats rounded to nine decimals (nm, nrad), without negative zeros."""
     return [round(float(value), 9) + 0.0 for value in np.ravel(values)]

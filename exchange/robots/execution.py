@@ -1,4 +1,4 @@
-"""Executable grasps: six postures each, in a frame of the user's choice, and the timed trajectory.
+"""Executable grasps: six postures each, a tool frame of the user's choice, and the timed trajectory.
 
 Each motion starts and ends at rest (minimum jerk, Flash and Hogan 1985). After the share u of its time it has covered
 the share 10 u^3 - 15 u^4 + 6 u^5 of its path. The steepest slope of this polynomial is 15/8."""
@@ -32,7 +32,7 @@ PHASES: Final = ("approach", "shape", "close", "squeeze", "lift")
 
 @dataclass(frozen=True)
 class ToolFrame:
-    """A frame fixed to the hand's root link, whose pose is commanded."""
+    """A frame fixed to the hand's root link; robots are commanded by the pose of this frame."""
 
     name: str
     pose: Floats
@@ -95,8 +95,8 @@ def executions(
     tool: ToolFrame,
     quality: dict[str, NDArray[Any]],
 ) -> Executions:
-    """Return grasps with trajectories: those of their scene, or for a free object, if a retreat exists, those planned
-    here."""
+    """Return grasps with their trajectories in a scene, or with straight approaches that are planned here.
+    Grasps without such an approach are left out. Raises InputError: no grasp has one."""
     frame, at = "object", np.tile(IDENTITY_POSE, (len(grasps), 1))
     free = np.ones(len(grasps), bool)
     if placed is None or grasps.approach is None or grasps.coming is None or grasps.lift is None:
@@ -134,7 +134,7 @@ _SLACK = 1e-2
 
 
 def parse_pose(text: str, what: str) -> Floats:
-    """Parse (7,) from `x y z qw qx qy qz` with a unit quaternion, separated by spaces or commas [m, 1]."""
+    """Parse a pose (7,) `x y z qw qx qy qz` with x y z in metres, separated by spaces or commas."""
     try:
         values = np.array([float(part) for part in text[:400].replace(",", " ").split()])
     except ValueError:
@@ -212,7 +212,7 @@ class Path:
 
 @dataclass(frozen=True)
 class RobotTrajectory:
-    """K points of all motions of a grasp, in time."""
+    """K points of all motions of a grasp, with times."""
 
     joint_names: tuple[str, ...]
     phase: tuple[str, ...]
@@ -237,7 +237,7 @@ def hand_limits(hand: HandModel) -> Limits:
 
 
 def straight_paths(found: Executions, row: int, points: int = 2) -> list[Path]:
-    """Return the motions of one grasp: root, its rotation and joints move evenly between postures."""
+    """Return the motions of one grasp; root pose and joints move evenly between postures."""
     paths = []
     for phase, start, end in zip(PHASES, POSTURES[:-1], POSTURES[1:], strict=True):
         a, b = found.postures[start], found.postures[end]
@@ -249,8 +249,8 @@ def straight_paths(found: Executions, row: int, points: int = 2) -> list[Path]:
 
 def time_motions(paths: Sequence[Path], names: Sequence[str], velocity: Floats, *, speed: float) -> RobotTrajectory:
     """Time the motions in sequence, each at rest at both ends; each starts at the end of the previous one.
-    `speed` is the used share of the limits `velocity` (J,) [rad/s or m/s] and of the hand's limits; above 0, at most
-    1."""
+    `speed` is a factor above 0 and at most 1 on the velocity limits of the joints, `velocity` (J,) [rad/s or m/s], and
+    of the hand."""
     phase, time, pose, joints = [paths[0].phase], [0.0], [paths[0].hand_pose[:1]], [paths[0].joints[:1]]
     for path in paths:
         seconds = max(SHORTEST_S, _STEEPEST * _slowness(path, velocity) / speed)
@@ -274,7 +274,7 @@ def time_motions(paths: Sequence[Path], names: Sequence[str], velocity: Floats, 
 
 
 def _slowness(path: Path, velocity: Floats) -> float:
-    """Return the duration of the motion at a constant rate within its limits [s]."""
+    """Return the shortest duration of the motion at a constant rate within its limits [s]."""
     pieces = len(path.joints) - 1
     joints = np.abs(np.diff(path.joints, axis=0)) / velocity
     way = np.linalg.norm(np.diff(path.hand_pose[:, :3], axis=0), axis=1) / HAND_M_S
@@ -284,7 +284,7 @@ def _slowness(path: Path, velocity: Floats) -> float:
 
 
 def _poses(start: Floats, end: Floats, shares: NDArray[np.float64]) -> Floats:
-    """Return (M, 7) poses between two at shares (M,) of the path."""
+    """Return (M, 7) poses between two poses, at shares (M,) of the path."""
     place = (1 - shares)[:, None] * start[:3] + shares[:, None] * end[:3]
     turn = np.array([slerp(start[3:], end[3:], float(share)) for share in shares])
     return np.concatenate([place, turn], axis=1)

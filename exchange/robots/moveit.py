@@ -1,7 +1,7 @@
 """Grasps as `moveit_msgs/Grasp` and `RobotTrajectory` messages in YAML, with URDFs of hand and object.
 
-`grasp_pose` is the pose of the tool frame, which is MoveIt's end-effector link. Directions are in the frame of the
-pose. ROS quaternions are x y z w. `effort` [N m or N] is the squeeze's: stiffness times distance from the grasp."""
+`grasp_pose` is the pose of the tool frame, which is MoveIt's end-effector link. Poses and directions are in `frame_id`.
+ROS quaternions are x y z w. `effort` [N m or N] of the squeeze is stiffness times the distance from the grasp."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LEAST_SHARE: Final = 0.5
 
 
 def write(bundle: Bundle, folder: Path, hand_files: Mapping[str, bytes]) -> list[Path]:
-    """Write `grasps.yaml`, `trajectories/GRASP.yaml`, the hand's URDF and meshes in `hand/`, the mesh in `object/`."""
+    """Write `grasps.yaml`, `trajectories/GRASP.yaml`, and URDFs and meshes to `hand/` and `object/`."""
     (folder / "trajectories").mkdir(parents=True, exist_ok=True)
     written = [dump_yaml(folder / "grasps.yaml", [_grasp(bundle, row) for row in range(len(bundle.found))])]
     for row, trajectory in enumerate(bundle.trajectories):
@@ -40,7 +40,7 @@ def _grasp(bundle: Bundle, row: int) -> dict[str, Any]:
     def point(posture: str, seconds: float, effort: Floats | None = None) -> dict[str, Any]:
         return _point(postures[posture].joint_positions[row, bundle.commanded_joints], seconds, effort=effort)
 
-    # End of each motion: the last time with its name.
+    # End of each motion: the last time of its phase.
     times = dict(zip(bundle.trajectories[row].phase, bundle.trajectories[row].time, strict=True))
     stiffness = found.hand.stiffness[found.hand.dof[found.hand.joint_body]]
     press = stiffness * (postures["squeeze"].joint_positions[row] - postures["grasp"].joint_positions[row])

@@ -1,7 +1,7 @@
-"""Grasps as MuJoCo scenes with a key frame per posture: the validator's hand alone, or on its arm.
+"""Grasps as MuJoCo scenes with a key frame per posture: the validator's scene, and one with the arm.
 
 The world is the frame of the grasps, z up in a scene. A mocap body leads the hand's root. Position actuators have the
-names of the degrees of freedom. In a scene gravity acts on the object alone; a free object floats."""
+names of the degrees of freedom. Gravity acts only in scenes with supports, and not on the hand."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from graspd.worker.validation.model import MujocoOptions, Scene, build, scene_sp
 
 #: Colours of the hand, the object, and everything else.
 _COLOURS: Final = ("0.36 0.45 0.58 1", "0.87 0.45 0.2 1", "0.75 0.75 0.72 1")
-#: Attributes of MJCF with another name in the specification.
+#: Attributes of MJCF that have other names in `MjSpec`.
 _SPEC_NAMES: Final = {"vertex": "uservert"}
 
 
 def write(bundle: Bundle, folder: Path) -> list[Path]:
-    """Write `scene.xml`, which needs no other file; `replay.py`, which validates its grasps; and an arm's `arm.xml`."""
+    """Write a self-contained `scene.xml`, `replay.py` to validate its grasps and, with an arm, `arm.xml`."""
     found, pieces = bundle.found, decompose(bundle.found.obj)
     folder.mkdir(parents=True, exist_ok=True)
     around = ((), ()) if found.placed is None else (found.placed.supports, found.placed.neighbours)
@@ -61,7 +61,7 @@ def write(bundle: Bundle, folder: Path) -> list[Path]:
 
 
 def _restore_digits(tree: Element, spec: Any) -> None:
-    """Restore all digits of numbers: MuJoCo writes six, but smaller differences decide verdicts."""
+    """Restore all digits of numbers: MuJoCo writes six, but smaller differences can decide verdicts."""
     for tag in ("body", "joint", "geom", "mesh"):
         for element in tree.iter(tag):
             source = getattr(spec, tag)(element.get("name")) if element.get("name") else None
@@ -75,7 +75,7 @@ def _restore_digits(tree: Element, spec: Any) -> None:
 
 
 def _settle(tree: Element, found: Executions) -> None:
-    """Fix supports in the world; set gravity as in the lift test, on the object alone."""
+    """Fix supports in the world; set gravity as in the lift test, without effect on the hand."""
     option = only_element(tree, "option")
     support = tree.find(".//body[@name='supports']")
     if support is not None:
@@ -92,7 +92,7 @@ def _settle(tree: Element, found: Executions) -> None:
 
 
 def add_appearance(tree: Element, found: Executions, names: tuple[str, ...]) -> None:
-    """Add colours of hand, object and neighbours (`names`), light and a camera; physics stays the same."""
+    """Add colours to the bodies `names`, a light, and a default view; physics stays the same."""
     for name, colour in zip_longest(names, _COLOURS[: len(names)], fillvalue=_COLOURS[-1]):
         for body in tree.findall(f".//body[@name='{name}']"):
             for geom in body.iter("geom"):
@@ -108,7 +108,7 @@ def add_appearance(tree: Element, found: Executions, names: tuple[str, ...]) -> 
 
 
 def _key(found: Executions, scene: Scene, posture: str, row: int) -> dict[str, str]:
-    """Return state and targets. A squeeze is only commanded: the fingers are at the grasp."""
+    """Return state and targets of a key frame; in squeeze and lift the fingers' state is the grasp."""
     command = found.postures[posture]
     stands = found.postures["grasp"] if posture in ("squeeze", "lift") else command
     pose = command.hand_pose[row]
@@ -131,7 +131,7 @@ def _key(found: Executions, scene: Scene, posture: str, row: int) -> dict[str, s
 
 
 def _names(hand: HandModel) -> Mapping[str, str]:
-    """Return the hand's own names for the validator's; `object`, `supports`, `root`, `mocap` are reserved."""
+    """Map the validator's names to the hand's own; reserved ones (`taken`) get the prefix `hand_`."""
     taken = {"object", "supports", "root", "mocap", "world"}
     found: dict[str, str] = {}
     for prefix, names in (("body", enumerate(hand.body_names)), ("dof", enumerate(hand.dof_names))):
@@ -191,7 +191,7 @@ def _add_arm_keys(tree: Element, bundle: Bundle, carrier: Carrier) -> None:
 
 
 def _arm_names(bundle: Bundle, carrier: Carrier) -> dict[str, str]:
-    """Return own names of arm and hand; repeated ones of the hand get the prefix `hand_`."""
+    """Map bodies to names of arm and hand; reserved or repeated names get the prefix `arm_` or `hand_`."""
     found: dict[str, str] = {}
     taken = {"object", "world", "flange"}
     for prefix, model in (("arm", carrier.arm.model), ("hand", bundle.found.hand)):

@@ -1,6 +1,6 @@
 """Grasps as posed meshes, one file each: binary glTF (+y up), and USD stages over time (extra `usd`).
 
-A stage is in metres, z up. Defaults show the grasp; 24 time samples per second lead from the standoff to the lift."""
+A stage is in metres, z up, at 24 time codes per second. Default values show the grasp, time samples the motion."""
 
 from __future__ import annotations
 
@@ -79,11 +79,11 @@ class Solid:
     colour: Colour
     """Linear RGB, 0 .. 1."""
     body: int | None = None
-    """Body of the hand that carries it; None: the object carries it, or it does not move."""
+    """Body of the hand to which the mesh belongs; None: it belongs to the object or a support."""
 
 
 def hand_meshes(found: Executions) -> list[Solid]:
-    """Return one mesh for each visible body of the hand, in the body's frame; second and later ones are numbered."""
+    """Return the hand's visible meshes in their bodies' frames; further meshes of a body are numbered."""
     bodies, made = drawn_bodies(found.hand), []
     for number, part in enumerate(hand_parts(found.hand)):
         before = bodies[:number].count(bodies[number])
@@ -148,7 +148,7 @@ def write_usd(bundle: Bundle, folder: Path) -> list[Path]:
         object_prim, hand_prim = bundle.prims
         root = f"/World/{hand_prim}"
         UsdGeom.Xform.Define(stage, root)
-        # The hand's joints are the trajectory's last ones.
+        # The hand's joints are the last columns of the trajectory.
         joints = trajectory.joints[:, -len(found.hand.joint_names) :]
         bodies, times = body_poses(found.hand, trajectory.hand_pose, joints), RATE * trajectory.time
         at_grasp = posed_bodies(found, "grasp", row)

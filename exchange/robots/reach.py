@@ -41,9 +41,9 @@ class Arm:
     mount: str
     mount_body: int
     mount_pose: Floats
-    """(7,) mount link in its body's frame."""
+    """(7,) pose of the mount link in its body's frame."""
     hand_pose: Floats
-    """(7,) hand's root link in the mount link."""
+    """(7,) pose of the hand's root link in the mount link's frame."""
 
 
 def read_arm(path: str | pathlib.Path, mount: str, hand_pose: Floats) -> Arm:
@@ -85,11 +85,11 @@ class Description:
     links: Mapping[str, tuple[int, Floats]]
     """Each link below the root: its body, and its pose (7,) in the body's frame."""
     mimics: frozenset[str]
-    """Joints that the description couples to others: its readers move them by themselves."""
+    """Joints that the description couples to others; its readers move these joints themselves."""
 
 
 def describe(files: Mapping[str, bytes], options: Mapping[str, Any] | None = None) -> Description:
-    """Return the description of a hand's files; see `load_hand`."""
+    """Return links and couplings of a hand; `files` and `options` as in `load_hand`."""
     source = HandSource.read(files, options)
     robot, tree = source.robot, build_tree(source.robot, source.options)
     return Description(
@@ -115,18 +115,18 @@ REASONS: Final = ("out of reach", "no continuous motion", "collision")
 
 @dataclass
 class ReachResult:
-    """Executable grasps of N."""
+    """Grasps that an arm can execute."""
 
     rows: list[int] = field(default_factory=list)
     paths: list[list[Path]] = field(default_factory=list)
     """Their motions; joints are the arm's, then the hand's."""
     refused: Counter[str] = field(default_factory=Counter)
-    """Number of the other grasps by reason."""
+    """Number of grasps that the arm cannot execute, by reason."""
     candidates: int = 0
 
 
 class ReachSearch:
-    """Searches motions of one arm with one hand around one object. Not thread-safe."""
+    """Search for motions of one arm with one hand around one object. Not thread-safe."""
 
     def __init__(self, arm: Arm, base: Floats, found: Executions, pieces: ConvexPieces) -> None:
         """Raise InputError if mink is not installed."""
@@ -145,7 +145,7 @@ class ReachSearch:
         self._order = np.array([int(self._model.joint(f"arm{b}").qposadr[0]) for b in arm.model.joint_body], np.intp)
 
     def all(self, wanted: int = 0) -> ReachResult:
-        """Search all grasps, or in order until `wanted` are found."""
+        """Search grasps in their order: all, or until `wanted` (above 0) are executable."""
         reached = ReachResult()
         for row in range(len(self.found)):
             reached.candidates += 1
@@ -160,7 +160,7 @@ class ReachSearch:
         return reached
 
     def one(self, row: int) -> tuple[list[Path] | None, str]:
-        """Return the motions of one grasp; else the reason for failure of the start that got farthest."""
+        """Return the motions of one grasp, or None and the reason why the best start failed."""
         long, short = (straight_paths(self.found, row, points) for points in (LONG, SHORT))
         ways = [a if a.phase in _LONG_PHASES else b for a, b in zip(long, short, strict=True)]
         rng, farthest, reason = np.random.default_rng(row), -1, ""
@@ -199,7 +199,7 @@ class ReachSearch:
         ], ""
 
     def _follow(self, q: Floats, poses: Floats) -> Floats | None:
-        """Return (M, A) dofs along root poses (M, 7) of the hand, from q at the first; None after a jump."""
+        """Return (M, A) dofs along root poses (M, 7) of the hand, from q on; None after a jump or failure."""
         rows = [q]
         for pose in poses[1:]:
             onward = self._solve(rows[-1], pose, STEPS // 4)
@@ -247,7 +247,7 @@ class ReachSearch:
         return ""
 
 
-#: Share of random postures in contact from which on a pair of bodies is excluded: their hulls exceed their meshes.
+#: A pair of bodies in contact in at least this share of random postures is excluded: hulls exceed their meshes.
 ALWAYS: Final = 0.95
 SAMPLES: Final = 100
 #: Name of the frame that carries the hand.
@@ -297,7 +297,7 @@ class ArmScene:
         self.hand_qpos = _addresses(self.model, hand, "hand")
 
     def touches(self, arm_joints: Floats, hand_joints: Floats, object_pose: Floats) -> str:
-        """Return the collision at arm dofs (A,), hand joints (J,) and an object pose (7,); empty if none."""
+        """Return the colliding pair at arm dofs (A,), hand joints (J,), object pose (7,); empty if none."""
         self._put(self.model, self.data, arm_joints, hand_joints)
         self.data.mocap_pos[0], self.data.mocap_quat[0] = object_pose[:3], object_pose[3:]
         mujoco.mj_kinematics(self.model, self.data)
@@ -332,7 +332,7 @@ class ArmScene:
             mujoco.mj_collision(model, data)
             count.update({tuple(sorted(model.geom_bodyid[c.geom].tolist())) for c in data.contact if c.dist < 0})
         for (a, b), times in sorted(count.items()):
-            # The first link turns at the base. Any other link that is always in a support means a wrong base.
+            # The first link turns at the base, inside a support. Any other link inside a support means a wrong base.
             if times >= ALWAYS * SAMPLES and (a or model.body(b).name == "arm1"):
                 self.spec.add_exclude(bodyname1=model.body(a).name, bodyname2=model.body(b).name)
 

@@ -1,14 +1,14 @@
 """Replay exported grasps in MuJoCo and validate them; needs mujoco and numpy, but not graspd.
 
     python replay.py scene.xml                 every grasp, one line each
-    python replay.py scene.xml --view [NAME]   watch one
-    python replay.py scene.xml --json
+    python replay.py scene.xml --view [NAME]   watch one grasp
+    python replay.py scene.xml --json          results as JSON
 
 Each grasp has six key frames in the scene: standoff, arrival, pregrasp, grasp, squeeze, lift. The hand must not touch
 anything during its approach, and closes in 0.8 s. With gravity it then rises within 0.4 s and holds for 2 s. Without
-gravity the object is pushed in six directions for 2 s each; the force [N] is ten times its mass [kg]. The object may
-end up to 5 cm and 15 degrees from its goal. Without --full a test ends early if the object's present velocities keep it
-there for 2 s."""
+gravity the object is pushed in six directions for 2 s each; the force [N] is ten times the object's mass [kg]. The
+object may end up to 5 cm and 15 degrees from its goal. Without --full a test ends early if the object, at its present
+velocities, would stay within half of these limits for the 2 s."""
 
 import argparse
 import json
@@ -154,7 +154,7 @@ class Replay:
         return bool(self.of_hand[contact.geom].any())
 
     def touches(self, grasp: str) -> bool:
-        """Check whether the open hand penetrates the object or anything else during its approach."""
+        """Check whether the open hand penetrates anything deeper than allowed during its approach."""
         for a, b, looks in (("standoff", "arrival", WAY_LOOKS), ("arrival", "pregrasp", CLOSING_LOOKS)):
             first, last = self.key(grasp, a), self.key(grasp, b)
             for look in range(looks):

@@ -4,9 +4,9 @@ Poses in the tables are poses of the tool frame: x y z [m], unit quaternion qw q
 the joints' names.
 
 In Isaac Sim's file, a grasp is the pose of the gripper's frame in the object's frame: position [m], quaternion w and
-xyz. `cspace_position` has the joints that hold, `pregrasp_cspace_position` the joints before. Joints that the URDF
-couples are omitted. Names of the two frames are informative. Isaac Sim uses `..._frame_link`, Isaac ROS `..._frame`, so
-both are written. Joint commands of the squeeze and trajectories are under our own key, which readers ignore."""
+xyz. `cspace_position` has the joints of the grasp, `pregrasp_cspace_position` those of the pregrasp. Joints that the
+URDF couples are omitted. Isaac Sim uses frame names `..._frame_link`, Isaac ROS `..._frame`, so both are written.
+Further postures and epsilon are under the key `graspd`, which readers ignore."""
 
 from __future__ import annotations
 

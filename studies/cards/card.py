@@ -101,7 +101,7 @@ def write_samples(shards: Shards, file: Path) -> bool:
 
 
 def choose(files: tuple[ShardFile, ...]) -> list[ShardFile]:
-    """Choose at most `MOST` shards over all objects, with a different hand each time."""
+    """Choose at most `MOST` shards, spread over the objects, with hands in rotation."""
     cells: dict[tuple[str, str], list[ShardFile]] = {}
     for file in files:
         cells.setdefault((file.hand, file.object), []).append(file)

@@ -50,7 +50,7 @@ class AssetFacts:
 
 @dataclass(frozen=True)
 class Contents:
-    """Input of a card; without a store, `snapshot` and `record` are None."""
+    """Input of a card; a folder has no `record`, and only an export has a `snapshot`."""
 
     name: str
     shards: Shards
@@ -106,7 +106,7 @@ def with_provenance(contents: Contents, file: Path) -> Contents:
     except OSError as error:
         raise InputError(f"{file} cannot be read: {error.strerror}") from None
     except (ValueError, AttributeError, TypeError):
-        raise InputError(f'{file} is not as {{"objects": {{"mug": {{"licence": "...", "source": "..."}}}}}}') from None
+        raise InputError(f'{file} must hold {{"objects": {{"mug": {{"licence": "...", "source": "..."}}}}}}') from None
     hands, objects = (_with_facts(getattr(contents, kind), said, file) for kind, said in groups.items())
     return replace(contents, hands=hands, objects=objects)
 
@@ -120,7 +120,7 @@ def _with_facts(
     for name, asset in assets.items():
         own = said.get(name, said.get("*", {}))
         if wrong := set(own) - {"licence", "source", "description"}:
-            raise InputError(f"{file}: {name} has {sorted(wrong)[0]!r}; there are licence, source and description")
+            raise InputError(f"{file}: {name} has {sorted(wrong)[0]!r}; known keys are licence, source and description")
         words = {key: str(own.get(key, getattr(asset, key))) for key in ("licence", "source", "description")}
         informed[name] = replace(asset, **words)  # type: ignore[arg-type]
     return informed

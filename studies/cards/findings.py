@@ -12,7 +12,7 @@ Row = Mapping[str, Any]
 
 #: A cell's yield below this share of the median over its hand's cells is low.
 _LITTLE: Final = 0.5
-#: Share of its range within which a joint hardly moves: it stays inside in 98 of 100 grasps.
+#: A joint hardly moves if 98 of 100 grasps use less than this share of its range.
 _STILL: Final = 0.05
 #: A larger share of grasps with a joint at its limit is reported.
 _AT_LIMIT: Final = 0.5
@@ -23,7 +23,7 @@ _UNEVEN: Final = 1.2
 #: A direction is preferred above this multiple of its share under uniform directions.
 _PEAKED: Final = 1.25
 _SHOWN: Final = 8
-#: Key of a card's `making`, and name of the setting that must not be mixed.
+#: Keys of a card's `making`, and names of the settings whose mixture is reported.
 _UNMIXED: Final = {
     "methods": "methods",
     "levels": "levels of the validator",
@@ -199,7 +199,7 @@ def _qualities(card: Row) -> Iterator[str]:
 
 def _mixed(card: Row) -> Iterator[str]:
     if count := card["repeated"]:
-        yield f"**{count:,} valid grasps equal another** of their cell to six digits."
+        yield f"**{count:,} valid grasps equal another** of their cell to six decimals."
     making = card["making"]
     for key, what in _UNMIXED.items():
         if len(making[key]) > 1:

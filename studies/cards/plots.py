@@ -14,7 +14,7 @@ from graspd.studies.cards.tally import Tally, cell_counts
 Row = Mapping[str, Any]
 COLOURS: Final = ("#0f766e", "#b45309", "#4338ca", "#be123c", "#4d7c0f", "#6b7280", "#a21caf", "#0369a1")
 INK: Final = "#1f2937"
-#: Largest number of objects of a matrix with names and numbers.
+#: Largest number of objects of a matrix that shows names and numbers.
 _NAMED: Final = 40
 #: Largest number of panels: the first hands get one each.
 _PANELS: Final = 6

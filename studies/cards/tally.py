@@ -1,6 +1,6 @@
 """Sums over the shards of a dataset, and approach directions in cells of equal area.
 
-A cell stores its grasps as a few float32 columns, so that millions fit in memory."""
+A cell (hand x object) stores its grasps as a few float32 columns, so that millions fit in memory."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from graspd.studies.cards.contents import AssetFacts, Contents, Pair, ShardConte
 from graspd.worker.grasps import Posture
 from graspd.worker.quality.diversity import cells_of
 
-#: Bins between a joint's limits.
+#: Number of bins between a joint's limits.
 BINS: Final = 200
 
 #: A joint closer to its limit than this share of its range counts as at its limit.
@@ -82,9 +82,9 @@ Array = NDArray[Any]
 Floats32 = NDArray[np.float32]
 #: Number of a cell's first grasps from which its diversity is computed.
 SAMPLED: Final = 512
-#: Number of arrays of a cell above which they are merged.
+#: A cell's arrays are merged if they are more than this.
 _UNPACKED: Final = 16
-#: Grasps with all numbers equal to this many digits (metres, radians) count as repeated.
+#: Grasps with all numbers equal to this many decimals (metres, radians) count as repeated.
 _DIGITS: Final = 6
 
 
@@ -95,13 +95,13 @@ class CellTally:
     n: Counter[str] = field(default_factory=Counter)
     """Numbers of grasps and pairs.
     `validated`: candidates in validated shards. `placed`: valid grasps placed into scenes; `clear`: clear in at least
-    one scene. `lift_tested`: valid grasps in scenes tested at half friction; `lift_hard`: held in this test."""
+    one scene. `lift_tested`: valid grasps with a lift test at half friction; `lift_hard`: lifted in this test."""
     seconds: float = 0.0
     """Worker seconds over all stages."""
     rejected: Counter[str] = field(default_factory=Counter)
     """Rejected candidates by reason."""
     refused: Counter[int] = field(default_factory=Counter)
-    """Number of pairs by code of `grasp/rejection`."""
+    """Number of pairs of grasp and scene by code of `grasp/rejection`."""
     columns: dict[str, list[Floats32]] = field(default_factory=dict)
     towards: list[Floats32] = field(default_factory=list)
     """Unit vectors from the object to the palm before the approach, object frame."""
@@ -145,7 +145,7 @@ class Tally:
     cells: dict[Pair, CellTally] = field(default_factory=dict)
     joints: dict[str, JointUse] = field(default_factory=dict)
     elevation: dict[str, dict[str, NDArray[np.int64]]] = field(default_factory=dict)
-    """Numbers of pairs of each hand, all and clear ones, by elevation of the palm over the table."""
+    """Numbers of pairs of grasp and scene of each hand, all and clear ones, by the palm's elevation."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Worker seconds of each kind of shard."""
     parts: Counter[str] = field(default_factory=Counter)
@@ -172,7 +172,7 @@ _ATTRIBUTES: Final = (
 
 
 def tally_of(contents: Contents, pieces: Iterable[ShardContents]) -> Tally:
-    """Sum all pieces; the pieces of a batch must be in the order base, scene, views, as from `pieces`."""
+    """Sum all pieces; the pieces of a batch must be in the order base, scene, views, as from `read_shards`."""
     tally = Tally()
     valid: dict[str, Array] = {}
     batch_now: tuple[Pair, int] | None = None
@@ -282,7 +282,7 @@ def _add_scene(
 #: Fewest grasps for statements on empty cells. With this many uniform grasps a cell is empty with probability e^-5,
 #: which gives 0.3 empty cells of 48.
 ENOUGH: Final = 5 * DIRECTION_CELLS
-#: Elevations from -90 to 90 degrees.
+#: Number of bins of elevations from -90 to 90 degrees.
 ELEVATION_BINS: Final = 36
 
 

@@ -49,9 +49,8 @@ def chart(
     keep: Callable[[dict[str, Any]], None],
 ) -> dict[str, Any]:
     """Run all settings on all pairs; validate each held grasp in `models` models around the nominal one.
-    `say` receives a line per cell, `keep` the partial result after each pair. Return `runs[]` with the keys of the
-    command line's contract, `summary[]` over hands and objects, `by_hand` over each hand's objects, `device`,
-    `created`."""
+    `say` receives a line per cell, `keep` the partial result after each pair. Return `runs[]` (one setting on one pair
+    each), `summary[]` over hands and objects, `by_hand` over each hand's objects, `device`, `created`."""
     runs: list[dict[str, Any]] = []
     for thing in things:
         for hand in hands:
@@ -128,8 +127,8 @@ def settings_of(
     run: ExecutionContext,
 ) -> list[Setting]:
     """Return a setting for every method, fidelity and batch; methods without fidelities have one each.
-    Methods with a step budget take seconds per grasp: they get `baseline_batch` grasps per call, other methods without
-    fidelities `batches[0]`. Raises InputError: a method is unknown, or an option belongs to no method."""
+    Of the latter, those with an option `steps` take seconds per grasp. They get `baseline_batch` grasps per call, the
+    others `batches[0]`. Raises InputError: a method is unknown, or an option belongs to no method."""
     variants = [_variant(text) for text in methods]
     given = _options_of(options, [name for name, _, _ in variants])
     found: list[Setting] = []

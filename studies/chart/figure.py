@@ -135,7 +135,7 @@ def draw_scenes(rows: Sequence[Row], files: Sequence[Path], *, second: str) -> N
     last = panels.flat[4]
     labels += _panel(last, timed, styles, x="seconds_to_first", y="lift", label=one_of_several)
     last.set_xlabel(f"{second}s to the first that is lifted (less is better)")
-    last.set_title("Lifted; of those that lift in every pair", loc="left", fontsize=11)
+    last.set_title("Lifted, by settings with a lift in every pair", loc="left", fontsize=11)
     last.set_ylim(-0.07, 1.07)
     panels.flat[5].set_visible(False)
     figure.legend(*panels.flat[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
@@ -313,7 +313,7 @@ def _place(axes: Any, pixels: float, labels: Sequence[Label]) -> list[Any]:
     made = []
     for index, at in chosen.items():
         box = offered[index][at]
-        # Far from its point, or nearer to another point, a label would be ambiguous without a line.
+        # A label far from its point, or nearer to another point, would be ambiguous without a line.
         led = at // len(_TURNS) > 1 or _is_nearer_to_another(box, points, index)
         made.append(_write(axes, labels[index], points[index], box, pixels, led=led))
     return made
@@ -388,7 +388,7 @@ def _bars(axes: Any, labels: Sequence[Label], half: float) -> Boxes:
 
 
 def _share(box: Boxes, boxes: Boxes) -> float:
-    """Return the covered area of a box; overlaps count for each covering box."""
+    """Return the covered share of a box's area; overlaps count for each covering box."""
     if not len(boxes):
         return 0.0
     across = np.minimum(box[2], boxes[:, 2]) - np.maximum(box[0], boxes[:, 0])

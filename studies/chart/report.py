@@ -1,4 +1,4 @@
-"""A chart as JSON, CSV, Markdown and plots: of free objects, or of scenes."""
+"""A chart of free objects or of scenes, as JSON, CSV, Markdown and plots."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def _head(chart: Row) -> str:
         "- *valid/s* and *first valid s*: time includes planning, validation, and metrics of held grasps; on a CPU a "
         "second is one core-second\n"
         "- *held/s, planner only*: held grasps per second of planner and postures\n"
-        "- *dexgraspbench*: share held under the unmodified protocol; *hard*: the same at half friction\n"
+        "- *dexgraspbench*: share held under the unmodified protocol; *hard*: at half friction, level *standard*\n"
         f"- *robust*: mean share of {chart['models']} perturbed models in which a held grasp also holds\n"
         f"- ε and contact area: μ = {chart['friction']:g}, within {1e3 * chart['threshold_m']:g} mm; ε and penetration "
         "are medians of a pair's grasps, then means over the pairs\n"
@@ -297,8 +297,8 @@ def _summary(rows: Sequence[Row], second: str) -> str:
             f"{row['pairs_with_one']} of {row['pairs']} | {gain} |"
         )
     note = (
-        "× filtered: speed of the planner only, relative to filtered grasps of the same fidelity; median over pairs "
-        "with lifted filtered grasps. "
+        "× filtered: median ratio of planner-only speeds, in the scene to filtered, over pairs with lifted filtered "
+        "grasps. "
         "Bold: no faster setting is better."
     )
     return "\n".join(lines) + f"\n\n{note}"

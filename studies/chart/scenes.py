@@ -1,7 +1,7 @@
 """Comparison of grasps planned in a scene with grasps of a free object that are filtered in the same scene.
 
-Methods that plan in scenes run in both modes, other methods only in the second. In both modes grasp i uses scene i of
-the object's stable faces, in turn. The tests are equal: clear trajectory, lift, lift under the unmodified protocol,
+Methods that plan in scenes run in both modes, other methods only in the second. In both modes the grasps use the
+scenes of an object in turn. The tests are equal: clear trajectory, lift, lift under the unmodified protocol,
 lift at half friction, and lift in models around the nominal one. Speed is lifted grasps per second; on a CPU per
 core-second, which is independent of other load. It is measured for planner and postures alone, and end to end: with
 trajectory, validator and metrics of lifted grasps."""
@@ -93,7 +93,7 @@ def scene_chart(
     """Run all settings on all pairs; a setting's `batch` is its number of grasps per pair.
     Each lifted grasp is lifted again in `models` models around the nominal one. `work` is a folder for the results of
     each setting and pair; an interrupted run resumes from it. `say` receives a line per cell, `keep` the partial result
-    after each pair. Return `runs[]` of one setting on one pair each, `summary[]` over the pairs, `by_hand`, `device`,
+    after each pair. Return `runs[]` (one setting on one pair each), `summary[]` over the pairs, `by_hand`, `device`,
     `created`."""
     runs: list[Row] = []
     for thing in things:
@@ -146,7 +146,7 @@ def _cached_result(
 
 
 def _run_setting(setting: Setting, way: str, hand: HandModel, place: ObjectScenes, models: int) -> Row:
-    """Return number, shares and rate of the grasps of one setting for a hand and an object."""
+    """Return counts, shares and speeds of one setting's grasps for a hand and an object."""
     obj = place.thing.load(setting.knobs.face_error_m)
     placed = place.scenes.placed(np.arange(setting.batch) % len(place.scenes.object_pose))
     row: Row = {"grasps": setting.batch, "seconds": 0.0, "end_seconds": 0.0, **_NOTHING}
@@ -192,7 +192,7 @@ def _plan_grasps(
 
 
 class ValidatedGrasps:
-    """Grasps with trajectories and lift verdicts, measured if held."""
+    """Grasps with trajectories and lift verdicts. Lifted grasps are measured, since the timing includes metrics."""
 
     def __init__(self, hand: HandModel, place: ObjectScenes, grasps: GraspSet, placed: PlacedGrasps) -> None:
         way = plan_trajectory(hand, place.true, grasps, placed)
@@ -250,7 +250,7 @@ def figures(rows: Sequence[Mapping[str, Any]]) -> Row:
 
 def summed(runs: Sequence[Row]) -> list[Row]:
     """Return a row for each mode, method and fidelity over all pairs.
-    `gain` is relative to mode filtered at the same fidelity: the median over pairs with lifted filtered grasps."""
+    `gain`: median ratio of speeds, in scene to filtered, over pairs that have lifted grasps in mode filtered."""
     groups: dict[tuple[str, str, str, int], list[Row]] = {}
     for run in runs:
         groups.setdefault((run["way"], run["method"], run["fidelity"], run["batch"]), []).append(run)

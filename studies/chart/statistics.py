@@ -51,13 +51,13 @@ def figures(cell: Rollout) -> dict[str, Any]:
 
 
 def widen(row: dict[str, Any], valid: int, grasps: int, per_second: float) -> None:
-    """Widen the bars of success and of the dependent speed by the counts; speed keeps the wider bars."""
+    """Set the bar of success to Wilson's interval; widen the bar of the speed at least to this interval."""
     row["gsr_low"], row["gsr_high"] = wilson(valid, grasps)
     widen_speed(row, "valid_per_second", valid, grasps, per_second)
 
 
 def widen_speed(row: dict[str, Any], key: str, valid: int, grasps: int, per_second: float) -> None:
-    """Widen the bars of a speed at least to the bars that follow from the share of counted grasps."""
+    """Widen the bar of a speed at least to Wilson's interval of the share of valid grasps."""
     low, high = wilson(valid, grasps)
     row[f"{key}_low"] = min(row[f"{key}_low"], low * per_second)
     row[f"{key}_high"] = max(row[f"{key}_high"], high * per_second)

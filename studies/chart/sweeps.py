@@ -56,8 +56,8 @@ def _options(**changes: Any) -> Change:
 
 
 def knob_values(quick: bool = False, knobs: Sequence[str] = ()) -> list[KnobValue]:
-    """Return values of all settings, of a few (`quick`), or of the named ones; each setting includes its default.
-    Raises InputError: a name is not a setting."""
+    """Return values of all settings or of the named ones (`knobs`), each setting with its default.
+    With `quick`, return four values of two settings. Raises InputError: a name is not a setting."""
 
     def knob(name: str, between: str, **values: Sequence[Any]) -> list[KnobValue]:
         rows = zip(*values.values(), strict=True)
@@ -84,7 +84,7 @@ def knob_values(quick: bool = False, knobs: Sequence[str] = ()) -> list[KnobValu
     ]
     known = list(dict.fromkeys(turn.knob for turn in found))
     if unknown := [name for name in knobs if name not in known]:
-        raise InputError(f"there is no setting {unknown[0]!r}; choose of {', '.join(map(repr, known))}")
+        raise InputError(f"there is no setting {unknown[0]!r}; choose from {', '.join(map(repr, known))}")
     if knobs:
         return [turn for turn in found if turn.knob in knobs]
     return [*found[:2], *(turn for turn in found if turn.knob == "queries")] if quick else found

@@ -36,12 +36,12 @@ SEED: Final = 4711
 WARM_SEED: Final = 1
 #: Seed of the models around the nominal one; neither jobs nor `graspd evaluate` use it.
 MODELS_SEED: Final = 2**31 + 1
-#: Number of best grasps by epsilon per object, as in table 2 of the paper.
+#: Number of best grasps by epsilon per pair, as in table 2 of the paper.
 BEST: Final = 10
 
 
 Make = Callable[[HandModel, ObjectModel, int, int], GraspSet]
-"""Function from hand, object, grasps and seed to grasps."""
+"""Function from hand, object, number of grasps and seed to grasps."""
 
 
 @dataclass(frozen=True)
@@ -168,7 +168,7 @@ class Rollout:
             self.shares.append(shares)
 
     def time_first(self, grasps: int) -> None:
-        """Time a call with few grasps (first valid one); above 1 s per grasp, derive the time from the batch."""
+        """Time a call of a few grasps, for the first valid one; above 1 s per grasp, scale the batch's time."""
         self.first_grasps = grasps
         each = self.end_seconds[-1] / self.setting.batch
         if each > 1.0:
@@ -184,7 +184,7 @@ class Rollout:
         return np.concatenate([columns[key] for columns in self.columns])
 
     def best(self) -> dict[str, float]:
-        """Return means over the `BEST` grasps by epsilon, with simulated displacement: a row of the paper's table 2."""
+        """Return a row of the paper's table 2: means over the `BEST` grasps by epsilon."""
         order = np.argsort(-self.values("epsilon"), kind="stable")[:BEST]
         pose, joints = (
             np.concatenate([getattr(found.grasp, name) for found in self.made])[order]

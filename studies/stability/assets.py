@@ -39,7 +39,7 @@ def sheet(thickness_mm: float) -> Any:
 
 
 def wedge(angle_deg: float) -> Any:
-    """Return a prism of 80 mm with one sharp edge."""
+    """Return a triangular prism, 80 mm long, with an edge of the given angle."""
     half = 0.06 * np.tan(np.radians(angle_deg) / 2)
     section = np.array([[0.0, 0.0], [0.06, -half], [0.06, half]])
     ends = [np.column_stack([section, np.full(3, z)]) for z in (-0.04, 0.04)]
@@ -47,7 +47,7 @@ def wedge(angle_deg: float) -> Any:
 
 
 def tunnel(diameter_mm: float) -> Any:
-    """Return a thick ring: 30 mm of wall around a hole."""
+    """Return a thick ring: a wall of 15 mm around a hole of the given diameter."""
     inner = diameter_mm * MILLIMETRES / 2
     return trimesh.creation.annulus(inner, inner + 0.015, 0.05, sections=48)
 
@@ -69,7 +69,7 @@ def _half_inverted(faces: Any) -> Any:
 
 
 def box_with_defect(name: str) -> Any:
-    """Return a box with a defect of `DEFECTS`."""
+    """Return a box with the named defect of `DEFECTS`."""
     mesh = trimesh.creation.box((0.07, 0.06, 0.05))
     return trimesh.Trimesh(mesh.vertices, DEFECTS[name](mesh.faces.copy()), process=False)
 
@@ -153,7 +153,7 @@ def shape_cell(
     allow_open: bool = False,
     **asked: Any,
 ) -> MapCell:
-    """Return candidates of a hand on a mesh, planned and validated as in a job.
+    """Return the map's cell of a hand on a mesh; candidates are planned and validated as in a job.
     `place` has panel, x and y of the cell. The `mesh` in metres is prepared like an upload; `allow_open`: it may be
     open. `options` has size and execution context of the job, `asked` its fidelity or method."""
     request = JobRequest(hand="hand", object="shape", grasps=options.count, want="candidates", rechecks=0, **asked)
@@ -199,8 +199,8 @@ _EFFORT: Final = 1.0
 
 def ring_hand(fingers: int, *, coupling: Coupling = "each joint", size: float = 1.0, ratio: float = 0.8) -> HandModel:
     """Return a hand of equal fingers around a palm.
-    `coupling` is which joints one drive moves. `size` is relative to a human hand. `ratio` is a coupled distal joint's
-    rotation divided by the middle joint's. Raises HandError: the hand is unusable."""
+    `coupling` names the joints that one drive moves. `size` is relative to a human hand. `ratio` is the rotation of a
+    coupled distal joint, divided by the middle joint's. Raises HandError: the hand is unusable."""
     radius, height = (size * x for x in _PALM_M)
     parts = [f'<robot name="ring"><link name="palm">{_solid("cylinder", -height / 2, radius, height)}</link>']
     for k in range(fingers):

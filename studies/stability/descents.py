@@ -43,7 +43,7 @@ RESIDUAL: Final = (0.35, 0.9)
 class Descent:
     state: HandState
     depths: Floats
-    """(n,) deepest penetration after the projection, as in a job [m]; before the projection, millimetres."""
+    """(n,) deepest penetration after the projection, as in a job [m]."""
     drift: float
     """Largest deviation of a quaternion's norm from 1, before the projection normalises it."""
 
@@ -60,7 +60,7 @@ def descend(
 ) -> Descent:
     """Run coarse and fine phase and projection from given hands.
     `rates` and `weights` are factors on the rates and on the weights of penetration. `iterations` is the length of the
-    fine phase, whose last row is repeated; default: the fidelity's length."""
+    fine phase, by default the fidelity's; beyond it the schedule's last row is repeated."""
     n = len(state.pivot)
     for side, schedule in ((pair.coarse, coarse_schedule(fidelity)), (pair.fine, fine_schedule(fidelity))):
         model = pair.model(side)

@@ -1,4 +1,4 @@
-"""Kernel gradients in float32 against central differences of the float64 reference, per axis."""
+"""Kernel gradients in float32, compared with central differences of the float64 reference."""
 
 from __future__ import annotations
 

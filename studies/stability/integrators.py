@@ -24,13 +24,13 @@ from graspd.worker.simulation.reference import Contacts, World
 Solver = Callable[[Contacts, Floats, World], Floats]
 
 RADIUS_M: Final = 0.035
-#: Gap between ball and cage at the start [m], at most the distance that the ball flies in this many steps.
+#: Gap between ball and cage at the start [m]; it is at most the ball's flight in `FLIGHT_STEPS` steps.
 GAP_M: Final = 2e-3
 FLIGHT_STEPS: Final = 10
 STEPS: Final = 60
-#: Largest penetration of a ball of 1 kg that counts as weak and as broken [m].
+#: Least penetration of a ball that counts as weak and as broken [m].
 SINK_M: Final = (5e-4, 5e-3)
-#: Largest energy over the initial one that counts as weak and as broken.
+#: Least ratio of largest to initial energy that counts as weak and as broken.
 ENERGY: Final = (1.02, 2.0)
 #: Sliding friction of the cage, and the viscous coefficient of the force-based contact [N s/m].
 FRICTION: Final = 0.8
@@ -69,7 +69,7 @@ def ball_world(dt: float, speed: float) -> World:
 
 
 def position_based(solver: Solver, *, dt: float, speed: float) -> tuple[float, float]:
-    """Return the ratio of a ball's largest energy to its initial one, and deepest penetration [m]; position-based."""
+    """Return a ball's ratio of largest to initial energy, and deepest penetration [m], with a `solver`."""
     points = _cage_around(dt, speed)
     world = ball_world(dt, speed)
 
@@ -85,7 +85,7 @@ def position_based(solver: Solver, *, dt: float, speed: float) -> tuple[float, f
 
 
 def force_based(*, dt: float, speed: float, stiffness: float, mass: float = 1.0) -> tuple[float, float]:
-    """Return the same values for penalty forces -k c n with friction; `stiffness` [N/m], `mass` [kg]."""
+    """Return the values of `position_based` for penalty forces; `stiffness` [N/m], `mass` [kg]."""
     points = _cage_around(dt, speed)
     inertia = 0.4 * mass * RADIUS_M**2
 
@@ -102,7 +102,7 @@ def force_based(*, dt: float, speed: float, stiffness: float, mass: float = 1.0)
 
 
 def _extremes(points: Floats, flight: Iterator[tuple[Floats, float]]) -> tuple[float, float]:
-    """Return largest energy and deepest penetration of a flight of centres and energies relative to the initial one."""
+    """Return largest energy and deepest penetration of a flight, which yields centres and energies."""
     most, deepest = 1.0, 0.0
     for centre, energy in flight:
         most, deepest = max(most, energy), max(deepest, _largest_depth(points, centre))
@@ -153,7 +153,7 @@ SOLVERS: Final[dict[str, Solver]] = {
     "Jacobi, averaged": partial(reference.jacobi, passes=8),
     "Jacobi, summed": summed_jacobi,
 }
-#: Values of `contact_solver`.
+#: Solvers that the setting `contact_solver` offers.
 _OFFERED: Final = tuple(SOLVERS)[:3]
 
 
@@ -259,7 +259,7 @@ def _wall_cell(name: str, solver: Solver, count: int, depth: float, step: float)
     rng = np.random.default_rng(count)
     points = np.concatenate([0.005 * rng.normal(size=(count, 2)), np.full((count, 1), RADIUS_M)], axis=1)
     normals = np.tile([0.0, 0, 1], (count, 1))
-    # The finger of the compliant solver has constant stiffness, independent of its number of points.
+    # The sum of weights is constant, so that the finger's stiffness does not depend on its number of points.
     contacts = Contacts(points, normals, np.full(count, -depth), np.full(count, 24.0 / count))
     world = ball_world(1.0, step)
     end = solver(contacts, np.array([0, 0, step, 0, 0, 0]), world)

@@ -1,4 +1,4 @@
-"""Model errors: grasps held in the validator's model, validated in models with a single error.
+"""Model errors: grasps that hold in the validator's model are tested in models with a single error.
 
 Amounts of error range from the amounts of `--robust` (`worker.validation.variant`) to amounts at which few grasps are
 held. Each grasp has its own direction of displacements and rotations."""

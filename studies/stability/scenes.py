@@ -26,7 +26,7 @@ from graspd.worker.simulation.environment import Scenes
 #: Boxes on a table: heights, and sides of their square footprints [mm].
 HEIGHTS_MM: Final = (5, 10, 20, 40, 80, 140, 200)
 SIDES_MM: Final = (30, 60, 120)
-#: Target beside walls and neighbours: sides and height [mm].
+#: Target among walls and neighbours: sides and height [mm].
 TARGET_MM: Final = (50, 50, 80)
 _TARGET: Final = "50 x 50 x 80 mm"
 GAPS_MM: Final = (5, 10, 20, 40, 80, 160)

@@ -246,7 +246,7 @@ def test_licences_can_be_given_for_what_was_added_without(kitchen: Case, tmp_pat
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("[", "is not as"),
+        ("[", "assets.json"),
         ('{"objects": {"teapot": {"licence": "x"}}}', "teapot"),
         ('{"hands": {"barrett": {"colour": "x"}}}', "colour"),
     ],

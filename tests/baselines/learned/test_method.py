@@ -167,7 +167,7 @@ def test_what_it_cannot_do_is_said_in_a_line(hand, network, tmp_path: Path) -> N
     refused("proposes grasps of barrett .*, not of allegro", hand=hand_from_path("allegro"))
     refused("not of barrett", network=replace(network, hand_digest="f" * 32))
     board = Obstacle.box([0, 0, -0.01, 1, 0, 0, 0], [1, 1, 0.02])
-    refused("has none, choose fast_graspd", placed=replace(on_table(BLOCK, 1), supports=(board,)))
+    refused("choose fast_graspd", placed=replace(on_table(BLOCK, 1), supports=(board,)))
     with pytest.raises(InputError, match="not known here"):
         plan = planner("learned", {"network": "e" * 32}, in_scenes=True)
         plan(hand, BLOCK, PlanRequest(1, QUICK), ExecutionContext())
