@@ -1,5 +1,5 @@
 """Viewer: a viser server that shows the grasps of one file, with a slider over the trajectory.
-Hand, object and scene are nodes. Metres; poses x y z, w x y z."""
+Hand, object and scene are nodes. Lengths are in metres; poses are x y z, then quaternion w x y z."""
 
 from __future__ import annotations
 
@@ -234,7 +234,7 @@ class Viewer:
         places = slider_axis(self._way)
         marks = tuple((float(place), point.name) for place, point in zip(places, self._way, strict=True) if point.name)
         start = next(place for place, name in marks if name == "grasp")
-        self.slider = gui.add_slider("way", 0.0, float(places[-1]), 0.01, start, marks=marks)
+        self.slider = gui.add_slider("trajectory", 0.0, float(places[-1]), 0.01, start, marks=marks)
         self._said = gui.add_markdown("")
         self._contacts = gui.add_checkbox("contacts", True)
         self._scene = gui.add_checkbox("scene", True, visible=bool(self._supports))
@@ -318,7 +318,7 @@ def _figures(shard: Shard, row: int) -> str:
     if (shaken := arrays.get("quality/shake_margin")) is not None and np.isfinite(shaken[row]):
         rows.append(("shaken", "holds" if shaken[row] < 1 else "fails"))
     if (clearance := arrays.get("quality/clearance_m")) is not None:
-        rows.append(("nearest to the scene", f"{1e3 * float(clearance[row]):.1f} mm"))
+        rows.append(("clearance", f"{1e3 * float(clearance[row]):.1f} mm"))
     return "\n".join(["| | |", "| --- | --- |", *(f"| {name} | {value} |" for name, value in rows)])
 
 
