@@ -19,7 +19,7 @@ from typing import Any, Final
 import numpy as np
 from sqlalchemy import Connection, Table
 
-from graspd.service.index.changes.rows import derive_states, job_row, row_from, shard_row, task_rows
+from graspd.service.index.changes.records import derive_states, job_row, row_from, shard_row, task_rows
 from graspd.service.index.database import upsert
 from graspd.service.index.index import Index
 from graspd.service.index.tables import attempts, grasps, jobs, metadata, shards, tasks

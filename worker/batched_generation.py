@@ -112,7 +112,7 @@ class _Job:
                 own.progress(1.0, 1.0, "done")
 
     def in_waves(self, join: int) -> Generator[Made]:
-        """Plan the needs of `join` batches in one launch, while the wave before is validated and measured."""
+        """Plan candidates of `join` batches in one launch, while the wave before is validated and measured."""
         require_graspable(self.hand, self.obj)
         stop, shares = threading.Event(), ProgressShares(self.sizes, self.run.progress)
         run = replace(self.run, cancelled=lambda: stop.is_set() or self.run.cancelled())
@@ -176,7 +176,7 @@ def _next_wave(waiting: deque[Batch], fresh: Iterator[Batch], most: int) -> list
 
 
 def _planned(scoring: Scoring, batches: Sequence[Batch]) -> _Wave:
-    """Plan the needs of the batches, in the single thread that owns the device."""
+    """Plan the next candidates of the batches, in the single thread that owns the device."""
     known: Known = {}
     rollout, request, asked = scoring.rollout(known), scoring.request, list[BatchRequest]()
     for batch in batches:

@@ -54,7 +54,7 @@ class ExecutionContext:
 
     @property
     def cores(self) -> int:
-        """Number of CPU threads, the default resolved; parallel parts get equal shares."""
+        """Number of CPU threads for this part: an equal share of `threads`, or of all available cores."""
         every = self.threads or available_cores()
         return every if self.sharing is None else max(1, every // max(1, self.sharing.members))
 
@@ -114,9 +114,9 @@ class ProgressShares:
 def parallel_map(
     parts: Sequence[T], work: Callable[[T, ExecutionContext], R], run: ExecutionContext, *, size: Callable[[T], int]
 ) -> list[R]:
-    """Run `work` on every part in parallel; return the results in order.
-    Each part has its own share of the cores and, by `size`, of the progress. The first failure stops the others; its
-    error is raised once all have ended."""
+    """Run `work` on every part in parallel; return the results in the order of `parts`.
+    Each part has an equal share of the cores, and a share of the progress in proportion to its `size`. The first
+    failure stops the others; its error is raised once all have ended."""
     if len(parts) == 1:
         return [work(parts[0], run)]
     sharing, stop = CoreSharing(len(parts)), threading.Event()
@@ -145,7 +145,7 @@ def parallel_map(
 def evaluate_rows(
     rows: Sequence[int], make: Callable[[], T], ask: Callable[[T, int], R], *, threads: int, name: str
 ) -> list[R]:
-    """Run tests on some grasps in parallel; return the results in their order."""
+    """Run `ask` on grasps `rows` in parallel, with one test per thread; return results in this order."""
     if not len(rows):
         return []
     if (workers := min(threads, len(rows))) <= 1:
@@ -175,7 +175,7 @@ def measure_rows(
     run: ExecutionContext,
     name: str,
 ) -> NDArray[np.float64]:
-    """Return measurements (count,) on the grasps that are `held` (count,), None: on all; nan for the others."""
+    """Return measurements (count,) of the grasps that are `held` (count,), else nan; None: of all grasps."""
 
     def asked(test: T, row: int) -> float:
         run.check("the validator")

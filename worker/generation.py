@@ -1,9 +1,9 @@
 """Generation of validated grasps: rounds of candidates until enough are valid or the budget ends.
 
 A grasp is feasible if it passes the geometric gate, and valid if it is feasible and held by the validator. Without
-validation, feasible grasps are counted instead and none is valid. If a job wants a share of models, a valid grasp
-counts only if it holds in this share of models. Expensive steps come last: measurement after validation, perturbed
-models last."""
+validation, feasible grasps are counted instead and none is valid. If a job wants robust grasps, a valid grasp counts
+only if it holds in the wanted share of perturbed models. Expensive steps come last: measurement follows validation, and
+perturbed models come last."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ from graspd.worker.validation.validator import prefiltered, validate
 REJECTIONS: Final = ("diverged", "blocked", "dropped", "gate", "not_robust", "weak", "alike")
 #: Rejection of each outcome with another name; failed pushes and lifts of the validator are `dropped`.
 _REJECTION_OF: Final = {"no_place": "blocked", **{f"gate_{name}": "gate" for name in GATES}}
-#: Outcomes of a push or a lift that drops a grasp.
+#: Names of the outcomes of failed pushes and of failed lifts.
 _PUSHED: Final = {
     Outcome.PENETRATION: "penetration",
     Outcome.LOST_WHILE_CLOSING: "lost_while_closing",
@@ -78,7 +78,7 @@ class ValidatedBatch:
     rejected: dict[str, int]
     """Number of rejected candidates, by `REJECTIONS`."""
     outcomes: dict[str, int]
-    """Rejected candidates, by `service.model.planning.OUTCOMES`: validator outcome or failed gate."""
+    """Number of rejected candidates, by outcome or failed gate (`service.model.planning.OUTCOMES`)."""
     verdict_key: str | None
     """Digest of all settings that affect verdicts; None: not validated."""
     planned: int
@@ -89,7 +89,7 @@ class ValidatedBatch:
     narrow: str | None = None
     """In scenes without a valid grasp, the geometric reason; see `narrow_reason`."""
     limit: Limit | None = None
-    """Payload limit of the best grasps, if none is selected because of the weight."""
+    """Payload limit of the tested grasps, if no grasp is selected because the object is too heavy."""
 
     def moved(self, by: Sequence[float]) -> ValidatedBatch:
         return replace(self, grasps=self.grasps.moved(by))
@@ -107,10 +107,10 @@ def validated_grasps(
     run: ExecutionContext = DEFAULT_CONTEXT,
     partial: bool = False,
 ) -> ValidatedBatch:
-    """Plan batch number `batch` of a job: `count` valid grasps (without validation: feasible), or fewer at the budget.
-    `scenes` are used in turn; valid then means lifted out of the scene. `pieces` runs during the first round's
-    planning. With `partial`, a cancellation returns the grasps validated so far; TaskCancelled if there are none.
-    Raises also the errors of `require_graspable`, and MeshError: the object has no usable convex pieces."""
+    """Plan batch number `batch` of a job: `count` valid grasps, or fewer if the budget is used up.
+    Without validation, feasible grasps count. `scenes` are used in turn; valid then means lifted out of the scene.
+    `pieces` runs while the first round is planned. With `partial`, a cancellation returns the grasps validated so far.
+    Raises errors of `require_graspable`. MeshError: no usable convex pieces. TaskCancelled: no grasps so far."""
     require_graspable(hand, obj)
     with Scoring(hand, obj, request, scenes=scenes, pieces=pieces, run=run) as scoring:
         work = Batch(scoring, batch, count, run)
@@ -176,8 +176,8 @@ class Scoring(AbstractContextManager["Scoring"]):
         self.run = replace(self.run, cancelled=DEFAULT_CONTEXT.cancelled)
 
     def rollout(self, known: Known) -> Rollout | None:
-        """Return the rollout of candidates; None: there is no validator.
-        Verdicts at the validator's own level are added to `known`."""
+        """Return the rollout of candidates; None: grasps are not validated, or the planner's loss decides.
+        Verdicts of rollouts at the job's level are added to `known`."""
         if self.pieces is None:
             return None
         pieces, in_scenes = self.pieces.result, self.scenes is not None
@@ -286,7 +286,7 @@ class Scoring(AbstractContextManager["Scoring"]):
         self, grasps: GraspSet, in_models: NDArray[np.bool_], valid: NDArray[np.bool_], run: ExecutionContext
     ) -> Arrays:
         """Return columns of the further tests that the request specifies.
-        Grasps `in_models` (N,) get robustness (exact for candidates), `valid` ones (N,) payload and shake."""
+        Grasps `in_models` (N,) are tested for robustness, `valid` grasps (N,) for payload and in the shake test."""
         request, columns = self.request, dict[str, NDArray[Any]]()
         if not (request.models or request.measures_payload or request.shake):
             return columns
@@ -362,7 +362,7 @@ class Batch:
         """Candidates to make and add next; None: the batch is ready for `finish`."""
 
     def _round_requests(self) -> Iterator[RoundRequest]:
-        """Yield the needs of each round, until `count` grasps are found or the budget is used up; `add` must follow."""
+        """Yield requests until `count` grasps are found or the budget is used up; call `add` after each."""
         wish, count = self.request, self.count
         if wish.want == "candidates":
             yield RoundRequest(0, range(count), self.candidates, (0.0, 1.0))

@@ -16,13 +16,13 @@ from graspd.worker.grasps import THRESHOLDS, GraspSet, joined, joined_columns
 
 Arrays = dict[str, NDArray[Any]]
 
-#: Seed stride between a batch's rounds, above the batch numbers of any job: a job has at most 31,250 batches.
+#: Step of seeds between a batch's rounds. It exceeds all batch numbers: a job has at most 31,250 batches.
 ROUND_STRIDE: Final = 1 << 20
 #: Fewest grasps of a round, and of a part of a round.
 SMALLEST_ROUND: Final = 8
 SMALLEST_PART: Final = 8
-#: Least share of valid grasps that is assumed for the next round, even if fewer were valid before; it bounds the
-#: rounds.
+#: Least share of valid grasps that is assumed for the next round, even if fewer were valid before. It limits the size
+#: of rounds.
 _LEAST_RATE: Final = 0.1
 
 
@@ -33,7 +33,7 @@ class Round:
     rows: NDArray[np.intp]
     """Row numbers of the selected grasps among the planned ones."""
     fates: NDArray[np.object_]
-    """Result of each planned grasp: selected, or one of `service.model.planning.OUTCOMES`."""
+    """Result of each planned grasp: `kept`, or one of `service.model.planning.OUTCOMES`."""
     in_scene: dict[str, NDArray[np.bool_]]
     """In scenes, masks of planned grasps: clear, lifted, lifted at half friction."""
     seconds: dict[str, float]

@@ -1,5 +1,5 @@
 """Viewer: a viser server that shows the grasps of one file, with a slider over the trajectory.
-Hand, object and scene are nodes. Units are metres; poses are x y z, w x y z."""
+Hand, object and scene are nodes. Lengths are in metres; poses are x y z, then quaternion w x y z."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from graspd.worker.rendering.scenery import Supports, slab_poses, slabs, visible
 from graspd.worker.rendering.sheets import metric_at_threshold
 from graspd.worker.scenes.neighbours import Neighbours
 
-#: Number of hand points whose distance from the object is shown, and the largest distance shown [m].
+#: Hand points whose distance from the object is shown, and the largest distance shown [m].
 POINTS: Final = 3000
 NEAR_M: Final = 0.005
 _OBJECT: Final = (232, 184, 120)
@@ -234,7 +234,7 @@ class Viewer:
         places = slider_axis(self._way)
         marks = tuple((float(place), point.name) for place, point in zip(places, self._way, strict=True) if point.name)
         start = next(place for place, name in marks if name == "grasp")
-        self.slider = gui.add_slider("way", 0.0, float(places[-1]), 0.01, start, marks=marks)
+        self.slider = gui.add_slider("trajectory", 0.0, float(places[-1]), 0.01, start, marks=marks)
         self._said = gui.add_markdown("")
         self._contacts = gui.add_checkbox("contacts", True)
         self._scene = gui.add_checkbox("scene", True, visible=bool(self._supports))

@@ -9,8 +9,7 @@ from typing import Any, Final
 
 from sqlalchemy import Connection, delete, func, select, update
 
-from graspd.service.index.database import IndexPart, upsert
-from graspd.service.index.project_scope import in_scope
+from graspd.service.index.database import IndexPart, in_scope, upsert
 from graspd.service.index.tables import datasets, deliveries, ends, webhooks
 from graspd.service.index.views import DeliveryView, EndView, WebhookView
 from graspd.service.model.clock import timestamp

@@ -13,7 +13,7 @@ from typing import Any, Final, TypeVar
 from sqlalchemy import Connection, Table, delete, select, update
 from sqlalchemy.exc import DataError
 
-from graspd.service.index.changes.rows import QUIET
+from graspd.service.index.changes.records import QUIET
 from graspd.service.index.index import Index
 from graspd.service.index.notes import StoreMark
 from graspd.service.index.outbox import last_end

@@ -6,8 +6,7 @@ from collections.abc import Collection, Sequence
 
 from sqlalchemy import Connection, case, delete, func, select, tuple_
 
-from graspd.service.index.database import IndexPart, upsert
-from graspd.service.index.project_scope import in_scope, shards_in_scope
+from graspd.service.index.database import IndexPart, in_scope, shards_in_scope, upsert
 from graspd.service.index.tables import grasps, tagged, tags
 from graspd.service.index.views import TagView
 from graspd.service.model.errors import NotFoundError

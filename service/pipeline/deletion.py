@@ -16,7 +16,7 @@ from typing import Final, TypeVar
 
 from sqlalchemy import Connection
 
-from graspd.service.index.changes.rows import QUIET
+from graspd.service.index.changes.records import QUIET
 from graspd.service.index.database import chunks
 from graspd.service.model import names
 from graspd.service.model.clock import timestamp

@@ -14,7 +14,14 @@ from numpy.typing import NDArray
 from graspd.service.model.matter import ACCELERATION
 from graspd.service.model.transforms import Floats
 from graspd.worker.control.jaw_squeeze import jaw_squeeze
-from graspd.worker.control.opening import Blocked, Openings, count_fingers, dof_steps, fingers_of_bodies, fingers_of_dofs
+from graspd.worker.control.opening import (
+    Blocked,
+    Openings,
+    count_fingers,
+    dof_steps,
+    fingers_of_bodies,
+    fingers_of_dofs,
+)
 from graspd.worker.control.squeeze import HoldForces, balance_forces
 from graspd.worker.grasps import Posture
 from graspd.worker.hands.jaws import jaws_of

@@ -39,10 +39,10 @@ class HoldForces:
 def balance_forces(
     posing: PostureData, grasp: Posture, total: float, friction: float, reach: tuple[float, float], most: int
 ) -> tuple[Floats, Floats]:
-    """Compute balanced contact forces of grasps within the hand's torque limits: residuals and torques of `HoldForces`.
-    Their normal components sum to `total` [N]. Where torques exceed a limit, all forces are scaled together, which
-    keeps the balance. At most `most` hand points press, the most spread out. A point presses within the first distance
-    of `reach`, on a finger without contact within the second [m]."""
+    """Compute balanced contact forces within torque limits: residuals and torques of `HoldForces`.
+    Normal forces sum to `total` [N]. If a torque exceeds its limit, all forces are scaled down together, which keeps
+    the balance. Points press within the first distance of `reach` [m]; on a finger without such points, within the
+    second distance. At most `most` of these points are used, far apart from each other."""
     bodies, near = posing.touch(grasp, max(reach))
     count, points, radius = len(grasp), len(posing.probe.points), posing.probe.obj.radius
     rows = int(touching.FIRST_TORQUE) + posing.hand.dofs

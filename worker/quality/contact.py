@@ -23,14 +23,14 @@ def contact_area_cm2(distance: Floats, area: Floats, thresholds_m: Floats) -> Fl
     """Compute the hand area (B, T) within each threshold (T,) of the object's surface, on either side [cm^2].
     The distances (B, N) are signed [m]; each point represents an `area` (N,) [m^2]."""
     near = np.abs(distance)
-    # Row by row, since the rounding of a matrix product depends on its number of rows.
+    # Sums of rows: the rounding of a matrix product would depend on its number of rows.
     return np.stack([np.where(near < t, area, 0.0).sum(axis=-1) for t in thresholds_m], axis=-1) * 1e4
 
 
 def spread_contacts(
     near: NDArray[np.bool_], place: Floats, normal: Floats, *, scale: float, limit: int
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Choose at most `limit` of the points `near` (B, T, N) of each grasp and threshold, spread as widely as possible.
+    """Choose at most `limit` points `near` (B, T, N) per grasp and threshold, as far apart as possible.
     Spread is measured by position (B, N, 3) divided by `scale`, the torque scale [m], and by normal (B, N, 3).
     Return indices (B, T, limit) and their number (B, T); further indices are undefined."""
     grasps, sets, _ = near.shape
@@ -51,8 +51,7 @@ def spread_contacts(
 
 
 def _farthest(points: Floats, inside: NDArray[np.bool_], count: int) -> NDArray[np.intp]:
-    """Select points (S, count) by the rule of `farthest_points` from each set (S, W, K), among those `inside` (S,
-    W)."""
+    """Select (S, count) points of sets (S, W, K) as `farthest_points` does, only among `inside` (S, W)."""
     rows = np.arange(len(points))
     mean = np.einsum("sw,swk->sk", inside.astype(float), points) / np.maximum(inside.sum(axis=1), 1)[:, None]
     start = np.where(inside, ((points - mean[:, None]) ** 2).sum(axis=2), -1.0)

@@ -21,10 +21,10 @@ _PAIRS: Final = 4096
 
 
 def explained_variance(posture: Posture) -> Floats:
-    """Compute the explained variance of (translation, rotation vector, joints), largest first; empty for fewer than 2
-    grasps.
-    The entries are shares of variance along the principal components. Diversity D is the first entry: near 1, all
-    grasps vary along one line; lower is more diverse. Units stay metres and radians, as in DexGraspBench."""
+    """Compute the explained variance (K,) of translation, rotation vector and joints, largest share first.
+    The entries are shares of variance along the principal components; empty for fewer than 2 grasps. Diversity D is the
+    first entry: near 1, all grasps vary along one line; lower is more diverse. Units stay metres and radians, as in
+    DexGraspBench."""
     if len(posture) < 2:
         return np.zeros(0)
     features = np.hstack(
@@ -39,8 +39,7 @@ def explained_variance(posture: Posture) -> Floats:
 def hand_points(hand: HandModel, posture: Posture) -> Floats:
     """Return the positions (N, P, 3) of the same `POINTS` surface points in N postures, object frame [m].
     The distance of two grasps is the mean distance of these points [m]. It covers the hand's pose and its joints, each
-    weighted by the motion that it causes. Grasps that an object's symmetry makes equivalent still count as different.
-    """
+    weighted by the motion that it causes. Grasps that are equivalent by the object's symmetry count as different."""
     points = sample_surface(hand, POINTS)
     poses = body_poses(hand, posture.hand_pose, posture.joint_positions)
     return np.asarray(apply(poses[:, points.body], points.position))
@@ -70,8 +69,8 @@ def least_distance(points: Floats) -> float | None:
 
 
 def distinct(points: Floats, least: float, *, given: int = 0) -> NDArray[np.bool_]:
-    """Select grasps (N,), in order, so that no two of `points` (N, P, 3) are closer than `least` [m]; 0 selects all.
-    The first `given` grasps are always selected."""
+    """Return a mask (N,) of grasps of which no two, by `points` (N, P, 3), are closer than `least` [m].
+    Earlier grasps take precedence; the first `given` are always selected. `least` 0 selects all."""
     kept = np.ones(len(points), bool)
     if least <= 0 or len(points) < 2:
         return kept

@@ -18,7 +18,7 @@ MAX_SELF_PENETRATION_MM: Final = 3.0
 MIN_CONTACT_LINKS: Final = 2
 
 
-#: Names of the gates, in order.
+#: Names of the gates, in the order in which they are checked.
 GATES: Final = ("penetration", "self_penetration", "contacts")
 
 

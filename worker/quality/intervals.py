@@ -12,8 +12,8 @@ _Z: Final = 1.959963984540054
 
 
 def wilson(part: int, whole: int) -> tuple[float, float]:
-    """Return the 95 % interval of a share (Wilson 1927); at shares 0 and 1 its width is above 0, unlike a bootstrap's.
-    Raises ValueError: `whole` is 0, or less than `part`."""
+    """Return the 95 % interval of the share `part` / `whole` (Wilson 1927).
+    At shares 0 and 1 its width is above 0, unlike a bootstrap's. Raises ValueError: `whole` is 0 or below `part`."""
     bounds = binomtest(part, whole).proportion_ci(method="wilson")
     return float(bounds.low), float(bounds.high)
 

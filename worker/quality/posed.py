@@ -52,7 +52,7 @@ class PostureData:
             return allocate_bodies(self.hand, count)
 
     def roots(self, hand_pose: Floats) -> tuple[Any, Any]:
-        """Return positions about the object's centre of mass, and rotations, of hands' roots (n, 7)."""
+        """Return positions relative to the object's centre of mass and rotations, from root poses (n, 7)."""
         with wp.ScopedDevice(self.device):
             position = wp.array(hand_pose[:, :3] - self.probe.obj.centre_of_mass, dtype=wp.vec3d)
             return position, wp.array(to_xyzw(hand_pose[:, 3:]), dtype=wp.quatd)
@@ -81,8 +81,8 @@ class PostureData:
         return self._gaps(posture, reach, self.finger.numpy()[self.points.body.numpy()])
 
     def _gaps(self, posture: Posture, reach: float, part: NDArray[np.int32]) -> Floats:
-        """Return least distances (N, P) of hand points grouped by `part` (points,), at most `reach` [m]; -1:
-        ignored."""
+        """Return the least distance (N, P) of each part of the hand, at most `reach` [m].
+        `part` (points,) is the part of each hand point; -1: ignored."""
         parts = sorted(set(part[part >= 0].tolist()))
         found = np.full((len(posture), len(parts)), reach)
         for rows in self.parts(len(posture)):
@@ -104,5 +104,5 @@ def _points(probe: Probe) -> Any:
 
 @cached_by_content(8)
 def posing_of(hand: HandModel, obj: ObjectModel, *, points: int, device: str) -> PostureData:
-    """Return the pair on a device with `points` hand points, cached in memory."""
+    """Return the data of the pair on a device, with `points` hand points; cached in memory."""
     return PostureData(probe_of(hand, obj, hand_points=points, object_points=64, device=device))

@@ -89,15 +89,15 @@ def measure(
     every_volume: bool = False,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> dict[str, NDArray[np.generic]]:
-    """Compute the quality columns of a base shard for N grasps at contact: `MEASURES`, thresholds, and the planner's
-    stability loss.
-    Raises InputError: no thresholds, or one beyond `REACH_M`. TaskCancelled: `run.cancelled()` returned True.
+    """Compute the quality columns of a base shard for N grasps at contact.
+    They are `MEASURES`, the thresholds, and the planner's stability loss. Raises InputError: no thresholds, or a
+    threshold outside 0 to `REACH_M`. TaskCancelled: `run.cancelled()` returned True.
 
     Args:
         friction: Coulomb coefficient of the wrench space.
         thresholds_m: T contact thresholds, at most `REACH_M` [m].
-        every_volume: compute the volume at all thresholds; otherwise only at the index's threshold, nan at the others.
-            A volume takes ten times as long as an epsilon.
+        every_volume: compute the volume at all thresholds; otherwise only at the threshold nearest to
+            `INDEX_THRESHOLD_M`, nan at the others. A volume takes ten times as long as an epsilon.
         run: receives the number of finished grasps; polled for cancellation between chunks."""
     thresholds = np.asarray(thresholds_m, float)
     if thresholds.ndim != 1 or not len(thresholds) or (thresholds <= 0).any() or (thresholds > REACH_M).any():
@@ -124,7 +124,7 @@ class _Terms:
 
     @cached_property
     def pair(self) -> _Pair:
-        """Cached, since a batch is measured in chunks of a few grasps."""
+        """Prepared hand and object, cached because a batch is measured in chunks of a few grasps."""
         content = content_of(self)
         with _lock:
             if content not in _pairs:
@@ -182,8 +182,7 @@ class _Chunk:
         return epsilon.reshape(count.shape), volume.reshape(count.shape)
 
     def shared_volume(self) -> Floats:
-        # Between object points, a face of the object may enter a piece; each face is within half a diagonal of the
-        # grid.
+        # A face may enter a piece between object points, but a point is within half a diagonal of their grid.
         near = self.found.piece_distance < self.pair.probe.sample_spacing
         if self.pair.volume.exact:
             near = self.pair.overlap.of(self.found, near)

@@ -1,6 +1,6 @@
 """Volume shared by hand and object, the pieces that may share it, and the depth of penetration.
 
-The volume is an exact boolean of solids, or counted in voxels where the object is not closed."""
+The volume is that of an exact boolean operation on solids. If the object is not closed, voxels are counted."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class SharedVolume:
         return Probe(self.hand, self.obj, hand_points=self.hand.bodies * 16, object_points=64)
 
     def by_voxels(self, bodies: Floats, pieces: NDArray[np.intp]) -> float:
-        """Count the voxel centres of the object that lie inside the pieces [cm^3]."""
+        """Return the volume of the voxels with centres inside both the object and the pieces [cm^3]."""
         matrices = pose_to_matrix(bodies[self._body[pieces]])
         solids = [self.hand.pieces[p] for p in pieces]
         posed = [piece.vertices @ m[:3, :3].T + m[:3, 3] for piece, m in zip(solids, matrices, strict=True)]
@@ -98,7 +98,7 @@ def _solid(vertices: Floats, faces: NDArray[np.int32]) -> m3d.Manifold | None:
     return solid if feasible else None
 
 
-#: Planes are distinct if they differ in this many digits (of metres, and of unit normals).
+#: Planes that are equal in this many decimals (offsets [m] and unit normals) count as one.
 _DIGITS: Final = 7
 
 
@@ -116,7 +116,7 @@ class Overlap:
         self._solids = _solids(hand.pieces)
 
     def of(self, found: Distances, near: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Return the pieces (B, P), among those that are `near` (B, P), that may share volume with the object."""
+        """Return a mask (B, P) of those `near` (B, P) pieces that may share volume with the object."""
         row, piece = np.nonzero(near)
         if not len(row):
             return near

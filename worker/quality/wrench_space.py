@@ -48,7 +48,7 @@ def cone_edges(normals: Floats, friction: float, *, edges: int = EDGES) -> Float
 def wrenches(
     points: Floats, normals: Floats, *, friction: float, centre: Floats, radius: float, edges: int = EDGES
 ) -> Floats:
-    """Return edge wrenches (..., E, 6): force, then torque about `centre` / `radius`, the object's largest [m].
+    """Return edge wrenches (..., E, 6): force, then torque about `centre` divided by `radius` [m].
     Contacts are at `points` (..., 3) [m] with unit normals (..., 3) into the object."""
     force = cone_edges(normals, friction, edges=edges)
     torque = cross((np.asarray(points, float) - centre)[..., None, :] / radius, force)
@@ -212,8 +212,8 @@ def _grown(
 def _simplices(
     points: Floats, own: NDArray[np.bool_], count: NDArray[Any]
 ) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Return the corners (H, 7) of simplices, each farthest from the span of earlier corners, and a mask (H,) of flat
-    hulls."""
+    """Return the corners (H, 7) of simplices, and a mask (H,) of flat hulls.
+    Each corner is the point farthest from the span of earlier corners."""
     rows = np.arange(len(points))
     mean = points.sum(axis=1) / count[:, None]
     far = np.where(own, ((points - mean[:, None]) ** 2).sum(axis=2), -1.0)
@@ -233,8 +233,8 @@ def _simplices(
 
 def _planes(corner: Floats) -> tuple[Floats, Floats]:
     """Return planes (H, 7, 6), (H, 7) of the facets of simplices (H, 7, 6) about the origin.
-    Facet i omits corner i. n x - d is minus 6! times the volume of the simplex of x and the facet. It equals the
-    barycentric coordinate of corner i, times the determinant of the edges."""
+    Facet i omits corner i. n x - d is minus 6! times the volume of the simplex of x and the facet. 6! times this volume
+    is the barycentric coordinate of corner i times the determinant of the edges."""
     edges = corner[:, 1:] - corner[:, :1]
     size = np.abs(np.linalg.det(edges))[:, None, None]
     slope = np.swapaxes(np.linalg.inv(edges), 1, 2)

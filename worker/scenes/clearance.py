@@ -49,7 +49,7 @@ def transfer(
         Columns of the scene shard with K = S N rows, scene by scene: `grasp/base_index`, `grasp/scene_index`,
         `grasp/hand_pose` (K, 7). `grasp/table_clearance_m` (K,) is the height of the hand's lowest point from pregrasp
         to grasp, `grasp/contact_table_clearance_m` (K,) its height at the grasp alone. `grasp/valid` (K,) is 1 where
-        both are at least `MARGIN_M`; `grasp/rejection` (K,) is a `Rejection`. With neighbours also
+        all clearances are at least `MARGIN_M`; `grasp/rejection` (K,) is a `Rejection`. With neighbours also
         `grasp/neighbour_clearance_m` (K,); for hands on a wrist also `grasp/wrist_positions` (K, U)."""
     if len(grasp) != len(pregrasp):
         raise InputError(f"{len(grasp)} grasps come with {len(pregrasp)} pregrasps; each grasp needs its own")

@@ -34,7 +34,7 @@ def supports_of(spec: SceneSpec) -> tuple[Obstacle, ...]:
 
 
 def walled_area(spec: SceneSpec) -> tuple[float, float] | None:
-    """Return the sides x and y of the rectangle about the origin, inside walls or on the board [m]; None: no walls."""
+    """Return the sides x and y of the area inside a bin's walls or on a shelf's board [m]; None: no limit."""
     return {"bin": BIN_SIZE, "shelf": (SHELF_SIZE[1], SHELF_SIZE[0])}.get(spec.kind)
 
 
@@ -95,8 +95,8 @@ def rotate_about_vertical(pose: Floats, angle: float) -> Floats:
 
 
 def move_inside(obj: ObjectModel, pose: Floats, size: tuple[float, float], rng: np.random.Generator) -> Floats:
-    """Move the pose to a random place in a rectangle x by y [m] about the origin. Raises SceneError: it does not
-    fit."""
+    """Move the pose to a random place in a rectangle x by y [m] about the origin.
+    Raises SceneError: the object does not fit."""
     corners = quat_rotate(pose[3:], obj.hull_vertices)[:, :2]
     low, high = corners.min(axis=0), corners.max(axis=0)
     room = np.asarray(size) / 2 - GAP

@@ -1,9 +1,8 @@
-"""Several objects in a scene: dropped together on a table, or placed beside one at rest; clearance of hands from them.
+"""Several objects in a scene, dropped together or placed one by one; clearance from neighbours.
 
 Collision shapes are convex hulls. They are exact against the table and conservative between objects, since no object is
-ever placed in another object's hollow. An object placed beside another has its rest pose from its own drop, so its pose
-is exact. Position and rotation about the vertical are drawn until its hull is clear of walls and of all other objects.
-"""
+ever placed in another object's hollow. A placed object has the exact rest pose of its own drop. Its position and its
+rotation about the vertical are drawn until its hull is clear of walls and of all other objects."""
 
 from __future__ import annotations
 
@@ -76,7 +75,7 @@ def drop_together(obj: ObjectModel, neighbours: Sequence[ObjectModel], *, count:
     negative, or there are too many neighbours. MeshError: a hull is flat, or the objects never come to rest."""
     if count < 0 or seed < 0 or not 1 <= len(neighbours) <= MOST_NEIGHBOURS:
         raise InputError(
-            f"scenes with neighbours need 1 to {MOST_NEIGHBOURS} of them and no negative number; "
+            f"scenes need 1 to {MOST_NEIGHBOURS} neighbours, and a number and a seed of at least 0; "
             f"got {count} scenes, {len(neighbours)} neighbours, seed {seed}"
         )
     heap = _Heap([one.centred for one in (obj, *neighbours)])
@@ -151,8 +150,7 @@ class _Heap:
         return None
 
     def _at_rest(self, seconds: float, rng: np.random.Generator) -> tuple[Floats, int, float] | None:
-        """Return the poses laid flat; None if an object leans, lies on another one, rolled away or would overlap
-        one."""
+        """Return the poses laid flat; None if an object leans, rolled away, or lies on or in another one."""
         flat, first = [], -1
         for k, (obj, pose) in enumerate(zip(self.objects, self.data.qpos.reshape(-1, 7).copy(), strict=True)):
             pose[3:] /= np.linalg.norm(pose[3:])
@@ -210,11 +208,11 @@ def _add_piece(spec: Any, body: Any, name: str, piece: ConvexPiece) -> None:
 
 #: Least gap between two objects [m]; the least gap from walls is `GAP`, as for the object.
 BETWEEN: Final = 0.005
-#: Number of draws of all neighbours of a scene, and of each neighbour.
+#: Largest number of draws of a scene, and of the place of each neighbour in a draw.
 _DRAWS: Final = 32
 _PLACES: Final = 100
-#: Largest distance of a neighbour's centre from the object's, as a multiple of the sum of both bounding radii. After
-#: each failed draw it grows by this amount.
+#: Largest distance of a neighbour's centre from the object's, as a multiple of the sum of both bounding radii, and the
+#: growth of this multiple after each failed draw.
 _REACH: Final = 1.25
 _FARTHER: Final = 0.1
 
@@ -229,7 +227,7 @@ def place_neighbours(
     count: int,
     seed: int,
 ) -> tuple[Floats, Floats]:
-    """Place M neighbours beside an object; return poses (S, 7) of the object and (S, M, 7).
+    """Place M neighbours beside an object; return poses (S, 7) of the object and (S, M, 7) of neighbours.
     All are `BETWEEN` apart and clear of supports. Scene i depends on the objects, the supports, the seed and i alone.
     `again` returns the pose (7,) of the object in scene i at attempt k. `others` are the neighbours; each rests on z =
     0. All stay inside the rectangle `within` about the origin, with sides x and y [m]. Raises SceneError: the
@@ -319,7 +317,7 @@ class _Hulls:
 
 
 def _is_separated(support: Obstacle, corners: Floats) -> bool:
-    """Check whether one plane of a support separates it from a hull: upward planes at no gap, other planes at `GAP`.
+    """Check whether a plane of a support separates it from a hull, by `GAP` unless the plane faces up.
     Two convex bodies may be apart although none of these planes separates them: then the result is False."""
     room = (corners @ support.planes[:, :3].T - support.planes[:, 3]).min(axis=0)
     least = np.where(support.planes[:, 2] > 1 - 1e-6, -SUNK, GAP)

@@ -53,8 +53,8 @@ def _neighbour(obj: ObjectModel) -> Neighbour:
 
 
 def joined_pieces(pieces: Sequence[Floats], most: int = MOST_PIECES) -> tuple[Floats, ...]:
-    """Merge pieces until at most `most` remain; each step joins the two pieces whose common hull adds the least
-    volume."""
+    """Merge pieces until at most `most` remain.
+    Each step joins the two pieces whose common hull adds the least volume."""
     left = list(pieces)
     volume = [union_volume((piece,)) for piece in left]
 
@@ -191,7 +191,7 @@ def gaps_between(things: Sequence[Neighbour], poses: Floats, farthest: float = 0
     return gaps
 
 
-#: Largest number of faces of a simplified hull; excess over its piece at which it has enough faces [m].
+#: Largest number of faces of a simplified hull; excess over its piece from which on no faces are added [m].
 MOST_PLANES: Final = 48
 ENOUGH_M: Final = 1e-3
 #: Corners closer than this are merged [m].
@@ -199,11 +199,10 @@ _SAME_M: Final = 1e-7
 
 
 def enclosing_solid(corners: Floats) -> tuple[Obstacle, float]:
-    """Return a convex solid of at most `MOST_PLANES` faces around points (V, 3), and its largest excess over their hull
-    [m].
-    The solid begins as the bounding box of the points. While it exceeds their hull by more than `ENOUGH_M`, its
-    farthest corner is cut off along the hull's face that is farthest from this corner. It never cuts into the hull.
-    Raises MeshError: the points lie in a plane."""
+    """Return a convex solid of at most `MOST_PLANES` faces around points (V, 3), and its excess [m].
+    The excess is the largest distance of a corner from the points' hull. The solid begins as the bounding box of the
+    points. While the excess is above `ENOUGH_M`, the farthest corner is cut off along the hull's face that is farthest
+    from this corner. A cut never enters the hull. Raises MeshError: the points lie in a plane."""
     from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
     try:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 #: Hull triangles within this angle of each other are one flat face [rad].
 COPLANAR_ANGLE = np.radians(0.05)
-#: A face is stable if the centre of mass projects at least this share of the hull's size inside its polygon.
+#: A face is unstable if the centre of mass projects outside its polygon by more than this share of the hull's size.
 STABILITY_MARGIN = 1e-4
 #: Resting faces whose normals differ by less than this [rad] count as one, since scanned flat bottoms have many facets.
 SAME_FACE_ANGLE = np.radians(2.0)
@@ -77,8 +77,8 @@ class RestingFaces:
 
 
 def rolling_poses(obj: ObjectModel, poses: Floats) -> int:
-    """Count the rest poses (S, 7) on a table in which the object may roll, because its surface is round there. A change
-    of its surface by `CHANGE_M` may then turn it by more than `ROLLS`."""
+    """Count the rest poses (S, 7) on a table in which the object may roll, because it is round there.
+    A change of its surface by `CHANGE_M` may then turn it by more than `ROLLS`."""
     faces = resting_faces(obj.centred)
     return sum(faces.rolls(settle(faces, pose[3:])[0]) for pose in np.asarray(poses, float))
 
@@ -94,7 +94,7 @@ def rolling_note(rolling: int, scenes: int) -> str | None:
 
 
 def resting_faces(obj: ObjectModel) -> RestingFaces:
-    """Compute the faces of the object's convex hull and how it tips over them; raise MeshError for a flat hull."""
+    """Compute the faces of the convex hull and how the object tips; raise MeshError for a flat hull."""
     import trimesh  # slow to import
 
     mesh = trimesh.Trimesh(obj.hull_vertices, obj.hull_faces, process=False)

@@ -39,7 +39,7 @@ REACH: Final = 0.25
 #: Largest rotation that may lay the object flat on its face [rad]; a larger one means that it was not at rest.
 MAX_SETTLE_ANGLE: Final = np.radians(5.0)
 MAX_ATTEMPTS: Final = 50
-#: Number of drops behind `scene/rest_probability`: the standard deviation of a share is at most 6 %.
+#: Number of drops behind `scene/rest_probability`: the standard deviation of a share is about 6 % at most.
 REFERENCE_DROPS: Final = 64
 _REFERENCE_SEED: Final = 2**31
 #: Sliding friction, then torsional and rolling friction [m]. With these values a can or a ball comes to rest, as on
@@ -65,8 +65,8 @@ class _Table:
 
 def drop(obj: ObjectModel, *, count: int, seed: int) -> dict[str, Floats]:
     """Drop an object onto a table until it rests, `count` times.
-    A drop is repeated with a new sample if it times out, or if the object rolls away. It is also repeated if no resting
-    face stays stable under a change of the surface by one millimetre. An object that rolls is laid on a steady face,
+    A drop is repeated with a new sample if it times out, or if the object leans or rolls away. It is also repeated if a
+    change of the surface by one millimetre makes the object topple. An object that rolls is laid on a steady face,
     see `settle_on_face`. Scene i depends only on the object, the seed and i. Return `scene/object_pose` (S, 7) with the
     lowest point of the object at z = 0, and `scene/drop_seconds` (S,). `scene/rest_probability` (S,) is the share of
     `REFERENCE_DROPS` reference drops (plus this one) on the same face. Raises InputError: count or seed is negative.
@@ -210,7 +210,7 @@ def _run(table: _Table) -> float | None:
     model, data, quiet = table.model, table.data, 0
     for step in range(round(TIMEOUT_S / TIMESTEP_S)):
         mujoco.mj_step(model, data)
-        # Linear velocity of the frame's origin and angular velocity in the body frame bound the speed of any point.
+        # The speed of the centre of mass plus the angular speed times the radius bounds the speed of any point.
         spin = data.qvel[3:]
         centre_velocity = data.qvel[:3] + quat_rotate(data.qpos[3:], np.cross(spin, table.obj.centre_of_mass))
         speed = np.linalg.norm(centre_velocity) + table.obj.radius * np.linalg.norm(spin)

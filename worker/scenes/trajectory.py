@@ -2,10 +2,10 @@
 
 In a scene the lift is a motion against gravity; around a free object it is the retreat along the approach. The hand's
 mounting must be clear as well, at wrist angles that are constant over the trajectory. Clearances are those of
-`body_clearance`, with more tolerance for fingertips that may touch a support. They are exact for half-spaces. For boxes
-and neighbours' pieces they are distances of the hand's features from planes: exact at corners, else a lower bound.
+`body_clearance`, with more tolerance for fingertips that may touch a support. They are exact for half-spaces; for boxes
+and neighbours' pieces some are lower bounds.
 
-In a scene, the approach has a direction and an opening of the hand without contact with object and obstacles."""
+In a scene, the direction of the approach and the opening of the hand are chosen to avoid object and obstacles."""
 
 from __future__ import annotations
 
@@ -76,8 +76,8 @@ class Trajectory:
 
 
 def plan_trajectory(hand: HandModel, obj: ObjectModel, grasps: GraspSet, placed: PlacedGrasps) -> Trajectory:
-    """Plan each grasp's trajectory in its scene: the first free direction of retreat, else the one with most
-    clearance."""
+    """Plan each grasp's trajectory in its scene.
+    The approach has the first free direction of retreat, else the direction with most clearance."""
     probe = probe_of(hand, obj, hand_points=_POINTS, object_points=64)
     count, scenes, which = len(grasps), placed.scenes, np.asarray(placed.index, np.intp)
     rise = RISE_M * np.array([scene.up for scene in scenes])[which]
@@ -141,7 +141,7 @@ def _unit(ways: Floats, instead: Floats) -> Floats:
 
 
 def _tilted(axis: Floats, tilt: float, side: int) -> Floats:
-    """Return unit vectors (n, 3) tilted by `tilt` [rad] from axes (n, 3), to the side of the number `side`."""
+    """Return unit vectors (n, 3) tilted by `tilt` [rad] from axes (n, 3), towards side number `side`."""
     least = np.eye(3)[np.argmin(np.abs(axis), axis=1)]
     across = _unit(np.cross(axis, least), least)
     leaning = quat_rotate(quat_from_axis_angle(across, np.full(len(axis), tilt)), axis)
@@ -158,7 +158,7 @@ def _retreat(hand_pose: Floats, way: Floats, steps: int) -> Floats:
 def _plan_approach(
     probe: Probe, pregrasp: Posture, scene: Environment, ways: Sequence[Floats]
 ) -> tuple[Floats, Floats, NDArray[np.bool_], Floats]:
-    """Return approaches along the first free direction of `ways`, (n, 3) each, or else the one with most clearance.
+    """Return approaches along the first free direction of `ways` (n, 3), else along the clearest one.
     The result has waypoints (n, W, 7), least clearance (n,), a mask (n,) of contact with the object, and direction (n,
     3)."""
     count, looks = len(pregrasp), (WAYPOINTS - 1) * LOOKS + 1
@@ -198,8 +198,8 @@ OBJECT_MARGIN_M: Final = 0.001
 OBJECT_WANTED_M: Final = 0.004
 #: On its approach the hand may be closer to the object than at its pregrasp, by at most this [m].
 NEARER_M: Final = 5e-4
-#: Number of postures stored on the approach, from standoff to pregrasp. Number of checks between two of them. Number of
-#: checks while the hand closes to the pregrasp.
+#: Number of stored postures from standoff to pregrasp, number of checks between two of them, and number of checks while
+#: the hand closes to the pregrasp.
 WAYPOINTS: Final = 6
 LOOKS: Final = 4
 _CLOSING: Final = 4
@@ -258,7 +258,7 @@ def _retreat_clearance(
         # clear.
         mounted = wrist_clearance(mounting, poses[rows, :looks:2], wrist[rows], scenes, which[rows])
         free[rows] = np.minimum(free[rows], mounted)
-    # Larger distances count equally.
+    # Distances above `reach` count as `reach`.
     reach = OBJECT_WANTED_M + 2 * NEARER_M
     gap = probe.body_gaps(postures.hand_pose, postures.joint_positions, reach=reach).reshape(count, len(share), -1)
     fingers = finger_of_body(probe.hand) >= 0

@@ -1,1 +1,1 @@
-"""Kernels and batched simulation. Mechanics only: objectives and stopping belong to planners."""
+"""Kernels and batched simulation: losses, gradients, steps. Planners choose starts and schedules."""

@@ -1,7 +1,7 @@
-"""Data of a simulation: hands to the device and back, arrays for a capacity of hands, schedule tables.
+"""Data of a simulation on its device: states of up to `capacity` hands, contacts, and schedules.
 
-All per-iteration values (dilation, weights, rates) are in tables on the device, read at a counter on the device. An
-iteration is therefore the same list of launches each time."""
+All per-iteration values (dilation, weights, rates) are in tables on the device. A counter on the device selects the
+row, so every iteration is the same list of launches."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from graspd.worker.simulation.device import joint_units, to_wxyz, to_xyzw
 from graspd.worker.simulation.kernels import contact, kinematics, packing, penalties
 from graspd.worker.simulation.model import MAX_DILATION, REFERENCE_POINTS, Model
 
-#: Kinds of penetration, see `kinematics.Depths`; arrays of the data that are fields of `kinematics.Hands`.
+#: Fields of `kinematics.Depths`, and fields of `kinematics.Hands`.
 _DEPTHS: Final = ("points", "object", "links", "obstacles")
 _HANDS: Final = (
     *("active", "iteration", "dilation_scale", "scene"),
@@ -27,7 +27,7 @@ _HANDS: Final = (
 
 
 class Tables:
-    """A schedule on the device; its rate of joints is multiplied by the `unit` (D,) of each dof."""
+    """A schedule on the device, with one rate per dof: the joint rate times `unit` (D,)."""
 
     def __init__(self, schedule: Schedule, unit: Floats) -> None:
         tables = (schedule.dilation, schedule.penetration, schedule.object_penetration, schedule.self_penetration)
@@ -39,7 +39,7 @@ class Tables:
 
 
 def allocate_contacts(capacity: int, points: int, *, marked: bool = False) -> Any:
-    """Allocate `packing.Contacts`; `marked`: at their points' indices, with marks."""
+    """Allocate `packing.Contacts` of shape (capacity, points), with an array of marks if `marked`."""
     out, shape = packing.Contacts(), (capacity, points)
     out.count, out.near_count = (wp.zeros(capacity, dtype=wp.int32) for _ in range(2))
     out.body, out.near = (wp.empty(shape, dtype=wp.int32) for _ in range(2))
@@ -53,15 +53,15 @@ class Data:
     """Arrays for up to `capacity` hands of a model; `worker.simulation.record` has the operations."""
 
     def __init__(self, model: Model, capacity: int, *, serial: bool | None = None) -> None:
-        """`serial`: threads of a launch run in order, as on a CPU. Otherwise contacts are sorted before they are
-        summed, which gives the same bits."""
+        """`serial`: threads of a launch run in order; by default on a CPU.
+        Otherwise contacts are first packed in the order of their points, so that sums are the same bit for bit."""
         self.device, self.capacity = model.device, capacity
         self.serial = not wp.get_device(model.device).is_cuda if serial is None else serial
         self.unit = joint_units(model.hand.model)
         with wp.ScopedDevice(self.device):
             self.contacts = allocate_contacts(capacity, model.count)
             self.marked = None if self.serial else allocate_contacts(capacity, model.count, marked=True)
-            #: Contacts, and near ones, in every chunk of marks (B, N / chunk).
+            #: Number of contacts, and number of near contacts, in every chunk of marks (B, N / chunk).
             chunks = (capacity, -(-model.count // packing.CHUNK))
             self.chunk_counts = [wp.zeros(chunks, dtype=wp.int32) for _ in range(2)]
             self.depths = kinematics.Depths()
@@ -69,7 +69,7 @@ class Data:
                 setattr(self.depths, kind, wp.zeros(capacity, dtype=wp.float32))
             self.schedule = Tables(still_schedule(), self.unit)
             self._allocate(capacity, model.bodies, model.dofs, model.options.velocities)
-            #: Motions that a contact solver stores for its reverse sweep; the direct solver stores none.
+            #: Number of motions that the contact solver stores for its reverse sweep.
             kept = {"direct": 0, "gauss_seidel": model.count}.get(model.options.contact_solver, model.options.passes)
             self.states = wp.zeros((capacity, model.options.velocities, kept), dtype=contact.vec6)
 
@@ -89,13 +89,13 @@ class Data:
         self.end, self.adjoint = (wp.zeros((B, M), dtype=contact.vec6) for _ in range(2))
         self.gradient, self.first, self.second = (wp.zeros((B, 6 + D), dtype=wp.float32) for _ in range(3))
         self.best, self.waited = wp.zeros(B, dtype=wp.float32), wp.zeros(B, dtype=wp.int32)
-        #: The same arrays, for kernels.
+        #: The arrays `_HANDS` as a struct for kernels.
         self.hands = kinematics.Hands()
         for name in _HANDS:
             setattr(self.hands, name, getattr(self, name))
 
     def set_state(self, state: HandState, *, dilation: Floats | None = None) -> None:
-        """Load up to `capacity` hands; the rest is switched off. Optimiser moments are cleared.
+        """Load n hands, at most `capacity`; switch off all others, and clear the optimiser's moments.
         `dilation` (n,) multiplies the schedule's dilation for each hand; by default 1."""
         n = len(state.pivot)
         scale = np.ones(self.capacity, dtype=np.float32)
@@ -115,19 +115,19 @@ class Data:
         self.waited.zero_()
 
     def deactivate(self, hands: NDArray[np.bool_]) -> None:
-        """Switch off hands (n,) from the next iteration on; they cost nothing more."""
+        """Switch off the hands of a mask (n,): kernels skip them from the next iteration on."""
         active = self.active.numpy()
         active[: len(hands)][hands] = 0
         self.active.assign(active)
 
     def set_scenes(self, index: NDArray[np.integer[Any]]) -> None:
-        """Set the scene (n,) of each hand, an index into the model's obstacles; -1: none. States do not change it."""
+        """Set each hand's scene number `index` (n,), -1: none; `set_state` does not change it."""
         padded = np.full(self.capacity, -1, dtype=np.int32)
         padded[: len(index)] = index
         self.scene.assign(padded)
 
     def set_schedule(self, schedule: Schedule) -> None:
-        """Upload the per-iteration tables; earlier records keep the tables they were recorded with.
+        """Upload the per-iteration tables; launches recorded before still read the former tables.
         Raises ValueError: a dilation above `MAX_DILATION`."""
         if len(schedule) and schedule.dilation.max() > MAX_DILATION:
             raise ValueError(f"the dilation may be at most {MAX_DILATION} m")
@@ -138,7 +138,7 @@ class Data:
         return np.max([getattr(self.depths, kind).numpy()[:n] for kind in _DEPTHS], axis=0)
 
     def near_share(self, reach: float, n: int) -> Floats:
-        """Return shares (n,) of hands' surface closer to the object than `reach` [m], at the last evaluation."""
+        """Return the share (n,) of each hand's surface within `reach` [m] of the object, as last evaluated."""
         inputs = [reach, float(REFERENCE_POINTS), self.contacts]
         with wp.ScopedDevice(self.device):
             share = wp.empty(n, dtype=wp.float32)
@@ -188,6 +188,6 @@ class Schedule:
 
 
 def still_schedule() -> Schedule:
-    """Return tables for distances and depths only: no dilation, no weights, no step."""
+    """Return a schedule of one iteration for distances and depths only: no dilation, weights or step."""
     zero = np.zeros(1)
     return Schedule(zero, zero, zero, zero, np.zeros((1, 3)))

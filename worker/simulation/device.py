@@ -1,4 +1,4 @@
-"""Arrays of a hand and an object on a Warp device, made once per pair; and bodies of many posed hands."""
+"""Arrays of a hand and of an object on a Warp device, and body poses of many hands."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from graspd.worker.simulation.kernels import kinematics, nearest, pieces, surfac
 
 #: Kernels' numbers for `ConvexPiece.kind`.
 _KINDS: Final = {"box": 0, "sphere": 1, "cylinder": 2, "capsule": 3, "hull": 4}
-SAMPLE_CELL_M: Final = 0.008  # cells that sort the object's samples [m]
+SAMPLE_CELL_M: Final = 0.008  # edge of the grid cells by which object samples are sorted [m]
 SLIDE_M: Final = 0.05  # travel of a sliding joint that moves a fingertip as much as one radian of a revolute joint [m]
 
 
@@ -135,9 +135,9 @@ class DeviceObject:
 
     @classmethod
     def create(cls, obj: ObjectModel, device: str, *, samples: Floats, phong_alpha: float, cell: float) -> DeviceObject:
-        """Upload an object with points (S, 3) on its surface, object frame [m].
+        """Upload an object with `samples` (S, 3) of its surface, object frame [m].
         `phong_alpha` is 0 for flat faces, 1 for full Phong projection. `cell` is the cell size of the distance grid
-        [m]; 0: no grid, every distance is exact."""
+        [m]; 0: no grid, all distances are computed from the mesh."""
         with wp.ScopedDevice(device):
             points = wp.array(obj.vertices - obj.centre_of_mass, dtype=wp.vec3)
             mesh = wp.Mesh(points=points, indices=wp.array(obj.faces.ravel(), dtype=wp.int32))
@@ -163,7 +163,7 @@ class DeviceObject:
         )
 
     def thinned(self, count: int) -> DeviceObject:
-        """Return the object with its first `count` samples, in farthest-point order: they are even."""
+        """Return the object with its first `count` samples; farthest-point order keeps them evenly spread."""
         if count >= len(self.samples):
             return self
         with wp.ScopedDevice(self.device):
@@ -173,9 +173,9 @@ class DeviceObject:
 
 
 def sorted_samples(samples: Floats) -> Any:
-    """Sort points (S, 3) [m] by the cells of a grid, on the current Warp device."""
+    """Sort points (S, 3) [m] by the cells of a grid, and upload them to the current Warp device."""
     low = samples.min(axis=0)
-    # At most 64 cells a side, so a large object has larger cells.
+    # At most 65 cells a side, so a large object has larger cells.
     size = max(SAMPLE_CELL_M, float((samples.max(axis=0) - low).max()) / 64)
     cell = np.floor((samples - low) / size).astype(int)
     shape = cell.max(axis=0) + 1
@@ -189,7 +189,7 @@ def sorted_samples(samples: Floats) -> Any:
 
 
 def posed_bodies(hand: HandModel, hand_pose: Floats, joint_positions: Floats, device: str = "cpu") -> Any:
-    """Return `kernels.chain.Bodies` (P, L) of roots (P, 7) and joint positions (P, J), placed as by `body_poses`."""
+    """Return `kernels.chain.Bodies` (P, L) for roots (P, 7) and joints (P, J), equal to `body_poses`."""
     chain, count = chain_of(hand, device), len(hand_pose)
     with wp.ScopedDevice(device):
         root, joints = (
@@ -202,7 +202,7 @@ def posed_bodies(hand: HandModel, hand_pose: Floats, joint_positions: Floats, de
 
 
 def allocate_bodies(hand: HandModel, count: int) -> Any:
-    """Allocate poses of `count` hands on the current device, uninitialised."""
+    """Allocate uninitialised body poses of `count` hands on the current device."""
     out = kernels.Bodies()
     out.position = wp.empty((count, hand.bodies), dtype=wp.vec3d)
     out.rotation = wp.empty((count, hand.bodies), dtype=wp.quatd)

@@ -1,7 +1,7 @@
 """Environment of an object: the convex obstacles of a scene that a hand must avoid.
 
 An obstacle is an intersection of half-spaces: one for a table top, six for a board or a wall. A neighbour's convex
-piece has one per face of its hull. Frames are the object's, as everywhere in planning."""
+piece has one per face of its hull. An `Environment` is in the object frame, `Scenes` are in the scene frame."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ class Obstacle:
     """A convex body: the points x with n.x <= d for each of its planes (n, d)."""
 
     planes: Floats  # (K, 4) outward unit normal and offset [m]
-    corners: Floats  # (V, 3) corners [m]; none for unbounded bodies, as a half-space
+    corners: Floats  # (V, 3) corners [m]; none for an unbounded body such as a half-space
     edges: NDArray[np.intp] = field(default_factory=lambda: np.zeros((0, 2), np.intp))
-    """(E, 2) corners joined by an edge."""
+    """(E, 2) indices of corners that an edge connects."""
     tips_m: float | None = None
-    """Clearance of fingertips, negative if they may press into it [m]; None: as for the rest of the hand."""
+    """Clearance of fingertips [m], negative if they may press into the body; None: that of the hand."""
 
     def __post_init__(self) -> None:
         if self.planes.ndim != 2 or self.planes.shape[1] != 4 or not len(self.planes):
@@ -44,8 +44,8 @@ class Obstacle:
 
     @classmethod
     def half_space(cls, normal: Sequence[float] | Floats, offset: float) -> Obstacle:
-        """Return all points below the plane n.x = offset; the normal need not have unit length.
-        Raises InputError: the normal is zero or not finite."""
+        """Return the half-space n.x <= offset; the normal need not have unit length.
+        Raises InputError: the normal is zero, or a number is not finite."""
         n = np.asarray(normal, float)
         length = float(np.linalg.norm(n))
         if n.shape != (3,) or not np.isfinite(n).all() or not np.isfinite(offset) or length < 1e-9:
@@ -69,17 +69,17 @@ class Obstacle:
         return cls(planes, pose[:3] + (signs * half) @ R.T, edges)
 
     def moved(self, pose: Floats) -> Obstacle:
-        """Return the obstacle moved by `pose` (7,): from its frame's coordinates to the outer frame."""
+        """Return the obstacle in the outer frame, in which its own frame has `pose` (7,)."""
         normals = quat_rotate(pose[3:], self.planes[:, :3])
         planes = np.column_stack([normals, self.planes[:, 3] + normals @ pose[:3]])
         return replace(self, planes=planes, corners=quat_rotate(pose[3:], self.corners) + pose[:3])
 
     def in_frame(self, pose: Floats) -> Obstacle:
-        """Return an obstacle given in an outer frame, in the frame at `pose` (7,) of the outer frame."""
+        """Return the obstacle in a frame that has `pose` (7,) in the present one: the inverse of `moved`."""
         return self.moved(invert(pose))
 
     def distance(self, points: Floats) -> Floats:
-        """Return signed distances (...) of points (..., 3) [m]: exact in and over faces, else a lower bound."""
+        """Return signed distances (...) of points (..., 3) [m]; beyond edges and corners a lower bound."""
         return np.asarray((points @ self.planes[:, :3].T - self.planes[:, 3]).max(axis=-1))
 
 
@@ -96,10 +96,10 @@ class Neighbour:
     """Another object in a scene, as convex pieces in its own frame."""
 
     obj: ObjectModel
-    pieces: tuple[Floats, ...]  # corners (V, 3) of each piece, as the validator simulates them
-    solids: tuple[Obstacle, ...]  # slightly enlarged pieces with few faces, as a hand avoids them
+    pieces: tuple[Floats, ...]  # corners (V, 3) of each piece, for the validator
+    solids: tuple[Obstacle, ...]  # slightly enlarged pieces with few faces, for the clearance of hands
     error_m: float  # largest excess of a solid over its piece [m]
-    about_centre: Neighbour | None = None  # the neighbour about its centre; None: it already is
+    about_centre: Neighbour | None = None  # the same with its frame at the centre; None: the frame is there already
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ class Scenes:
     """(S, M, 7) of the neighbours in the scene frame."""
 
     def centred(self, obj: ObjectModel) -> Scenes:
-        """Return the scenes with the frames of their object `obj` and of the neighbours at their centres."""
+        """Return the scenes with the frames of the object `obj` and of all neighbours moved to their centres."""
         poses = np.array(self.neighbour_pose, float)
         for number, one in enumerate(self.neighbours):
             poses[:, number] = to_centre(poses[:, number], one.obj.centre)
@@ -121,7 +121,7 @@ class Scenes:
         return Scenes(self.supports, to_centre(self.object_pose, obj.centre), neighbours, poses)
 
     def placed(self, index: NDArray[np.intp]) -> PlacedGrasps:
-        """Return grasps in these scenes, by scene number (N,)."""
+        """Return N grasps in these scenes; `index` (N,) has the scene number of each grasp."""
         index = np.asarray(index, np.intp)
         return PlacedGrasps(self.supports, self.object_pose, index, self.neighbours, self.neighbour_pose)
 
@@ -150,7 +150,7 @@ class PlacedGrasps:
 
     @cached_property
     def fixed(self) -> str:
-        """Digest of the surroundings common to all grasps wherever the object rests: supports and neighbours."""
+        """Digest of what all grasps have in common: supports and neighbours, without poses of objects."""
         told = hashlib.sha256()
         solids = [solid for one in self.neighbours for solid in one.solids]
         for body in (*self.supports, *solids):
@@ -164,7 +164,7 @@ class PlacedGrasps:
         return Scenes(self.supports, self.object_pose, self.neighbours, self.neighbour_pose)
 
     def centred(self, obj: ObjectModel) -> PlacedGrasps:
-        """Return the grasps' scenes with the frames of `obj` and of the neighbours at their centres."""
+        """Return the grasps with the frames of the object `obj` and of all neighbours moved to their centres."""
         return self.everywhere.centred(obj).placed(self.index)
 
     def neighbours_of(self, scene: int) -> Floats:

@@ -1,7 +1,7 @@
-"""Distance grid of an object with the lists of near faces of its cells, cached on disk.
+"""Distance grid of an object, and lists of the faces near each cell; both are cached on disk.
 
-Both depend on the object alone and take a fifth of the time of a process until its first grasp. Later processes on a
-CPU read the file. A GPU computes them faster than a file is read."""
+Both depend on the object, the cell size and `phong_alpha`, not on the hand. They take a fifth of the time until a
+process's first grasp, so later processes on a CPU read a file. A GPU computes them faster than a file is read."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ from graspd.worker.simulation.kernels import nearest, surface
 
 Arrays = Mapping[str, NDArray[Any]]
 
-FIELD_REACH: Final = 0.06  # largest distance from the surface that is looked up [m]
-LISTED_M: Final = 0.004  # cells within this distance plus the grid's error of the surface list their nearest faces [m]
-_MOST_CELLS: Final = 96  # largest number of cells a side; the larger error of a coarser grid is accounted for
+FIELD_REACH: Final = 0.06  # margin of the grid around the object's bounding box [m]
+LISTED_M: Final = 0.004  # cells closer to the surface than this plus the grid's error list their nearest faces [m]
+_MOST_CELLS: Final = 96  # largest number of cells a side; a coarser grid has a larger `field_error`
 
 
 def add_grid(skin: Any, obj: ObjectModel, mesh: Any, cell: float) -> None:
     """Add the distance grid and the lists of its cells to a surface, on the current Warp device.
     `skin` is a `surface.Surface` with `cells.faces`; `mesh` is its `warp.Mesh`, vertices about the centre of mass;
-    `cell` is the cell size of the grid [m]."""
+    `cell` is the least cell size of the grid [m]."""
     low = obj.vertices.min(axis=0) - obj.centre_of_mass - FIELD_REACH
     high = obj.vertices.max(axis=0) - obj.centre_of_mass + FIELD_REACH
     cell = max(cell, float((high - low).max()) / _MOST_CELLS)
     shape = tuple(int(n) for n in np.ceil((high - low) / cell).astype(int) + 1)
     skin.field_origin = wp.vec3(*low)
     skin.field_cell = cell
-    # A distance has slope at most 1, so trilinear interpolation between corners is off by less than half a diagonal.
+    # A distance has slope at most 1, so interpolation errs by less than half a diagonal; half a cell is allowed for.
     skin.field_error = 0.5 * cell
 
     def fill() -> None:
@@ -126,14 +126,14 @@ def feature_normals(vertices: Floats, faces: NDArray[np.integer[Any]]) -> Floats
 
 
 def _summed(group: NDArray[np.integer[Any]], rows: Floats) -> Floats:
-    """Return each row's sum over its group (R, 3)."""
+    """Return for each row (R, 3) the sum of all rows of its group."""
     total = np.zeros((int(group.max(initial=0)) + 1, 3))
     np.add.at(total, group, rows)
     return total[group]
 
 
 def list_cells(faces: Any, mesh: Any, field: Any, low: Any, size: float, within: float) -> Any:
-    """List the `faces` of `faces_of` for grid cells closer to the surface than `within`.
+    """Return `nearest.Cells` of `faces`, for grid cells closer to the surface than `within` [m].
     `low` is the first corner of the grid `field`."""
     cells = nearest.Cells()
     cells.faces = faces

@@ -1,4 +1,4 @@
-"""Kernel launches recorded once and run many times; only counters on the device change between runs."""
+"""Kernel launches, recorded once and run many times with the same arguments."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import warp as wp
 
 
 class Launches:
-    """Ordered launches; on CUDA they become a graph once they have run often enough."""
+    """Ordered launches; on CUDA, more than two runs in one call use a captured graph."""
 
     def __init__(self, device: str) -> None:
         self.device = device
@@ -64,7 +64,7 @@ def launch(kernel: Any, dim: Any, *, device: Any = None, **given: Any) -> None:
         wp.launch(kernel, dim, device=device, **given)
 
 
-#: CPU seconds of kernels on the CPU while they are counted.
+#: CPU seconds of kernels on the CPU, while `kernel_seconds` is active.
 _spent: ContextVar[list[float] | None] = ContextVar("spent", default=None)
 
 
@@ -93,9 +93,9 @@ def _counted() -> Iterator[None]:
 
 
 def _packed(command: Any) -> Callable[[], object]:
-    """Return a function that runs a recorded launch on the CPU.
-    Warp packs the arguments at each launch, under the interpreter's lock: a twentieth of an iteration of a few hands,
-    for which other threads wait. Here they are packed once, as by Warp."""
+    """Return a function that runs a recorded launch, on the CPU with arguments that are packed in advance.
+    Warp packs them at each launch while it holds the interpreter's lock. For a few hands, other threads then wait a
+    twentieth of each iteration."""
     if not command.device.is_cpu or command.adjoint or command.block_dim > 1:
         return partial(command.launch)
     bounds, *values = command.params

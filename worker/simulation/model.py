@@ -15,13 +15,13 @@ from graspd.worker.simulation.device import DeviceHand, DeviceObject
 from graspd.worker.simulation.kernels import contact, pieces
 from graspd.worker.simulation.obstacles import DeviceObstacles
 
-#: Weights of points are areas in units of 1/800 of the hand's surface, so the loss does not depend on their number.
+#: Weights of points are areas in units of 1/800 of the hand's surface: the loss is independent of the points' number.
 REFERENCE_POINTS: Final = 800
 REFERENCE_SAMPLES: Final = 2000  # number of object samples at which each has weight 1
-#: Number of hand points against other links at which each has weight 1.
+#: Number of hand points for tests against other links at which each point has weight 1.
 REFERENCE_SELF_POINTS: Final = 1000
 SOLVERS: Final = {"direct": contact.direct, "jacobi": contact.jacobi, "gauss_seidel": contact.gauss_seidel}
-NEAR_GAP: Final = 4e-3  # contacts with at most this gap are listed for the direct solver: four steps of the object [m]
+NEAR_GAP: Final = 4e-3  # largest gap of contacts in the direct solver's near list: four steps of the object [m]
 CPU_LANE: Final = 64  # points per thread on the CPU, where starting a thread costs as much as a point; on CUDA 1
 MAX_DILATION: Final = 0.1  # largest dilation of a schedule [m]
 
@@ -59,7 +59,7 @@ class Model:
     obj: DeviceObject
     options: LossOptions
     obstacles: DeviceObstacles | None  # obstacles that the hands must avoid; None: there are none
-    count: int  # hand points
+    count: int  # number of hand points
     point_body: Any
     point_position: Any
     point_weight: Any
@@ -77,7 +77,7 @@ class Model:
         options: LossOptions,
         obstacles: DeviceObstacles | None = None,
     ) -> Model:
-        """Create the model, points on the hand's device; raise InputError for an unknown contact solver."""
+        """Create the model with arrays on the hand's device; raise InputError for an unknown contact solver."""
         if options.contact_solver not in SOLVERS:
             raise InputError(f"unknown contact solver {options.contact_solver!r}; choose one of {', '.join(SOLVERS)}")
         weight = points.area * (REFERENCE_POINTS / points.area.sum())
@@ -125,7 +125,7 @@ class Model:
 
 
 def initial_motions(velocities: int, step: float, gyration: float) -> Floats:
-    """Return free motions (M, 6) of the object: rest, +-x, +-y, +-z, then (13) the same for rotations."""
+    """Return free motions (M, 6): rest, +-x, +-y, +-z, and for M = 13 also rotations +-x, +-y, +-z."""
     rows = [np.zeros(6)]
     for axis in range(3 if velocities == 7 else 6):
         for sign in (1.0, -1.0):

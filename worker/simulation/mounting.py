@@ -1,4 +1,4 @@
-"""Clearance of a hand's mounting from obstacles, at the clear wrist angles nearest to rest.
+"""Clearance of a hand's mounting (links above its root) from obstacles, and choice of wrist angles.
 Planners use the clearance of the mounting's points, which is cheap; validity uses the exact clearance."""
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.simulation.environment import CLEAR_M, Environment
 from graspd.worker.simulation.obstacles import MARGIN_M, obstacle_clearance
 
-#: Numbers of points of a mounting: outermost points in so many directions, then corners spread over it.
+#: Points of a mounting: the outermost ones in this many directions, and this many corners spread over the mounting.
 OUTERMOST: Final = 20
 SPREAD: Final = 40
-TRIES: Final = 4  # wrist positions of a hand whose exact clearances are computed
+TRIES: Final = 4  # largest number of wrist positions of a hand whose exact clearance is computed
 
 
 def choose_wrist(
     hand: HandModel, poses: Floats, scenes: Sequence[Environment], which: NDArray[np.integer[Any]] | None = None
 ) -> tuple[Floats, Floats]:
     """Choose wrist angles that stay constant while the hand moves; return the mounting's clearance.
-    `poses` (N, P, 7) are root poses of N hands, object frame; `which` (N,) has the scene of each hand, by default the
-    first. The search ends at a clearance of `CLEAR_M`. Return wrist angles (N, K): the first of `wrist_positions` with
-    enough clearance of points and mounting, else those with the largest clearance of points. Also return the least
+    `poses` (N, P, 7) are root poses of N hands, object frame; `which` (N,) is the scene of each hand, by default the
+    first. Return wrist angles (N, K): the first of `wrist_positions` with a clearance of `CLEAR_M`, else the clearest
+    one tried. At most `TRIES` whose points are clear are tried; if no points are clear, one. Also return the least
     clearance (N,) of the mounting from obstacles at all poses [m]. Without a mounting K is 0 and the clearance inf."""
     mounting, count = hand.mounting, len(poses)
     if mounting is None:
@@ -49,9 +49,8 @@ def missing_mounting_clearance(
     room: float = 0.0,
     exact: bool = True,
 ) -> Floats:
-    """Return the clearance (N,) missing at mountings for `MARGIN_M` + `room` [m], at root poses (N, 7) and their best
-    angles.
-    It is at least 0. `exact`: check the mounting itself, not only its points."""
+    """Return by how much (N,) mountings miss a clearance of `MARGIN_M` + `room` [m], at least 0.
+    `poses` (N, 7) are root poses; wrists have their best angles. `exact`: check the mounting, not only its points."""
     mounting, wanted = hand.mounting, MARGIN_M + room
     if mounting is None or not len(poses):
         return np.zeros(len(poses))
@@ -72,7 +71,7 @@ def _solve_wrist(
     points: Floats,
     enough: float,
 ) -> tuple[Floats, Floats]:
-    """Return angles and clearance as `choose_wrist`; the clearance of points (N, W) is overwritten."""
+    """Return angles and clearance as `choose_wrist` does; overwrite the clearance of `points` (N, W)."""
     wrists, count = wrist_positions(mounting), len(poses)
     number, room, rows = np.zeros(count, np.intp), np.full(count, -np.inf), np.arange(count)
     for _ in range(min(TRIES, len(wrists))):
@@ -92,7 +91,7 @@ def point_clearance(
     mounting: HandModel, poses: Floats, scenes: Sequence[Environment], which: NDArray[np.intp]
 ) -> Floats:
     """Return the least clearance (N, W) of a mounting's points over root poses (N, P, 7), at W wrist positions [m].
-    Scenes are `which` (N,). The mounting itself has no more clearance, except near edges and corners of solids."""
+    Scenes are `which` (N,). The mounting's own clearance is at most this, except near edges and corners of solids."""
     points = points_of(mounting)
     out = np.full((len(poses), len(points)), np.inf)
     for scene in np.unique(which):

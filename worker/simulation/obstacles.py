@@ -23,7 +23,7 @@ from graspd.worker.simulation.kernels import obstacles as kernels
 from graspd.worker.simulation.kernels import solids as solid_kernels
 from graspd.worker.simulation.launches import launch
 
-#: Clearance of hands from obstacles in planning [m]: twice a scene's requirement, as trajectories are swept in steps.
+#: Clearance of hands from obstacles in planning [m]: twice a scene's requirement, since trajectories are sampled.
 MARGIN_M: Final = 0.004
 FAR_M: Final = 0.1  # distances from solids are capped at this [m]
 
@@ -46,7 +46,7 @@ class PosedFeatures:
         return cls(centre, axis, features.radius, (features.axis**2).sum(axis=1) > 0.5)
 
     def distance(self, obstacle: Obstacle) -> Floats:
-        """Return signed distances (P, F) from an obstacle [m]: exact over a half-space, else a lower bound."""
+        """Return signed distances (P, F) from an obstacle [m]: exact for half-spaces, else lower bounds."""
         normal, offset = obstacle.planes[:, :3], obstacle.planes[:, 3]
         sine = np.sqrt(np.maximum(0.0, 1.0 - (self.axis @ normal.T) ** 2))
         reach = self.radius[:, None] * np.where(self.rim[:, None], sine, 1.0)
@@ -54,7 +54,7 @@ class PosedFeatures:
 
 
 def _solid_distances(hand: HandModel, postures: Posture, scene: Environment) -> Floats:
-    """Return `body_clearance` (P, L) without the tolerance of fingertips, in float32 (3e-8 at 0.3 m)."""
+    """Return distances (P, L) of bodies from a scene's solids [m], in float32 (rounding: 3e-8 at 0.3 m)."""
     bodies = body_poses(hand, postures.hand_pose, postures.joint_positions)
     device = _device_hand(hand)
     obstacles = DeviceObstacles.create(hand, [scene], np.zeros(3), "cpu")
@@ -117,7 +117,7 @@ def _half_space_clearance(
 def obstacle_clearance(
     hand: HandModel, postures: Posture, scenes: Sequence[Environment], which: NDArray[np.integer[Any]] | None = None
 ) -> Floats:
-    """Return the least of the `body_clearance` of each posture (P,) [m]."""
+    """Return the least `body_clearance` (P,) of each posture [m]."""
     return np.asarray(body_clearance(hand, postures, scenes, which).min(axis=1))
 
 
@@ -127,7 +127,7 @@ class DeviceObstacles:
 
     features: Any
     solids: Any
-    any_solid: bool  # whether an obstacle is no half-space
+    any_solid: bool  # whether any obstacle is not a half-space
 
     @classmethod
     def create(
@@ -140,8 +140,7 @@ class DeviceObstacles:
         margin: float | Floats = MARGIN_M,
     ) -> DeviceObstacles:
         """Upload obstacles in the object frame.
-        `centre` (3,) is the object's centre of mass; `margin` the clearance [m] of all features, or (L,) of each
-        body."""
+        `centre` (3,) is the object's centre of mass. `margin` is the clearance of features [m], or (L,) per body."""
         found = hand.features
         kept = np.broadcast_to(np.asarray(margin, float), hand.bodies)[found.body]
         sorted_ = [sorted(scene.obstacles, key=lambda o: len(o.corners) > 0) for scene in scenes]
@@ -194,7 +193,7 @@ def _feature_ball(features: HandFeatures, piece: int) -> tuple[Floats, float]:
 
 
 def _sphere(corners: Floats) -> tuple[Floats, float]:
-    """Return a bounding sphere; for unbounded bodies it is unused."""
+    """Return centre and radius [m] of a bounding sphere; radius 0 for no corners."""
     if not len(corners):
         return np.zeros(3), 0.0
     centre = (corners.min(axis=0) + corners.max(axis=0)) / 2

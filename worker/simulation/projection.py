@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt projection of hands out of penetration, holding contacts (kernels.projection)."""
+"""Levenberg-Marquardt projection of hands out of penetration that keeps contacts (kernels.projection)."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from graspd.worker.simulation.launches import Launches
 from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.record import record_placement
 
-CAPACITY: Final = 1024  # residuals per grasp and iteration
-CUDA_LANE: Final = 16  # residuals per GPU thread that are added to the equations
+CAPACITY: Final = 1024  # largest number of residuals per grasp and iteration
+CUDA_LANE: Final = 16  # residuals that one GPU thread adds to the equations
 BETTER_M: Final = 1e-5  # least reduction of penetration by which a state is better than another one [m]
 
 
@@ -38,7 +38,7 @@ class ProjectionOptions:
     obstacle_target: float = 5e-4  # distance of moved features beyond their margin
     damping: float = 1e-3  # damping per residual
     scale: tuple[float, float, float] = (1.0, 12.5, 25.0)
-    """Translation [m], rotation and joints [rad] that move a hand's surface equally: levers of 8 and 4 cm."""
+    """Translation [m], rotation and joints [rad] that move a surface equally far: levers of 8 and 4 cm."""
     step: float = 3e-3  # largest step in units of the scaled variables [m]
 
 
@@ -96,7 +96,7 @@ class Projection:
         return out
 
     def _states(self, state: HandState) -> Any:
-        """Upload hands in double precision; beyond the loaded ones the arrays are unused."""
+        """Upload hands in double precision, padded with zeros to the capacity."""
         rest = self.data.capacity - len(state.pivot)
         out = kernels.States()
         with wp.ScopedDevice(self.model.device):

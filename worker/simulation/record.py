@@ -27,7 +27,7 @@ OPTIMIZERS: Final = ("adam", "gd")
 
 def record_placement(m: Model, d: Data, *, room: float = 0.0, within: float | None = None) -> Launches:
     """Record contacts and penetration depths only; `room` is added to each feature's margin [m].
-    `within`: contacts need to be exact only within this distance [m]; it does not change the depths."""
+    `within`: contacts need to be exact only up to this distance [m]; depths do not depend on it."""
     out = Launches(m.device)
     add_poses(out, m, d)
     add_distances(out, m, d, within=within)
@@ -48,7 +48,7 @@ def record_evaluation(m: Model, d: Data) -> Launches:
 
 def record_iteration(m: Model, d: Data, optimizer: str, *, patience: int = 0) -> Launches:
     """Record one iteration: gradient and step.
-    With a `patience`, a grasp without improvement for so many iterations is switched off and costs no more time.
+    If `patience` is above 0, a grasp without improvement for this many iterations is switched off.
     Raises InputError: unknown optimizer."""
     out = record_evaluation(m, d)
     add_step(out, m, d, optimizer, patience=patience)
@@ -75,7 +75,7 @@ def add_distances(out: Launches, m: Model, d: Data, *, within: float | None = No
 
 
 def add_contact(out: Launches, m: Model, d: Data) -> None:
-    """Add the contact step and its gradient with respect to distances, or their substitute.
+    """Add the contact step and its gradient by distances; without `simulate` only attract points.
     The direct solver has two launches: over simulations, then over contacts."""
     o, c = m.options, d.contacts
     if not o.simulate:
@@ -90,7 +90,7 @@ def add_contact(out: Launches, m: Model, d: Data) -> None:
 
 
 def add_penalties(out: Launches, m: Model, d: Data, *, room: float = 0.0) -> None:
-    """Add penetration terms, and the gradient's transfer from points to bodies."""
+    """Add penetration terms, and transfer the gradient from points to bodies."""
     o, over = m.options, (d.capacity, m.pieces)
     weight = [REFERENCE_SAMPLES / len(m.obj.samples), d.schedule.object_penetration]
     inputs = [m.hand.pieces, m.obj.sorted_samples, *weight]
@@ -108,7 +108,7 @@ def add_penalties(out: Launches, m: Model, d: Data, *, room: float = 0.0) -> Non
 
 
 def add_self_penalty(out: Launches, m: Model, d: Data, margin: float) -> None:
-    """Add the term of links inside links, or closer than `margin` [m]."""
+    """Add the penalty on links that penetrate each other or are closer than `margin` [m]."""
     inputs = [m.hand.pieces, m.body_points, m.self_scale, margin, d.schedule.self_penetration]
     out.add(pieces.pieces_in_pieces, (d.capacity, m.pieces), inputs=inputs, outputs=[d.hands, d.depths.links])
 

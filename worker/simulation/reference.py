@@ -1,6 +1,6 @@
 """The contact step in float64 NumPy, written for clarity: the reference of the kernels and of studies.
 
-Contacts (N, 3), motions (6) as linear and angular parts. Distances and free motions may have leading axes."""
+A motion (6,) is a translation, then a rotation vector. Distances and free motions may have leading axes."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class World:
 
 
 def row(normal: Floats, point: Floats) -> Floats:
-    """Return rows (..., 6): displacement of `point` along `normal`, both (..., 3), per motion."""
+    """Return rows (..., 6) that map a motion to the displacement of `point` along `normal`, both (..., 3)."""
     return np.concatenate([normal, np.cross(point, normal)], axis=-1)
 
 
@@ -49,7 +49,7 @@ def loss(s: Floats, world: World) -> Floats:
 
 
 def direct(contacts: Contacts, s0: Floats, world: World, passes: int = 60) -> Floats:
-    """Solve compliant contact by reweighted least squares: motions (..., 6) from free ones (..., 6)."""
+    """Return motions (..., 6) in compliant contact for free ones (..., 6), by reweighted least squares."""
     n, offset = contacts.normals, world.dilation - contacts.distances
     k = world.stiffness * contacts.weights
     j = row(n, contacts.points)
@@ -69,7 +69,7 @@ def direct(contacts: Contacts, s0: Floats, world: World, passes: int = 60) -> Fl
 
 
 def gauss_seidel(contacts: Contacts, s0: Floats, world: World) -> tuple[Floats, Floats]:
-    """Run one sweep of position-based dynamics with Coulomb friction: motions (..., 6) from free motions.
+    """Return motions (..., 6) after one sweep of position-based dynamics with Coulomb friction.
     Also return the impulses (..., N, 2) of each contact, normal and tangential."""
     s = s0
     impulses = []
@@ -83,7 +83,7 @@ def gauss_seidel(contacts: Contacts, s0: Floats, world: World) -> tuple[Floats, 
 
 
 def jacobi(contacts: Contacts, s0: Floats, world: World, passes: int) -> Floats:
-    """Average the corrections of all active contacts, `passes` times: motions (..., 6) from free ones."""
+    """Return motions (..., 6) after `passes` steps, each with the mean correction of all active contacts."""
     p, n = contacts.points, contacts.normals
     s = s0
     for _ in range(passes):
@@ -95,7 +95,7 @@ def jacobi(contacts: Contacts, s0: Floats, world: World, passes: int) -> Floats:
 
 
 def _push_out(p: Floats, n: Floats, rho: Floats, s: Floats, world: World) -> tuple[Floats, Floats]:
-    """Return normal impulses (...) that end penetration at points (..., 3) moved by s, and their effect."""
+    """Return normal impulses (...) that end penetration at points (..., 3), and the motions they cause."""
     j = row(n, p)
     back = j @ np.linalg.inv(world.mass)
     impulse = np.maximum(world.dilation - rho + np.sum(j * s, axis=-1), 0.0) / np.sum(j * back, axis=-1)

@@ -13,10 +13,9 @@ from graspd.worker.objects import mesh_geometry
 from graspd.worker.objects.disk_cache import cached_arrays
 from graspd.worker.objects.model import ObjectModel
 
-#: Edges between faces that turn by more than this have their own samples: they enter links between surface samples.
+#: Edges whose faces turn by more than 35 degrees have samples of their own: such an edge may enter a link unseen.
 SHARP_EDGE_COS = np.cos(np.radians(35.0))
-#: Random points per selected sample; fewer points above the third value's number of samples, since cost grows with the
-#: product of both.
+#: Random points per selected sample, fewer for more than `MANY` samples: the cost grows with both numbers' product.
 CANDIDATES, FEWER_CANDIDATES, MANY = 6, 3, 8_000
 
 

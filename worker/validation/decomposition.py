@@ -41,7 +41,7 @@ MAX_EXCESS_M: Final = 2e-3
 #: CoACD's concavity thresholds from coarse to fine; the first that gives good pieces is used.
 THRESHOLDS: Final = (0.1, 0.05, 0.03)
 MAX_PIECES: Final = 64
-#: CoACD's preprocessing is off: it inflates near-convex scans by 9 to 17 % and takes a minute. Meshes are closed here.
+#: No preprocessing by CoACD: it inflates near-convex scans by 9 to 17 % and takes a minute. Meshes are already closed.
 _COACD: Final = {
     "preprocess_mode": "off",
     "resolution": 1000,

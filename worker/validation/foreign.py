@@ -1,7 +1,7 @@
 """Verdicts in another model of the same hand: grasps planned with one model are validated in the other model.
 
 The other model provides the mechanism: shapes, masses, joint frames, limits, couplings, armature and dry friction. The
-grasp's own model provides the controller: commanded postures, gains, torque limits and, with the gains, the damping."""
+grasp's own model provides the controller: commanded postures, gains, damping and torque limits."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ class ForeignVerdicts:
     same: HandMatch
 
     def facts(self) -> dict[str, Any]:
-        """Return the facts of both validations, with `share_counts`.
-        validation_hand: name of the other model. fingertips_mm: distance between the fingertips of both models.
+        """Return a JSON record of both validations: the keys of `share_counts`, and three more.
+        validation_hand: name of the other model. fingertips_mm: largest distance between fingertips of both models.
         foreign_key: terms of the verdicts in the other model."""
         a, b = self.nominal.success == 1, self.foreign.success == 1
         return {
@@ -52,7 +52,7 @@ class ForeignVerdicts:
 
 
 def share_counts(held: Mapping[str, int]) -> dict[str, Any]:
-    """Return shares of grasps from their counts: held in both models, in one model, or in neither; None: no grasps.
+    """Return shares from numbers of grasps held in both models, in one, or in neither; None: no grasps.
     foreign_held: the counts. agreement: share of grasps with equal verdicts in both models. foreign_share: share of
     nominally held grasps that hold in the other model. foreign_gsr: share of all grasps that hold in it."""
     n, nominal = sum(held.values()), held["both"] + held["nominal"]

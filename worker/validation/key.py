@@ -21,12 +21,12 @@ from graspd.worker.validation.decomposition import ConvexPieces
 
 Level = Literal["dexgraspbench", "standard", "fast"]
 
-#: Increase after changes of verdicts by the protocol's or the scene's code, other than its constants.
+#: Revision of the code of protocol and scene; increase it if code (not a constant) changes verdicts.
 REVISION: Final = 6
 
 _EARLY: Final = ("FIRST_LOOK_S", "INTERVAL_S", "SURE", "AHEAD", "LOST_ROTATION")
-#: Constants that affect a verdict, by module; below, constants that only one level uses. Other constants of these
-#: modules affect no verdict.
+#: Constants that affect verdicts, by module; `LEVEL_MOVES` has constants that only one level uses. Other constants of
+#: these modules affect no verdict.
 MOVES: Final[dict[ModuleType, tuple[str, ...]]] = {
     protocol: ("DIRECTIONS", "MAX_DISPLACEMENT_M", "MAX_ROTATION", "MAX_PENETRATION_M", "STAGES", "STAGE_S", "HOLD_S"),
     matter: ("ACCELERATION",),

@@ -1,7 +1,7 @@
 """The lift test: the object rests in its scene; the hand closes, squeezes, lifts and holds it.
 
-dexgraspbench: DexGraspBench's tabletop test as published. From the pregrasp 1 N acts down; then the hand rises 10 cm in
-0.4 s, without a hold.
+dexgraspbench: DexGraspBench's tabletop test as published. From the pregrasp on, the object's weight (published: 1 N)
+acts down. After the squeeze the hand rises 10 cm in 0.4 s, without a hold.
 lift: the hand starts at its standoff and must touch nothing on its approach. Fingertips may touch supports, or press
 into them as deep as the scene allows. The hand rises smoothly in 0.8 s and holds for 2 s, with early termination as at
 level standard. Neighbours are free bodies on the table; they must not move by 2 cm or topple.
@@ -59,7 +59,7 @@ class LiftOutcome(IntEnum):
 class LiftTest:
     outcome: LiftOutcome = LiftOutcome.NOT_TRIED
     margin: float = 0.0
-    """Largest ratio of deviation from the commanded position or rotation to its limit, after the end of the lift."""
+    """Larger ratio of final deviation in position or rotation to its limit; 0: the hand did not rise."""
     steps: int = 0
 
     @property
@@ -109,7 +109,7 @@ class Lift(Test):
         return rollout
 
     def _begin(self, grasps: GraspSet, row: int) -> LiftTest:
-        """Set up the grasp's scene with the object at rest; gravity acts on the object alone, as published."""
+        """Set up the grasp's scene with all objects at rest; gravity acts on objects but not on the hand."""
         self._steps, number = 0, int(self.placed.index[row])
         self._scene_pose = invert(np.asarray(self.placed.object_pose[number], float))
         self._up = self.placed.scenes[number].up
@@ -170,7 +170,7 @@ class Lift(Test):
         return bool((distance < -allowed)[on_support].any() or (distance[of_hand & ~on_support] < -OVERHANG_M).any())
 
     def _rise(self, grasps: GraspSet, row: int, path: Floats = SMOOTHLY, step_s: float = RISING_S) -> None:
-        """Raise the root to the top; except at level dexgraspbench, stop as soon as the object is lost."""
+        """Raise the root by `RISE_M`; except at level dexgraspbench, stop as soon as the object is lost."""
         root = np.asarray(grasps.squeeze.hand_pose[row], float)
         self.scene.command(self.data, root, grasps.squeeze.joint_positions[row])
         for number, share in enumerate(path):
@@ -194,7 +194,7 @@ class Lift(Test):
 
     def _root_yield(self) -> tuple[Floats, Floats] | None:
         """Return the root's position (3,) and its rotation (4,) relative to the command.
-        None: the root is fixed, or the object is not in the hand. Unlike an arm, the protocol's weld yields by 10
+        None: the root is fixed, or motion is measured in the world. Unlike an arm, the protocol's weld yields by 10
         degrees under the weight of a hammer. An object that only follows this deviation has not moved in the hand."""
         at = self.scene.root_qpos
         if at < 0 or not self._in_hand:

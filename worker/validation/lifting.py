@@ -28,7 +28,7 @@ LiftLevel = Literal["dexgraspbench", "lift"]
 #: Finished lifts, by `lift_digest`.
 KnownLifts = dict[str, LiftTest]
 LEVELS: Final[tuple[LiftLevel, ...]] = get_args(LiftLevel)
-#: Increase after changes of verdicts by the lift test's code, other than its constants.
+#: Revision of the lift test's code; increase it if code (not a constant) changes verdicts.
 REVISION: Final = 5
 _MOVES: Final = {surroundings: ("RISE_M",), protocol: ("LOOKS", "OVERHANG_M", "LOSSES"), postures: ("ROOM_M", "WIDE")}
 
@@ -76,7 +76,7 @@ def validate_lifts(
         placed: the grasps' scenes; `index` has the scene of each grasp.
         hard: sliding friction halved, torsional friction a tenth; also for supports.
         pieces: convex pieces of the object; by default its CoACD pieces.
-        known: finished lifts of this hand, object and level, which are reused; new ones are added to it.
+        known: finished lifts of this hand, object and level; they are reused, and new lifts are added.
         run: receives the number of finished grasps; polled for cancellation between grasps."""
     require_approaches(grasps, placed, level)
     began = time.perf_counter()
@@ -122,13 +122,13 @@ def require_approaches(grasps: GraspSet, placed: PlacedGrasps, level: LiftLevel)
     if level not in LEVELS:
         raise InputError(f"unknown level {level!r} of the lift test; choose one of {', '.join(LEVELS)}")
     if len(placed.index) != len(grasps) or (level == "lift" and grasps.approach is None):
-        raise InputError("the lift test needs a scene and, except at level dexgraspbench, an approach of each grasp")
+        raise InputError("each grasp needs a scene for the lift test, and an approach unless level is dexgraspbench")
 
 
 def lift_key(
     hand: HandModel, obj: ObjectModel, placed: PlacedGrasps, level: LiftLevel, hard: bool, *, pieces: ConvexPieces
 ) -> str:
-    """Return the digest of a lift's terms: those of the push test, the supports, and the lift's constants."""
+    """Return the digest of a lift's terms: those of pushes, supports, neighbours, the lift's constants."""
     pushes = verdict_key(hand, obj, "dexgraspbench" if level == "dexgraspbench" else "standard", hard, pieces=pieces)
     supports = b"".join(np.round(s.planes, 9).tobytes() for s in placed.supports)
     constants = {name: getattr(module, name) for module, names in _MOVES.items() for name in names}

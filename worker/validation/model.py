@@ -31,15 +31,15 @@ HARD: Final = (0.5, 0.1)
 DAMPING_TIME: Final = 0.02
 HAND_SOLIMP: Final = (0.5, 0.99, 1e-4, 0.5, 2.0)
 HAND_SOLREF: Final = (0.005, 1.0)
-#: Time constant [s] and damping ratio of couplings. They are stiffer than contacts, or a pressed finger would stretch
-#: them; MuJoCo's minimum is 2 steps.
+#: Time constant [s] and damping ratio of couplings. They are stiffer than contacts: otherwise a pressed finger would
+#: stretch them. MuJoCo's minimum is 2 steps.
 COUPLING_SOLREF: Final = (0.008, 1.0)
 COUPLING_SOLIMP: Final = (0.98, 0.999, 1e-4, 0.5, 2.0)
 #: Features of today's MuJoCo that version 3.3.2, pinned by DexGraspBench, lacks. They are off here: several contacts
 #: per pair of convex pieces, and a solver for each island of contacts.
 NOT_IN_3_3_2: Final = int(mujoco.mjtDisableBit.mjDSBL_MULTICCD) | int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
-#: Degrees of freedom from which on sparse Jacobians cost less; MuJoCo's own rule is 60. Time of lifts with sparse
-#: Jacobians: .77 for 28 dofs (Allegro), .73 for 34 (Shadow), 1.09 for 20 (Barrett). Verdicts differ only by rounding.
+#: Number of dofs from which on Jacobians are sparse; MuJoCo's own rule is 60. Lift time, sparse over dense Jacobians:
+#: .77 for 28 dofs (Allegro), .73 for 34 (Shadow), 1.09 for 20 (Barrett). Verdicts differ only by rounding.
 SPARSE: Final = 24
 #: A body without geometry has the inertia of a ball of this radius [m].
 _BARE_RADIUS: Final = 0.01
@@ -57,7 +57,7 @@ class MujocoOptions:
     root: str = "weld"
     """weld: free root, welded to a mocap body (the protocol); fixed: the root itself is the mocap body."""
     friction: tuple[float, float] = FRICTION
-    """Sliding and torsional friction with an object of `FRICTION`; scaled for other objects."""
+    """Sliding and torsional friction with an object of default friction; scaled for other objects."""
 
     def hardened(self) -> MujocoOptions:
         """Return the options with the friction of the hard protocol, `HARD`."""
@@ -107,7 +107,7 @@ class Scene:
     neighbours: tuple[FreeBody, ...]
     tip_geoms: NDArray[np.bool_]
     pressing: Floats
-    """(G,) allowed depth of fingertips on their approach in a geom [m]; above 0 where supports allow it."""
+    """(G,) allowed depth of fingertips in each geom on the approach [m]; above 0 where contact is allowed."""
 
     @property
     def push(self) -> float:
@@ -359,7 +359,7 @@ def _add_actuators(spec: Any, hand: HandModel) -> None:
 def add_object(
     spec: Any, obj: ObjectModel, pieces: Sequence[Floats], friction: list[float], mass: float, name: str = "object"
 ) -> None:
-    """Add a free body of a mass [kg], frame at the centre of mass, from corners (V, 3) of each piece."""
+    """Add a free body of `mass` [kg] from corners (V, 3) of each piece; frame at the centre of mass."""
     body = spec.worldbody.add_body(name=name, pos=obj.centre_of_mass)
     body.add_freejoint(name=name)
     # By default MuJoCo would place the centre of mass at the body's position in its parent.
@@ -396,7 +396,7 @@ def blend(a: Posture, b: Posture, row: int, share: float) -> tuple[Floats, Float
 
 
 def _add_tendon(spec: Any, hand: HandModel, tendon: Tendon, name: str, leading: NDArray[np.int32]) -> None:
-    """Add one actuator on the sum of joints, which are not coupled in any other way."""
+    """Add one actuator on the weighted sum of a tendon's joints, which have no other coupling."""
     cord = spec.add_tendon(name=name)
     for d, pull in zip(tendon.dofs, tendon.coefficients, strict=True):
         cord.wrap_joint(f"joint{leading[d]}", pull)

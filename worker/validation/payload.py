@@ -1,17 +1,17 @@
 """Payload of grasps: heaviest mass that each grasp lifts or holds; shake test; limit and load capacity.
 
-The hand closes once around the object with its own mass. Then the mass is varied: the object hangs, or is pushed, until
-its motion decides. The search for the heaviest mass begins at the friction bound of the closed hand. Each test starts
-from the final state of the heaviest mass that passed.
+The hand closes once around the object at its own mass. Then the mass is varied: the object hangs, or is pushed, until
+its motion decides. The search begins near the mass that the contact forces of the closed hand bear. Each hanging test
+starts from the final state of the heaviest mass that passed, each push from the closed hand.
 
 The shake moves a lifted object to and fro, first along x of the scene, then along y. In the simulation the hand is at
 rest and the inertial force of the motion acts on the object. Accelerations begin at zero; the constant velocity that
 this adds to the hand has no effect (Galilean invariance).
 
-Load capacity: the heaviest object that contact forces could bear within actuator limits and friction. Each grasp has
-one linear program. Contact forces inside friction pyramids balance the weight and all torques about the centre of mass,
-and no drive exceeds its effort. The result is an upper bound: it may contain forces that no controller can exert, and
-its pyramids enclose the cones. Forces against the palm, across joints, or towards a joint's stop cost no effort."""
+Load capacity: the heaviest object that contact forces could bear within actuator limits and friction. Each direction of
+the weight has one linear program. Contact forces inside friction pyramids balance the weight and all torques about the
+centre of mass, and no drive exceeds its effort. The result is an upper bound: maybe no controller can exert the forces,
+and pyramids enclose the cones. Forces on the palm, along joint axes, or towards a joint's stop cost no effort."""
 
 from __future__ import annotations
 
@@ -43,9 +43,9 @@ from graspd.worker.validation.model import Scene, scene_of
 from graspd.worker.validation.prescreening import HANGING_CLOSING, LIFTING, FixedRootScene
 from graspd.worker.validation.protocol import DIRECTIONS, LOST, Outcome, Test
 
-#: Resolution of payloads, as a ratio; payloads are rounded down.
+#: Ratio of upper to lower bound at which the search ends; the payload is the lower bound.
 TOLD: Final = 1.03
-#: First mass as a share of the friction bound (median over the grasps of `benchmarks.payload`), and first step.
+#: First mass as a share of `_bound` (median over the grasps of `benchmarks.payload`), and first ratio of masses.
 FIRST: Final = 0.75
 STEP: Final = math.sqrt(2)
 #: Largest number of stages of simulation per load.
@@ -180,13 +180,13 @@ def payloads(
     return measure_rows(len(grasps), held, make, lambda test, row: test.payload(grasps, row), run=run, name="payload")
 
 
-#: Fewest grasps that must lift a light object before their payload counts as the hand's limit; otherwise the grasps'
-#: shape may be the cause. The light object has the default mass, or the second value's share of the wanted mass.
+#: Fewest grasps that must lift a light object before their payload counts as the hand's limit; with fewer, the shape of
+#: the grasps may be the cause. The light object has the default mass, at most the share `LIGHT` of the wanted mass.
 LEAST: Final = 2
 LIGHT: Final = 1 / 8
-#: Number of grasps after which no more grasps are tested.
+#: Fewest tested grasps before a job gives up because the wanted mass is out of reach.
 ENOUGH: Final = 8
-#: Ratio of wanted mass to best payload from which on no more grasps are tested.
+#: Ratio of wanted mass to best payload above which the wanted mass is out of reach.
 HOPELESS: Final = 2.0
 
 
@@ -200,7 +200,7 @@ class Limit:
     lifts_kg: float
     """Largest payload of the grasps, from simulated lifts."""
     bound_kg: float
-    """Largest load capacity of a grasp (`worker.validation.payload`)."""
+    """Largest load capacity of the grasps, at least `lifts_kg`."""
     wanted_kg: float | None = None
 
     @property
@@ -229,8 +229,8 @@ def limit_of(
     least: int = LEAST,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Limit | None:
-    """Return the payload limit of N grasps. None: a grasp lifts the `wanted` mass [kg], or fewer than `least` grasps
-    lift a light object."""
+    """Return the payload limit of N grasps.
+    None: a grasp lifts the `wanted` mass [kg], or fewer than `least` grasps lift a light object."""
     if len(grasps) < least:
         return None
     light = obj.with_mass(mass=MASS_KG if wanted is None else min(MASS_KG, LIGHT * wanted))
@@ -247,7 +247,7 @@ def limit_of(
     return Limit(hand.name, obj.friction, len(grasps), lifts, max(bound, lifts), wanted)
 
 
-#: Amplitude [m], frequency [Hz] and periods along each axis: at most 7.1 m/s2.
+#: Amplitude [m], frequency [Hz] and number of periods along each axis; the acceleration is at most 7.1 m/s2.
 AMPLITUDE_M: Final = 0.02
 FREQUENCY_HZ: Final = 3.0
 PERIODS: Final = 3
@@ -298,12 +298,12 @@ def shake_margins(
 
 
 _POINTS: Final = 600
-#: Hand points within this distance may make contact while the hand closes [m]; at most so many, widely spread.
+#: Hand points within this distance of the object count as contacts [m]; at most `MOST` are used, widely spread.
 WITHIN_M: Final = 0.01
 MOST: Final = 32
 #: A joint closer to its limit than this share of its range rests on its stop.
 AT_STOP: Final = 0.02
-#: Result of `linprog`.
+#: Status of `linprog` for an unbounded problem.
 _UNBOUNDED: Final = 3
 
 
@@ -324,7 +324,7 @@ def capacities(hand: HandModel, obj: ObjectModel, grasp: Posture, against: Float
         forces = cone_edges(-found.normal[row, chosen], obj.friction / math.cos(math.pi / EDGES))
         torques = generalized_forces(hand, found.bodies[row], probe.points.body[chosen], points, -forces)
         moments = cross((points - obj.centre_of_mass)[:, None] / obj.radius, forces)
-        # Limits of contacts' effort on each dof, up then down; unlimited at a stop.
+        # Torque limits of each dof, for its positive and then its negative direction; unlimited at a stop.
         near, rest = AT_STOP * hand.span, q[row]
         bounds = (np.where(stop, np.inf, hand.effort) for stop in (rest > hand.upper - near, rest < hand.lower + near))
         efforts = np.concatenate([*bounds])
@@ -337,7 +337,7 @@ def capacities(hand: HandModel, obj: ObjectModel, grasp: Posture, against: Float
 
 
 def _largest_load(forces: Floats, moments: Floats, torques: Floats, efforts: Floats, along: Floats) -> float:
-    """Return the largest weight [N] balanced by pyramid edges: forces, moments (E, 3), torques (E, D)."""
+    """Return the largest weight [N] that edges with forces and moments (E, 3) and torques (E, D) balance."""
     from scipy.optimize import linprog
 
     count = len(forces)

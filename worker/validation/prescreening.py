@@ -3,9 +3,8 @@
 The hand closes and squeezes around the object in a fraction of the time of the full test. In a scene the support is
 then removed, and most of the object's weight pulls for a moment. A free object is pushed towards the corners of a
 tetrahedron, with nearly twice its weight. Friction is halved in these tests. Objects that slip are tested once more
-from the same closed hand at full friction; in a scene the pull is then a third above the weight. The result is not a
-verdict: it ranks candidates at a fifth of a verdict's cost, and the full test still validates the selected ones.
-"""
+from the same closed hand at full friction; in a scene the pull is then 30 % above the weight. The result is not a
+verdict: it ranks candidates at a fifth of a verdict's cost, and the full test still validates the selected ones."""
 
 from __future__ import annotations
 
@@ -33,7 +32,7 @@ T = TypeVar("T")
 #: The root is fixed, because the protocol's compliant root costs twice as much. MuJoCo's iterations against slip are
 #: off: in so short a time they make no difference.
 PHYSICS: Final = MujocoOptions(timestep=0.006, root="fixed", noslip_iterations=0)
-#: The same for a lift: with coarser contacts the object creeps under its own weight.
+#: Physics of lifts: with coarser contacts the object creeps under its own weight.
 LIFTING: Final = MujocoOptions(root="fixed")
 #: Number of stages of closing and of squeezing; number of stages of hanging.
 CLOSING: Final = 2
@@ -44,9 +43,9 @@ PUSHED: Final = 2
 #: Pulls in object weights: hanging at half friction, hanging at full friction, and push. Rejecting a good candidate
 #: costs more than accepting one that fails the full test. Of 32 Allegro candidates that lift at half friction, 1.3
 #: weights reject 19, the present value 9. Of 63 that hold a free object at half friction, 2 weights and two stages of
-#: closing rejected 14, the present values 9. An object that is not held must be lost when a push ends. At full friction
-#: the pull exceeds the weight: 10 of 25 candidates that lift .8 of it fail another lift test, but 3 of 21 that lift
-#: 1.3.
+#: closing rejected 14, the present values 9. A push must be strong enough to move an object that is not held. At full
+#: friction the pull exceeds the weight: of 25 candidates that lift .8 weights, 10 fail another lift test; of 21 that
+#: lift 1.3 weights, 3 fail it.
 HANGS: Final = 0.8
 HANGS_WHOLE: Final = 1.3
 PULL: Final = 1.8
@@ -74,8 +73,8 @@ class LiftRollout(Lift):
         self._half, self._whole = scenes
 
     def score(self, grasps: GraspSet, row: int, beat: float = np.inf) -> float:
-        """Return the ratio of motion to its limit after hanging at half friction; below 1: lifted. If it is not below
-        1, return the same at full friction plus `SLIPS`, or `beat` if `beat` is below 1 + `SLIPS`."""
+        """Return the ratio of motion to its limit after hanging at half friction; below 1: lifted.
+        Otherwise return the ratio at full friction plus `SLIPS`, or `beat` if `beat` is below 1 + `SLIPS`."""
         self.scene = self._half
         if self._begin(grasps, row).outcome is not LiftOutcome.NOT_TRIED:
             return DEEP
@@ -92,8 +91,8 @@ class LiftRollout(Lift):
         return SLIPS + self._hang_score(HANGS_WHOLE)
 
     def _hang_score(self, weights: float, enough: float = GONE) -> float:
-        """Return the ratio of motion to its limit, extrapolated to `HOLD_S` after support removal. As soon as the
-        present value reaches `enough`, return it without extrapolation."""
+        """Return the ratio of motion to its limit, extrapolated to `HOLD_S` after removal of the supports.
+        As soon as the present ratio reaches `enough`, return it without extrapolation."""
         self.data.mocap_pos[1] = self._scene_pose[:3] - AWAY_M * self._up
         self.data.xfrc_applied[self.scene.object_body, :3] = -weights * self.scene.push * self._up
         return self._extrapolate(HANGING, enough)
@@ -108,8 +107,8 @@ class PushRollout(Test):
 
     def score(self, grasps: GraspSet, row: int, beat: float = np.inf) -> float:
         """Return the largest ratio of motion to its limit in pushes at half friction; below 1: held.
-        If it is not below 1, return the same at full friction plus `SLIPS`.
-        Return inf as soon as the score cannot improve on `beat`; below 1 + `SLIPS`, only half friction could."""
+        Otherwise return the ratio at full friction plus `SLIPS`.
+        Return inf as soon as the score cannot be below `beat`; if `beat` is below 1 + `SLIPS`, skip full friction."""
         self.scene = self._half
         if self._start(grasps, row).outcomes[0] is Outcome.PENETRATION:
             return DEEP
@@ -149,9 +148,9 @@ class ShortTests:
         self._lock = threading.Lock()
 
     def scores(self, grasps: GraspSet, placed: PlacedGrasps | None, beat: Floats | None = None) -> Floats:
-        """Return scores (N,) of grasps, see `worker.planners.Rollout`: by pushes if free, else by lifts.
-        Scores are below 1 for grasps that hold at half the friction, and below 2 at full friction. Each call uses
-        `threads`; planners on the CPU already call from all their threads."""
+        """Return scores (N,) of grasps (`worker.planners.Rollout`): from lifts in `placed`, else from pushes.
+        Scores are below 1 for grasps that hold at half friction, and below 2 for grasps that hold at full friction.
+        Each call uses `threads`; planners on the CPU already call from all their threads."""
         with self._lock:
             if self._scenes is None:
                 around = (placed.supports, placed.neighbours) if placed is not None else ()
@@ -175,16 +174,16 @@ class ShortTests:
 HANGING_CLOSING: Final = 4
 #: Pull on a hanging object, in weights: mean over the accelerating part of a smooth rise (`lift.SMOOTHLY`).
 RISING: Final = 1.06
-#: Duration of a load change, in steps [s]; a sudden change would act like up to twice the load.
+#: Duration of a load change [s], and number of its steps; a sudden change would act like up to twice the load.
 LOADING_S: Final = 0.04
 LOADS: Final = 5
 
 
 class FixedRootScene(Lift):
-    """A scene with a fixed root. Not thread-safe."""
+    """Tests in a scene with a fixed root: the hand closes, and the object hangs. Not thread-safe."""
 
     def _closed(self, grasps: GraspSet, row: int) -> bool:
-        """Close the hand around the object; return whether it holds on to it."""
+        """Close the hand around the object; return whether the object stays in the hand."""
         if self._begin(grasps, row).outcome is not LiftOutcome.NOT_TRIED:
             return False
         return self._close(grasps, row, give_up=True, stages=HANGING_CLOSING) and not is_invalid(self.data)

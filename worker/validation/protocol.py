@@ -34,14 +34,14 @@ DEXGRASPBENCH_INTERVAL_S: Final = 0.2
 #: Sequential test: time of the first check, and interval [s]. Earlier checks miss slow creep under a weak squeeze.
 FIRST_LOOK_S: Final = 0.08
 INTERVAL_S: Final = 0.04
-#: A push ends once motion at `AHEAD` times the present rate stays inside this share of the limits until 2 s. The rule
-#: was tested on 502 grasps of three hands, of which 76 are lost within 2 s: it accepts 2 lost ones. A rule with the
-#: plain rate and half of the limits accepts as many, but simulates 1.7 times as long.
+#: A push ends once motion at `AHEAD` times the present rate would stay inside this share of the limits until 2 s. The
+#: rule was tested on 502 grasps of three hands, of which 76 are lost within 2 s: it accepts 2 of these. A rule with the
+#: present rate and half of the limits accepts as many, but simulates 1.7 times as long.
 SURE: Final = 0.8
 AHEAD: Final = 2.0
 #: Share of the limits for extrapolated motion in a short test; below it the object counts as still.
 STILL: Final = 0.5
-#: Ratio to the limit of a state that is not finite.
+#: Ratio of motion to its limit that stands for a state with numbers that are not finite.
 LOST: Final = 10.0
 #: Rotation during closing or rising above which the object is lost [rad]; no passing grasp reached half of it.
 LOST_ROTATION: Final = math.radians(30.0)
@@ -203,8 +203,7 @@ class Test:
         self.data.xfrc_applied[self.scene.object_body, :3] = self.scene.push * np.array(DIRECTIONS[direction])
 
     def _hold(self, rollout: Rollout) -> Outcome:
-        """Sequential test: reject if a limit is exceeded; accept if faster motion until 2 s would stay inside the
-        limit."""
+        """Simulate a push: reject once a limit is exceeded, accept once faster motion would stay below it."""
         elapsed = FIRST_LOOK_S - INTERVAL_S
         self._run(elapsed)
         before, turned_before = self._offset(), self._motion()[1]

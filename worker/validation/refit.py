@@ -59,7 +59,7 @@ def fits_of(hand: HandModel) -> frozenset[Fit]:
 
 def offset_piece(piece: ConvexPiece, by_m: float) -> ConvexPiece:
     """Return a piece with its surface offset by `by_m` [m] along all face normals (negative: inwards).
-    Boxes and cylinders keep their edges; capsules and spheres are exact. Corners of a hull are cut at the offset
+    Boxes and cylinders keep their edges; capsules and spheres are offset exactly. Corners of a hull are cut at the
     surface of the Minkowski sum with a ball. A piece too thin to shrink by this much keeps half of its thickness."""
     if piece.kind == "hull":
         vertices, faces = hull(_offset(piece.vertices, by_m))
@@ -145,9 +145,9 @@ def _primitive_like(piece: ConvexPiece, kind: str) -> ConvexPiece:
 
 def _capsule(solid: float, across: float) -> tuple[float, float]:
     """Return radius and length of a capsule of a volume [m^3] and a variance across its axis [m^2].
-    The variance is at least the sphere's. A cylinder's variance is r^2 / 4, a ball's r^2 / 5. A capsule's variance is
-    r^2 (1 / 4 - s / 20), where s is the caps' share of the volume. The solution iterates: s grows with r^3 and has
-    little effect on r."""
+    A variance above that of a ball gives nearly a ball. A cylinder's variance is r^2 / 4, a ball's r^2 / 5. A capsule's
+    variance is r^2 (1 / 4 - s / 20), where s is the caps' share of the volume. The solution iterates: s grows with r^3
+    and has little effect on r."""
     radius = 2 * math.sqrt(across)
     for _ in range(20):
         caps = min(1.0, 4 / 3 * math.pi * radius**3 / solid)

@@ -100,14 +100,14 @@ def robust(
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Robustness:
     """Validate grasps in models around the nominal one, by six pushes at level standard or by lifts.
-    Raises InputError: no scene or approach of each grasp. MeshError: the object has no usable convex pieces.
+    Raises InputError: a grasp has no scene or approach. MeshError: the object has no usable convex pieces.
 
     Args:
         held: (N,) verdicts of the nominal model; only grasps with 1 are tested. By default all.
-        placed: their scenes, for the lift test; None: six pushes.
-        wanted: share of models in which a grasp must hold; its validation ends once that is decided. 0: validate all.
-        seed: of the models, with the grasp's own numbers.
-        hard: at the hard protocol's friction.
+        placed: the grasps' scenes, for the lift test; None: six pushes.
+        wanted: share of models in which a grasp must hold; a grasp's tests end once this is decided. 0: test in all.
+        seed: seed of the models, together with the grasp's own numbers.
+        hard: sliding friction halved, torsional friction a tenth.
         pieces: convex pieces of the object; by default its CoACD pieces.
         run: receives the number of finished grasps; polled for cancellation between models."""
     if placed is not None:

@@ -49,7 +49,7 @@ class Verdicts:
     hard: bool
     pieces: int
     volume_ratio: float
-    """Ratio of the volume of the object's convex pieces to its own."""
+    """Ratio of the volume of the convex pieces to the object's volume."""
     excess_m: float
     """Mean height of the pieces above the object's surface [m]."""
     terms: str
@@ -90,8 +90,8 @@ def validate(
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Verdicts:
     """Validate grasps by DexGraspBench's force-closure protocol; levels: see `worker.validation.protocol`.
-    MuJoCo releases the GIL while it steps, so threads use a few cores; for many cores `run` has a process pool. If
-    `run` has a prefilter, it decides the clear cases, see `worker.validation.prefilter.prefilter`. Raises InputError:
+    MuJoCo releases the GIL while it steps, so threads can use a few cores; for many cores, `run` needs a process pool.
+    If `run` has a prefilter, it decides clear cases, see `worker.validation.prefilter.prefilter`. Raises InputError:
     unknown level. MeshError: the object has no usable convex pieces. TaskCancelled: `run.cancelled()` returned True.
 
     Args:
@@ -101,7 +101,7 @@ def validate(
         level: dexgraspbench, standard, or fast.
         hard: sliding friction halved, torsional friction a tenth.
         pieces: convex pieces of the object; by default its CoACD pieces.
-        known: finished CPU rollouts with the same terms, which are reused; new ones are added to it.
+        known: finished CPU rollouts with the same terms; they are reused, and new rollouts are added.
         prefilter: result of `prefiltered` on these grasps with the same terms; None: it is computed.
         run: receives the number of finished grasps; polled for cancellation between grasps."""
     if level not in LEVELS:
@@ -125,7 +125,7 @@ def validate(
     contradicted = first.contradicted(rollouts)
     if not first.is_trusted(contradicted):
         log.warning(
-            "%d of %d rechecked verdicts are contradicted: the CPU validates all", contradicted, len(first.rechecked)
+            "%d of %d rechecked verdicts are wrong: the CPU validates all grasps", contradicted, len(first.rechecked)
         )
         _run_tests(case, grasps, list(first.stands), rollouts, run)
     ordered = [rollouts[row] for row in range(len(grasps))]
@@ -153,7 +153,7 @@ def validate(
 def prefiltered(
     hand: HandModel, obj: ObjectModel, grasps: GraspSet, *, level: Level, pieces: ConvexPieces, run: ExecutionContext
 ) -> PrefilterVerdicts:
-    """Run the GPU prefilter for `validate` beforehand, in the thread that has the device."""
+    """Run the GPU prefilter for `validate` beforehand, in the thread that owns the device."""
     prefilter_terms = prefilter_key_terms(hand, level, run)
     terms = verdict_key(hand, obj, level, False, pieces=pieces, prefilter=prefilter_terms)
     case = _Case(hand, obj, pieces, "standard", False)

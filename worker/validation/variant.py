@@ -29,14 +29,14 @@ from graspd.worker.validation.refit import Fit, fits_of, refit_hand
 
 Vector = tuple[float, float, float]
 
-#: Range of each axis. Growth of shapes, negative for shrinking [m].
+#: Ranges of the axes. Growth or shrinkage of shapes [m].
 GROWTH_M: Final = 1e-3
-#: Factors of drive gains and of the object's mass.
+#: Largest factor on damping, gains, `ARMATURE`, `DRY_FRICTION` and the object's mass; the least is its inverse.
 FACTOR: Final = 2.0
 #: Armature [kg m^2] and dry friction [N m] of DexGraspBench's Shadow hand, which the protocol omits for other hands.
 ARMATURE: Final = 2e-4
 DRY_FRICTION: Final = 0.01
-#: Sliding friction over the nominal 0.6; the torsional coefficient scales with the same factor.
+#: Range of the factor on sliding and torsional friction: sliding friction 0.4 to 0.8 instead of the nominal 0.6.
 FRICTIONS: Final = (0.4 / 0.6, 0.8 / 0.6)
 CENTRE_M: Final = 5e-3
 SHIFT_M: Final = 2e-3
@@ -94,7 +94,7 @@ def couplings_of(hand: HandModel) -> tuple[Coupling, ...]:
 
 
 def first_axes(hand: HandModel, models: int, seed: tuple[int, ...]) -> list[Axis]:
-    """Return the axes of a grasp's first models: all axes of the hand in random order, then a repetition."""
+    """Return the axes of a grasp's first models: all axes in random order, then all in another order."""
     axes = axes_of(hand)
     rounds = range(-(-models // len(axes)))
     return [axes[i] for k in rounds for i in np.random.default_rng((*seed, k)).permutation(len(axes))][:models]
@@ -131,7 +131,7 @@ def draw(axis: Axis, hand: HandModel, rng: np.random.Generator) -> Variant:
             fingers = len(hand.fingertips)
             return Variant(lags=tuple((LATEST * rng.permutation(fingers) / (fingers - 1)).tolist()))
         case _:
-            raise ValueError("nothing varies along no axis")
+            raise ValueError("a variant needs an axis other than NONE")
 
 
 #: Variants of collision shapes.
@@ -196,7 +196,7 @@ def replace_coupling(hand: HandModel, coupling: Coupling) -> HandModel:
 
 
 def nearest(hand: HandModel, joints: Floats) -> Floats:
-    """Return the joint positions (N, J), feasible for a hand with fewer dofs, nearest to the given ones."""
+    """Return the nearest joint positions (N, J) that are feasible for a hand with fewer dofs."""
     dof, rate = hand.dof[hand.joint_body], hand.multiplier[hand.joint_body]
     drive = np.zeros((len(dof), hand.dofs))
     drive[np.arange(len(dof)), dof] = rate
@@ -206,7 +206,7 @@ def nearest(hand: HandModel, joints: Floats) -> Floats:
 #: Solver parameters of compliant couplings: MuJoCo's default, 2.5 times as slow as the protocol's, and softer.
 COMPLIANT_SOLREF: Final = (0.02, 1.0)
 COMPLIANT_SOLIMP: Final = (0.9, 0.95, 1e-3, 0.5, 2.0)
-#: Compiled parts of a variant: shapes, their growth, drives.
+#: Parts of a variant that need their own compiled model: shapes, their growth, couplings.
 _Build = tuple[Fit, float, Coupling]
 
 
@@ -239,8 +239,8 @@ class Models:
         self, grasps: GraspSet, row: int, placed: PlacedGrasps, variant: Variant, *, dexgraspbench: bool = False
     ) -> LiftTest:
         """Lift a grasp in a variant; for the nominal variant the result equals `validate_lifts` bit for bit.
-        `grasps` have their approach except at level dexgraspbench. `placed` has the scenes of all grasps, with the
-        supports and neighbours of these models. `dexgraspbench`: run the published test instead of the full one."""
+        `grasps` need an approach, except for `dexgraspbench`. `placed` has the scenes of all grasps, with the supports
+        and neighbours of these models. `dexgraspbench`: run the published test instead of the full one."""
         number = int(placed.index[row])
         variant = restrict_to_support(variant, placed.scenes[number].up)
         one, where = displaced_grasp(self.obj, grasps, row, variant), placed.take(slice(row, row + 1))

@@ -6,8 +6,7 @@ from collections.abc import Collection
 
 from sqlalchemy import ColumnElement, Connection, and_, case, or_, select
 
-from graspd.service.index.database import IndexPart, rows_in
-from graspd.service.index.project_scope import assets_in_scope, in_scope, nearest_asset, page_rows
+from graspd.service.index.database import IndexPart, assets_in_scope, in_scope, nearest_asset, page_rows, rows_in
 from graspd.service.index.tables import assets, object_sets
 from graspd.service.index.views import AssetView, ObjectSetView, Page
 from graspd.service.model.errors import SEARCHED, NotFoundError, available_names

@@ -8,8 +8,7 @@ from typing import Any, Final
 
 from sqlalchemy import ColumnElement, Connection, Float, case, cast, func, literal, select
 
-from graspd.service.index.database import IndexPart
-from graspd.service.index.project_scope import in_scope, page_rows
+from graspd.service.index.database import IndexPart, in_scope, page_rows
 from graspd.service.index.queries.jobs import SHARE_DONE, outcomes_of
 from graspd.service.index.tables import attempts, dataset_cells, dataset_snapshots, datasets, jobs, shards, tasks
 from graspd.service.index.views import CellView, DatasetView, Page, SnapshotView

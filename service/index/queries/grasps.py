@@ -35,8 +35,7 @@ from sqlalchemy import (
 )
 from sqlalchemy.sql.operators import in_op, is_
 
-from graspd.service.index.database import IndexPart, chunks
-from graspd.service.index.project_scope import decode, encode, page_size, shards_in_scope
+from graspd.service.index.database import IndexPart, chunks, decode, encode, page_size, shards_in_scope
 from graspd.service.index.tables import dataset_cells, grasps, jobs, shards, tagged, tasks
 from graspd.service.index.views import GraspView, Page
 from graspd.service.model.base import Model

@@ -8,8 +8,7 @@ from typing import Any, Final, Literal
 
 from sqlalchemy import Column, ColumnElement, Connection, Float, and_, case, cast, func, select
 
-from graspd.service.index.database import IndexPart
-from graspd.service.index.project_scope import in_scope, in_scope_by_job, page_rows, page_size, shards_in_scope
+from graspd.service.index.database import IndexPart, in_scope, in_scope_by_job, page_rows, page_size, shards_in_scope
 from graspd.service.index.tables import attempts, jobs, shards, tasks
 from graspd.service.index.views import AttemptView, JobView, Page, ShardView, StageProgress, TaskView
 from graspd.service.model.planning import ranges_of, sum_outcomes

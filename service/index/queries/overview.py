@@ -10,8 +10,7 @@ from typing import Any, Final
 
 from sqlalchemy import ColumnElement, Connection, Select, Table, case, func, select
 
-from graspd.service.index.database import Database, IndexPart
-from graspd.service.index.project_scope import in_scope, in_scope_by_job, page_size, shards_in_scope
+from graspd.service.index.database import Database, IndexPart, in_scope, in_scope_by_job, page_size, shards_in_scope
 from graspd.service.index.tables import attempts, damage, jobs, shards, spent, tasks, workers
 from graspd.service.index.views import FailureGroup, MatrixCell, Stats, UsageDay, WorkerView
 from graspd.service.model.clock import age_of

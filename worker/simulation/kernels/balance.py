@@ -9,7 +9,7 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
-#: Newton steps, and halvings of one, before a system counts as unsolved: 4 to 9 steps and no halving are usual.
+#: Largest number of Newton steps, and of halvings of one step: 4 to 9 steps and no halving are usual.
 STEPS = wp.constant(60)
 HALVINGS = wp.constant(30)
 
@@ -27,7 +27,7 @@ class Workspace:
 
 @wp.func
 def slope(matrix: wp.array3d(dtype=wp.float64), b: int, k: int, r: wp.array2d(dtype=wp.float64)):
-    """Return the product of column k of system b and a vector."""
+    """Return the product of column k of system b and the vector r[b]."""
     total = wp.float64(0.0)
     for i in range(matrix.shape[2]):
         total = total + matrix[b, k, i] * r[b, i]
@@ -98,8 +98,8 @@ def nonnegative(
     sound_out: wp.array(dtype=wp.int32),
 ):
     """Solve B systems, launched over B.
-    `matrix` (B, K, R) holds their columns, `count` (B,) the number of used ones. `x` is (B, K); `feasible` (B,) is 0
-    where the steps are not enough."""
+    `matrix` (B, K, R) holds their columns, `count` (B,) the number of used columns. `x` is (B, K); `sound` (B,) is 0
+    if `STEPS` are not enough."""
     b = wp.tid()
     work = work_inout
     rows = matrix_in.shape[2]

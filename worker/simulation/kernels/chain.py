@@ -19,7 +19,7 @@ class Chain:
     multiplier: wp.array(dtype=wp.float64)  # factor from the dof's value to the joint's value
     offset: wp.array(dtype=wp.float64)  # added to this product
     tip: wp.array(dtype=wp.int32)  # 1: a fingertip
-    first: wp.array(dtype=wp.int32)  # (L + 1,) features of a body
+    first: wp.array(dtype=wp.int32)  # (L + 1,) first feature of each body
     centre: wp.array(dtype=wp.vec3d)  # (F,) body frame
     about: wp.array(dtype=wp.vec3d)  # (F,) axis of a rim; zero: a ball
     radius: wp.array(dtype=wp.float64)
@@ -35,7 +35,7 @@ class Bodies:
 
 @wp.func
 def place_body(chain: Chain, bodies: Bodies, p: wp.int32, body: wp.int32, value: wp.float64):
-    """Compute the pose of a body from its parent's and its joint's value [rad or m]."""
+    """Compute the pose of a body from its parent's pose and the value of its joint [rad or m]."""
     turned = bodies.rotation[p, chain.parent[body]]
     place = bodies.position[p, chain.parent[body]] + wp.quat_rotate(turned, chain.origin_p[body])
     turned = turned * chain.origin_q[body]
@@ -54,7 +54,7 @@ def joint_value(chain: Chain, body: wp.int32, q: wp.float64):
 
 @wp.func
 def joint_axis(chain: Chain, bodies: Bodies, p: wp.int32, body: wp.int32):
-    """Return the axis of a body's joint in the frame of the poses, which its rotation does not change."""
+    """Return the axis of a body's joint in the frame of the poses; the joint's own motion keeps it."""
     return wp.quat_rotate(bodies.rotation[p, body], chain.axis[body])
 
 

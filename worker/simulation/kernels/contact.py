@@ -1,14 +1,14 @@
-"""One step of the object against the static hand, M times per grasp, and its gradient by distances.
+"""One step of the object against the static hand for M velocities per grasp, and its loss gradient.
 
 A simulation starts the object with velocity v_m; s0 = dt (v, omega) is its free motion. A hand point p has the distance
-rho and the outward object normal n. After the object's motion s = (x, theta) about its centre of mass, its gap is rho -
-j.s with j = (n, p x n). The violation is C = r - rho + j.s, where r is the dilation. Hand and object are in frictional
+rho and the outward object normal n. After the object's motion s = (x, theta) about its centre of mass, p has the gap
+rho - j.s with j = (n, p x n). The violation is C = r - rho + j.s with the dilation r. Hand and object are in frictional
 contact while C > 0 (paper, eq. 1 and section III-C). The loss of one simulation is (|x| + g |theta|) / |s0| with g the
 gyration radius; L_stable is the mean over m.
 
-Each kernel writes dL/drho. On active points it is the exact adjoint of the solve. On free points it is the leak: `leak`
-times the gradient on contact, fading with distance. `one_sided` selects only the leak that attracts the point to the
-object. With the paper's two-sided leak, opposite velocities cancel wherever nothing touches."""
+The result is dL/drho. On active points it is the adjoint of the solve with constant slip directions. On free points it
+is the leak: `leak` times the gradient on contact, fading with distance. `one_sided` selects only the leak that attracts
+the point to the object. With the paper's two-sided leak, opposite velocities cancel where nothing touches."""
 
 import warp as wp
 
@@ -37,12 +37,12 @@ class Physics:
     one_sided: wp.int32
     step: wp.float32  # |s0| of a moving simulation [m]
     radius: wp.float32  # no used point is farther from the centre of mass [m]
-    near_gap: wp.float32  # direct solver: contacts with a larger gap are not in the list of near ones [m]
+    near_gap: wp.float32  # direct solver: largest gap of contacts in the near list [m]
 
 
 @wp.func
 def row(n: wp.vec3, p: wp.vec3):
-    """Return (n, p x n), the derivative of the gap's closing along n by the object's motion."""
+    """Return (n, p x n): its product with the object's motion is the displacement of p along n."""
     t = wp.cross(p, n)
     return vec6(n[0], n[1], n[2], t[0], t[1], t[2])
 
@@ -55,7 +55,7 @@ def point_motion(s: vec6, p: wp.vec3):
 
 @wp.func
 def add_isotropic(a: mat66, c0: wp.float32, c1: wp.vec3, c2: wp.mat33):
-    """Add sum c (x + theta x p)^2 given the moments sum c, sum c p, sum c p p'."""
+    """Add the matrix of sum c |x + theta x p|^2 to `a`, from the moments sum c, sum c p, sum c p p'."""
     trace = c2[0, 0] + c2[1, 1] + c2[2, 2]
     cross = wp.skew(c1)
     for i in range(3):
@@ -119,7 +119,7 @@ def displacement_gradient(s: vec6, physics: Physics):
 
 @wp.func
 def free_gradient(pull: wp.float32, gap: wp.float32, physics: Physics):
-    """Return dL/drho of a free point at distance `gap` from the dilated surface, from that on contact."""
+    """Return dL/drho of a free point from `pull`, its value on contact, and `gap` to the dilated surface."""
     if physics.one_sided == 1 and pull < 0.0:
         return float(0.0)
     return physics.leak * pull * wp.exp(-gap / physics.leak_length)
@@ -137,7 +137,7 @@ def direct(
     end_out: wp.array2d(dtype=vec6),
     adjoint_out: wp.array2d(dtype=vec6),
 ):
-    """Solve order-independent compliant contact, in one 6 x 6 system. Launch over (B, M).
+    """Solve compliant contact as 6 x 6 systems, independent of the order of contacts. Launch over (B, M).
     Minimises 1/2 (s - s0)' M (s - s0) + k/2 sum w_i max(0, C_i)^2 with friction of at most mu k w_i C_i, by iteratively
     reweighted least squares. A sliding contact is a spring of stiffness k w_i mu C_i / |u_t|, a sticking one of k w_i.
     `near` (B, N) lists the contacts with a gap of at most `near_gap`: other contacts are ignored unless the object
@@ -253,8 +253,8 @@ def gauss_seidel(
     end_out: wp.array2d(dtype=vec6),
 ):
     """Take the paper's step: one sweep of position-based dynamics over the contacts (Deul 2016), in order.
-    Contact i moves the object by -M^-1 j C / w along the normal. Friction then moves the object against the slip of the
-    contact's point, by at most mu times this impulse. `states` (B, M, N) stores the object's motion before each contact
+    Contact i moves the object by -M^-1 j C / w along the normal. Friction then opposes the slip of the contact's point,
+    with an impulse of at most mu C / w. `states` (B, M, N) stores the object's motion before each contact
     for the reverse sweep. `passes_in` is ignored, since `states` has room for one sweep. Launch over (B, M)."""
     b, m = wp.tid()
     if hands_in.active[b] == 0:
@@ -331,8 +331,8 @@ def jacobi(
     end_out: wp.array2d(dtype=vec6),
 ):
     """Take averaged Jacobi passes, each with the mean correction of all active contacts, in any order.
-    `states` (B, M, >= passes) stores the motion before each pass. The summed (not averaged) form diverges with the
-    number of contacts. The adjoint takes the count of active contacts as constant. Launch over (B, M)."""
+    `states` (B, M, >= passes) stores the motion before each pass. Summed instead of averaged corrections diverge if
+    contacts are many. The adjoint takes the count of active contacts as constant. Launch over (B, M)."""
     b, m = wp.tid()
     if hands_in.active[b] == 0:
         return

@@ -4,13 +4,13 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
-#: Separations below this may be overlaps [m]: positions of some decimetres round by a tenth of it.
+#: Separations below this may be overlaps [m]: positions of some decimetres have rounding errors of a tenth of this.
 SLACK = wp.constant(wp.float32(1.0e-7))
 
 
 @wp.struct
 class Solids:
-    """Convex solids, each in the frame of its body: outward planes n x <= d, corners, and a box around it."""
+    """Convex solids, each in the frame of its body: outward planes n x <= d, corners, and a bounding box."""
 
     plane: wp.array(dtype=wp.vec4)
     first_plane: wp.array(dtype=wp.int32)

@@ -25,9 +25,9 @@ class Skin:
     corner_normal: wp.array(dtype=wp.vec3)  # (3 F,)
     low: wp.vec3  # box around the object
     high: wp.vec3
-    coarse: wp.array3d(dtype=wp.float32)  # distances at nodes, the first one at `low`; empty: not known
+    coarse: wp.array3d(dtype=wp.float32)  # distances at grid nodes, the first one at `low`; empty: no grid
     spacing: wp.float32
-    coarse_reach: wp.float32  # distances of `coarse` from here on are not exact [m]
+    coarse_reach: wp.float32  # larger distances in `coarse` are not exact [m]
 
 
 @wp.struct
@@ -41,7 +41,7 @@ class NearestPoint:
 
 @wp.func
 def coarse_distance(skin: Skin, p: wp.vec3):
-    """Return the distance at the node of the grid nearest to point p of the grid, and a bound on their separation."""
+    """Return the distance at the grid node nearest to p, and a bound on the separation of node and p."""
     at = (p - skin.low) / skin.spacing
     x = wp.min(int(at[0] + 0.5), skin.coarse.shape[0] - 1)
     y = wp.min(int(at[1] + 0.5), skin.coarse.shape[1] - 1)
@@ -119,7 +119,7 @@ def mesh_distance(
     closest_out: wp.array(dtype=wp.vec3),
     normal_out: wp.array(dtype=wp.vec3),
 ):
-    """Run `nearest` on points. Launch over them."""
+    """Run `nearest` on N points. Launch over N."""
     i = wp.tid()
     found = nearest(skin_in, point_in[i], reach_in)
     distance_out[i] = found.distance
@@ -137,7 +137,7 @@ def pieces_distance(
     distance_inout: wp.array2d(dtype=wp.float32),
 ):
     """Compute the least distance of S points to each of P pieces for B grasps, within `reach`.
-    Launch over (B, S); `distance_inout` (B, P) holds `reach` before."""
+    Launch over (B, S); before, `distance_inout` (B, P) must be filled with `reach`."""
     b, s = wp.tid()
     for piece in range(pieces_in.body.shape[0]):
         offset = point_in[s] - piece_p_in[b, piece]
@@ -156,7 +156,7 @@ def self_distance(
     point_in: wp.array2d(dtype=wp.vec3),
     depth_inout: wp.array2d(dtype=wp.float32),
 ):
-    """Compute the depth (B, L) of each body in others with counted contact, or of others in it.
+    """Compute the greatest depth (B, L) of each body in others, or of others in it, where contact counts.
     Launch over points (B, N)."""
     b, i = wp.tid()
     x = point_in[b, i]
@@ -178,12 +178,12 @@ class BodyPoints:
     first: wp.array(dtype=wp.int32)  # (L + 1,)
     position: wp.array(dtype=wp.vec3d)  # body frame
     middle: wp.array(dtype=wp.vec3d)  # (L,) centre of a ball around a body's points
-    extent: wp.array(dtype=wp.float32)  # (L,) its radius
+    extent: wp.array(dtype=wp.float32)  # (L,) radius of this ball
 
 
 @wp.func
 def placed_at(origin: wp.vec3d, place: wp.vec3d, turned: wp.quatd, point: wp.vec3d):
-    """Return a body's point [m] relative to `origin`, in the kernels' precision."""
+    """Return a body's point [m] relative to `origin`, in single precision."""
     x = place + wp.quat_rotate(turned, point) - origin
     return wp.vec3(wp.float32(x[0]), wp.float32(x[1]), wp.float32(x[2]))
 

@@ -1,8 +1,8 @@
 """Convex hulls in six dimensions, grown point by point (beneath-beyond), for wrench spaces.
 
-A facet is a simplex of 6 points with the 6 facets across its ridges: `neighbour[f, k]` shares all corners of f but
-`vertex[f, k]`. Its plane n x = d has an outward n. It is scaled: n x - d is 6! times the volume of the simplex of the
-facet and x, negative inside. A new point sees the facets whose plane it is above. They are removed, and every ridge
+A facet is a simplex of 6 points. It has 6 neighbours: `neighbour[f, k]` shares all corners of f but `vertex[f, k]`.
+Its plane n x = d has an outward n. The plane is scaled: n x - d is 6! times the volume of the simplex of the facet and
+x, negative inside. A new point sees a facet if it lies above the facet's plane. Seen facets are removed. Every ridge
 between a seen and an unseen facet spans a new facet with the point. The new plane is a positive combination of the two
 old planes (Grassmann and Pluecker: determinants of six points out of eight). No system of equations is solved and no
 root is computed."""
@@ -42,8 +42,8 @@ class Hull:
 @wp.func
 def climb(hull: Hull, start: int, x: vec6):
     """Return a facet that x is above, or -1 if x is inside; the hull contains the origin.
-    Scale all planes to 1 at the origin. The plane that x is highest above is a corner of the polar polytope where a
-    linear function is greatest. Ascending from neighbour to neighbour ends there, as the simplex method does."""
+    Planes are compared by n x / d. The plane with the largest value is the corner of the polar polytope at which a
+    linear function is greatest. An ascent from neighbour to neighbour ends there, as in the simplex method."""
     here = start
     best = wp.dot(hull.normal[here], x) / hull.offset[here]
     at = wp.int32(-1)
@@ -101,7 +101,7 @@ def connect_facet(hull: Hull, e: int, k: int, mark: wp.array(dtype=wp.int64), no
                 held = hull.holder[at]
                 other = held / 8
                 if held < 0:
-                    # A third facet at one ridge is never compensated, so the hull counts as failed.
+                    # A third facet at one ridge keeps `pending` above 0, so the hull counts as failed.
                     pending = pending + 1000000
                 else:
                     pending = pending - 1
@@ -165,7 +165,7 @@ def insert(
                 hull.fresh[born] = e
                 hull.side[born] = k
                 born = born + 1
-    # A table slightly larger than its content stays in the nearest cache.
+    # A table that is not much larger than its content stays in the processor's cache.
     size = wp.int32(1024)
     while size < 6 * born and size < hull.stamp.shape[0]:
         size = 2 * size
@@ -251,7 +251,7 @@ def grow_to_nearest(
     mark: wp.array(dtype=wp.int64),
     stamp: int,
 ):
-    """Grow the hull where it is nearest to the origin, until its nearest facet is the whole hull's.
+    """Grow the hull at its facet nearest to the origin, until no point is above this facet.
     Return the facet's distance, at most 0 for an outside origin, and 1 on failure. A facet with no point above it is a
     facet of the hull of all points. No facet of the built part is nearer, and the whole hull contains the part. So this
     distance is the whole hull's (Zheng, "An efficient algorithm for a grasp quality measure", IEEE T-RO 2013)."""
@@ -306,8 +306,8 @@ def measure_hulls(
     result_out: wp.array2d(dtype=wp.float64),
 ):
     """Build one hull after the other from 7 facets: facet i omits corner i and is next to all others.
-    Points are about a point inside the first simplex; distances are from `origin_in`. `result_out` has three numbers:
-    least distance of a facet, at most 0 for an outside origin; volume, nan where `whole_in` is 0; 1 if feasible."""
+    Points are relative to a point inside the first simplex; distances are from `origin_in`. `result_out` has the least
+    distance of a facet, at most 0 for an outside origin; the volume, nan where `whole_in` is 0; and 1 on success."""
     hull = hull_inout
     for h in range(count_in.shape[0]):
         for i in range(7):

@@ -1,5 +1,5 @@
-"""Jams of opening fingers, and the retreat of open hands. Fingers that would penetrate other fingers are held back;
-hands still in contact retreat."""
+"""Jams of opening fingers, and the retreat of open hands.
+Fingers that would penetrate other links are held back; hands that are still in contact retreat."""
 
 import warp as wp
 
@@ -17,7 +17,7 @@ class FingerJams:
     """Fingers held back where they would jam: B hands, F fingers."""
 
     going: wp.array(dtype=wp.int32)  # (B,)
-    share: wp.array2d(dtype=wp.float64)  # (B, F) share of the path of each finger
+    share: wp.array2d(dtype=wp.float64)  # (B, F) share of its path that each finger moves
     limit: wp.array2d(dtype=wp.float32)  # (B, F) allowed depth
     depth: wp.array2d(dtype=wp.float32)  # (B, F) greatest depth on the path
     blocked: wp.array2d(dtype=wp.int32)  # (B, F) 1: blocked by something else
@@ -45,7 +45,7 @@ def place_on_path(
     way_in: wp.float64,
     bodies_out: Bodies,
 ):
-    """Place bodies of hands at this share of their path. Launch over B."""
+    """Place bodies of hands at the share `way` of their paths. Launch over B."""
     b = wp.tid()
     if jams_in.going[b] == 0:
         return
@@ -108,7 +108,7 @@ def limit_depth(more_in: wp.float32, jams_inout: FingerJams):
 
 @wp.kernel
 def shorten_paths(less_in: wp.float64, jams_inout: FingerJams):
-    """Reduce the path of jammed fingers to a share `less`; finish hands without any. Reset depths. Over B."""
+    """Multiply the paths of jammed fingers by `less`; finish hands without jams. Reset depths. Over B."""
     b = wp.tid()
     if jams_inout.going[b] == 0:
         return
@@ -123,14 +123,14 @@ def shorten_paths(less_in: wp.float64, jams_inout: FingerJams):
 
 @wp.kernel
 def take_path(fingers_in: Fingers, hands_in: Hands, jams_in: FingerJams, open_inout: wp.array2d(dtype=wp.float64)):
-    """Write the dofs of fingers after jams are held back. Launch over (B, D)."""
+    """Write the dofs at the ends of the shortened paths. Launch over (B, D)."""
     b, d = wp.tid()
     open_inout[b, d] = hands_in.q[b, d] + path_displacement(fingers_in, hands_in, jams_in, open_inout, b, d)
 
 
 @wp.struct
 class Retreat:
-    """Retreat of B open hands along their palm's approach."""
+    """Retreat of B open hands against their palms' approach."""
 
     going: wp.array(dtype=wp.int32)  # (B,)
     clear: wp.array(dtype=wp.float32)

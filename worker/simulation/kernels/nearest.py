@@ -1,9 +1,9 @@
 """The closest point of a triangle mesh by lists: grid cells near the surface list their nearest faces.
 
 No tree is traversed. Let D be the distance of a cell's centre from the surface, and h half the cell's diagonal. The
-nearest face to a point of the cell is at most D + 2 h from the centre. Faces are sorted by this distance k. A point at
-e from the centre skips faces with k - e > its nearest distance so far. The sign is that of the angle-weighted normal of
-the feature with the closest point (Baerentzen & Aanaes 2005)."""
+nearest face to a point of the cell is at most D + 2 h from the centre. Faces are sorted by their distance k from the
+centre. A point at distance e from the centre skips faces with k - e above its least distance so far. The sign is that
+of the angle-weighted normal of the feature with the closest point (Baerentzen & Aanaes 2005)."""
 
 import warp as wp
 
@@ -149,7 +149,7 @@ def count_faces(
     radius_out: wp.array(dtype=wp.float32),
     count_out: wp.array(dtype=wp.int32),
 ):
-    """Count the faces to list per cell with a corner within `within`, and their range from its centre.
+    """Count the faces to list for each cell with a corner within `within`; store their largest distance.
     Launch over the cells, in the order of their index."""
     cell = wp.tid()
     place = cell_of(cell, wp.vec3i(field_in.shape[0] - 1, field_in.shape[1] - 1, field_in.shape[2] - 1))

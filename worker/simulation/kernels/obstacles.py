@@ -1,7 +1,7 @@
 """Hands against the obstacles of their scene: distances, penalties, residuals.
 
-The hand is represented by its features: corners of boxes and hulls, spheres and ends of capsules (balls), rims of
-cylinders. They are exact against half-spaces; for solids see `solids`."""
+The hand is represented by features: balls (corners of boxes and hulls, spheres, ends of capsules) and rims of
+cylinders. Their distances from half-spaces are exact; for solids see `solids`."""
 
 import warp as wp
 
@@ -11,7 +11,7 @@ from graspd.worker.simulation.kernels.wrenches import add_wrench
 
 wp.set_module_options({"enable_backward": False})
 
-#: Share of a start's clearance that fingertips keep from supports which they may approach.
+#: Share of `room` that fingertips keep from obstacles with a clearance of their own for fingertips (`tips`).
 TIP_ROOM = wp.constant(wp.float32(0.25))
 
 
@@ -25,13 +25,13 @@ class Features:
     radius: wp.array(dtype=wp.float32)
     margin: wp.array(dtype=wp.float32)  # clearance [m]; negative: it may penetrate
     tip: wp.array(dtype=wp.int32)  # 1: of a fingertip
-    first: wp.array(dtype=wp.int32)  # (P + 1,) features of a piece
+    first: wp.array(dtype=wp.int32)  # (P + 1,) first feature of each piece
     middle: wp.array(dtype=wp.vec3)  # (P,) centre of a ball around the features of a piece, body frame
-    extent: wp.array(dtype=wp.float32)  # (P,) its radius [m]
-    first_edge: wp.array(dtype=wp.int32)  # (P + 1,)
+    extent: wp.array(dtype=wp.float32)  # (P,) radius of this ball [m]
+    first_edge: wp.array(dtype=wp.int32)  # (P + 1,) first edge of each piece
     start: wp.array(dtype=wp.vec3)  # (E,) ends of an edge, body frame
     end: wp.array(dtype=wp.vec3)
-    thickness: wp.array(dtype=wp.float32)  # (E,) radius about it
+    thickness: wp.array(dtype=wp.float32)  # (E,) radius around the edge [m]
 
 
 @wp.struct
@@ -46,11 +46,11 @@ class Feature:
 
 @wp.struct
 class Obstacles:
-    """Convex obstacles of all scenes in sequence, unbounded ones first; scene number -1: no obstacles."""
+    """Convex obstacles, scene by scene, in each scene half-spaces first. Scene number -1: no obstacles."""
 
-    first: wp.array(dtype=wp.int32)  # (S + 1,)
-    first_solid: wp.array(dtype=wp.int32)  # (S,) first one with corners
-    first_plane: wp.array(dtype=wp.int32)  # (O + 1,)
+    first: wp.array(dtype=wp.int32)  # (S + 1,) first obstacle of each scene
+    first_solid: wp.array(dtype=wp.int32)  # (S,) first obstacle with corners
+    first_plane: wp.array(dtype=wp.int32)  # (O + 1,) first plane of each obstacle
     planes: wp.array(dtype=wp.vec4)  # outward unit normal and offset
     tips: wp.array(dtype=wp.float32)  # (O,) clearance of fingertips, if less than their margin [m]
     centre: wp.array(dtype=wp.vec3)  # (O,) bounding sphere
@@ -131,7 +131,7 @@ def is_near(
     body_p: wp.array2d(dtype=wp.vec3),
     body_q: wp.array2d(dtype=wp.quat),
 ):
-    """Check whether a piece's ball is closer to a half-space of its scene than its clearance plus `more`."""
+    """Check whether the ball around a piece is closer to a half-space than its clearance plus `more`."""
     if features.first[piece] == features.first[piece + 1]:
         return False
     i = features.first[piece]
@@ -156,8 +156,8 @@ def penalty(
     hands_inout: Hands,
     depth_inout: wp.array(dtype=wp.float32),
 ):
-    """Add the gradient of w sum w_i min(h_i - margin_i - room, 0)^2 of half-spaces; deepest shortfalls.
-    Launch over (B, P)."""
+    """Add the gradient of w sum min(h_i - margin_i - room, 0)^2 over features i and half-spaces.
+    Record the deepest shortfall. Launch over (B, P)."""
     b, piece = wp.tid()
     hands = hands_inout
     if hands.active[b] == 0 or hands.scene[b] < 0:

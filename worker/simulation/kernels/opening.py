@@ -1,6 +1,6 @@
-"""Opening of fingers around a grasp: direction, distance, and jams.
+"""Opening of the fingers of a grasp: directions, and the first step with enough clearance.
 
-Each finger is checked by itself, all hands at once; finished hands and fingers cost nothing more."""
+Fingers are checked one by one, all hands in parallel; finished hands and fingers are skipped."""
 
 import warp as wp
 
@@ -13,7 +13,7 @@ wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 @wp.struct
 class Fingers:
-    """Units that open as one: F fingers of a hand with L bodies and D dofs."""
+    """F fingers of a hand with L bodies and D dofs; each finger opens as a unit."""
 
     of_body: wp.array(dtype=wp.int32)  # (L,) -1: none
     of_dof: wp.array(dtype=wp.int32)  # (D,) -1: does not open
@@ -39,15 +39,15 @@ class Sweep:
     going: wp.array(dtype=wp.int32)  # (B,)
     direction: wp.array2d(dtype=wp.float64)  # (B, D)
     clear: wp.array2d(dtype=wp.float32)  # (B, F) distance at the present step, at most the wanted one
-    best: wp.array2d(dtype=wp.float32)  # (B, F) greatest so far
-    chosen: wp.array2d(dtype=wp.int32)  # (B, F) first step with that
+    best: wp.array2d(dtype=wp.float32)  # (B, F) greatest distance so far
+    chosen: wp.array2d(dtype=wp.int32)  # (B, F) first step with this distance
 
 
 @wp.func
 def opened(
     fingers: Fingers, hands: Hands, direction: wp.array2d(dtype=wp.float64), b: wp.int32, d: wp.int32, steps: wp.int32
 ):
-    """Return a dof after `steps` steps. A grasp slightly outside its limits must not jump."""
+    """Return a dof's value after `steps` steps, within limits that are widened to the grasp's own value."""
     q = hands.q[b, d]
     value = q + wp.float64(steps) * fingers.step[d] * direction[b, d]
     return wp.clamp(value, wp.min(fingers.lower[d], q), wp.max(fingers.upper[d], q))
@@ -62,7 +62,7 @@ def body_wrenches(
     force_out: wp.array2d(dtype=wp.vec3d),
     torque_out: wp.array2d(dtype=wp.vec3d),
 ):
-    """Compute forces on bodies (B, L) and torques about the origin, along the object's normals.
+    """Compute forces on bodies (B, L) along the object's normals, and their torques about the origin.
     A point's force is `reach` minus its distance, if positive. Launch over (B, L)."""
     b, body = wp.tid()
     force = wp.vec3d(wp.float64(0.0))
@@ -88,8 +88,8 @@ def opening_directions(
     away_out: wp.array2d(dtype=wp.float64),
     sweep_out: Sweep,
 ):
-    """Compute opening directions (B, D): a share `plain` against `closing`, the rest along the forces.
-    The fastest dof of a finger has 1. Start all hands. Launch over B."""
+    """Compute opening directions (B, D): a share `plain` of -`closing`, the rest along the forces.
+    The motion along the forces has speed 1 at each finger's fastest dof. Start all hands. Launch over B."""
     b = wp.tid()
     dofs = away_out.shape[1]
     for d in range(dofs):
@@ -134,7 +134,7 @@ def opening_directions(
 def open_against_closing(
     fingers_in: Fingers, stuck_in: wp.float32, first_in: Sweep, sweep_out: Sweep, step_out: wp.array(dtype=wp.int32)
 ):
-    """Restart hands with a finger that moved less than `stuck`, against `closing`. Launch over B."""
+    """Restart hands against `closing` if a finger has less clearance than `stuck`. Launch over B."""
     b = wp.tid()
     step_out[0] = 0
     sweep_out.going[b] = 0
@@ -195,8 +195,8 @@ def finger_clearance(
 
 @wp.kernel
 def measure_opening(wanted_in: wp.float32, step_in: wp.array(dtype=wp.int32), sweep_inout: Sweep):
-    """Select each finger's first clear step, or the step with the largest distance; stop hands with all fingers clear.
-    Over B."""
+    """Select each finger's first clear step, else the step with the largest distance.
+    Stop hands with all fingers clear. Launch over B."""
     b = wp.tid()
     if sweep_inout.going[b] == 0:
         return
@@ -220,14 +220,14 @@ def take_opening(
     plain_in: Sweep,
     open_out: wp.array2d(dtype=wp.float64),
 ):
-    """Write dofs (B, D) of each finger; they are plain if its clearance exceeds that of the first opening, or `stuck`.
-    Launch over (B, D)."""
+    """Write dofs (B, D) of the first opening, or of the restarted one if its finger has more clearance.
+    A clearance above `stuck` in the first opening counts as `stuck`. Launch over (B, D)."""
     b, d = wp.tid()
     open_out[b, d] = hands_in.q[b, d]
     finger = fingers_in.of_dof[d]
     if finger < 0:
         return
-    # A hand that was not restarted has no plain opening.
+    # `plain` is the restarted opening; its clearance is -1e9 for a hand that was not restarted.
     if plain_in.best[b, finger] > wp.min(first_in.best[b, finger], stuck_in):
         open_out[b, d] = opened(fingers_in, hands_in, plain_in.direction, b, d, plain_in.chosen[b, finger])
     else:

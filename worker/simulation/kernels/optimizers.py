@@ -1,4 +1,4 @@
-"""One optimiser step per grasp; the root turns about the palm centre by exp of a world rotation."""
+"""One optimiser step per grasp; the root turns about the palm centre by a world rotation vector."""
 
 import warp as wp
 
@@ -30,7 +30,7 @@ def descend(
     second_inout: wp.array2d(dtype=wp.float32),
     hands_inout: Hands,
 ):
-    """Take a step of Adam (Kingma & Ba 2015), or where `adam` is 0 of the paper's plain gradient descent.
+    """Take a step of Adam (Kingma & Ba 2015), or if `adam` is 0 of gradient descent, as in the paper.
     Rates: translation, rotation, every dof. With `clamp` 1, dofs stay inside their limits. Launch over B."""
     b = wp.tid()
     if hands_inout.active[b] == 0:
@@ -66,7 +66,7 @@ def descend(
 
 @wp.kernel
 def advance(iteration_inout: wp.array(dtype=wp.int32)):
-    """Count an iteration on the device, where schedules are read, so that a captured graph can be replayed. Over 1."""
+    """Increase the iteration counter on the device, so that a captured graph can be replayed. Over 1."""
     iteration_inout[0] = iteration_inout[0] + 1
 
 
@@ -80,7 +80,7 @@ def converge(
     active_inout: wp.array(dtype=wp.int32),
 ):
     """Switch off a grasp whose merit has not improved by 1 % for `patience` iterations. Launch over B.
-    The merit is L_stable plus the penetration depths in millimetres, without the changing weights of a schedule."""
+    The merit is L_stable plus the sum of penetration depths [mm], without the changing weights of a schedule."""
     b = wp.tid()
     if active_inout[b] == 0:
         return

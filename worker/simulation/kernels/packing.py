@@ -27,7 +27,7 @@ class Contacts:
     gradient: wp.array2d(dtype=wp.float32)  # dL/d distance
     near_count: wp.array(dtype=wp.int32)
     near: wp.array2d(dtype=wp.int32)  # indices of contacts that the object may reach in its step
-    mark: wp.array2d(dtype=wp.int32)  # of contacts at their points' indices, not packed; else empty
+    mark: wp.array2d(dtype=wp.int32)  # mark of each point if contacts are not packed yet; else empty
 
 
 @wp.kernel
@@ -37,7 +37,7 @@ def count_marks(
     kept_out: wp.array2d(dtype=wp.int32),
     near_out: wp.array2d(dtype=wp.int32),
 ):
-    """Count contacts, and near ones, of every `CHUNK` points of a hand. Launch over (B, N / CHUNK)."""
+    """Count contacts and near contacts among every `CHUNK` points of a hand. Launch over (B, N / CHUNK)."""
     b, chunk = wp.tid()
     if active_in[b] == 0:
         return

@@ -19,7 +19,7 @@ def points_to_bodies(
     hands_inout: Hands,
     depth_inout: wp.array(dtype=wp.float32),
 ):
-    """Compute the wrench gradient on bodies from dL/drho, penetration and attraction term. Launch over (B, N / lane).
+    """Add wrench gradients on bodies from dL/drho, penetration and attraction. Launch over (B, N / lane).
     Penetration: w sum w_i min(rho, 0)^2. Attraction: -2 w d l sum w_i exp(-rho / l) of points outside, with d = `pull`
     and l = `pull_length` [m]. The distance grows along the object's outward normal (normals are taken as constant)."""
     b, part = wp.tid()
@@ -78,7 +78,7 @@ def near_share(
 
 @wp.kernel
 def attract(pull_in: wp.float32, length_in: wp.float32, hands_in: Hands, contacts_inout: Contacts):
-    """Attract free points to the object, fading with distance: the control without simulation. Launch over (B, N)."""
+    """Attract free points to the object by a force that fades with distance. Launch over (B, N)."""
     b, i = wp.tid()
     if hands_in.active[b] == 0 or i >= contacts_inout.count[b]:
         return

@@ -1,5 +1,5 @@
 """Signed distance to the hand's convex pieces, and its penalties: object in links, links in links.
-Thin parts of an object pass between hand points; they do not pass between the pieces' faces."""
+A thin part of an object may pass unseen between hand points, but not through a piece."""
 
 import warp as wp
 
@@ -162,14 +162,14 @@ def cells_around(samples: Samples, p: wp.vec3, extent: wp.vec3):
 
 @wp.func
 def samples_of(samples: Samples, i: wp.int32, j: wp.int32, first: wp.int32, last: wp.int32):
-    """Return the first sample in a run of cells along z, and the first behind it."""
+    """Return the first sample in a run of cells along z, and the first sample after the run."""
     row = (i * samples.shape[1] + j) * samples.shape[2]
     return wp.vec2i(samples.first[row + first], samples.first[row + last + 1])
 
 
 @wp.func
 def clip_depth(pieces: Pieces, piece: wp.int32, x: wp.vec3, above: wp.float32):
-    """Return `piece_distance`, or any distance larger than `above` where it is larger."""
+    """Return `piece_distance`; if it exceeds `above`, the result may be any distance that does."""
     if pieces.kind[piece] != HULL:
         return piece_distance(pieces, piece, x)
     d = float(-1.0e9)
@@ -195,8 +195,8 @@ def object_in_pieces(
     hands_inout: Hands,
     depth_inout: wp.array(dtype=wp.float32),
 ):
-    """Add the gradient of w sum depth^2 over object samples in a piece; deepest per grasp. Over (B, P).
-    Moving the body by +n deepens a sample nearest to the face with outward normal n: its gradient is 2 w depth n."""
+    """Add the gradient of w sum depth^2 over object samples in a piece; record the deepest. Over (B, P).
+    A motion of the body along n deepens samples below the face with outward normal n: the gradient is 2 w depth n."""
     b, piece = wp.tid()
     if hands_inout.active[b] == 0:
         return
@@ -258,7 +258,7 @@ def may_touch(
     body_p: wp.array2d(dtype=wp.vec3),
     body_q: wp.array2d(dtype=wp.quat),
 ):
-    """Check whether body `own` has points within `reach` of a counted piece's centre of body `other`."""
+    """Check whether points of body `own` may be within `reach` of a piece of `other` with this `centre`."""
     if pieces.apart[own, other] == 0 or points.first[own] == points.first[own + 1]:
         return False
     offset = body_p[b, own] - centre

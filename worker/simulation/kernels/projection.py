@@ -1,8 +1,8 @@
 """Gauss-Newton projection out of penetration: residuals of clearances, rows, normal equations.
 
-A residual is w (d - target) with a signed distance d. Its row is the derivative of d by (root translation, root
-rotation about the pivot, dofs). Distances are hand point to object (normal n of the object), object sample to link, and
-point of a link to another link."""
+A residual is d - target with weight w and a signed distance d. Its row is the derivative of d by (root translation,
+root rotation about the pivot, dofs). Distances are of hand points from the object, of object samples from links, and of
+points of a link from other links."""
 
 import warp as wp
 
@@ -24,7 +24,7 @@ from graspd.worker.simulation.kernels.pieces import (
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
-#: Terms of the normal equations are summed as integers of this unit, 2^-44: rows are of order one and shorter.
+#: Terms of the normal equations are summed as integers in units of 2^-44: entries of rows are at most of order one.
 FIXED = wp.constant(2.0**44)
 
 
@@ -252,9 +252,8 @@ def keep_best(
     best_inout: States,
     depth_inout: wp.array(dtype=wp.float64),
 ):
-    """Store hands with the least penetration so far, by more than `better` [m]; finish hands without any. Reset
-    residuals.
-    Launch over B."""
+    """Store states whose penetration is the least so far by more than `better` [m]. Launch over B.
+    Finish hands whose least penetration is at most `better`. Reset residuals."""
     b = wp.tid()
     if active_inout[b] == 0:
         return
@@ -287,8 +286,8 @@ def step(
     hands_inout: Hands,
 ):
     """Take a damped Gauss-Newton step, at most `longest` in units of `scale` (n,). Launch over B.
-    (S H S + d I) x = -S g by Cholesky, motion S x; d is `damping` times the number of residuals. The equations are
-    reset."""
+    Solve (S H S + d I) x = -S g by Cholesky and move by S x; d is `damping` times the number of residuals. Reset the
+    equations."""
     b = wp.tid()
     if hands_inout.active[b] == 0:
         return

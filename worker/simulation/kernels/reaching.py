@@ -1,7 +1,7 @@
-"""Random hands with an object between opposed fingers, drawn until one is clear in a grid of distances.
+"""Random hand poses with the object between opposed fingers, drawn until one is clear of the object.
 
 One thread draws for one start. A draw's numbers follow from the start's seed and the draw's number, not from other
-draws. Hands are tested as balls."""
+draws. Hands are tested as sets of balls in the object's distance grid."""
 
 import warp as wp
 
@@ -14,7 +14,7 @@ WAYS = wp.constant(4)  # random directions, of which the one most perpendicular 
 
 @wp.struct
 class Grips:
-    """P pairs of places of an object, about its centre of mass, and K opposed postures, about the palm."""
+    """P pairs of places on an object (origin: centre of mass), and K opposed postures (origin: palm)."""
 
     middle: wp.array(dtype=wp.vec3)  # (P,)
     axis: wp.array(dtype=wp.vec3)  # (P,) unit
@@ -26,7 +26,7 @@ class Grips:
     opened: wp.array(dtype=wp.float32)  # (K,) width between the pads, ascending
     balls: wp.array2d(dtype=wp.vec3)  # (K, S) centres of balls in the hand
     radius: wp.float32
-    deep: wp.float32  # share of the way from pads to palm by which the pair may be nearer to the palm
+    deep: wp.float32  # largest shift of the pair from the pads to the palm, as a share of their distance
     palm: wp.vec3  # unit, direction that the palm faces
     noise: wp.array(dtype=wp.float32)  # (D,) standard deviation of dofs
     lower: wp.array(dtype=wp.float32)
@@ -76,7 +76,7 @@ def drawn(
     retreats: wp.array(dtype=wp.float32),
     state: wp.uint32,
 ):
-    """Draw a hand around a pair of places, at the nearest clear distance."""
+    """Draw a hand around a pair of places, at the first clear one of the `retreats`."""
     out = HandSample()
     pair = wp.min(first_above(grips.sums, wp.randf(state)), grips.sums.shape[0] - 1)
     line = grips.axis[pair]
@@ -128,7 +128,7 @@ def reach(
     rotation_out: wp.array(dtype=wp.quat),
     q_out: wp.array2d(dtype=wp.float32),
 ):
-    """Find the first clear draw of each start from number `first` on, and its number; -1: none of `draws`.
+    """Find each start's first clear draw with a number from `first` to below `draws`; number -1: none.
     Launch over B."""
     b = wp.tid()
     number_out[b] = -1
@@ -139,7 +139,7 @@ def reach(
             number_out[b] = k
             pivot_out[b] = found.pivot
             rotation_out[b] = found.rotation
-            # A sequence different from the draw's own, whose state belongs to the draw.
+            # This random sequence differs from the draw's.
             noise = wp.rand_init(seed_in[b] + 1, draws_in + k)
             for d in range(q_out.shape[1]):
                 q = grips_in.posture[found.posture, d] + grips_in.noise[d] * wp.randn(noise)

@@ -2,9 +2,9 @@
 
 The nearest points of two separate convex bodies lie on a corner and a face or on two edges. If they overlap, a corner
 or an edge of one is in the other. The tests therefore compare the link's features and edges with the obstacle, and the
-obstacle's edges with the link. Along a straight edge the signed distance from a convex body is a convex function. Its
-least value is found between two tangents below it: their intersection is a lower bound, so distant edges cost two
-evaluations."""
+obstacle's edges with the link. Along a straight edge the signed distance from a convex body is a convex function. The
+intersection of two tangents is a lower bound of its minimum, so distant edges cost two evaluations. Further tangents
+find the minimum."""
 
 import warp as wp
 
@@ -23,10 +23,10 @@ from graspd.worker.simulation.kernels.wrenches import add_wrench
 
 wp.set_module_options({"enable_backward": False})
 
-#: Largest number of evaluations between the tangents, and tolerance of the value at their intersection [m].
+#: Largest number of evaluations between the ends of an edge, and tolerance of the minimum [m].
 LOOKS = wp.constant(20)
 EXACT = wp.constant(wp.float32(1.0e-8))
-ON_FACE = wp.constant(wp.float32(1.0e-5))  # a point this far outside a plane's face counts as on it [m]
+ON_FACE = wp.constant(wp.float32(1.0e-5))  # points up to this far outside a face's plane count as inside [m]
 
 
 @wp.struct
@@ -40,7 +40,7 @@ class EdgeMinimum:
 
 @wp.struct
 class NearestObstacle:
-    """The nearest point of a link to an obstacle; `direction` is the gradient of the distance by `point`."""
+    """Least distance of a link from an obstacle; a motion of `point` along `direction` increases it."""
 
     distance: wp.float32
     point: wp.vec3
@@ -57,15 +57,15 @@ def tangent_intersection(
 
 @wp.func
 def edge_gradient(n0: wp.vec3, g0: wp.float32, n1: wp.vec3, g1: wp.float32):
-    """Return the gradient of the least value on an edge, with slopes g0 < 0 < g1 beside it.
-    At a bend it is the mixture of both sides' gradients without a slope along the edge."""
+    """Return the gradient at the minimum on an edge, from gradients n0, n1 and slopes g0 < 0 < g1 nearby.
+    It is the mixture of n0 and n1 that has no slope along the edge."""
     share = g1 / (g1 - g0)
     return share * n0 + (1.0 - share) * n1
 
 
 @wp.func
 def plane_over(obstacles: Obstacles, k: wp.int32, x: wp.vec3):
-    """Return (normal, value) of the plane of obstacle k that x is farthest outside of."""
+    """Return (normal, value) of the plane of obstacle k with the largest signed distance of x."""
     out = wp.vec4(0.0, 0.0, 0.0, -1.0e9)
     for i in range(obstacles.first_plane[k], obstacles.first_plane[k + 1]):
         plane = obstacles.planes[i]
@@ -87,8 +87,8 @@ def convex_distance(pieces: Pieces, piece: wp.int32, obstacles: Obstacles, k: wp
 def least_on_edge(
     pieces: Pieces, piece: wp.int32, obstacles: Obstacles, k: wp.int32, a: wp.vec3, b: wp.vec3, limit: wp.float32
 ):
-    """Return the place of edge a b nearest to a piece, or deepest in an obstacle, see `convex_distance`.
-    A value of at least `limit` means that no place is nearer."""
+    """Return the place on edge a-b nearest to a piece, or deepest in an obstacle (`convex_distance`).
+    A value of at least `limit` means that no place is nearer than `limit`."""
     along = b - a
     at0 = convex_distance(pieces, piece, obstacles, k, a)
     at1 = convex_distance(pieces, piece, obstacles, k, b)
@@ -174,7 +174,7 @@ def nearest_edge(
     body_p: wp.array2d(dtype=wp.vec3),
     body_q: wp.array2d(dtype=wp.quat),
 ):
-    """Return the nearest edge of obstacle k to a piece, or the piece's deepest edge in the obstacle."""
+    """Return the edge of obstacle k nearest to a piece, or the piece's deepest edge in the obstacle."""
     out = NearestObstacle()
     out.distance = limit
     q = piece_rotation(pieces, piece, b, body_q)
@@ -194,7 +194,7 @@ def nearest_edge(
         start = body_p[b, body] + wp.quat_rotate(body_q[b, body], features.start[e])
         end = body_p[b, body] + wp.quat_rotate(body_q[b, body], features.end[e])
         thickness = features.thickness[e]
-        # If separate, the obstacle's edges and the link's features give the distance: only penetration counts here.
+        # Obstacle edges and link features give the distance of separate bodies, so only penetration counts here.
         deepest = least_on_edge(pieces, -1, obstacles, k, start, end, wp.min(out.distance, 0.0) + thickness)
         if deepest.value - thickness < wp.min(out.distance, 0.0):
             out.distance = deepest.value - thickness
@@ -252,7 +252,7 @@ def residuals(
     target_in: wp.float32,
     residuals_out: Residuals,
 ):
-    """Emit residuals: terms of `penalty` within margin + near move to margin + target. Over (B, P)."""
+    """Emit residuals: features and edges within margin + near move to margin + target. Over (B, P)."""
     b, piece = wp.tid()
     hands = hands_in
     if hands.active[b] == 0 or hands.scene[b] < 0 or features_in.first[piece] == features_in.first[piece + 1]:
@@ -287,7 +287,7 @@ def distances(
     distance_inout: wp.array2d(dtype=wp.float32),
 ):
     """Compute the least distance (B, L) of each body from the solids of scene 0, at most `reach`.
-    A feature over no face of an obstacle is skipped: an edge of the obstacle is nearer to the link. Over (B, P)."""
+    A feature that is not above a face is skipped: an edge of the obstacle is nearer to the link. Over (B, P)."""
     b, piece = wp.tid()
     body = pieces_in.body[piece]
     least = reach_in

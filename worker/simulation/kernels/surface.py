@@ -3,8 +3,8 @@
 The inputs are the closest point b on a face, barycentric weights w_k, and corner normals n_k. The projection onto the
 tangent plane of corner k is pi_k(b) = b - ((b - v_k).n_k) n_k. The smoothed surface point is
     r* = (1 - alpha) b + alpha sum_k w_k pi_k(b)   (Boubekeur & Alexa 2008; the paper's formula drops the first b).
-The distance is sign |r - b| + (b - r*).n with n the interpolated normal. Unlike sign |r - r*| it is continuous across
-the surface. Corner normals stop at creases, so boxes and cylinders keep their edges."""
+The distance of a point r is sign |r - b| + (b - r*).n with the interpolated normal n. Unlike sign |r - r*| it is
+continuous across the surface. Normals are not averaged across creases, so boxes and cylinders keep their edges."""
 
 import warp as wp
 
@@ -25,7 +25,7 @@ class Surface:
     field: wp.array3d(dtype=wp.float32)  # coarse grid of distances; empty: not used
     field_origin: wp.vec3
     field_cell: wp.float32
-    field_error: wp.float32  # points with a grid distance above `exact below` + this skip the mesh
+    field_error: wp.float32  # grid distances above `exact_below` + this are used without the mesh
     cells: Cells  # faces near each cell of the grid; without lists the mesh's tree is used
 
 
@@ -86,7 +86,7 @@ def mesh_distance(surface: Surface, point: wp.vec3, reach: wp.float32):
 
 @wp.func
 def cell_at(surface: Surface, x: wp.vec3):
-    """Return the cell of a point in units of the grid's cells, and whether the grid has it."""
+    """Return the cell of a place x (from the grid's origin, in cells), and whether the grid has this cell."""
     i = int(wp.floor(x[0]))
     j = int(wp.floor(x[1]))
     k = int(wp.floor(x[2]))
@@ -201,8 +201,8 @@ def field_distance(surface: Surface, point: wp.vec3):
 
 @wp.func
 def distance(surface: Surface, point: wp.vec3, reach: wp.float32, exact_below: wp.float32, keep: wp.float32):
-    """Return the mesh's distance near the surface, else the grid's; `reach` beyond that.
-    Also `reach` where the grid's distance is above `keep`, which is at least `exact_below`."""
+    """Return the mesh's distance near the surface, else the grid's; `reach` outside the grid.
+    Grid distances of at least `keep` also become `reach`; `keep` is at least `exact_below`."""
     if surface.field.shape[0] > 0:
         cube = cube_around(surface, point)
         coarse = cube_distance(cube)
@@ -248,8 +248,8 @@ def gather(
     contacts_inout: Contacts,
 ):
     """Pack candidate contacts per grasp: hand points closer than dilation + keep. Launch over (B, N / lane).
-    `near` lists contacts with a gap of at most `near_gap`. With space for `mark` each point writes to its own index,
-    marked, for `packing.pack`."""
+    `near` lists contacts with a gap of at most `near_gap`. If `mark` is not empty, each point is written with a mark
+    to its own index, for `packing.pack`."""
     b, part = wp.tid()
     if hands_in.active[b] == 0:
         return

@@ -63,7 +63,7 @@ def touch(
 
 @wp.func
 def apart(touching: NearbySurface, radius: wp.float64, b: wp.int32, i: wp.int32, j: wp.int32):
-    """Return the squared separation of two contacts: by place divided by `radius`, and by direction."""
+    """Return the squared separation of two contacts: of places divided by `radius`, plus of normals."""
     place = (wp.vec3d(touching.closest[b, i]) - wp.vec3d(touching.closest[b, j])) / radius
     turn = wp.vec3d(touching.normal[b, i]) - wp.vec3d(touching.normal[b, j])
     return wp.dot(place, place) + wp.dot(turn, turn)
@@ -84,11 +84,11 @@ def choose(
     chosen_out: wp.array2d(dtype=wp.int32),
     count_out: wp.array(dtype=wp.int32),
 ):
-    """Choose at most C pressing points (B, C) of each hand, the most spread out. Launch over B.
+    """Choose at most C pressing points (B, C) of each hand that are far apart. Launch over B.
     Points press if they face the object with a cosine below `facing` and are closer than `near`. On a finger without
     such points, `far` replaces `near`; `finger` has the finger of each body, -1: none. Each chosen point is the
-    farthest from earlier points (Gonzalez 1985). `touches` (B, F), `list`, `least` (B, N) are scratch; `count` (B,) is
-    their number."""
+    farthest from earlier points (Gonzalez 1985). `count` (B,) is the number of chosen points. `touches` (B, F), `list`
+    and `least` (B, N) are scratch."""
     b = wp.tid()
     limit = chosen_out.shape[1]
     for f in range(touches_out.shape[1]):
@@ -145,7 +145,7 @@ def choose(
 
 @wp.func
 def first_tangent(n: wp.vec3d):
-    """Return a unit vector perpendicular to n; along a coordinate axis where n is along another."""
+    """Return a unit vector perpendicular to n; it is along a coordinate axis if n is."""
     axis = wp.vec3d(wp.float64(1.0), wp.float64(0.0), wp.float64(0.0))
     if wp.abs(n[1]) < wp.abs(n[0]) and wp.abs(n[1]) <= wp.abs(n[2]):
         axis = wp.vec3d(wp.float64(0.0), wp.float64(1.0), wp.float64(0.0))
@@ -169,8 +169,8 @@ def columns(
     matrix_out: wp.array3d(dtype=wp.float64),
 ):
     """Compute columns (B, C * E, 7 + D) of the balance. Launch over (B, C).
-    Each edge of a contact's pyramid has unit normal force. Its rows are its wrench, with torque / `radius`; `sum`;
-    and the torques of the dofs that exert it, divided by their limits."""
+    Each column is an edge of a contact's friction pyramid, with unit normal force. Its rows are the wrench (torque
+    divided by `radius`), `sum`, and the torques of the dofs that exert the force, divided by their limits."""
     b, c = wp.tid()
     if c >= count_in[b]:
         return
@@ -190,7 +190,7 @@ def columns(
         matrix_out[b, k, 6] = sum_in
         for d in range(effort_in.shape[0]):
             matrix_out[b, k, FIRST_TORQUE + d] = wp.float64(0.0)
-    # By virtual work: an edge's joint torque is its force along the contact's motion by the joint.
+    # Virtual work: a joint's torque is the edge's force times the contact's motion per unit of joint motion.
     body = points_in.body[i]
     while body > 0:
         way = joint_axis(chain_in, bodies_in, b, body)
@@ -212,7 +212,7 @@ def scale_torques(
     matrix_inout: wp.array3d(dtype=wp.float64),
     unit_out: wp.array(dtype=wp.float64),
 ):
-    """Divide torques of a balance by `unit` (B,), with which the largest of them is `weight`. Launch over B.
+    """Divide torques of a balance by `unit` (B,), so that the largest becomes `weight`. Launch over B.
     `count` (B,) becomes the number of columns instead of contacts."""
     b = wp.tid()
     count = EDGES * count_inout[b]
@@ -239,8 +239,8 @@ def net_wrench(
     residual_out: wp.array(dtype=wp.float64),
     torque_out: wp.array2d(dtype=wp.float64),
 ):
-    """Compute the net wrench of forces in these shares (B, C * E), divided by the sum of their normal components.
-    Launch over B. Also compute the torques (B, D) that exert them at the sum `total`, or at less within limits."""
+    """Compute the norm (B,) of the net wrench of edge forces `share` (B, C * E), over their normal sum.
+    Also compute the torques (B, D) that exert the normal sum `total`, scaled down to their limits. Launch over B."""
     b = wp.tid()
     whole = wp.float64(0.0)
     for k in range(count_in[b]):

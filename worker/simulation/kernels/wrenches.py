@@ -7,7 +7,7 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
-#: Value of one count: 2^-36, below the rounding of any float32 above 1e-4. Sums may reach 1.3e8.
+#: Value of one count: 2^-36, about the rounding error of a float32 near 1e-4. Sums may reach 1.3e8.
 UNIT = wp.constant(1.0 / 68719476736.0)
 PER_UNIT = wp.constant(68719476736.0)
 MOST = wp.constant(1.0e6)  # largest component that one thread may add: hands far inside an object reach about 1e4
@@ -17,7 +17,7 @@ Wrenches = wp.array3d(dtype=wp.int64)  # (B, L, 6)
 
 @wp.func
 def counts(x: wp.float32):
-    """Return a component in counts; 0 if not finite, which other data of the hand reveal."""
+    """Return a component in counts of `UNIT`, at most `MOST` in size; 0 if it is not finite."""
     if not wp.isfinite(x):
         return wp.int64(0)
     return wp.int64(wp.clamp(x, -MOST, MOST) * PER_UNIT)

@@ -21,7 +21,7 @@ PATIENCE: Final = 5
 #: Number of ticks (of `protocol.INTERVAL_S`) after which a grasp stays undecided. Grasps that hold take at least 32, 1
 #: in 100 of them more than 47. A few slow grasps would delay the whole launch.
 MOST_TICKS: Final = 48
-#: Ticks of one stage of closing, of the whole closing, until the first check of a push, and of a whole push.
+#: Ticks of one stage of closing; stages of each motion; ticks until the first check of a push, and of a whole push.
 STAGE = wp.constant(round(protocol.STAGE_S / protocol.INTERVAL_S))
 STAGES = wp.constant(protocol.STAGES)
 FIRST_LOOK = wp.constant(round(protocol.FIRST_LOOK_S / protocol.INTERVAL_S))
@@ -37,7 +37,7 @@ LOST = wp.constant(int(Outcome.LOST_WHILE_CLOSING))
 DISPLACED = wp.constant(int(Outcome.DISPLACED))
 ROTATED = wp.constant(int(Outcome.ROTATED))
 DIVERGED = wp.constant(int(Outcome.DIVERGED))
-#: Ratio above which an exceeded limit is clear; ticks after which it is final; ticks after which a grasp ends.
+#: Ratio of motion to its limit above which a failure is clear; most ticks after a failure; most ticks of a grasp.
 CLEAR = wp.constant(BAND[1])
 PATIENT = wp.constant(PATIENCE)
 MOST = wp.constant(MOST_TICKS)
@@ -130,7 +130,7 @@ def blend(a: wp.vec4, b: wp.vec4, share: wp.float32):
         cosine = -cosine
     angle = wp.acos(wp.min(cosine, 1.0))
     first, second = 1.0 - share, share
-    if angle > 1.0e-3:  # below, the chord is the arc
+    if angle > 1.0e-3:  # below, linear interpolation is accurate
         first, second = wp.sin(first * angle) / wp.sin(angle), wp.sin(second * angle) / wp.sin(angle)
     return wp.normalize(first * a + second * b)
 

@@ -5,7 +5,7 @@ only rejects: clear failures are final, all other grasps are validated on the CP
 both kinds are final. The prefilter is not used at level `dexgraspbench` or for lifts.
 
 The model is the validator's own, compiled once; data that differ between grasps (postures, commands, pushes) are
-arrays. A pool of worlds takes grasps from a queue on the device. A launch stays full until the queue is empty, and one
+arrays. A pool of worlds takes grasps from a queue on the device. All worlds are busy until the queue is empty, and one
 graph serves any number of grasps."""
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ log = logging.getLogger(__name__)
 
 #: One clear verdict in this many is also validated on the CPU.
 RECHECK_ONE_IN: Final = 50
-#: Increase after changes of the prefilter's verdicts by its code, other than its constants.
+#: Revision of the prefilter's code; increase it if code (not a constant) changes verdicts.
 REVISION: Final = 1
 #: Pool sizes, for few grasps and for many; with arbitrary sizes nearly every launch would build a new pool.
 WORLDS: Final = {"cuda": (256, 1024), "cpu": (8, 32)}
-#: Number of cached pools, each with its model, arrays and graph, for the pairs validated last.
+#: Number of cached pools (model, arrays, graph): those that were used last.
 _KEPT_POOLS: Final = 4
-#: Largest share of rechecked verdicts that the CPU may contradict (plus one) while the prefilter is trusted.
+#: The prefilter is trusted while the CPU contradicts at most this share of the rechecked verdicts, or only one verdict.
 _MOST_CONTRADICTED: Final = 0.05
 
 
@@ -78,7 +78,7 @@ class PrefilterOutcomes:
 
     @property
     def clearly_failed(self) -> NDArray[np.bool_]:
-        """(N,) whether the object is lost, or the hand starts inside it."""
+        """(N,) whether the object is lost with a clear margin, or the hand starts inside it."""
         inside = self.outcome[:, 0] == Outcome.PENETRATION
         kinds = (Outcome.LOST_WHILE_CLOSING, Outcome.DISPLACED, Outcome.ROTATED)
         lost = np.isin(self.outcome, kinds).any(axis=1) & np.isfinite(self.margin) & (self.margin > BAND[1])
