@@ -1,7 +1,7 @@
-"""Known vulnerabilities of what this environment and the images install: `python docker/audit.py`.
+"""List known vulnerabilities of packages here and in the images: `python docker/audit.py`.
 
-Asks PyPI's advisory database through pip-audit. Exit code 0: none is known; 1: there are some, or nothing could be
-asked, which is said.
+Queries PyPI's advisory database by pip-audit. Exit code 0: no vulnerability is known; 1: a vulnerability is known, or
+the query failed; the output states which.
 """
 
 from __future__ import annotations
@@ -39,16 +39,16 @@ def _recheck(what: str, *options: str) -> int:
             fix = ", ".join(flaw["fix_versions"]) or "no release fixes it yet"
             _say(f"{package['name']} {package['version']}: {flaw['id']}; {fix}")
     if not asked:
-        _say(f"{what}: nothing was audited: the advisory database cannot be reached from here")
+        _say(f"{what}: nothing was audited: the advisory database is unreachable")
         return 1
     unknown = len(packages) - len(asked)
-    left_out = f"; {unknown} could not be asked about" if unknown else ""
+    left_out = f"; {unknown} were skipped" if unknown else ""
     _say(f"{what}: {len(asked)} packages, {len(bad)} with known vulnerabilities{left_out}")
     return 1 if bad else 0
 
 
 def _last_line(text: str) -> str:
-    return (text.strip().splitlines() or ["pip-audit said nothing"])[-1]
+    return (text.strip().splitlines() or ["pip-audit printed no error"])[-1]
 
 
 def _say(line: str) -> None:

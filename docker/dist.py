@@ -1,8 +1,8 @@
-"""Wheel and sdist of what git knows of the working tree: the same bytes from the same sources, wherever they are built.
+"""Build wheel and sdist of the files that git tracks, with identical bytes on every machine.
 
 usage: python docker/dist.py [FOLDER]      (default: dist)
 
-Times in the archives are those of the last commit, modes are plain, owners are nobody's, entries are in order.
+In the archives, times are that of the last commit, modes and owners are fixed, and entries are sorted.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from pathlib import Path
 from typing import Final
 
 REPOSITORY: Final = Path(__file__).resolve().parent.parent
-#: What the packages are made of; tests and benchmarks stay in the repository.
-#: Folders that are packages of graspd: graspd/ links to them, a distribution has them there.
+#: Top-level folders that are packages of graspd: symbolic links in the repository, copies in a distribution.
 _PACKAGES: Final = ("service", "worker", "api", "baselines", "exchange", "studies")
+#: Files of the distributions; tests and benchmarks are omitted.
 _PARTS: Final = ("pyproject.toml", "README.md", "LICENSE", "graspd", *_PACKAGES)
 
 
 def build(folder: Path) -> list[Path]:
-    """Make both in a folder; returns their paths."""
+    """Build wheel and sdist in a folder; return their paths."""
     epoch = int(_git("log", "-1", "--format=%ct"))
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="graspd-dist-") as place:
@@ -56,7 +56,7 @@ def _copy(sources: Path) -> None:
 
 
 def _plain(data: bytes, epoch: int) -> bytes:
-    """A .tar.gz again, with what differs between two builds made equal."""
+    """Return the .tar.gz with times, owners, modes, headers and order that are equal in every build."""
     packed = io.BytesIO()
     with tarfile.open(fileobj=io.BytesIO(data)) as old, tarfile.open(fileobj=packed, mode="w") as new:
         for member in sorted(old.getmembers(), key=lambda member: member.name):

@@ -1,4 +1,4 @@
-"""Pins of the images: every package they install, at the version that is installed here and that the tests ran with.
+"""Pin every package of the images to the installed version, with which the tests ran.
 
 `python docker/pin.py` writes constraints.txt, and api.lock, worker.lock and build.lock with the hashes of the wheels.
 """
@@ -18,17 +18,17 @@ from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parent.parent
 FOLDER = ROOT / "docker"
-#: What the images are made of; `graspd up` and its embedded Redis do not run there.
+#: Extras of each image; `graspd up` and its embedded Redis do not run in images.
 IMAGES = {"api": ("api", "postgres"), "worker": ("worker", "gpu")}
 EXTRAS = tuple(dict.fromkeys(extra for extras in IMAGES.values() for extra in extras))
-#: Machines that images are built for, and their Python.
+#: CPU architectures of the images, and their Python version.
 MACHINES = ("x86_64", "aarch64")
 PYTHON = "3.11"
 _NOTE = "# Versions in the images; `make pins` writes this file."
 
 
 def requirements(*extras: str) -> list[Requirement]:
-    """What pyproject.toml asks for with these extras."""
+    """Return the requirements in pyproject.toml with these extras."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     lines = list(project["dependencies"])
     for extra in extras:
@@ -37,7 +37,7 @@ def requirements(*extras: str) -> list[Requirement]:
 
 
 def closure(wanted: Iterable[Requirement]) -> dict[str, str]:
-    """Name and version of all packages that requirements bring in here, the indirect ones too."""
+    """Return name -> installed version of all required packages, including indirect dependencies."""
     found: dict[str, str] = {}
     seen: set[tuple[str, frozenset[str]]] = set()
     waiting = list(wanted)
@@ -50,7 +50,7 @@ def closure(wanted: Iterable[Requirement]) -> dict[str, str]:
         try:
             found[name] = distribution(name).version
         except PackageNotFoundError:
-            raise SystemExit(f"{name} is not installed here; run `make pins`") from None
+            raise SystemExit(f"{name} is not installed; run `make pins`") from None
         waiting += _needs(name, extras)
     return found
 
@@ -64,9 +64,9 @@ def _needs(name: str, extras: frozenset[str]) -> Iterator[Requirement]:
 
 
 def wheels(wanted: Iterable[str]) -> dict[str, tuple[str, set[str]]]:
-    """Version and SHA-256 of the wheels that pip would take, on each machine that images are built for.
+    """Return name -> version and SHA-256 of the wheels that pip would install, for all architectures.
 
-    Asks the package index. SystemExit where a package has no wheel.
+    Queries the package index. Raises SystemExit if a package has no wheel.
     """
     found: dict[str, tuple[str, set[str]]] = {}
     for machine in MACHINES:
@@ -85,7 +85,7 @@ def wheels(wanted: Iterable[str]) -> dict[str, tuple[str, set[str]]]:
 
 
 def main() -> None:
-    """Write the pins, and for each image those that it installs with the hashes of their wheels."""
+    """Write the constraints, and for each image a lock file with hashes of wheels."""
     pins = _versions(requirements(*EXTRAS))
     lines = [f"{name}=={version}" for name, version in sorted(pins.items())]
     (FOLDER / "constraints.txt").write_text("\n".join([_NOTE, *lines, ""]))

@@ -1,4 +1,4 @@
-"""What the pages call the reader's own, for `docs/commands.py`: hands, meshes, shards, scenes, small datasets."""
+"""Files of readers of the docs, for `docs/commands.py`: hands, meshes, shards, scenes, datasets."""
 
 import os
 import re
@@ -16,7 +16,7 @@ from graspd.service.store.assets import builtin_files
 
 _PROGRAM: Final = (sys.executable, "-m", "graspd")
 REPOSITORY: Final = Path(__file__).resolve().parent.parent
-#: Shards that a reader has, and how they are made; grasps of the demo are of a hand that fits a table more often.
+#: Output -> commands that make it. The demo uses Shadow, because its free grasps clear the table more often.
 _MADE: Final = {
     "demo-out": ("demo --out demo-out --hand shadow --object mug -n 8 --fidelity draft --scenes 4 --views 1",),
     "grasps.h5": ("synth --hand allegro --object mug -n 8 --fidelity draft -o grasps.h5",),
@@ -25,12 +25,12 @@ _MADE: Final = {
         "render shards/block.h5 --views 2 -o shards/block-views.h5",
     ),
 }
-#: Commands of a reader before the page's own, run beside its service.
+#: Function that runs a graspd command for the files of a page.
 Graspd = Callable[..., None]
 
 
 def files_for(page: Path, folder: Path, data: Path, environment: Mapping[str, str]) -> None:
-    """Fill a folder with what the page's commands name and do not make; `data` is that of the service."""
+    """Make the files that commands of a page read but do not make; `data` is the folder of the service."""
 
     def graspd(*words: str) -> None:
         subprocess.run([*_PROGRAM, *words], cwd=folder, env=dict(environment), check=True, capture_output=True)
@@ -58,7 +58,7 @@ def files_for(page: Path, folder: Path, data: Path, environment: Mapping[str, st
 
 
 def _meshes(folder: Path) -> None:
-    """Meshes in metres, in millimetres, open, overlapping; a folder of them."""
+    """Make meshes in metres and millimetres, an open mesh, overlapping components, and a folder of meshes."""
     import trimesh
 
     for name in ("mug", "bottle", "block"):
@@ -106,7 +106,7 @@ def _dataset(name: str, graspd: Graspd) -> None:
 
 
 def _for_datasets(text: str, folder: Path, graspd: Graspd) -> None:
-    """The files that the page prints, the reader's hand, and a second version of what is exported."""
+    """Make the printed files, the reader's hand, and a second version of the export."""
     graspd("hands", "add", "my_hand/my_hand.urdf", "--no-self-test")
     (folder / "kitchen.toml").write_text(_printed(text, "```toml\nname"))
     (folder / "assets.json").write_text(_printed(text, '```json\n{"objects"'))
@@ -114,11 +114,11 @@ def _for_datasets(text: str, folder: Path, graspd: Graspd) -> None:
 
 
 def _for_million(text: str, folder: Path, graspd: Graspd) -> None:
-    """Sources of the objects, as the page of datasets prints them, and those of the pilot's."""
+    """Make the file of sources and licences of objects in datasets.md, and that of the pilot."""
     del text, graspd
     datasets = (REPOSITORY / "docs" / "how-to" / "datasets.md").read_text()
     (folder / "assets.json").write_text(_printed(datasets, '```json\n{"objects"'))
-    # Licences of objects that the small datasets lack would be refused.
+    # The original file lists objects that the small dataset lacks, and would be refused.
     (folder / "docs" / "results" / "pilot" / "assets.json").write_text('{"objects": {"*": {"licence": "CC-BY-4.0"}}}')
 
 
@@ -133,7 +133,7 @@ def _for_scaling(text: str, folder: Path, graspd: Graspd) -> None:
 
 
 def _for_planners(text: str, folder: Path, graspd: Graspd) -> None:
-    """A network without skill, and maps of scenes."""
+    """Make a network with random weights, and a folder of maps of scenes."""
     del text, graspd
     from graspd.baselines.learned.network import save
     from graspd.worker.hands.load import hand_from_path
@@ -145,7 +145,7 @@ def _for_planners(text: str, folder: Path, graspd: Graspd) -> None:
 
 
 def _for_quality(text: str, folder: Path, graspd: Graspd) -> None:
-    """DexGraspBench's layout of the shard, and the hand once more."""
+    """Export the shard in DexGraspBench's layout; copy the hand and the mesh."""
     import trimesh
 
     del text
@@ -159,7 +159,7 @@ def _for_quality(text: str, folder: Path, graspd: Graspd) -> None:
 
 
 def _for_scenes(text: str, folder: Path, graspd: Graspd) -> None:
-    """A folder of shards planned in a scene, and the first scene file of the page."""
+    """Make a shard planned in a scene, and the first scene file of the page."""
     few = ("--fidelity", "draft", "-n", "4", "-o", "folder/block.h5")
     (folder / "folder").mkdir()
     graspd("synth", "--hand", "barrett", "--object", "block", "--scene", "table", *few)

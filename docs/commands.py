@@ -1,9 +1,9 @@
-"""The commands that README and docs print: found, checked against the command line, and run.
+"""Find, check and run the commands of README and docs.
 
-usage: python -m docs.commands [PAGE ...]    (make docs-commands; hours of two cores for all)
+usage: python -m docs.commands [PAGE ...]    (make docs-commands; all pages take hours on two cores)
 
-Each page gets a folder with the files that a reader would have (`docs/command_files.py`), and a service where a line
-needs one; its lines run in their order, as they are printed. Ends with 1 if a line failed.
+Each page gets a folder with the files of a reader (`docs/command_files.py`), and a service if a command needs one. The
+commands of a page run in the printed order. The exit code is 1 if a command fails.
 """
 
 import argparse
@@ -32,11 +32,11 @@ PAGES: Final = (
     *sorted(page for page in DOCS.rglob("*.md") if not {"results", "adr"} & set(page.relative_to(DOCS).parts)),
 )
 LIMIT_S: Final = 3600.0
-#: Where a page says that the service is; each run has a port of its own.
+#: Address of the service on the pages; each run replaces it by its own address.
 _PRINTED_URL: Final = "http://127.0.0.1:8000"
-#: And where it is for a page of which no line asks one: nobody listens there.
+#: Address for pages whose commands need no service; nothing listens there.
 _NOBODY: Final = "http://127.0.0.1:9"
-#: What needs a service; one that is not started saves half a minute of a core.
+#: Commands that need a service. Its start takes half a minute of CPU time.
 _ASKS: Final = re.compile(
     r"graspd (submit|jobs|datasets|grasps|tags|admin (index|store)|doctor|controller|worker)\b|"
     r"graspd (objects|hands|networks) (?!check)|http://|\$API|graspd-data"
@@ -44,60 +44,60 @@ _ASKS: Final = re.compile(
 _FENCED: Final = re.compile(r"^```(\w*)\n(.*?)^```\n?", re.DOTALL | re.MULTILINE)
 _INDENTED: Final = re.compile(r"(?:^\n)((?:^    .*\n)+)", re.MULTILINE)
 _TRIED: Final = re.compile(r"<!-- tried: [\w-]+ -->\s*$")
-#: The output that a page shows after a command that ends with an error.
+#: Error message shown after a command that fails.
 _REFUSAL: Final = re.compile(r"\s*```\ngraspd: ")
 _OURS: Final = {"graspd", "benchmarks", "docs", "examples", "tests"}
-#: What an indented block of commands begins with; any other is a file or a formula.
+#: First words of an indented block of commands; other indented blocks are files or formulas.
 _FIRST: Final = re.compile(r"(?:\w+=\S+ )*(?:\S*/)?(?:graspd|python|make|export|cp|curl|docker|kubectl) ")
 _OPERATORS: Final = {"|", "||", "&&", ";", "&", ">", ">>", "<", "2>", "(", ")"}
-#: What a line has that is not run here, and why. A line with none of it is run.
+#: Patterns of commands that are not run, with the reason.
 NOT_RUN: Final = (
     (
         r'^(\w+="[^"]*" )?(docker|kubectl|sbatch|apptainer|ssh|oauth2-proxy|for|done)\b|SHARED|cp \.env|'
         "--grasps 3200",
-        "needs Docker, or a cluster",
+        "needs Docker or a cluster",
     ),
-    (r"\.\.\.|…|\[-|\[[A-Z]|<\w", "stands for a family of commands"),
+    (r"\.\.\.|…|\[-|\[[A-Z]|<\w", "is a template of several commands"),
     (
         r"\b(DATA|DIR|FILE|FOLDER|HAND|OBJECT|OTHER|BEFORE|AFTER|NAME|ID|UUID|URL|MESH|SHARDS|SOURCES|W|JOB|PROJECT|KEY|"
         r"PASSWORD)\b|--joint-map",
-        "has a place that the reader fills in",
+        "has a placeholder",
     ),
     (r"python src/|dexlearn\.train|cp -r", "needs the sources of another project"),
     *(() if find_spec("torch") else ((r"train_grasp_predictor|network=my_hand|proposed\.h5", "needs torch"),)),
-    (r"^pip |\bjq\b|benchmarks\.gallery", "needs packages or programs from elsewhere"),
-    (r"cuda|--join\b|on_gpu|gpu-check", "needs a GPU, or its tools"),
-    (
-        r"^make |^\. \.venv|pre-commit",
-        "the repository's own verbs and environment, which are tested and used without this",
-    ),
+    (r"^pip |\bjq\b|benchmarks\.gallery", "needs other packages or programs"),
+    (r"cuda|--join\b|on_gpu|gpu-check", "needs a GPU or its tools"),
+    (r"^make |^\. \.venv|pre-commit", "is a make target, or sets up the environment"),
     (r"graspd (up|api|controller|worker|view)\b(?!.*--check)", "does not end"),
-    (r"graspd (keys|projects|webhooks)\b", "with the first key every other line needs one; tests/api runs them"),
-    (r"datasets (cancel|retry|delete|restore)", "the dataset that stands in is read below; tests/api runs them"),
-    (r"--grasps 1000|kitchen\.toml --yes|my-objects --yes$", "takes hours; a small dataset of that name stands for it"),
+    (r"graspd (keys|projects|webhooks)\b", "would make all other commands need a key; tests/api tests it"),
+    (
+        r"datasets (cancel|retry|delete|restore)",
+        "would change the dataset that later commands read; tests/api tests it",
+    ),
+    (r"--grasps 1000|kitchen\.toml --yes|my-objects --yes$", "takes hours; a small dataset replaces it"),
 )
 
 
 @dataclass(frozen=True)
 class Line:
-    """A command of a page, without its comment; parts of a continued line are one."""
+    """A command of a page, without comment and line breaks."""
 
     page: str
     text: str
     refused: bool = False
-    """The page shows an error after it, or its comment says *refused*."""
+    """Whether the command must fail: an error message follows, or its comment says *refused*."""
     tried: bool = False
-    """It is in a block that tests/deploy runs."""
+    """Whether tests/deploy runs the command."""
 
     @property
     def reason(self) -> str:
-        """Why it is not run; empty where it is."""
+        """Reason why the command is not run; empty if it is run."""
         if self.tried:
             return "tests/deploy/test_operations.py runs it"
         return next((why for what, why in NOT_RUN if re.search(what, self.text)), "")
 
     def fault(self) -> str:
-        """A command, option, module or verb of it that is not known; empty where all are."""
+        """Return an unknown command, option, module or make target of the line; empty if all are known."""
         for program, *words in _commands(self.text):
             if program.rpartition("/")[2] == "graspd":
                 found = _graspd_fault(words)
@@ -132,7 +132,7 @@ def lines_of(page: Path) -> Iterator[Line]:
 
 
 def _commands(text: str) -> Iterator[list[str]]:
-    """The simple commands of a line, without assignments before them."""
+    """Split a line into simple commands, without assignments of variables."""
     lexer = shlex.shlex(text, posix=True, punctuation_chars="|&;<>()")
     lexer.whitespace_split = True
     command: list[str] = []
@@ -170,7 +170,7 @@ def _loaded(module: str, name: str) -> Any:
 
 
 def _resolved(command: Any, words: list[str]) -> tuple[Any, list[str]]:
-    """The subcommand that words name, with the rest; or what is wrong."""
+    """Return the subcommand with the remaining words, or an error message."""
     while hasattr(command, "get_command") and words and not words[0].startswith("-"):
         inner = command.get_command(None, words[0])
         if inner is None:
@@ -182,7 +182,7 @@ def _resolved(command: Any, words: list[str]) -> tuple[Any, list[str]]:
 
 
 def run_page(page: Path) -> list[str]:
-    """Run the lines of a page; each that failed, with the end of its output."""
+    """Run the commands of a page; return those that failed, with the end of their output."""
     from graspd.service.run.supervisor import Supervisor
     from graspd.service.settings import Settings
 
@@ -212,7 +212,7 @@ def run_page(page: Path) -> list[str]:
 
 
 def run_line(text: str, folder: Path, environment: Mapping[str, str]) -> tuple[int, str]:
-    """Exit code and output of a line typed at a terminal where every question is answered with yes."""
+    """Run a command at a pseudo-terminal with the answer `y`; return exit code and output."""
     terminal, stdin = os.openpty()
     try:
         os.write(terminal, b"y\n")
@@ -220,7 +220,7 @@ def run_line(text: str, folder: Path, environment: Mapping[str, str]) -> tuple[i
         place: dict[str, Any] = {"cwd": folder, "env": dict(environment), "timeout": LIMIT_S}
         done = subprocess.run(text, shell=True, check=False, **streams, **place)
     except subprocess.TimeoutExpired:
-        return 124, f"not ended after {LIMIT_S:.0f} s"
+        return 124, f"still running after {LIMIT_S:.0f} s"
     finally:
         os.close(terminal)
         os.close(stdin)
@@ -237,13 +237,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("pages", nargs="*", help="names or paths of pages; default: all")
     given = {Path(name).name for name in parser.parse_args(arguments).pages}
     if unknown := given - {page.name for page in PAGES}:
-        parser.error(f"no page of the docs is called {', '.join(sorted(unknown))}")
+        parser.error(f"unknown pages of the docs: {', '.join(sorted(unknown))}")
     failed = []
     for page in PAGES:
         if (not given or page.name in given) and not all(line.reason for line in lines_of(page)):
             say(page.name)
             failed += run_page(page)
-    say("\n".join(failed) or "all that was run ended well")
+    say("\n".join(failed) or "all commands that were run succeeded")
     return int(bool(failed))
 
 

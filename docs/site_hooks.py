@@ -1,6 +1,6 @@
-"""Hooks of MkDocs: pages outside `docs/` join the site, and links to other files of the repository become plain text.
+"""MkDocs hooks: add pages outside `docs/` to the site; remove links to other files of the repository.
 
-GitHub renders the same Markdown without them: README.md, CONTRIBUTING.md and their like stay where a forge looks.
+GitHub renders the same files without the hooks, so README.md, CONTRIBUTING.md and others stay in the root folder.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any, Final
 from mkdocs.structure.files import File, Files
 
 ROOT: Final = Path(__file__).resolve().parents[1]
-#: Pages of the repository by their place in the site.
+#: Page of the repository -> its path in the site.
 OUTSIDE: Final = {
     "README.md": "index.md",
     "CONTRIBUTING.md": "project/contributing.md",
@@ -30,21 +30,21 @@ _LINK: Final = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^()\s]+)\)|(src
 
 
 def on_files(files: Files, *, config: Any) -> Files:
-    """Add the pages from outside."""
+    """Add the pages outside `docs/`."""
     for source, place in OUTSIDE.items():
         files.append(File.generated(config, place, content=(ROOT / source).read_text()))
     return files
 
 
 def on_page_markdown(markdown: str, *, page: Any, files: Files, **_: Any) -> str:
-    """Links as the site has them: pages from outside at their place, other files outside `docs/` as plain text."""
+    """Return the page with links of the site; links to files that are not in the site become plain text."""
     place = page.file.src_uri
     if place.startswith(("results/", "adr/")):
-        page.meta.setdefault("search", {"boost": 0.2})  # figures answer few questions by themselves
+        page.meta.setdefault("search", {"boost": 0.2})  # pages of figures rarely answer a question
     source = _INSIDE.get(place, f"docs/{place}")
 
     def of_site(link: str) -> str | None:
-        """The link in the site; None where its target is not there."""
+        """Return the link within the site; None if the site lacks the target."""
         if re.match(r"[a-z]+:|#", link):
             return link
         path, mark, anchor = link.partition("#")

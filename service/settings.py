@@ -120,7 +120,7 @@ class Settings(BaseSettings):
         0, ge=0, description="resident memory at which a worker is replaced [MiB]; 0: half of all memory"
     )
     retry_backoff_s: float = Field(
-        2.0, ge=0, description="wait before the second attempt [s]; doubled before each further one"
+        2.0, ge=0, description="wait before the second attempt [s]; doubled before each further attempt"
     )
     max_upload_bytes: int = Field(
         64 * 2**20, gt=0, description="largest upload of a hand, object or network over HTTP [bytes]"

@@ -1,6 +1,6 @@
-"""Writes the Grafana dashboard beside it: `python docker/monitoring/dashboard.py`.
+"""Write the Grafana dashboard `grafana.json`: `python docker/monitoring/dashboard.py`.
 
-A dashboard is a page of JSON that says the same of every panel; here a panel is one line. Import `grafana.json` in
+The JSON repeats the same settings for every panel; here each panel is one row of a table. Import `grafana.json` in
 Grafana (Dashboards, New, Import) and choose the Prometheus that scrapes graspd.
 """
 
@@ -11,44 +11,49 @@ from pathlib import Path
 from typing import Any
 
 _WIDE, _HIGH = 24, 8
-#: Title, unit of Grafana, width of 24, and what is drawn: legend and expression. A single value is a tile.
+#: Title, Grafana unit, width (of 24), and legend -> expression. An empty legend makes a tile with one value.
 ROWS: dict[str, list[tuple[str, str, int, dict[str, str]]]] = {
     "Now": [
-        ("Valid grasps a second", "short", 4, {"": 'max(graspd_grasps_per_second{verdict="valid"})'}),
+        ("Valid grasps per second", "short", 4, {"": 'max(graspd_grasps_per_second{verdict="valid"})'}),
         ("Workers", "short", 4, {"": 'max(sum without (state) (graspd_workers{state=~"idle|busy"}))'}),
-        ("Tasks that wait", "short", 4, {"": "sum(max by (priority, stage) (graspd_queue_depth))"}),
+        ("Waiting tasks", "short", 4, {"": "sum(max by (priority, stage) (graspd_queue_depth))"}),
         ("Unfinished jobs", "short", 4, {"": "sum(max by (state) (graspd_jobs_unfinished))"}),
         ("Controller", "bool_yes_no", 4, {"": "max(graspd_controller_up)"}),
         ("Damaged objects", "short", 4, {"": "max(graspd_store_damaged)"}),
     ],
     "Work": [
         (
-            "Grasps a second",
+            "Grasps per second",
             "short",
             12,
             {"{{verdict}}": "max by (verdict) (rate(graspd_grasps_total[$__rate_interval]))"},
         ),
-        ("Shards a second", "short", 12, {"{{stage}}": "max by (stage) (rate(graspd_shards_total[$__rate_interval]))"}),
-        ("Tasks that wait", "short", 8, {"{{priority}} {{stage}}": "max by (priority, stage) (graspd_queue_depth)"}),
         (
-            "Age of the oldest that waits",
+            "Shards per second",
+            "short",
+            12,
+            {"{{stage}}": "max by (stage) (rate(graspd_shards_total[$__rate_interval]))"},
+        ),
+        ("Waiting tasks", "short", 8, {"{{priority}} {{stage}}": "max by (priority, stage) (graspd_queue_depth)"}),
+        (
+            "Age of the oldest waiting task",
             "s",
             8,
             {"{{priority}} {{stage}}": "max by (priority, stage) (graspd_queue_oldest_task_seconds)"},
         ),
-        ("Oldest job", "s", 8, {"{{state}}": "max by (state) (graspd_job_oldest_seconds)"}),
+        ("Age of the oldest job", "s", 8, {"{{state}}": "max by (state) (graspd_job_oldest_seconds)"}),
     ],
     "Workers": [
         ("Workers", "short", 8, {"{{state}}": "max by (state) (graspd_workers)"}),
         (
-            "Tasks in hand",
+            "Running tasks",
             "short",
             8,
             {"{{stage}}": "sum by (stage) (max by (priority, stage) (graspd_tasks_running))"},
         ),
         ("Oldest heartbeats", "s", 8, {"{{worker}}": "topk(5, max by (worker) (graspd_worker_lease_age_seconds))"}),
         (
-            "Seconds of a task: half, and 95 of 100",
+            "Duration of a task, median and 95th percentile",
             "s",
             12,
             {
@@ -59,39 +64,33 @@ ROWS: dict[str, list[tuple[str, str, int, dict[str, str]]]] = {
             },
         ),
         (
-            "Failures and tasks handed back, an hour",
+            "Failures and returned tasks per hour",
             "short",
             12,
             {
                 "{{stage}} {{kind}}": "max by (stage, kind) (increase(graspd_task_failures_total[1h])) > 0",
-                "{{stage}} {{kind}} (handed back)": "max by (stage, kind) "
-                "(increase(graspd_task_handbacks_total[1h])) > 0",
+                "{{stage}} {{kind}} (returned)": "max by (stage, kind) (increase(graspd_task_handbacks_total[1h])) > 0",
             },
         ),
     ],
     "Service": [
+        ("Ended jobs per hour", "short", 12, {"{{state}}": "max by (state) (increase(graspd_jobs_ended_total[1h]))"}),
         (
-            "Jobs that ended, an hour",
-            "short",
-            12,
-            {"{{state}}": "max by (state) (increase(graspd_jobs_ended_total[1h]))"},
-        ),
-        (
-            "Bytes written a second",
+            "Bytes written per second",
             "Bps",
             12,
             {"{{stage}}": "max by (stage) (rate(graspd_shard_bytes_total[$__rate_interval]))"},
         ),
-        ("Latency of the parts", "s", 12, {"{{part}}": "max by (part) (graspd_part_latency_seconds)"}),
-        ("Parts that answer", "bool_yes_no", 12, {"{{part}}": "min by (part) (graspd_part_up)"}),
+        ("Response time of the parts", "s", 12, {"{{part}}": "max by (part) (graspd_part_latency_seconds)"}),
+        ("Parts that respond", "bool_yes_no", 12, {"{{part}}": "min by (part) (graspd_part_up)"}),
         (
-            "Requests a second",
+            "Requests per second",
             "reqps",
             12,
             {"{{status}}": "sum by (status) (rate(graspd_http_requests_total[$__rate_interval]))"},
         ),
         (
-            "Time to answer, 95 of 100",
+            "Response time, 95th percentile",
             "s",
             12,
             {
@@ -105,7 +104,7 @@ _SOURCE = {"type": "prometheus", "uid": "${source}"}
 
 
 def dashboard() -> dict[str, Any]:
-    """The whole page."""
+    """Return the dashboard as JSON data."""
     panels: list[dict[str, Any]] = []
     y = 0
     for name, row in ROWS.items():
@@ -153,7 +152,7 @@ def _panel(number: int, title: str, unit: str, place: dict[str, int], drawn: dic
 
 
 def text() -> str:
-    """The file."""
+    """Return the text of `grafana.json`."""
     return json.dumps(dashboard(), indent=2) + "\n"
 
 

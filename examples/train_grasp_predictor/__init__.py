@@ -1,1 +1,1 @@
-"""A network that sees an object and proposes Barrett grasps: what a dataset of grasps is worth. See README.md."""
+"""Network that proposes grasps from a depth picture, to compare sources of training data; see README."""

@@ -1,4 +1,4 @@
-"""Train on each source of data, lift objects that none has shown: `python -m examples.train_grasp_predictor --help`."""
+"""Train on each source and lift unseen objects: `python -m examples.train_grasp_predictor --help`."""
 
 from __future__ import annotations
 
@@ -33,19 +33,19 @@ from graspd.worker.objects.prepare import object_from_path
 
 FREE, BASELINE = "free, filtered", "graspit, filtered"
 ACROSS, NEAREST = "no network: across", "no network: nearest"
-#: What becomes of the first row without its parts, and of the controls with its evaluator.
+#: Rows of the ablations: the first source without parts of its method, and the controls with its evaluator.
 DEFAULT_CONTEXT, UNMOVED = "proposals alone", "chosen, not moved"
 VALIDATED: Final = {ACROSS: "across, chosen and moved", NEAREST: "nearest, chosen and moved"}
 EXTRAS: Final = (DEFAULT_CONTEXT, UNMOVED, *VALIDATED.values())
-#: Pictures of each unseen object, and of each unseen face.
+#: Pictures per unseen object, and per unseen face.
 PICTURES: Final = (16, 4)
-#: Of the noise from which grasps are proposed, where nothing chooses among them: of 1, 0.3 and 0.1 what lifted most of
-#: the unseen faces; and where an evaluator does, for each half.
+#: Standard deviation of the noise from which grasps are proposed, without an evaluator: the best of 1, 0.3 and 0.1 on
+#: unseen faces. With an evaluator, each value gives half of the proposals.
 SPREAD: Final = 0.3
 SPREADS: Final = (0.3, 1.0)
-#: Evaluators that validate together.
+#: Number of evaluators in the ensemble.
 MEMBERS: Final = 3
-#: Noise of the depth camera that all are shown.
+#: Noise of the depth camera in all pictures.
 NOISE: Final = "stereo"
 
 Option = typer.Option
@@ -53,7 +53,7 @@ Option = typer.Option
 
 @dataclass
 class Study:
-    """Everything that is the same for all sources."""
+    """Data and settings shared by all sources."""
 
     hand: HandModel
     shards: Shards
@@ -70,7 +70,7 @@ class Study:
         self.models = {name: object_from_path(self.meshes / name / "clean.stl") for name in names}
 
     def exams(self) -> list[Exam]:
-        """Unseen objects on all their faces, and unseen faces of the others."""
+        """Return the exams: unseen objects on all faces, and unseen faces of the other objects."""
         found = []
         for name in self.back:
             mine = [sight for sight in self.seen if sight.scene.object == name]
@@ -92,7 +92,7 @@ class Study:
         return sources.with_failures(self.others[sources.FAILED], obj, own, self.count)
 
     def makers(self) -> dict[str, Callable[[str], TrainedModel]]:
-        """From a source to what it teaches of an object; the first is what the others are compared with."""
+        """Return source -> function from an object to its training data. The first source is the reference."""
         made: dict[str, Callable[[str], TrainedModel]] = {sources.SCENES: self.usual}
         made |= {name: partial(self.put_into, name) for name in (FREE, BASELINE) if name in self.others}
         return made
@@ -115,28 +115,28 @@ class Study:
 
 
 def main(
-    shards: Annotated[str, Option(help="Shards of grasps planned on tables, with views: a folder, a store.")],
+    shards: Annotated[str, Option(help="Shards of grasps planned on tables, with views: a folder or a store.")],
     meshes: Annotated[Path, Option(help="Folder with the objects' meshes, OBJECT/clean.stl.")],
-    held_out: Annotated[str, Option(help="Objects to evaluate on, with commas; none of them is trained on.")] = "",
+    held_out: Annotated[str, Option(help="Objects for evaluation only, separated by commas.")] = "",
     hand: Annotated[str, Option(help="URDF or built-in hand of the data.")] = "barrett",
-    free: Annotated[str, Option(help="Shards of valid grasps of free objects, to be put on tables and filtered.")] = "",
-    baseline: Annotated[str, Option(help="The same of the graspit baseline.")] = "",
+    free: Annotated[str, Option(help="Shards of valid free grasps, to be transferred to tables and filtered.")] = "",
+    baseline: Annotated[str, Option(help="Shards of free grasps of the baseline graspit.")] = "",
     raw: Annotated[
-        str, Option(help="Shards planned on tables with `want candidates`, with views: failures told.")
+        str, Option(help="Shards planned on tables with `want candidates`, with views; they include failures.")
     ] = "",
-    grasps: Annotated[int, Option(help="Grasps of each object, at most.")] = 256,
+    grasps: Annotated[int, Option(help="Maximum number of grasps per object.")] = 256,
     steps: Annotated[int, Option(help="Training steps of each network.")] = 3000,
-    seeds: Annotated[int, Option(help="Networks trained on each source.")] = 3,
-    ablations: Annotated[bool, Option(help="Other sizes and choices of the data besides.")] = False,
-    plain: Annotated[bool, Option("--plain", help="The first network alone: minutes instead of hours.")] = False,
+    seeds: Annotated[int, Option(help="Number of networks per source.")] = 3,
+    ablations: Annotated[bool, Option(help="Also use other sizes and selections of the data.")] = False,
+    plain: Annotated[bool, Option("--plain", help="No evaluators: minutes instead of hours.")] = False,
     threads: Annotated[int, Option(help="Threads of torch.")] = 1,
-    output: Annotated[Path, Option("--output", "-o", help="JSON of all scores; what it has is kept.")] = Path(
+    output: Annotated[Path, Option("--output", "-o", help="JSON file of all scores; existing ones are kept.")] = Path(
         "predictor.json"
     ),
-    network: Annotated[Path | None, Option(help="Where the first network on scenes is saved, for planning.")] = None,
-    sheet: Annotated[Path | None, Option(help="PNG of what the first seed proposes.")] = None,
+    network: Annotated[Path | None, Option(help="File for the first network on scenes, for planning.")] = None,
+    sheet: Annotated[Path | None, Option(help="PNG file with proposals of the first seed.")] = None,
 ) -> None:
-    """Train a grasp predictor on each source of data and lift what it proposes for unseen objects and faces."""
+    """Train a grasp predictor on each source of data; lift unseen objects and faces with its proposals."""
     torch.set_num_threads(threads)
     backend.start()
     model = hand_from_path(hand)
@@ -178,7 +178,7 @@ def _proposers(
     ablations: bool,
     plain: bool,
 ) -> Iterator[tuple[str, int, Row, Proposer]]:
-    """Each source and seed that `rows` do not have: what is known of it, and what proposes."""
+    """Yield source, seed, facts and proposer for each source and seed that `rows` lack."""
     done = {(row["hand"], row["source"], row["seed"]) for row in rows}
     main = study.makers()
     for source, make in wanted.items():
@@ -217,7 +217,7 @@ def _proposers(
 
 
 def _validates(practice: TrainingRun) -> tuple[Ensemble, int]:
-    """What a source's first network is practised with until it can validate them all, and by how many candidates."""
+    """Train an ensemble on attempts of a source's first network; return ensemble and number of attempts."""
     tries = practice.tries(seed=0)
     return Ensemble(learned(practice.hand, tries, seed=seed) for seed in range(MEMBERS)), len(tries)
 
@@ -231,7 +231,7 @@ def _without(study: Study, given: Sequence[TrainedModel]) -> dict[str, Proposer]
 
 
 def _by(made: ProposalNetwork, spreads: Sequence[float]) -> Proposer:
-    """Proposals of a network, as many from noise of each of the spreads."""
+    """Return a proposer with equal numbers of proposals from noise of each spread."""
 
     def proposer(sight: Sight, count: int, rng: np.random.Generator) -> Proposals:
         shown = slice(0, SHOWN)

@@ -1,6 +1,6 @@
 #!/bin/bash
-# Grasps of free objects to compare with: bash examples/train_grasp_predictor/data.sh OBJECTS OUT, OBJECTS a folder of
-# OBJECT/clean.stl. Writes OUT/free and OUT/baseline; what is there already is not made again.
+# Make free grasps for comparison: bash examples/train_grasp_predictor/data.sh OBJECTS OUT. OBJECTS is a folder of meshes
+# OBJECT/clean.stl. Writes OUT/free and OUT/baseline; existing files are kept.
 set -eu
 objects=$1 out=$2
 mkdir -p "$out/free" "$out/baseline"
@@ -9,7 +9,7 @@ for hand in barrett allegro; do
             077_rubiks_cube koala spot; do
         mesh=$objects/$name/clean.stl
         [ -f "$out/free/$hand-$name.h5" ] ||
-            graspd synth --hand $hand --object "$mesh" -n 160 -o "$out/free/$hand-$name.h5" || [ $? = 3 ] # fewer
+            graspd synth --hand $hand --object "$mesh" -n 160 -o "$out/free/$hand-$name.h5" || [ $? = 3 ] # exit code 3: fewer grasps than requested
         [ -f "$out/baseline/$hand-$name.h5" ] || graspd synth --hand $hand --object "$mesh" --method graspit \
             --option keep=20 --want candidates -n 192 -o "$out/baseline/$hand-$name.h5" || [ $? = 3 ]
     done

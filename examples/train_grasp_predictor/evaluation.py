@@ -1,4 +1,4 @@
-"""What proposals are worth: lifts of objects, and of faces, that nobody was trained on."""
+"""Evaluation of proposals by lifts of unseen objects and faces."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.lift import LiftOutcome
 
 Row = dict[str, Any]
-#: From a picture, a number and a generator to so many proposals, the best first where there is one.
+#: Function from a picture, a number and a generator to that number of proposals, the best first if scored.
 Proposer = Callable[[Sight, int, np.random.Generator], Proposals]
-#: Proposals for a picture, of which those that are clear go first, and how many of them are carried out.
+#: Proposals per picture, and how many of them are executed; clear proposals come first.
 PROPOSED: Final = 8
 TAKEN: Final = 2
-#: What a picture shows that was held back.
+#: Kinds of exams: the object, or only its resting face, is unseen in training.
 OBJECT, FACE = "unseen object", "unseen face"
 
 
 @dataclass(frozen=True)
 class Exam:
-    """Pictures of one object that nobody was trained on."""
+    """Pictures of one object, excluded from training."""
 
     object: str
     kind: str
@@ -40,13 +40,13 @@ class Exam:
 
     @classmethod
     def of(cls, name: str, kind: str, model: ObjectModel, seen: Sequence[Sight], count: int) -> Exam:
-        """So many of the pictures, spread over the scenes."""
+        """Select `count` of the pictures at random, always the same for one name."""
         order = np.random.default_rng(zlib.crc32(name.encode())).permutation(len(seen))
         return cls(name, kind, model, decompose(model), [seen[i] for i in order[:count]])
 
 
 def proposals_for(hand: HandModel, exam: Exam, proposer: Proposer, *, seed: int) -> tuple[list[Ready], float]:
-    """What is carried out for each picture, and the share of all proposals that would have met the table."""
+    """Return the executed proposals of each picture, and the share of proposals that penetrate the table."""
     ready, table = [], []
     for number, sight in enumerate(exam.seen):
         rng = np.random.default_rng([seed, number, zlib.crc32(exam.object.encode())])
@@ -59,7 +59,7 @@ def proposals_for(hand: HandModel, exam: Exam, proposer: Proposer, *, seed: int)
 def examined(
     hand: HandModel, exams: Sequence[Exam], proposer: Proposer, *, seed: int, epsilon: bool
 ) -> Iterator[tuple[Exam, Row, list[Ready], Lifted]]:
-    """One row for each object: shares of the proposals that were carried out."""
+    """Yield each exam with a row of results: shares of the executed proposals."""
     for exam in exams:
         ready, table = proposals_for(hand, exam, proposer, seed=seed)
         lifted = carried_out(hand, exam.model, exam.pieces, ready, list(exam.seen), epsilon=epsilon)

@@ -1,7 +1,7 @@
-"""A network that says whether a hand will lift what a camera saw, learned from hands that did and did not.
+"""Network that predicts from an object's point cloud whether a hand lifts the object.
 
-It sees the points of the object from the hand, the points of the hand from the object, and how high both are above the
-table: what is near what, as in the evaluator of 6-DOF GraspNet (Mousavian et al., ICCV 2019), with joints of the hand.
+Inputs are object points relative to the hand, hand points with their distances from the object, and heights above the
+table. The network extends the evaluator of 6-DOF GraspNet (Mousavian et al., ICCV 2019) to hands with joints.
 """
 
 from __future__ import annotations
@@ -24,32 +24,32 @@ from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.surface import sample_surface
 
-#: Points of the hand, and of the object in one look at it.
+#: Points of the hand, and of the object, in one input.
 HAND_POINTS: Final = 96
 SHOWN: Final = 160
-#: Distances are told up to this [m], in units of `_NEAR_M`.
+#: Upper limit of distances in the input, and their unit [m].
 _FAR_M, _NEAR_M = 0.06, 0.05
-#: Training steps; hands of each, and noise of points [m].
+#: Training steps, hands per step, and noise of points [m].
 STEPS: Final = 1500
 BATCH: Final = 64
 JITTER_M: Final = 0.001
-#: Looks at a picture, each at other points of it, whose verdicts are averaged; hands of one pass.
+#: Point sets per picture, over which scores are averaged; hands per forward pass.
 LOOKS: Final = 2
 _TOGETHER: Final = 64
 
 
 @dataclass(frozen=True)
 class Hands:
-    """N hands as the evaluator sees them, in the frame of the table."""
+    """N hands as input of the evaluator, in the table frame."""
 
     points: torch.Tensor
-    """(N, 2, H, 3) of the surface, at the grasp and at the squeeze [m]."""
+    """(N, 2, H, 3) surface points at grasp and squeeze [m]."""
     normals: torch.Tensor
     """(N, 2, H, 3)"""
     place: torch.Tensor
-    """(N, 3) of the root link [m]."""
+    """(N, 3) position of the root link [m]."""
     rotation: torch.Tensor
-    """(N, 3, 3) of the root link."""
+    """(N, 3, 3) rotation of the root link."""
 
     @classmethod
     def of(cls, hand: HandModel, hands: Proposals) -> Hands:
@@ -74,27 +74,27 @@ class Hands:
         return Hands(*(part[which] for part in vars(self).values()))
 
     def turned_back(self, vectors: torch.Tensor) -> torch.Tensor:
-        """Vectors (N, ..., 3) of the table's frame in that of the root link."""
+        """Rotate vectors (N, ..., 3) from the table frame to the frame of the root link."""
         return torch.einsum("nji,n...j->n...i", self.rotation, vectors)
 
 
 @dataclass(frozen=True)
 class Attempts:
-    """Hands that were carried out for some pictures, and what became of them."""
+    """Hands executed for some pictures, and their outcomes."""
 
     points: torch.Tensor
-    """(V, P, 3) of each picture, in the frame of the table [m]."""
+    """(V, P, 3) object points of each picture, in the table frame [m]."""
     normals: torch.Tensor
     """(V, P, 3)"""
     picture: torch.Tensor
-    """(N,) index of each hand's."""
+    """(N,) index of each hand's picture."""
     hands: Hands
     lifted: torch.Tensor
     """(N,) 0 or 1."""
 
     @classmethod
     def of(cls, hand: HandModel, seen: list[Sight], hands: list[Proposals], lifted: NDArray[np.bool_]) -> Attempts:
-        """Hands of each picture, and whether each, in their order, lifted."""
+        """Create attempts from the hands of each picture; `lifted` has one value per hand, in the same order."""
         picture = np.repeat(np.arange(len(seen)), [len(one) for one in hands])
         parts = (np.concatenate([np.asarray(getattr(one, name)) for one in hands]) for name in vars(hands[0]))
         points, normals = (
@@ -103,7 +103,7 @@ class Attempts:
         return cls(points, normals, torch.from_numpy(picture), Hands.of(hand, Proposals(*parts)), _tensor(lifted))
 
     def and_those(self, others: Attempts) -> Attempts:
-        """These tries and others."""
+        """Return these attempts followed by others."""
         hands = Hands(
             *(
                 torch.cat([part, more])
@@ -123,7 +123,7 @@ class Attempts:
 
 
 class Evaluator(nn.Module):
-    """The logit of a lift, for N hands and as many looks at objects."""
+    """Network for the logit of a lift, for N hands and N point clouds."""
 
     def __init__(self, hand: HandModel) -> None:
         super().__init__()
@@ -142,7 +142,7 @@ class Evaluator(nn.Module):
         )
 
     def forward(self, points: torch.Tensor, normals: torch.Tensor, hands: Hands) -> torch.Tensor:
-        """(N,) from points (N, P, 3) of objects with normals."""
+        """Return logits (N,) from object points and normals (N, P, 3)."""
         near, gaps = [], []
         for which in (0, 1):
             own, out = hands.points[:, which], hands.normals[:, which]
@@ -164,20 +164,20 @@ class Evaluator(nn.Module):
 
 
 class Ensemble(nn.Module):
-    """The mean of evaluators that learned by themselves: a hand that is moved until one of them believes in it is where
-    that one errs, and the others seldom err there too."""
+    """Mean of independently trained evaluators.
+    Refinement tends to hands that one evaluator overrates, but other evaluators rarely have the same error."""
 
     def __init__(self, members: Iterable[nn.Module]) -> None:
         super().__init__()
         self.members = nn.ModuleList(members)
 
     def forward(self, points: torch.Tensor, normals: torch.Tensor, hands: Hands) -> torch.Tensor:
-        """(N,) as of one."""
+        """Return mean logits (N,)."""
         return torch.stack([member(points, normals, hands) for member in self.members]).mean(dim=0)
 
 
 def learned(hand: HandModel, tries: Attempts, *, seed: int, steps: int = STEPS, rate: float = 2e-3) -> Evaluator:
-    """An evaluator that has seen so many batches of the candidates."""
+    """Train an evaluator on `steps` batches of attempts."""
     torch.manual_seed(seed)
     evaluator = Evaluator(hand)
     optimiser = torch.optim.AdamW(evaluator.parameters(), lr=rate, weight_decay=1e-2)
@@ -197,7 +197,7 @@ def learned(hand: HandModel, tries: Attempts, *, seed: int, steps: int = STEPS, 
 
 
 def scores(evaluator: nn.Module, hand: HandModel, sight: Sight, hands: Proposals) -> Floats:
-    """(N,) logits of hands at one picture: always at the same points of it."""
+    """Return logits (N,) of hands for one picture, from fixed points of the picture."""
     found, seen = np.zeros(len(hands)), Hands.of(hand, hands)
     points, normals = _tensor(sight.points), _tensor(sight.normals)
     with torch.no_grad():
@@ -212,7 +212,7 @@ def scores(evaluator: nn.Module, hand: HandModel, sight: Sight, hands: Proposals
 
 
 def _points(into: int) -> nn.Sequential:
-    """Of each point by itself."""
+    """Return a network that maps each point separately."""
     return nn.Sequential(nn.Linear(into, 64), nn.ReLU(), nn.Linear(64, 128), nn.ReLU(), nn.Linear(128, 128))
 
 
@@ -221,7 +221,7 @@ def _far(distance: torch.Tensor) -> torch.Tensor:
 
 
 def _looked(points: torch.Tensor, normals: torch.Tensor, which: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """`SHOWN` points of each picture, drawn anew, with normals."""
+    """Draw `SHOWN` points of each picture, with normals."""
     some = torch.randint(points.shape[1], (len(which), SHOWN))
     return points[which[:, None], some], normals[which[:, None], some]
 

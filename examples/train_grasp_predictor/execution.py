@@ -1,8 +1,8 @@
-"""From proposals to lifts: what a robot does that knows its hand, the table and what its camera saw, and nothing else.
+"""Open-loop execution of proposals by a robot that knows only hand, table and the camera's points.
 
-A proposal is carried out open loop: from a standoff along its way in, fingers opened wider than it says where the table
-has room for that, then to its grasp and its squeeze, then up. Only what the table forbids is fixed before: a hand that
-would stand in it is raised. The mesh of the object is the simulator's alone.
+The hand approaches from a standoff, closes to the grasp and the squeeze, and rises. During the approach, fingers are
+opened wider than proposed if the table leaves room. A hand that would penetrate the table is raised beforehand. Only
+the simulator knows the mesh of the object.
 """
 
 from __future__ import annotations
@@ -29,36 +29,36 @@ from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.lift import LiftOutcome
 from graspd.worker.validation.lifting import validate_lifts
 
-#: Fingers open by the first of these shares of their range, beyond the proposed pregrasp, for which there is room.
+#: Opening of the fingers beyond the proposed pregrasp, in shares of their range; the first that leaves room is used.
 OPENED: Final = (0.15, 0.1, 0.05, 0.0)
-#: Most by which a hand is raised out of the table [m].
+#: Largest rise of a hand out of the table [m].
 MOST_RAISED_M: Final = 0.05
-#: Postures of the way in.
+#: Waypoints of the approach.
 WAYPOINTS: Final = 6
-#: Points of the hand that are looked at, and the least distance on the way from what the camera saw [m].
+#: Number of hand points, and their least distance from the camera's points on the approach [m].
 _POINTS: Final = 400
 SEEN_M: Final = 0.002
-#: Of epsilon: contacts within this [m].
+#: Contact threshold of epsilon [m].
 CONTACT_M: Final = 0.005
 
 
 @dataclass(frozen=True)
 class Ready:
-    """Proposals as they are carried out, and what the robot knows of them before."""
+    """Proposals ready for execution, with checks by the robot."""
 
     hands: Proposals
     opened: Floats
-    """(N, J) joints of the hand that comes."""
+    """(N, J) joints of the hand on the approach."""
     table: NDArray[np.bool_]
-    """(N,) whether the hand as it was proposed would have stood in the table at its grasp."""
+    """(N,) whether the proposed grasp penetrates the table."""
     clear: NDArray[np.bool_]
-    """(N,) whether grasp and way are clear of the table, and the way of the points that the camera saw."""
+    """(N,) whether grasp and approach are clear of the table, and the approach also of the camera's points."""
 
 
 def made_ready(hand: HandModel, proposed: Proposals, sight: Sight) -> Ready:
-    """Proposals for one picture, opened, and raised out of the table by no more than they stand in it.
+    """Open the fingers of proposals for one picture; raise hands until they are clear of the table.
 
-    How far the hand is to squeeze is no place where it will stand: the object is between.
+    The squeeze is not checked, because the object blocks the fingers before they reach it.
     """
     at_grasp = obstacle_clearance(hand, Posture(proposed.hand_pose, proposed.joints), [table()])
     first = _raised(proposed, CLEAR_M - at_grasp)
@@ -84,47 +84,47 @@ def _raised(hands: Proposals, by: Floats) -> Proposals:
 
 
 def part_of(hands: Proposals, which: NDArray[np.intp]) -> Proposals:
-    """Some of the proposals."""
+    """Return the proposals at the indices `which`."""
     return Proposals(*(np.asarray(part)[which] for part in vars(hands).values()))
 
 
 def taken(ready: Ready, which: NDArray[np.intp]) -> Ready:
-    """Some of the proposals."""
+    """Return the ready proposals at the indices `which`."""
     return Ready(part_of(ready.hands, which), ready.opened[which], ready.table[which], ready.clear[which])
 
 
 def wider(hand: HandModel, joints: Floats, share: float) -> Floats:
-    """(N, J) joints, closing ones opened by a share of their range."""
+    """Return joints (N, J) with closing joints opened by a share of their range."""
     q = hand.reduce(joints)
     return np.asarray(hand.expand(np.clip(q - share * hand.closing * hand.span, hand.lower, hand.upper)))
 
 
 def tighter(hand: HandModel, joints: Floats, by: float) -> Floats:
-    """(N, J) joints, closing ones closed by so much [rad or m]."""
+    """Return joints (N, J) with closing joints closed further by `by` [rad or m]."""
     q = hand.reduce(joints)
     return np.asarray(hand.expand(np.clip(q + by * hand.closing, hand.lower, hand.upper)))
 
 
 def chosen(ready: Ready, count: int) -> NDArray[np.intp]:
-    """(count,) which proposals are carried out: the first that are clear, then others."""
+    """Return the indices (count,) of the proposals to execute: clear ones first."""
     return np.argsort(~ready.clear, kind="stable")[:count]
 
 
 def way_in(hands: Proposals) -> Floats:
-    """(N, W, 7) from the standoff to the grasp's place."""
+    """Return the approach (N, W, 7) of the root link from the standoff to the grasp."""
     poses = np.repeat(hands.hand_pose[:, None], WAYPOINTS, axis=1)
     poses[..., :3] -= np.linspace(STANDOFF_M, 0.0, WAYPOINTS)[:, None] * hands.approach[:, None]
     return poses
 
 
 def table() -> Environment:
-    """What the robot knows to stand around: a table whose top is z = 0, which fingertips may touch."""
+    """Return the known obstacles: a table with its top at z = 0, which fingertips may touch."""
     top = Obstacle.half_space([0.0, 0.0, 1.0], 0.0)
     return Environment((Obstacle(top.planes, top.corners, tips_m=0.0),), UP)
 
 
 def _room_on_the_way(hand: HandModel, hands: Proposals, opened: Floats) -> Floats:
-    """(N,) least distance of the coming hand from the table [m]; fingertips may touch."""
+    """Return the least distance (N,) of the hand from the table on the approach [m]; fingertips may touch."""
     path = way_in(hands)
     n, steps = path.shape[:2]
     coming = Posture(path.reshape(-1, 7), np.repeat(opened, steps, axis=0))
@@ -132,38 +132,38 @@ def _room_on_the_way(hand: HandModel, hands: Proposals, opened: Floats) -> Float
 
 
 def _passes(hand: HandModel, hands: Proposals, opened: Floats, sight: Sight) -> NDArray[np.bool_]:
-    """(N,) whether the coming hand's surface keeps `SEEN_M` from the points that were seen."""
+    """Check (N,) whether the hand keeps `SEEN_M` from the camera's points on the approach."""
     path = way_in(hands)
     n, steps = path.shape[:2]
     points = hand_points(hand, path.reshape(-1, 7), np.repeat(opened, steps, axis=0))
-    # Farther away it does not matter how far: a search without a bound takes ten times as long.
+    # A search without a distance limit takes ten times as long.
     distance, _ = cKDTree(sight.points).query(points.reshape(-1, 3), distance_upper_bound=SEEN_M)
     return np.asarray(np.isinf(distance).reshape(n, -1).all(axis=1))
 
 
 def hand_points(hand: HandModel, pose: Floats, joints: Floats) -> Floats:
-    """(N, H, 3) points on the hand's surface."""
+    """Return points (N, H, 3) on the hand's surface."""
     surface = sample_surface(hand, _POINTS)
     return np.asarray(apply(body_poses(hand, pose, joints)[:, surface.body], surface.position))
 
 
 @dataclass(frozen=True)
 class Lifted:
-    """What became of N proposals."""
+    """Outcomes of N executed proposals."""
 
     lift: NDArray[np.bool_]
     hard: NDArray[np.bool_]
-    """At half the friction besides."""
+    """Whether the hand also lifts at half friction."""
     outcome: NDArray[np.uint8]
     """`LiftOutcome`."""
     epsilon: Floats
-    """(N,) of the hand as it was proposed."""
+    """(N,) of the executed grasps; nan: not measured."""
 
 
 def carried_out(
     hand: HandModel, obj: ObjectModel, pieces: ConvexPieces, ready: list[Ready], seen: list[Sight], *, epsilon: bool
 ) -> Lifted:
-    """Lift tests of all proposals of some pictures of one object."""
+    """Run the lift test of all proposals for some pictures of one object."""
     index = np.repeat(np.arange(len(seen)), [len(one.hands) for one in ready])
     lying = np.array([sight.object_pose for sight in seen])
     back = invert(lying[index])

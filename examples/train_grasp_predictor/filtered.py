@@ -1,4 +1,4 @@
-"""Grasps that were planned around a free object, put into scenes: those whose way the table allows."""
+"""Free grasps transferred to scenes, without those that collide with the table."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from graspd.worker.scenes.trajectory import plan_trajectory
 from graspd.worker.simulation.environment import PlacedGrasps
 from graspd.worker.simulation.obstacles import MARGIN_M, obstacle_clearance
 
-#: Grasps whose way is planned at a time.
+#: Grasps per call of the trajectory planner.
 _TOGETHER: Final = 32
 
 
 def valid_grasps(shards: Shards, obj: str) -> GraspSet | None:
-    """The valid grasps of an object, of all batches; None: there is none."""
+    """Return the valid grasps of an object from all batches; None if there are none."""
     found = []
     for file in sorted(shards.only(objects=[obj]).of("base"), key=lambda file: file.batch):
         shard = read_shard(shards.path(file), kind="base")
@@ -45,18 +45,18 @@ def filtered(
     *,
     seed: int,
 ) -> TrainedModel:
-    """As many grasps as other data have in the same scenes, as far as there are.
+    """Transfer up to as many free grasps to the scenes as another source has there.
 
-    What a scene has no grasp for is made up for in the others of the object.
+    If a scene gets too few grasps, other scenes of the object get more.
 
     Args:
         hand: the hand.
         obj: the object.
-        free: grasps around it.
+        free: free grasps of the object.
         scenes: S scenes.
-        object_pose: (S, 7) where it lies in them.
-        wanted: (S,) how many grasps the other data have in each.
-        seed: of the order in which grasps are tried.
+        object_pose: (S, 7) pose of the object in each scene.
+        wanted: (S,) number of grasps that the other source has in each scene.
+        seed: seed of the order in which grasps are tested.
     """
     rng = np.random.default_rng(seed)
     order = np.array([rng.permutation(len(free)) for _ in scenes])
@@ -82,23 +82,23 @@ def filtered(
 
 
 def nothing(hand: HandModel) -> TrainedModel:
-    """No grasp."""
+    """Return an empty set of grasps."""
     return _to_be_proposed([], np.zeros((0, 12 + 3 * len(hand.joint_names))))
 
 
 def _to_be_proposed(scenes: Sequence[Scene], rows: Floats) -> TrainedModel:
-    """Grasps that nobody lifted, which all count alike."""
+    """Return grasps without lift tests, with equal weights."""
     return TrainedModel(scenes, rows, np.ones(len(rows)), np.zeros(len(rows), bool), np.ones(len(rows)))
 
 
 def _stands(free: GraspSet, order: NDArray[np.intp], pose: Floats, hand: HandModel) -> NDArray[np.bool_]:
-    """(N,) whether the hand stands clear of the table at the grasp."""
+    """Check (N,) whether the hand is clear of the table at the grasp."""
     scene = PlacedGrasps(table().obstacles, pose[None], np.zeros(1, np.intp)).scenes
     return np.asarray(obstacle_clearance(hand, free.grasp.take(order), list(scene)) >= MARGIN_M)
 
 
 def _on_their_way(hand: HandModel, obj: ObjectModel, grasps: GraspSet, pose: Floats) -> GraspSet:
-    """Those of the grasps whose way in and out is clear, with it."""
+    """Return the grasps with a clear approach and lift, with these trajectories."""
     placed = PlacedGrasps(table().obstacles, pose[None], np.zeros(len(grasps), np.intp))
     way = plan_trajectory(hand, obj, grasps, placed)
     found = replace(grasps, approach=way.approach, coming=way.open, lift=way.lift, scene=placed.index)

@@ -1,7 +1,7 @@
-"""The proposal network in PyTorch: what `baselines.learned.network` reads and runs without it.
+"""Proposal network in PyTorch; `baselines.learned.network` runs the trained network without PyTorch.
 
-Points of an object seen by one camera become one feature; a flow carries noise to grasps that go with it, so a cloud
-gets as many different proposals as one likes (conditional flow matching, Lipman et al. 2023).
+The object's points in one picture become one feature. Conditional on this feature, a flow maps noise to grasps, so each
+cloud can have any number of different proposals (conditional flow matching, Lipman et al. 2023).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _FREQUENCIES = 4
 
 
 class Proposer(nn.Module):
-    """A velocity for each of G half-made grasps of each of B clouds."""
+    """Encoder of point clouds, and velocity of the flow from noise to grasps."""
 
     def __init__(self, size: int) -> None:
         super().__init__()
@@ -28,7 +28,7 @@ class Proposer(nn.Module):
         self.flow = nn.ModuleDict({"in": nn.Linear(given, 512), **blocks, "out": nn.Linear(512, size)})
 
     def seen(self, points: torch.Tensor, height: torch.Tensor) -> torch.Tensor:
-        """(B, 257) of points (B, P, 7) and of how high above the table their mean is (B,) [m]."""
+        """Encode points (B, P, 7) and the anchors' heights (B,) above the table [m] as features (B, 257)."""
         each = points
         for name in ("0", "1", "2"):
             each = relu(self.encoder[name](each))
@@ -36,7 +36,7 @@ class Proposer(nn.Module):
         return torch.cat([feature, height[:, None] / UNIT_M], dim=1)
 
     def velocity(self, x: torch.Tensor, time: torch.Tensor, seen: torch.Tensor, label: torch.Tensor) -> torch.Tensor:
-        """(N, D) from x (N, D), time (N,), what is seen (N, 257) and label (N,)."""
+        """Return velocities (N, D) from x (N, D), time (N,), features (N, 257) and label (N,)."""
         turns = 2 * torch.pi * time[:, None] * 2.0 ** torch.arange(_FREQUENCIES)
         h = silu(self.flow["in"](torch.cat([x, turns.sin(), turns.cos(), seen, label[:, None]], dim=1)))
         for name in ("0", "1"):

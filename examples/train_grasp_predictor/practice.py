@@ -1,8 +1,8 @@
-"""What an evaluator learns from: hands that are carried out for pictures that its network was trained on.
+"""Training data of an evaluator: hands executed for the training pictures of a proposal network.
 
-First proposals of the network and moved grasps of its data; then, round by round, what an evaluator of the candidates
-so far chooses and moves: where it believes most, its errors cost most (policies, too, are taught where they themselves
-lead to: DAgger, Ross et al., AISTATS 2011).
+The first round executes proposals of the network and perturbed grasps of its data. Each later round trains an evaluator
+on all attempts so far, and executes the hands that it selects and refines. So the evaluator learns from its own errors,
+as policies do in DAgger (Ross et al., AISTATS 2011).
 """
 
 from __future__ import annotations
@@ -24,40 +24,40 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.validation.decomposition import decompose
 
-#: Pictures of each object that are practised with at first; proposals, and grasps of the data, for each of them.
+#: First round: pictures per object, and proposals and grasps of the data per picture.
 PICTURES: Final = 32
 PROPOSED: Final = 8
 GRASPS: Final = 8
-#: Pictures of each object in each later round, and what is chosen for each of them.
+#: Later rounds: pictures per object, and selected hands per picture.
 LATER: Final = 24
 CHOSEN: Final = 16
-#: Proposals that these are chosen among: fewer than later, for what they teach is where errors lie.
+#: Proposals from which these hands are selected: fewer than in evaluation, because the aim is to find errors.
 AMONG: Final = 32
-#: Sizes of the moves of these grasps, in turn.
+#: Sizes of the perturbations of grasps, used in turn.
 SIZES: Final = (0.0, 0.5, 1.0, 2.0)
-#: How often an evaluator's own choices are tried, and learned from.
+#: Number of later rounds.
 AGAIN: Final = 2
 
-#: From the rows of a scene's grasps, a picture of it and a generator to hands.
+#: Function from the rows of a scene's grasps, a picture of the scene and a generator to hands.
 _HandsFor = Callable[[Floats, Sight, np.random.Generator], Proposals]
 
 
 @dataclass(frozen=True)
 class TrainingRun:
-    """Hands carried out in the scenes of one source's data."""
+    """Execution of hands in the scenes of one source."""
 
     hand: HandModel
     models: Mapping[str, ObjectModel]
     """Objects by name."""
     given: Sequence[TrainedModel]
-    """The data, object by object."""
+    """Grasps of the source, one entry per object."""
     seen: Sequence[Sight]
-    """Pictures; those whose scene has grasps are practised with."""
+    """Pictures; only those of scenes with grasps are used."""
     source: Proposer
-    """What the network proposes."""
+    """Proposer of the network."""
 
     def tries(self, *, seed: int) -> Attempts:
-        """All rounds."""
+        """Run all rounds and return their attempts."""
         rng = np.random.default_rng(seed)
         tries = self.candidates(self.beginning, PICTURES, rng)
         for _ in range(AGAIN):
@@ -66,7 +66,7 @@ class TrainingRun:
         return tries
 
     def candidates(self, hands_for: _HandsFor, pictures: int, rng: np.random.Generator) -> Attempts:
-        """What becomes of hands for so many pictures of each object."""
+        """Execute hands for at most `pictures` pictures of each object."""
         sights: list[Sight] = []
         hands: list[Proposals] = []
         lifted = []
@@ -85,7 +85,7 @@ class TrainingRun:
         return Attempts.of(self.hand, sights, hands, np.concatenate(lifted))
 
     def beginning(self, rows: Floats, sight: Sight, rng: np.random.Generator) -> Proposals:
-        """What the first round tries: proposals, then moved grasps of the scene."""
+        """Return the hands of the first round: proposals, then perturbed grasps of the scene."""
         drawn = decode(rows[rng.choice(len(rows), GRASPS)], np.zeros(3))
         return joined(self.source(sight, PROPOSED, rng), moved(self.hand, drawn, np.resize(SIZES, GRASPS), rng))
 

@@ -1,4 +1,4 @@
-"""Of what a network proposes for a picture, the hands that an evaluator believes in, moved until it believes more."""
+"""Selection of proposals with the best evaluator scores, and refinement by random perturbations."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from graspd.baselines.learned.network import Proposals
 from graspd.service.model.transforms import quat_from_axis_angle, quat_multiply, quat_rotate
 from graspd.worker.hands.model import HandModel
 
-#: Moves of size 1, standard deviations: of the place [m], the attitude [rad] and the joints [rad or m], each by itself,
-#: all closing ones together, and these at the squeeze alone: too little and too much of it both lose what is held.
+#: Standard deviations of a perturbation of size 1: position [m], rotation [rad], each joint [rad or m], all closing
+#: joints together, and all closing joints in the squeeze only, because too weak and too strong a squeeze fail.
 PLACE_M, TURN, JOINT, CLOSING, SQUEEZE = 0.008, 0.1, 0.05, 0.05, 0.05
-#: Sizes of the moves, round by round; the hands that go on from each, and the moves of each of these.
+#: Size of perturbations in each round; hands kept per round, and perturbations per kept hand.
 ROUNDS: Final = (1.0, 0.7, 0.5, 0.4)
 KEPT, MOVES = 12, 4
-#: What is not clear of the table and of what was seen counts so much less [logit].
+#: Penalty of hands that are not clear of the table and the camera's points [logit].
 _BLOCKED: Final = 4.0
-#: Hands whose places are no farther apart are the same proposal [m].
+#: Hands whose root links are at most this far apart count as the same proposal [m].
 APART_M: Final = 0.01
 
-#: Proposals that a picture begins with: 32 lifted fewer of the unseen faces, 256 no more.
+#: Initial proposals per picture: 32 lifted fewer unseen faces, and 256 lifted no more.
 BEGUN: Final = 96
 
 
 @dataclass(frozen=True)
 class RefinedHands:
-    """A `Proposer` of what an evaluator has chosen."""
+    """`Proposer` of hands selected and refined by an evaluator."""
 
     hand: HandModel
     evaluator: nn.Module
@@ -44,7 +44,7 @@ class RefinedHands:
     begun: int = BEGUN
 
     def __call__(self, sight: Sight, count: int, rng: np.random.Generator) -> Proposals:
-        """(count,) hands, the best first."""
+        """Return `count` hands, the best first."""
         hands, values = self._scored(self.source(sight, self.begun, rng), sight)
         for size in self.rounds:
             best = np.argsort(-values, kind="stable")[:KEPT]
@@ -55,13 +55,13 @@ class RefinedHands:
         return part_of(hands, _apart(hands, np.argsort(-values, kind="stable"), count))
 
     def _scored(self, hands: Proposals, sight: Sight) -> tuple[Proposals, Floats]:
-        """Hands as they would be carried out, and what they are worth."""
+        """Return hands ready for execution, and their scores."""
         ready = made_ready(self.hand, hands, sight)
         return ready.hands, scores(self.evaluator, self.hand, sight, ready.hands) - _BLOCKED * ~ready.clear
 
 
 def moved(hand: HandModel, hands: Proposals, size: ArrayLike, rng: np.random.Generator) -> Proposals:
-    """Hands (N,), each moved at random a little; `size` () or (N,)."""
+    """Perturb N hands at random; `size` is () or (N,)."""
     n = len(hands)
     by = np.broadcast_to(size, (n,))[:, None]
     turn = TURN * by * rng.standard_normal((n, 3))
@@ -81,12 +81,12 @@ def moved(hand: HandModel, hands: Proposals, size: ArrayLike, rng: np.random.Gen
 
 
 def joined(*parts: Proposals) -> Proposals:
-    """Proposals one after another."""
+    """Concatenate proposals."""
     return Proposals(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])))
 
 
 def _apart(hands: Proposals, order: np.ndarray, count: int) -> np.ndarray:
-    """The first of an order that lie apart, then, where these are too few, the others."""
+    """Return the first hands of `order` with distinct positions; if these are too few, also others."""
     chosen: list[int] = []
     for index in order:
         gaps = np.linalg.norm(hands.hand_pose[chosen, :3] - hands.hand_pose[index, :3], axis=1)

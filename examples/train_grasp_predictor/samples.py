@@ -1,7 +1,6 @@
-"""What cameras saw of objects on a table, and the grasps of each scene as rows of numbers that a network learns.
+"""Training samples: point clouds of objects on a table, and grasps of each scene as rows of numbers.
 
-A row has the 12 + 3 J numbers of `baselines.learned.network`, in the frame of the table, z up, counted from its
-origin.
+A row has the 12 + 3 J numbers of `baselines.learned.network`, in the table frame with z up.
 """
 
 from __future__ import annotations
@@ -21,15 +20,15 @@ from graspd.worker.grasps import GraspSet
 
 Floats = NDArray[np.float64]
 
-#: Points of a cloud that are kept; fewer are shown to a network at a time.
+#: Points per cloud; the input of a network is a part of them.
 POINTS: Final = 1024
-#: A picture that shows less of its object is left out [pixels].
+#: Least number of object pixels in a picture; pictures with fewer are omitted.
 LEAST_SEEN: Final = 60
 
 
 @dataclass(frozen=True)
 class Scene:
-    """One object as it lies on one face; `shard` is the base shard of the grasps that were planned there."""
+    """An object at rest on one face; `shard` is the base shard of the grasps planned in the scene."""
 
     object: str
     shard: str
@@ -38,15 +37,15 @@ class Scene:
 
 @dataclass(frozen=True)
 class Sight:
-    """One picture of a scene as points of its object, in the frame of the table."""
+    """One picture of a scene as points of its object, in the table frame."""
 
     scene: Scene
     points: Floats
     """(P, 3) [m]"""
     normals: Floats
-    """(P, 3) unit, toward the camera."""
+    """(P, 3) unit normals towards the camera."""
     object_pose: Floats
-    """(7,) where the object lies: for labels and for the simulator, never shown to who proposes."""
+    """(7,) pose of the object, for labels and simulation; not an input of networks."""
 
     @property
     def anchor(self) -> Floats:
@@ -55,11 +54,11 @@ class Sight:
 
 
 def sights(shards: Shards, *, noise: str) -> list[Sight]:
-    """All pictures that show enough of their object.
+    """Return all pictures with at least `LEAST_SEEN` pixels of the object.
 
     Args:
         shards: base and views shards of grasps that were planned in scenes.
-        noise: of the depth camera; see docs/how-to/clouds.md.
+        noise: noise of the depth camera; see docs/how-to/clouds.md.
     """
     clouds = Pictures(shards, valid=False).clouds(POINTS, noise=noise, frame="table")
     found = []
@@ -80,11 +79,11 @@ class TrainedModel:
     rows: Floats
     """(K, 12 + 3 J)"""
     label: Floats
-    """(K,) 1: to be proposed; 0: an example of what fails."""
+    """(K,) 1: grasp to propose; 0: failed grasp."""
     hard: NDArray[np.bool_]
-    """(K,) whether it lifts at half the friction too."""
+    """(K,) whether the grasp also lifts at half friction."""
     weight: Floats
-    """(K,) how often a grasp is shown, beside the others of its scene."""
+    """(K,) relative frequency in training among the grasps of the scene."""
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -95,12 +94,12 @@ class TrainedModel:
 
 
 def taught(shards: Shards, obj: str, *, valid: bool = True) -> TrainedModel:
-    """The grasps of an object that were planned in its scenes, in the order of their batches."""
+    """Return the grasps in an object's scenes, sorted by batch: valid ones, or all with a verdict."""
     scenes: list[Scene] = []
     rows, label, hard = [], [], []
     for file in sorted(shards.only(objects=[obj]).of("base"), key=lambda file: file.batch):
         shard = read_shard(shards.path(file), kind="base")
-        # What is not clear on its way has no verdict: it is no example of anything.
+        # Grasps without a clear approach have no verdict and are omitted.
         kept = np.flatnonzero(
             np.asarray(shard["quality/valid"]) == 1 if valid else np.asarray(shard["quality/success"], int) >= 0
         )
@@ -113,12 +112,12 @@ def taught(shards: Shards, obj: str, *, valid: bool = True) -> TrainedModel:
 
 
 def poses_of(shard: Shard) -> Floats:
-    """(S, 7) where the object lies in each scene of a base shard."""
+    """Return the object's poses (S, 7) in the scenes of a base shard."""
     return np.asarray(shard["scene/object_pose"], float)
 
 
 def rows_of(grasps: GraspSet, object_pose: Floats) -> Floats:
-    """(K, 12 + 3 J) from grasps in the object's frame, which lies at `object_pose` (K, 7)."""
+    """Return rows (K, 12 + 3 J) from grasps in the object frame and the object's poses (K, 7)."""
     assert grasps.approach is not None
     way = grasps.approach[:, -1, :3] - grasps.approach[:, 0, :3]
     way /= np.linalg.norm(way, axis=1, keepdims=True)
@@ -131,13 +130,13 @@ def rows_of(grasps: GraspSet, object_pose: Floats) -> Floats:
 
 
 def apart(faces: Floats) -> int:
-    """Of directions that look up (S, 3) in the object's frame, the one that is farthest from all others."""
+    """Return the index of the up direction (S, 3), in the object frame, that is farthest from the others."""
     cosine = faces @ faces.T - 2.0 * np.eye(len(faces))
     return int(np.argmin(cosine.max(axis=1)))
 
 
 def each_scene(taught_here: TrainedModel) -> Iterator[tuple[Scene, NDArray[np.intp]]]:
-    """Scenes with the rows of their grasps."""
+    """Yield scenes with the row numbers of their grasps."""
     rows: dict[Scene, list[int]] = {}
     for row, scene in enumerate(taught_here.scenes):
         rows.setdefault(scene, []).append(row)

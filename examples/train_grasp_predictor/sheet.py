@@ -1,4 +1,4 @@
-"""A page to look at: for each unseen object what each source proposes, as it is carried out."""
+"""Page of pictures: executed proposals of each source for each unseen object."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from graspd.worker.rendering.pictures import grasp_pictures
 from graspd.worker.rendering.sheets import label_page
 
 SIDE: Final = 200
-#: Pictures of each object whose first proposal is drawn.
+#: Pictures per object; the first proposal for each is drawn.
 DRAWN: Final = 2
 _LIFTED, _LOST = (40, 160, 60), (200, 60, 50)
 
@@ -27,7 +27,7 @@ Found = tuple[Exam, list[Ready], Lifted]
 
 
 def page(hand: HandModel, found: Mapping[str, Mapping[str, Found]]) -> bytes:
-    """PNG with a row for each object and `DRAWN` pictures of each source; a green frame: it was lifted."""
+    """Return a PNG with a row per object and `DRAWN` pictures per source; a green frame means lifted."""
     rows, names = [], []
     for obj, of_sources in found.items():
         cells = []
@@ -44,7 +44,7 @@ def page(hand: HandModel, found: Mapping[str, Mapping[str, Found]]) -> bytes:
 
 
 def _lying(obj: ObjectModel, pose: Floats) -> ObjectModel:
-    """The surface of an object as it lies on the table."""
+    """Return the object with its surface moved to a pose on the table."""
     vertices, normals = apply(pose, obj.vertices), quat_rotate(pose[3:], obj.corner_normals)
     return replace(obj, vertices=vertices, corner_normals=normals)
 

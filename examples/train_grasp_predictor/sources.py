@@ -1,4 +1,4 @@
-"""What networks are trained on: the same number of grasps of each object, in the same scenes and pictures."""
+"""Sources of training data, with the same number of grasps per object in the same scenes and pictures."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.environment import UP
 
-#: Sizes of the ablation beside the usual one, and other quarters than the first.
+#: Ablations: smaller sizes, and quarters selected by similarity instead of the first quarter.
 QUARTER, SIXTEENTH = "scenes, a quarter", "scenes, a sixteenth"
 ALIKE, UNLIKE = "scenes, the quarter most alike", "scenes, the quarter most unlike"
 FAILED, HARD = "scenes, failures told", "scenes, by half the friction"
 SCENES: Final = "scenes in the loop"
-#: How often a grasp is shown that lifts at half the friction too, for each that does not.
+#: Weight in training of grasps that also lift at half friction; other grasps have weight 1.
 HARD_WEIGHT: Final = 4.0
-#: Radians that weigh like a metre where grasps are compared.
+#: Length equivalent to one radian in distances of grasps [m].
 _RADIAN_M: Final = 0.05
 
 
 class Held:
-    """Which scenes are trained on: those of an object's faces but one, the one that looks least like the others."""
+    """Scenes excluded from training: one face of each object, the face that differs most from the others."""
 
     def __init__(self, shards: Shards, objects: Sequence[str]) -> None:
         self.face: dict[str, int] = {}
@@ -50,19 +50,19 @@ class Held:
 
 
 def in_scenes(shards: Shards, obj: str, held: Held, count: int) -> TrainedModel:
-    """The first grasps of an object that were planned in its scenes."""
+    """Return the first `count` grasps planned in training scenes of an object."""
     return first(held.trained(taught(shards, obj)), count)
 
 
 def first(given: TrainedModel, count: int) -> TrainedModel:
-    """The first grasps; all, where there are fewer."""
+    """Return the first `count` grasps, or all if there are fewer."""
     return given.take(np.arange(min(count, len(given))))
 
 
 def put_into(
     free: Shards, hand: HandModel, obj: ObjectModel, name: str, like: TrainedModel, held: Held, *, seed: int
 ) -> TrainedModel:
-    """As many free grasps as `like` has, put into its scenes and filtered."""
+    """Return up to as many free grasps as `like` has, transferred to its scenes and filtered."""
     scenes, counts = zip(*((scene, len(rows)) for scene, rows in each_scene(like)), strict=True)
     poses = np.array([held.poses[scene] for scene in scenes])
     grasps = valid_grasps(free, name)
@@ -70,8 +70,8 @@ def put_into(
 
 
 def spread(given: TrainedModel, held: Held, count: int, *, alike: bool) -> TrainedModel:
-    """`count` grasps of an object that resemble one another, or do not: the nearest to the one in their middle, or each
-    the farthest from those before it."""
+    """Return `count` similar (`alike`) or dissimilar grasps of an object, beginning with the medoid.
+    Similar grasps are the nearest to the medoid; each dissimilar grasp is the farthest from those before it."""
     place = _of_object(given, held)
     apart_by = np.linalg.norm(place[:, None] - place[None], axis=2)
     if alike:
@@ -85,7 +85,7 @@ def spread(given: TrainedModel, held: Held, count: int, *, alike: bool) -> Train
 
 
 def _of_object(given: TrainedModel, held: Held) -> Floats:
-    """(K, ...) hands' places in the object's frame: positions [m], columns of rotations and joints as lengths."""
+    """Return hand poses (K, D) in the object frame: position, rotation columns and joints as lengths [m]."""
     pose = np.array([held.poses[scene] for scene in given.scenes])
     back = quat_conjugate(pose[:, 3:])
     position = quat_rotate(back, given.rows[:, :3] - pose[:, :3])
@@ -95,10 +95,10 @@ def _of_object(given: TrainedModel, held: Held) -> Floats:
 
 
 def with_failures(shards: Shards, obj: str, held: Held, count: int) -> TrainedModel:
-    """The first grasps of an object that were planned in its scenes and validated, whatever the verdict."""
+    """Return the first `count` validated grasps in training scenes of an object, with any verdict."""
     return first(held.trained(taught(shards, obj, valid=False)), count)
 
 
 def by_friction(given: TrainedModel) -> TrainedModel:
-    """The same grasps, those shown more often that lift at half the friction."""
+    """Return the grasps with larger weights for those that lift at half friction."""
     return replace(given, weight=np.where(given.hard, HARD_WEIGHT, 1.0))

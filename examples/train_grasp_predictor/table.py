@@ -1,4 +1,4 @@
-"""The scores as tables: what each source is worth, by unseen objects and faces, and object by object."""
+"""Tables of scores: by source, on unseen objects and faces, and by object."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from examples.train_grasp_predictor.evaluation import FACE, OBJECT
 
 Row = dict[str, Any]
 
-#: Column -> kind of exam, figure, digits.
+#: Column -> kind of exam, key of the score.
 _COLUMNS: Final = {
     "lift": (OBJECT, "lift"),
     "first proposal": (OBJECT, "best"),
@@ -23,8 +23,8 @@ _COLUMNS: Final = {
 
 
 def markdown(rows: Sequence[Row]) -> str:
-    """For each hand a table of sources and one of objects. Cells are means over the objects, each counting alike; then
-    the mean over seeds and the standard deviation between them."""
+    """Return a table by source and a table by object for each hand. Cells by object are means over seeds.
+    Cells by source are means over objects with equal weights, then mean ± standard deviation over seeds."""
     parts = []
     for hand in dict.fromkeys(row["hand"] for row in rows):
         mine = [row for row in rows if row["hand"] == hand]

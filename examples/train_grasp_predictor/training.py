@@ -1,4 +1,4 @@
-"""Training: the same number of steps for every source."""
+"""Training of the proposal network, with the same number of steps for every source."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from numpy.typing import NDArray
 from examples.train_grasp_predictor.network import UNIT_M, Proposer
 from examples.train_grasp_predictor.samples import Sight, TrainedModel, each_scene
 
-#: Clouds of a step, points that a network is shown of each, and grasps of each.
+#: Clouds per step, points per cloud, and grasps per cloud.
 BATCH: Final = 24
 SHOWN: Final = 160
 GRASPS: Final = 8
-#: How much position, rotation, way in, and joints at grasp, pregrasp and squeeze count: most of all where a hand is.
+#: Weights of position, rotation, approach, and joints at grasp, pregrasp and squeeze in the loss.
 COUNTS: Final = (8.0, 4.0, 1.0, 1.0, 0.2, 0.5)
-#: Further noise of points, standard deviation [m].
+#: Standard deviation of additional noise of points [m].
 JITTER_M: Final = 0.001
-#: Least deviation of a number of a row: what never changes has none.
+#: Lower limit of the standard deviations of row entries; constant entries would have 0.
 _LEAST: Final = 1e-3
 
 
 @dataclass(frozen=True)
 class Trained:
-    """A network with what its numbers mean."""
+    """Trained network with the normalisation of its rows."""
 
     network: Proposer
     mean: NDArray[np.float32]
-    """(D,) of the rows it learned, positions counted from the cloud's anchor."""
+    """(D,) of the training rows, with positions relative to the cloud's anchor."""
     std: NDArray[np.float32]
     loss: float
     """Mean over the last tenth of the steps."""
@@ -39,21 +39,21 @@ class Trained:
 
 @dataclass(frozen=True)
 class TrainingData:
-    """All pictures that show a scene with grasps, as tensors."""
+    """Tensors of all pictures of scenes with grasps."""
 
     points: torch.Tensor
-    """(V, P, 3) counted from the anchor."""
+    """(V, P, 3) relative to the anchor [m]."""
     normals: torch.Tensor
     height: torch.Tensor
-    """(V,) of the anchor above the table."""
+    """(V,) height of the anchor above the table [m]."""
     rows: list[torch.Tensor]
-    """(K, D) of each picture, positions counted from its anchor."""
+    """(K, D) of each picture, with positions relative to its anchor."""
     label: list[torch.Tensor]
     weight: list[torch.Tensor]
 
     @classmethod
     def of(cls, seen: Sequence[Sight], taught: Sequence[TrainedModel]) -> TrainingData:
-        """Pictures of scenes that have grasps."""
+        """Create tensors of the pictures of scenes with grasps."""
         of_scene = {scene: (part, which) for part in taught for scene, which in each_scene(part)}
         kept = [sight for sight in seen if sight.scene in of_scene]
         rows, label, weight = [], [], []
@@ -74,9 +74,9 @@ class TrainingData:
 
 
 def train(lessons: TrainingData, *, steps: int, seed: int, rate: float = 1e-3) -> Trained:
-    """A network that has seen so many batches of the lessons.
+    """Train a network on `steps` batches.
 
-    Each time a cloud is shown it is turned about the vertical with its grasps, thinned anew and shaken a little.
+    In each batch, clouds and their grasps are rotated about the vertical; points are drawn at random and get noise.
     """
     torch.manual_seed(seed)
     everything = torch.cat([_turned_rows(rows, _angles(len(rows))) for rows in lessons.rows for _ in range(4)])
@@ -103,7 +103,7 @@ def train(lessons: TrainingData, *, steps: int, seed: int, rate: float = 1e-3) -
 
 
 def _weights(size: int) -> torch.Tensor:
-    """(D,) how much the parts of a row count, 1 in the mean."""
+    """Return the weights (D,) of the entries of a row, with mean 1."""
     joints = (size - 12) // 3
     parts = zip(COUNTS, (3, 6, 3, joints, joints, joints), strict=True)
     weights = torch.cat([torch.full((length,), count) for count, length in parts])
@@ -111,13 +111,13 @@ def _weights(size: int) -> torch.Tensor:
 
 
 def _batch(lessons: TrainingData) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Points (B, P, 7), heights (B,), rows (B G, D) and labels (B G,)."""
+    """Draw points (B, P, 7), heights (B,), rows (B G, D) and labels (B G,)."""
     chosen = torch.randint(len(lessons), (BATCH,))
     angle = _angles(BATCH)
     some = torch.randint(lessons.points.shape[1], (BATCH, SHOWN))
     points, normals = (part[chosen[:, None], some] for part in (lessons.points, lessons.normals))
     points = turned(points, angle[:, None]) + JITTER_M * torch.randn(BATCH, SHOWN, 3)
-    # The anchor is that of all points; of those shown the mean differs a little, as it does when proposing.
+    # The anchor is the mean of all points, which differs slightly from the mean of the drawn points.
     above = (points[..., 2] + lessons.height[chosen, None])[..., None] / UNIT_M
     clouds = torch.cat([points / UNIT_M, turned(normals, angle[:, None]), above], dim=2)
     rows, label = [], []
@@ -129,14 +129,14 @@ def _batch(lessons: TrainingData) -> tuple[torch.Tensor, torch.Tensor, torch.Ten
 
 
 def turned(vectors: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
-    """Vectors (..., 3) turned about the vertical by angles (...) [rad]."""
+    """Rotate vectors (..., 3) about the vertical by angles (...) [rad]."""
     c, s = angle.cos(), angle.sin()
     x, y, z = vectors.unbind(-1)
     return torch.stack([c * x - s * y, s * x + c * y, z.expand_as(x)], dim=-1)
 
 
 def _turned_rows(rows: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
-    """Rows (K, D), each turned by its angle (K,)."""
+    """Rotate each row (K, D) about the vertical by its angle (K,) [rad]."""
     vectors = rows[:, :12].reshape(len(rows), 4, 3)
     return torch.cat([turned(vectors, angle[:, None]).reshape(len(rows), 12), rows[:, 12:]], dim=1)
 

@@ -1,4 +1,4 @@
-"""What a network must beat: hands across what is seen, and the grasps of the most similar picture."""
+"""Controls without a network: pinches across visible points, and grasps of the most similar picture."""
 
 from __future__ import annotations
 
@@ -16,31 +16,31 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.pinch_postures import oppositions_of
 from graspd.worker.simulation.environment import UP
 
-#: Draws for each hand that is kept, and the farthest that a hand leans from straight down [rad].
+#: Random draws per returned hand, and largest angle between hand and vertical [rad].
 DRAWS: Final = 8
 LEANS: Final = np.deg2rad(20.0)
-#: By how much closing joints press beyond contact [rad]: of 0.1, 0.2 and 0.4 what lifts most of objects trained on.
+#: Angle by which joints close beyond contact [rad]: the best of 0.1, 0.2 and 0.4 on training objects.
 SQUEEZE: Final = 0.1
-#: Share of their range by which fingers are open before they close.
+#: Opening of the fingers before closing, as a share of their range.
 _OPEN: Final = 0.15
-#: Share of points beyond which an extent does not count them: a depth camera's edges bleed.
+#: Share of points ignored at each end of an extent, because edges in depth pictures are blurred.
 _OUTSIDE: Final = 0.02
-#: How far below the top of what is seen pads take hold at most [m].
+#: Largest depth of the fingertips below the top of the visible points [m].
 BELOW_TOP_M: Final = 0.03
-#: Turns about the vertical and points by which pictures are compared.
+#: Rotations about the vertical, and points, in comparisons of pictures.
 TURNS: Final = 16
 COMPARED: Final = 64
 
 
 def across(hand: HandModel, sight: Sight, count: int, *, squeeze: float, rng: np.random.Generator) -> Proposals:
-    """Hands from above with opposed fingers across what is seen: of random directions those in which it is narrow.
+    """Return pinches from above across the visible points, in the narrowest of random directions.
 
     Args:
         hand: a hand whose fingers oppose one another.
         sight: the picture.
-        count: N.
-        squeeze: by how much closing joints press beyond contact [rad].
-        rng: draws directions.
+        count: number of hands.
+        squeeze: angle by which joints close beyond contact [rad].
+        rng: generator of directions.
     """
     known, n = oppositions_of(hand), DRAWS * count
     turn, lean = rng.uniform(0, 2 * np.pi, n), rng.uniform(-LEANS, LEANS, n)
@@ -63,20 +63,20 @@ def across(hand: HandModel, sight: Sight, count: int, *, squeeze: float, rng: np
 
 
 def _frame(x: Floats, towards: Floats) -> Floats:
-    """(N, 3, 3) rotations with first columns `x` (N, 3), unit, and third ones as near to `towards` (N, 3) as may be."""
+    """Return rotations (N, 3, 3): first column `x` (N, 3), unit; third column nearest to `towards` (N, 3)."""
     z = towards - (towards * x).sum(axis=1, keepdims=True) * x
     z /= np.linalg.norm(z, axis=1, keepdims=True)
     return np.stack([x, np.cross(z, x), z], axis=-1)
 
 
 class Nearest:
-    """The grasps of the picture that looks most alike after a turn about the vertical."""
+    """Proposer of the grasps of the most similar picture, up to rotations about the vertical."""
 
     def __init__(self, seen: Sequence[Sight], taught: Sequence[TrainedModel]) -> None:
         """
         Args:
-            seen: pictures; those whose scene has grasps are kept.
-            taught: the grasps.
+            seen: pictures; only those of scenes with grasps are used.
+            taught: grasps of each object.
         """
         self._rows = {scene: part.rows[which] for part in taught for scene, which in each_scene(part)}
         self._seen = [sight for sight in seen if sight.scene in self._rows]
@@ -85,11 +85,11 @@ class Nearest:
 
     @staticmethod
     def _shape(sight: Sight) -> Floats:
-        """(C, 3) some points, counted from the anchor's foot on the table."""
+        """Return some points (C, 3) relative to the table point below the anchor."""
         return np.asarray(sight.points[:COMPARED] - [*sight.anchor[:2], 0.0])
 
     def propose(self, sight: Sight, count: int, rng: np.random.Generator) -> Proposals:
-        """The grasps of the most similar pictures, the best first, where theirs would lie here."""
+        """Return the grasps of the most similar pictures, moved to this object; the best picture is first."""
         shape = self._shape(sight)
         angles = 2 * np.pi * np.arange(TURNS) / TURNS
         turns = np.stack([_turned(shape, -angle) for angle in angles])
@@ -115,7 +115,7 @@ class Nearest:
 
 
 def _gaps(tree: cKDTree, points: Floats) -> Floats:
-    """(...) distances of points (..., 3) from the nearest of a tree."""
+    """Return the distances (...) of points (..., 3) from the nearest point of a tree."""
     return np.asarray(tree.query(points)[0])
 
 

@@ -95,7 +95,7 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
         "quality/thresholds_m": Column("T", "f8", "m", "none", "contact thresholds of the sweep"),
         **_measured(optional=False),
         "quality/valid": Column(
-            "N", "u1", "bool", "none", "1: feasible, and held by the validator; 0 also if not validated"
+            "N", "u1", "bool", "none", "1: feasible, and held in validation; 0 also if not validated"
         ),
         "quality/feasible": _flag("1: within the geometric limits of penetration and contact", "u1"),
         "quality/success": _flag(
@@ -257,7 +257,7 @@ ATTRIBUTES: Final[dict[str, RootAttribute]] = {
     "created": RootAttribute("text", "time of creation, RFC 3339"),
     "code_version": RootAttribute("text", "version of graspd that made the shard"),
     "shard_id": RootAttribute("text", "name of the shard in the store"),
-    "inputs": RootAttribute("texts", "names of the shards from which this one was made"),
+    "inputs": RootAttribute("texts", "names of the shards from which this shard was made"),
     "joint_names": RootAttribute("texts", "order of the hand's joints", _BASE),
     "wrist_joint_names": RootAttribute(
         "texts",
@@ -267,7 +267,7 @@ ATTRIBUTES: Final[dict[str, RootAttribute]] = {
     "root_link": RootAttribute("text", "link of the hand to which poses refer"),
     "mu": RootAttribute("number", "Coulomb coefficient of `quality/epsilon` and `quality/wrench_volume`", _BASE),
     "want": RootAttribute(
-        "text", "valid: valid grasps were requested (feasible ones without validation); candidates: any", _BASE
+        "text", "valid: valid grasps were requested (without validation: feasible); candidates: any grasps", _BASE
     ),
     "candidates": RootAttribute("integer", "candidates planned until the last stored grasp", _BASE),
     "outcomes": RootAttribute("text", "JSON: rejected candidates by outcome", _BASE),
@@ -280,7 +280,7 @@ ATTRIBUTES: Final[dict[str, RootAttribute]] = {
     ),
     "verdict_level": RootAttribute("text", "level of validation; `none`: not validated", _BASE),
     "verdict_key": RootAttribute(
-        "text", "digest of everything that decides the verdicts; do not average verdicts with different keys", _BASE
+        "text", "digest of all settings that affect the verdicts; do not average verdicts with different keys", _BASE
     ),
     "scene": RootAttribute(
         "text", "scene of the grasps, as JSON; absent: planned around a free object", ("base", "scene", "views")
@@ -288,12 +288,12 @@ ATTRIBUTES: Final[dict[str, RootAttribute]] = {
     "source": RootAttribute("text", "imported grasps: address or citation of the source", _BASE),
     "licence": RootAttribute("text", "imported grasps: terms of use", _BASE),
     "base_shard": RootAttribute(
-        "text", "base shard whose grasps were transferred, or were planned in the scenes shown", ("scene", "views")
+        "text", "base shard of the grasps that were transferred to the scenes, or planned in them", ("scene", "views")
     ),
-    "scene_shard": RootAttribute("text", "scene shard that is shown, or contains the grasps", ("base", "views")),
+    "scene_shard": RootAttribute("text", "scene shard of the grasps or pictures", ("base", "views")),
     "neighbours": RootAttribute("texts", "names of the neighbours"),
     "neighbour_digests": RootAttribute("texts", "digests of the neighbours' files"),
-    "neighbour_sources": RootAttribute("texts", "paths from which a local command read them; empty: built in"),
+    "neighbour_sources": RootAttribute("texts", "paths from which a local command read neighbours; empty: built in"),
 }
 
 
