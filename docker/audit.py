@@ -18,13 +18,13 @@ PINS = Path(__file__).parent / "constraints.txt"
 def main() -> int:
     """Audit the environment, then the versions that the images install."""
     found = [
-        _recheck("this environment", "--skip-editable", "--local"),
-        _recheck("the images", "--requirement", str(PINS), "--no-deps", "--disable-pip"),
+        _audit("this environment", "--skip-editable", "--local"),
+        _audit("the images", "--requirement", str(PINS), "--no-deps", "--disable-pip"),
     ]
     return max(found)
 
 
-def _recheck(what: str, *options: str) -> int:
+def _audit(what: str, *options: str) -> int:
     command = [sys.executable, "-m", "pip_audit", "--format", "json", "--progress-spinner", "off", *options]
     run = subprocess.run(command, capture_output=True, text=True, check=False)
     try:

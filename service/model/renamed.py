@@ -13,7 +13,6 @@ KEYS: Final = {
     "audit_held": "recheck_held",
     "tried": "candidates",
     "lane": "priority",
-    "unsound": "infeasible",
     "fragile": "not_robust",
 }
 _LEVELS: Final = {"letter": "dexgraspbench", "certificate": "standard", "screen": "fast"}

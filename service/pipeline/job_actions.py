@@ -23,6 +23,7 @@ from graspd.service.model.clock import timestamp
 from graspd.service.model.digests import job_id
 from graspd.service.model.domain import JobOptions, JobRequest, batches_of
 from graspd.service.model.errors import ConflictError, InputError, NotFoundError, SceneError, UnavailableError
+from graspd.service.model.fidelity import AUTO
 from graspd.service.model.messages import (
     Capabilities,
     Origin,
@@ -184,7 +185,7 @@ def prepare(
     check_scene(request, obj, beside)
     services.queue.ping()
     named = request.model_copy(update={"hand": hand.name, "object": obj.name})
-    request, choice = Resolver(services.store).choose(named)
+    request, choice = Resolver(services.store).choose(named) if named.fidelity == AUTO else (named, None)
     origin = Origin(request=bound("request"), key=bound("key"))
     record = JobRecord(
         id=job_id(request, hand.digest, obj.digest, scope.project),
