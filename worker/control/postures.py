@@ -41,15 +41,15 @@ WIDE: Final = 0.4
 _POINTS: Final = 600
 PRESSING_M: Final = 0.003
 MAX_PRESSING: Final = 16
-#: Range within which points of a finger near the object, but without contact, press [m]. The command must close this
-#: finger, or else the other fingers push a free object past it.
+#: Distance below which a finger without contact is closed by the squeeze, too [m]. Otherwise the other fingers push a
+#: free object past it.
 CLOSING_M: Final = 0.009
 #: Distances at which a finger could touch the object but does not [m]. Fingers beyond are not part of the grasp.
 STANDS_OFF_M: Final = (0.005, 0.02)
-#: Reach of their measurement [m].
+#: Reach of distance measurements of such fingers [m].
 FAR_M: Final = 0.025
-#: Largest number of closing steps of such fingers, each `opening.OPENING_STEP` or `SLIDING_STEP_M`, and the distance at
-#: which they stop [m]. Between two points of a finger, its surface is up to half a millimetre closer.
+#: Largest number of closing steps of such fingers (`opening.dof_steps`), and their distance at the end [m]. Between two
+#: sampled points, a finger's surface is up to half a millimetre closer.
 CLOSING_STEPS: Final = 16
 CLOSED_M: Final = 0.0005
 #: Sum of the contact forces' normal components [N], and the Coulomb coefficient for their balance. The coefficient is
@@ -141,14 +141,14 @@ def touching_links(hand: HandModel, obj: ObjectModel, grasp: Posture, *, device:
 
 def fingers_off_object(hand: HandModel, obj: ObjectModel, grasp: Posture, *, device: str = "cpu") -> NDArray[np.bool_]:
     """Return a mask (N,) of grasps with a finger whose distance from the object is in `STANDS_OFF_M`."""
-    return _fingers_off(posing_of(hand, obj, points=_POINTS, device=device), grasp).any(axis=1)
+    return np.asarray(_fingers_off(posing_of(hand, obj, points=_POINTS, device=device), grasp).any(axis=1))
 
 
 def close_fingers(
     hand: HandModel, obj: ObjectModel, grasp: Posture, placed: PlacedGrasps, *, device: str = "cpu"
 ) -> Posture:
-    """Return N grasps whose fingers at a distance in `STANDS_OFF_M` have closed until they touch the object.
-    Fingers that would meet other fingers or obstacles first keep their posture, as do grippers."""
+    """Return N grasps in which fingers at a distance in `STANDS_OFF_M` have closed until they touch the object.
+    A finger that would first meet another finger or an obstacle keeps its posture. Grippers are unchanged."""
     posing = posing_of(hand, obj, points=_POINTS, device=device)
     off = _fingers_off(posing, grasp)
     rows = np.flatnonzero(off.any(axis=1))
@@ -171,7 +171,7 @@ def _fingers_off(posing: PostureData, grasp: Posture) -> NDArray[np.bool_]:
 
 
 def _closed_until_contact(posing: PostureData, hand_pose: Floats, q: Floats, moved: NDArray[np.bool_]) -> Floats:
-    """Return dofs (n, D), those of `moved` closed until their finger's distance falls to `CLOSED_M`."""
+    """Close the dofs `moved` (n, D) until the distance of their finger is `CLOSED_M`; return all dofs (n, D)."""
     hand, count, looks = posing.hand, len(q), CLOSING_STEPS + 1
     step = moved * hand.closing * dof_steps(hand)
     path = np.clip(q[:, None] + np.arange(looks)[None, :, None] * step[:, None], hand.lower, hand.upper)

@@ -1,4 +1,4 @@
-"""Candidates of a grasp, ranked by contact balance and simulated in turn until one is good enough."""
+"""Candidates of a grasp: ranked by contact balance, then simulated one by one until one is good enough."""
 
 from __future__ import annotations
 
@@ -17,25 +17,24 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.data import HandState
 from graspd.worker.simulation.environment import PlacedGrasps
 
-#: Number of a grasp's candidates refined (fine phase) and simulated at once: refinement costs half of a rollout.
+#: Number of candidates of a grasp in one fine phase. Their refinement costs half of a rollout.
 TOGETHER: Final = 2
-#: A refined hand with a merit above this has no rollout unless its grasp has no other candidate: of 176 such hands of
-#: Allegro and Shadow 3 lifted at half friction.
+#: Largest merit of a refined hand with a rollout, if its grasp has another candidate. Of 176 Allegro and Shadow hands
+#: above it, 3 lifted at half friction.
 HOPEFUL: Final = 0.3
-#: A grasp with a score above this has failed: the object is lost, or the trajectory is blocked.
+#: Scores above this mean a lost object or a blocked trajectory.
 POOR: Final = 7.0
-#: Share of the squeeze force in a second rollout of a hand that nearly holds at half friction. Of 144 hands of Shadow
-#: .80 lift with the whole force, .83 with half, .92 with the best of six forces.
+#: Share of the squeeze force in the second rollout of hands with scores from 1 to `NEARLY`. Of 144 Shadow hands, .80
+#: lift with the whole force, .83 with half of it, .92 with the best of six forces.
 GENTLER: Final = 0.5
 NEARLY: Final = 2.5
-#: Score below which no further candidate of a free grasp is simulated, and the same in scenes. Below 1 an object holds
-#: at half friction in short pushes. A limit of 0.5 instead of 1, with one retry above it, raises the share of grasps
-#: that hold at half friction in the whole test: Shadow .70 to .76, Allegro .81 to .88, Barrett .83 to .92, at a tenth
-#: more time.
+#: Score below which no further candidate is simulated: of a free grasp, and in scenes. Scores below 1 mean that the
+#: object holds in short pushes at half friction. For free grasps, a limit of 0.5 takes a tenth more time than 1. The
+#: share that holds in validation at half friction rises: Shadow .70 to .76, Allegro .81 to .88, Barrett .83 to .92.
 GOOD: Final = 0.5
 GOOD_IN_SCENES: Final = 0.995
-#: Added to the merit of a hand in a scene with a finger that stands off the object, and its best score: worse than
-#: that of any other hand that lifts at half friction.
+#: Penalty on the merit of a hand in a scene if a finger stands off the object. Then its best score, which exceeds the
+#: scores of all other hands that lift at half friction.
 STANDING_OFF: Final = 0.2
 BEST_OFF: Final = 0.999
 #: Score of candidates without a rollout.
@@ -64,9 +63,9 @@ class Refinements:
     losses: Floats
     merit: Floats
     infeasible: NDArray[np.bool_]
-    """Whether the depth or the number of touching links fails the geometric gate: such hands have no rollout."""
+    """Whether the penetration depth or the number of touching links fails the geometric gate; then without rollout."""
     off: NDArray[np.bool_]
-    """Whether a finger stands off an object in a scene; such hands are simulated last and selected last."""
+    """Whether a finger stands off an object in a scene. Such hands are simulated last."""
 
 
 Seat = Callable[[NDArray[np.intp], NDArray[np.intp]], Refinements]
@@ -124,10 +123,10 @@ def select_by_rollout(
     together: int = TOGETHER,
     device: str = "cpu",
 ) -> Selection:
-    """Return each grasp's first candidate with a good enough rollout, or else the one with the smallest score.
-    `together` candidates of each grasp are refined and simulated in the order (n, each) of merit, then further ones for
-    grasps without a good candidate. Unbalanced or infeasible hands have no rollout; a grasp's first hand is still used.
-    Candidates that do not beat the scores `beat` (n,) of earlier attempts leave these scores unchanged."""
+    """Return the first candidate of each grasp with a good enough rollout, or else the one with the smallest score.
+    `order` (n, each) lists the candidates by merit. `together` candidates of each grasp are refined and simulated, then
+    further ones of grasps without a good candidate. Unbalanced or infeasible hands have no rollout, but the first hand
+    of a grasp is returned if no other is. Scores `beat` (n,) of earlier attempts change only if a candidate is better."""
     good = GOOD if placed is None else GOOD_IN_SCENES
     beat = np.full(len(order), np.inf) if beat is None else beat
     taken, left = Selection.none(beat, hand.dofs), np.arange(len(order))
@@ -174,7 +173,7 @@ def _reduce_squeeze(
     rollout: RolloutOf,
     device: str,
 ) -> None:
-    """Use a smaller squeeze force for hands (k,) that nearly lift, if it improves the score.
+    """Reduce the squeeze force of hands (k,) that nearly lift if this improves their scores.
     Soft fingers act as springs: a larger force turns the object farther out of the hand."""
     poor = np.flatnonzero((score >= 1.0) & (score < NEARLY))
     if not len(poor):
@@ -187,18 +186,18 @@ def _reduce_squeeze(
     score[poor[better]] = again[better]
 
 
-#: Coulomb coefficient for the balance of contacts: lower than in any test, for a reserve.
+#: Friction coefficient in the balance of contact forces. It is below those of all tests, as a reserve.
 FRICTION: Final = 0.3
-#: The same in scenes: hands that balance at this friction mostly lift at half friction (AUC .80 of refined hands of
-#: Allegro and Shadow whose merit is below .1; .74 with `FRICTION`).
+#: The same in scenes. Hands that balance at this friction mostly lift at half friction: AUC .80 for refined Allegro and
+#: Shadow hands with a merit below .1, and .74 with `FRICTION`.
 SCENE_FRICTION: Final = 0.15
 #: Weight of L_stable relative to the residual of the balance.
 STABILITY: Final = 0.05
-#: Weight of penetration [1/m] above the tolerance [m]: one more millimetre outweighs most of the residual.
+#: Weight [1/m] of penetration above the tolerance [m]. One more millimetre outweighs most of the residual.
 DEPTH: Final = 200.0
 TOLERATED_M: Final = 5e-4
-#: Weight of the share of the hand's surface near a free object after the coarse phase, and the distance that counts as
-#: near [m]. Among equally balanced hands, those that enclose more of the object are refined or simulated first.
+#: Weight of the share of the hand's surface within `NEAR_M` [m] of a free object after the coarse phase. Of equally
+#: balanced hands, those that enclose more of the object are refined first.
 NEARNESS: Final = 2.0
 NEAR_M: Final = 0.005
 
@@ -219,8 +218,8 @@ def merits(
     device: str = "cpu",
 ) -> Floats:
     """Compute merits (n,); smaller is better.
-    The merit sums the residual of contact forces balanced with `friction`, a share of L_stable (n,), and excess
-    `depths` (n,) [m]."""
+    A merit is the residual of the force balance with `friction`, plus weighted L_stable (n,) and penetration `depths`
+    (n,) [m]."""
     holds = hold_forces(hand, obj, posture_of(hand, obj, state), friction=friction, device=device)
     merit = holds.residual + STABILITY * losses
     if depths is not None:
@@ -229,7 +228,7 @@ def merits(
 
 
 def rank_hands(merit: Floats, grasps: int) -> NDArray[np.intp]:
-    """Return rows (grasps, each) of each grasp's hands, the best first; hands of one grasp are adjacent."""
+    """Return the row numbers (grasps, each) of hands, the best of each grasp first; its hands are adjacent."""
     each = merit.reshape(grasps, -1)
     # The stable sort keeps hands of equal merit in the order of their starts.
     return np.argsort(each, axis=1, kind="stable") + np.arange(grasps)[:, None] * each.shape[1]

@@ -59,19 +59,19 @@ Rows = NDArray[np.intp]
 CHUNK: Final = 10
 #: Fewest grasps per thread.
 PART: Final = 4
-#: A grasp with a larger merit is retried: a fifth (Shadow) to a half of such grasps hold, and most of the others.
+#: Grasps with a larger merit are retried. A fifth (Shadow) to a half of them hold; of the others, most hold.
 SET_OUT_AGAIN: Final = 0.05
-#: The same for rollout scores, see `worker.planners.port.Rollout`: a tenth to a quarter of such grasps hold.
+#: Grasps with a larger rollout score (`worker.planners.port.Rollout`) are retried. A tenth to a quarter of them hold.
 FAILED: Final = 2.0
 #: Score of a free grasp that holds without contact at one finger.
 STANDS: Final = 1.99
-#: Free grasps with larger scores are retried; one value per attempt. The first value includes grasps that may slip at
-#: half friction, the second those with a finger off the object. A further attempt at failed grasps is as productive as
-#: the first ones, so the yield per second hardly changes, but fewer grasps of a hard pair fail.
+#: Free grasps with larger scores are retried; one limit for each attempt. Grasps that may slip at half friction exceed
+#: the first limit, those with a finger off the object also the second. Later attempts are as productive as the first,
+#: so they hardly change the yield per second, but fewer grasps of hard pairs fail.
 FREE: Final = (GOOD, STANDS, *(FAILED,) * 18)
-#: Grasps in scenes with larger scores are retried; one value per attempt. Grasps that lift at full friction only are
-#: retried, too: five attempts instead of two raise the share that lifts at half friction from .63 to .67 (Allegro, 12
-#: objects of their own mass), at 3 % more time, as only half friction is tested in them.
+#: Grasps in scenes with larger scores are retried; one limit for each attempt. Grasps with a finger off the object
+#: exceed only the first limit, those that lift at full friction only the first five. Five attempts instead of two raise
+#: the share that lifts at half friction from .63 to .67 (Allegro, 12 objects of their own mass), at 3 % more time.
 IN_SCENES: Final = (GOOD_IN_SCENES, *(1.0,) * 4, FAILED)
 #: Largest number of attempts of one grasp at once.
 AHEAD: Final = 4
