@@ -126,7 +126,7 @@ def select_by_rollout(
     """Return the first candidate of each grasp with a good enough rollout, or else the one with the smallest score.
     `order` (n, each) lists the candidates by merit. `together` candidates of each grasp are refined and simulated, then
     further ones of grasps without a good candidate. Unbalanced or infeasible hands have no rollout, but the first hand
-    of a grasp is returned if no other is. Scores `beat` (n,) of earlier attempts change only if a candidate is better."""
+    of a grasp is returned if no other is. Scores `beat` (n,) of earlier attempts change only for better candidates."""
     good = GOOD if placed is None else GOOD_IN_SCENES
     beat = np.full(len(order), np.inf) if beat is None else beat
     taken, left = Selection.none(beat, hand.dofs), np.arange(len(order))
