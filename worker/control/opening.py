@@ -1,4 +1,4 @@
-"""Opening of hands around their grasps, on a device.
+"""Opening of hands from their grasps, on a device.
 Purpose: see `worker.control.postures`; method: `worker.simulation.kernels.opening` and `.jamming`."""
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from graspd.worker.quality.posed import PostureData
 from graspd.worker.simulation.kernels import distance, jamming, opening, optimizers
 from graspd.worker.simulation.launches import Launches, launch
 
-#: Largest distance of opening fingers from the object [m]. It covers the errors of a calibrated arm. From a larger
+#: Distance from the object at which fingers stop opening [m]. It covers the errors of a calibrated arm. From a larger
 #: distance, fingers arrive faster on closing and push the object away more often.
 CLEARANCE_M: Final = 0.003
-#: A finger with less motion along its contact normals opens against `HandModel.closing` alone [m].
+#: A finger with less distance from the object after opening is opened again, against `HandModel.closing` alone [m].
 STUCK_M: Final = 0.003
 #: The root retreats only if the open hand is closer than this to the object [m]. A palm in contact pushes the object
 #: away. So does a palm that returns from a large distance while the fingers close.
@@ -34,14 +34,14 @@ PLAIN_OPENING: Final = 0.3
 OPENING_STEP: Final = 0.05
 SLIDING_STEP_M: Final = 0.002
 OPENING_STEPS: Final = 24
-#: Allowed penetration of a finger into the rest of the hand on its path, beyond that in the grasp [m]. Then the checked
-#: shares of the path. A jammed finger opens half as far. After the last failed check it does not open.
+#: Allowed penetration of an opening finger into the rest of the hand, in addition to that in the grasp [m]; checked
+#: shares of its path; number of checks. A jammed finger opens half as far, after the last failed check not at all.
 JAM_M: Final = 5e-4
 WAY: Final = (1 / 3, 2 / 3, 1.0)
 JAM_LOOKS: Final = 4
 RETREATS_M: Final = (0.0, 0.0025, 0.005, 0.0075, 0.010, 0.015, 0.020)
 
-#: Returns which fingers of the hands `rows` are blocked on the paths (n, K, D) of their dofs.
+#: Returns a mask (n, F) of blocked fingers, for hands `rows` (n,) and paths (n, K, D) of their dofs.
 Blocked = Callable[[NDArray[np.intp], Floats], NDArray[np.bool_]]
 
 
@@ -63,7 +63,7 @@ def fingers_of_bodies(hand: HandModel) -> NDArray[np.int32]:
 
 
 def dof_steps(hand: HandModel) -> Floats:
-    """Return the step (D,) of each dof [rad or m]."""
+    """Return the opening step (D,) of each dof [rad or m]."""
     return np.where(prismatic_dofs(hand), SLIDING_STEP_M, OPENING_STEP)
 
 
@@ -72,7 +72,7 @@ def count_fingers(hand: HandModel) -> int:
 
 
 class Openings:
-    """N hands opened together from their grasps: dofs `q` (N, D) and open dofs `wide` (None: to be computed)."""
+    """N hands opened together from grasps with dofs `q` (N, D); `wide`: open dofs (N, D), by default `q`."""
 
     def __init__(self, posing: PostureData, hand_pose: Floats, q: Floats, wide: Floats | None = None) -> None:
         self.posing, self.hand_pose, self.q = posing, hand_pose, q
@@ -87,7 +87,7 @@ class Openings:
         self.bodies = posing.bodies(self.count)
 
     def open_from(self, grasp: Posture) -> None:
-        """Open each finger on its own as far from the object as possible; `grasp` is the start."""
+        """Open each finger from `grasp` until it is `CLEARANCE_M` from the object, or as far as possible."""
         first, plain = self._sweep(), self._sweep()
         self._open_directions(grasp, first)
         self._step(first)
@@ -97,7 +97,7 @@ class Openings:
         self._launch(opening.take_opening, self.open.shape, inputs, [self.open])
 
     def without_jams(self, blocked: Blocked | None = None) -> Floats:
-        """Return the open dofs (N, D), reduced towards the grasp where fingers jam or `blocked` applies.
+        """Return the open dofs (N, D); fingers that jam or are `blocked` open less far or not at all.
         A finger that jams on opening would not reach the grasp on closing."""
         jams = self._jams()
         depth = self._depths(jams)
@@ -114,7 +114,7 @@ class Openings:
         return np.array(self.open.numpy())
 
     def retreated(self) -> Floats:
-        """Return root poses (N, 7) of the open hands, moved back along the palm's approach while in contact."""
+        """Return root poses (N, 7) of the open hands; hands in contact retreat along the palm's approach."""
         posing, device = self.posing, self.posing.device
         with wp.ScopedDevice(device):
             back = jamming.Retreat()
@@ -182,7 +182,7 @@ class Openings:
         return out
 
     def _depths(self, jams: Any) -> list[Launches]:
-        """Return launches that compute fingers' depths in the grasp, then at each check on the path."""
+        """Return launches that compute fingers' depths in other links: in the grasp, then at each of `WAY`."""
         posing, probe = self.posing, self.posing.probe
         shape = (self.count, len(posing.hand.pieces))
         with wp.ScopedDevice(posing.device):

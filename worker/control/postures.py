@@ -1,4 +1,4 @@
-"""Postures around a grasp: the open pregrasp without contact, and the squeeze, which presses.
+"""Postures around a grasp: the open pregrasp without contact, and the squeeze that presses.
 
 Both affect a grasp's success more than the optimiser does (Dexonomy, table VI).
 
@@ -33,18 +33,18 @@ from graspd.worker.simulation.obstacles import body_clearance, obstacle_clearanc
 
 #: Clearance of opening fingers from obstacles [m].
 ROOM_M: Final = 0.0025
-#: Further opening of a joint on the approach, as a share of its range beyond the pregrasp. Without this opening,
+#: Largest opening of a joint beyond the pregrasp, on the approach, as a share of its range. Without this opening,
 #: fingers that enclose the object would push it away on the approach.
 WIDE: Final = 0.4
 
-#: Number of hand points in the check of a posture; largest distance of pressing points [m]; largest number of them.
+#: Number of hand points in the check of a posture; largest distance [m] and largest number of points that press.
 _POINTS: Final = 600
 PRESSING_M: Final = 0.003
 MAX_PRESSING: Final = 16
-#: Distance below which a finger without contact is closed by the squeeze, too [m]. Otherwise the other fingers push a
+#: The squeeze also closes a finger without contact at less than this distance [m]. Otherwise the other fingers push a
 #: free object past it.
 CLOSING_M: Final = 0.009
-#: Distances at which a finger could touch the object but does not [m]. Fingers beyond are not part of the grasp.
+#: Least and largest distance at which a finger stands off the object [m]. Farther fingers are not part of the grasp.
 STANDS_OFF_M: Final = (0.005, 0.02)
 #: Reach of distance measurements of such fingers [m].
 FAR_M: Final = 0.025
@@ -67,7 +67,7 @@ def pregrasp(
     """Compute N postures from which the hand closes.
     Every finger moves away from the object along its contact normals until its points are `CLEARANCE_M` away. It stops
     earlier at other fingers and, for `placed` grasps, at obstacles of the scene. Then the root retreats along the
-    palm's approach until contact ends. It rises where fingers would penetrate a support they may touch."""
+    palm's approach until contact ends. The root rises where fingers would penetrate a support they may touch."""
     posing = posing_of(hand, obj, points=_POINTS, device=device)
     poses, joints = np.zeros((len(grasp), 7)), np.zeros((len(grasp), len(hand.joint_names)))
     for rows in posing.parts(len(grasp)):
@@ -81,8 +81,8 @@ def pregrasp(
 
 
 def wide_open(hand: HandModel, obj: ObjectModel, pregrasp: Posture, placed: PlacedGrasps) -> Floats:
-    """Return joint positions (N, J) for the approach: fingers opened against `HandModel.closing` by `WIDE` of their
-    range. They stop before they touch one another or an obstacle."""
+    """Return joint positions (N, J) for the approach, with fingers opened by `WIDE` of their range.
+    Fingers open against `HandModel.closing`, and stop before they touch one another or an obstacle."""
     posing = posing_of(hand, obj, points=_POINTS, device="cpu")
     joints = np.zeros((len(pregrasp), len(hand.joint_names)))
     for rows in posing.parts(len(pregrasp)):
@@ -147,7 +147,7 @@ def fingers_off_object(hand: HandModel, obj: ObjectModel, grasp: Posture, *, dev
 def close_fingers(
     hand: HandModel, obj: ObjectModel, grasp: Posture, placed: PlacedGrasps, *, device: str = "cpu"
 ) -> Posture:
-    """Return N grasps in which fingers at a distance in `STANDS_OFF_M` have closed until they touch the object.
+    """Close fingers of N grasps at a distance in `STANDS_OFF_M` until they touch the object.
     A finger that would first meet another finger or an obstacle keeps its posture. Grippers are unchanged."""
     posing = posing_of(hand, obj, points=_POINTS, device=device)
     off = _fingers_off(posing, grasp)
@@ -171,7 +171,7 @@ def _fingers_off(posing: PostureData, grasp: Posture) -> NDArray[np.bool_]:
 
 
 def _closed_until_contact(posing: PostureData, hand_pose: Floats, q: Floats, moved: NDArray[np.bool_]) -> Floats:
-    """Close the dofs `moved` (n, D) until the distance of their finger is `CLOSED_M`; return all dofs (n, D)."""
+    """Return dofs (n, D), those `moved` (n, D) closed until their finger's distance is `CLOSED_M`."""
     hand, count, looks = posing.hand, len(q), CLOSING_STEPS + 1
     step = moved * hand.closing * dof_steps(hand)
     path = np.clip(q[:, None] + np.arange(looks)[None, :, None] * step[:, None], hand.lower, hand.upper)
@@ -199,8 +199,7 @@ def _blocked_paths(hand: HandModel, opening: Openings, placed: PlacedGrasps | No
 
 
 def _finger_clearance(hand: HandModel, hand_pose: Floats, paths: Floats, placed: PlacedGrasps) -> Floats:
-    """Return fingers' least clearance (B, fingers) on paths (B, K, D), by `body_clearance`; inf for dofs without a
-    finger."""
+    """Return fingers' least clearance (B, F) from obstacles on paths (B, K, D); inf without bodies."""
     count, steps, _ = paths.shape
     finger = fingers_of_bodies(hand)
     out = np.full((count, count_fingers(hand)), np.inf)
@@ -216,7 +215,7 @@ def _finger_clearance(hand: HandModel, hand_pose: Floats, paths: Floats, placed:
 RAISE_OPEN_M: Final = CLEAR_M + 0.0025
 
 RAISE_CLOSING_M: Final = CLEAR_M + 0.0003
-#: Checked shares of the trajectory to the grasp: those of the sweep, without the grasp itself.
+#: Checked shares of the trajectory from the pregrasp to the grasp, without the grasp itself.
 RAISE_LOOKS: Final = tuple(np.arange(8) / 8)
 #: Largest raise of a hand [m]: a hand raised further would press the object down.
 HIGHEST_RAISE_M: Final = 0.008
@@ -240,7 +239,7 @@ def raise_pregrasps(hand: HandModel, grasp: Posture, pregrasp: Posture, placed: 
 
 
 def _missing_clearance(hand: HandModel, grasp: Posture, pregrasp: Posture, placed: PlacedGrasps) -> Floats:
-    """Return the missing clearance (n, looks) of hands at the shares `RAISE_LOOKS` of their trajectory."""
+    """Return the missing clearance (n, looks) of hands at `RAISE_LOOKS` of their trajectory [m]."""
     share = np.array(RAISE_LOOKS)[None, :, None]
     pose = (1 - share) * pregrasp.hand_pose[:, None] + share * grasp.hand_pose[:, None]
     pose[..., 3:] = pregrasp.hand_pose[:, None, 3:]  # a pregrasp has the orientation of its grasp

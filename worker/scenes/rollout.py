@@ -1,5 +1,5 @@
-"""Rollouts of candidates: in a scene a clearance check and a short lift, around a free object short pushes
-(`worker.validation.prescreening`). Candidates that pass are validated in the whole test."""
+"""Rollouts of candidates: short lift and clearance check in a scene, short pushes of a free object.
+Candidates that pass these tests (`worker.validation.prescreening`) are validated in the whole test."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from graspd.worker.validation.prescreening import SLIPS, ShortTests
 from graspd.worker.validation.validator import KnownRollouts, validate
 
 #: Added to the score of a candidate that would lift but whose approach is blocked. The sum is worse than the score of
-#: any candidate that drops the object after a free approach, since most grasps have a free approach. It is better than
-#: the score of a lost object.
+#: any candidate that drops the object after a free approach, since most grasps have a free approach. The sum is
+#: better than the score of a lost object.
 BLOCKED: Final = 8.0
 #: Added if only the validator detects contact on the approach: the object's convex pieces protrude from its surface.
 #: Level `dexgraspbench` does not test the approach.
 TOUCHES: Final = 2.0
-#: Added to the score of a candidate that passes the short rollout but does not lift.
+#: Factor on the short test's score, at most 1, of a candidate that fails the whole test; added to `SLIPS` + 1.
 FALLS: Final = 0.4
-#: Highest score of a candidate that lifts at half the friction.
+#: Highest score of a candidate that lifts at half friction.
 BEST: Final = 0.99
 
 
@@ -48,7 +48,7 @@ def rollout_on(
     known: dict[str, Any] | None = None,
     level: Level = "standard",
 ) -> Callable[[GraspSet, PlacedGrasps | None, Floats], Floats] | None:
-    """Return the rollout for `run`; None: the planner's loss decides. `known` caches verdicts of `level`.
+    """Return the rollout for `run`; None: the planner's merit decides. `known` caches verdicts of `level`.
     Around free objects a GPU has no rollouts, because it plans faster than the CPU simulates. In scenes it waits for
     the rollouts, which use all threads.
     """
@@ -68,7 +68,7 @@ def hold_rollout(
     level: Level = "standard",
 ) -> Callable[[GraspSet, PlacedGrasps | None, Floats], Floats]:
     """Return a `worker.planners.Rollout` that scores free grasps (N,) by short pushes.
-    Grasps with scores below 2 and `beat` are tested by the six pushes; those that fail get scores of at least 2."""
+    Grasps with scores below both 2 and `beat` are validated at `level`; those that fail score at least 2."""
     shorts, run = ShortTests(hand, obj, pieces), ExecutionContext(threads=1)
 
     def rollout(grasps: GraspSet, placed: PlacedGrasps | None, beat: Floats | None = None) -> Floats:
@@ -96,7 +96,7 @@ def lift_rollout(
     level: LiftLevel = "lift",
 ) -> Callable[[GraspSet, PlacedGrasps | None, Floats], Floats]:
     """Return a `worker.planners.Rollout` that scores grasps (N,) in scenes by short lifts.
-    Scores are below 1 for grasps with a clear trajectory that lift at half friction, below 2 at full friction.
+    A grasp with a clear trajectory scores below 1 if it lifts at half friction, below 2 if at full friction.
     Candidates that hold the hanging object briefly are validated by the whole lift test: a squeeze may slowly turn an
     object out of the hand. `threads` are per call; on the CPU, planners already use all threads."""
     shorts, run = ShortTests(hand, obj, pieces, threads=threads), ExecutionContext(threads=threads)
@@ -124,7 +124,7 @@ def lift_rollout(
         some = np.flatnonzero(score < SLIPS)
         hard[some] = lift(grasps.take(some), placed.take(some), hard=True).success == 1
         out[hard] = np.minimum(score[hard], BEST)
-        # The grasp has another candidate that lifts at full friction: only half friction would be better.
+        # The grasp already has a candidate that lifts at full friction, so this test is skipped.
         out[~hard & found] = beat[~hard & found]
         some = np.flatnonzero(~hard & ~found if level == "lift" else hard | ~found)
         full = lift(grasps.take(some), placed.take(some))
@@ -144,7 +144,7 @@ FARTHEST_M: Final = 1.0
 
 
 def lift_level(validation: str) -> LiftLevel:
-    """Return the level of the lift test for a job's validation; `dexgraspbench` is also a level of scenes."""
+    """Return the level of the lift test for a job's validation: `dexgraspbench` if chosen, else `lift`."""
     return "dexgraspbench" if validation == "dexgraspbench" else "lift"
 
 
@@ -196,7 +196,7 @@ def scene_verdicts(
 
 
 def outcomes_in_scenes(columns: Arrays) -> dict[str, NDArray[np.bool_]]:
-    """Return masks (N,) of grasps that are clear, lift, and lift at half friction, from columns of `scene_verdicts`."""
+    """Return masks (N,) of grasps that are clear, lift, lift at half friction; see `scene_verdicts`."""
     clear = np.asarray(columns["quality/success"] >= 0)
     if "quality/lift_outcome" not in columns:
         return {"clear": clear, "lift": np.zeros_like(clear), "lift_hard": np.zeros_like(clear)}

@@ -1,13 +1,13 @@
-"""Antipodal starts: opposed fingers around a pair of surface points, opened slightly wider than the pair.
+"""Antipodal starts: opposed fingers around two surface points, slightly farther apart than these.
 
 Two surface points with opposite normals are antipodal (Nguyen, "Constructing force-closure grasps", 1988). Pairs are
 found by comparing samples of the surface with one another.
 
 The distance by which a hand must rise to be clear of obstacles is computed from a few outline points per posture. This
-test is cheap enough for many more hands than the exact collision test.
+costs less than the exact collision test, so many more hands can be tested.
 
 Around a free object, hands also start at random pairs that are no wider than the hand opens (`ReachSampling`). In most
-draws a finger or the palm penetrates the object. A test of balls in the hand rejects such draws before the simulation.
+draws a finger or the palm penetrates the object. A test with balls inside the hand rejects such draws early.
 
 A fingertip is modelled as a ball with the thickness of the hand's thinnest fingertip, next to an end of a pair. Space
 for this ball is necessary for a grasp between opposed fingertips, but not sufficient."""
@@ -56,23 +56,23 @@ SAMPLES: Final = 500
 ACROSS: Final = 0.96
 #: Least distance of the two points [m].
 THINNEST_M: Final = 0.002
-#: Clearance between pad and object, on each side [m].
+#: Least and largest clearance between pad and object, on each side [m].
 ROOM_M: Final = (0.003, 0.015)
 #: Horizontal distance from the centre of mass at which the probability of a pair falls by a factor of e [m], and least
-#: factor. The probability is lower for steep pairs and pairs that are hard to reach. Share of Allegro grasps on six
-#: objects held at half friction: 0.28 with 30 mm and a least factor of 0.02, 0.38 with these values.
+#: factor. `SELDOM` reduces it for pairs hard to reach, and for pairs with a cosine to the vertical above `STEEP`. Share
+#: of Allegro grasps on six objects that hold at half friction: .28 with 30 mm and a least factor of .02, else .38.
 BESIDE_M: Final = 0.02
 FAR: Final = 0.005
 STEEP: Final = 0.5
 SELDOM: Final = 0.1
-#: Largest distance of the pads from the ends of the pair at which a candidate counts as close enough [m].
+#: Largest distance of the pads from the ends of the pair at which a draw counts as close enough [m].
 NEAR_M: Final = 0.008
 #: Number of hands whose draws are compared at once; a larger number needs more memory and saves no time.
 AT_ONCE: Final = 256
 #: Least cosine between an approach from above and the vertical, for flat objects.
 UPRIGHT: Final = 0.9
-#: Noise of the posture as a share of each joint's range, and number of directions compared per draw. Tolerances of
-#: postures that are narrower, and of postures that are wider than the drawn width [m].
+#: Noise of the posture as a share of each joint's range, and number of directions compared per draw. Amounts by which a
+#: posture may be narrower and wider than the drawn width [m].
 NOISE: Final = 0.03
 WAYS: Final = 4
 ALIKE_M: Final = (0.002, 0.006)
@@ -113,7 +113,7 @@ class Openings:
 
     pairs: Crossings
     sums: Floats
-    """(P,) cumulative probability; empty if there is no pair."""
+    """(P,) cumulative probability; empty if no pair fits."""
     known: Oppositions
     up: Floats
     """(3,) direction against gravity, object frame."""
@@ -127,7 +127,7 @@ class Openings:
     def of(
         cls, known: Oppositions, obj: ObjectModel, scene: Environment, *, tip: float = 0.0, upright: bool = False
     ) -> Openings:
-        """Select pairs with space for fingertips of thickness `tip` [m] at both ends."""
+        """Select pairs narrow enough for the hand; favour pairs with space for fingertips `tip` thick [m]."""
         pairs = crossings_of(obj)
         level = np.abs(pairs.axis @ scene.up) < STEEP
         fits = pairs.width + 2 * ROOM_M[0] <= known.widest
@@ -151,7 +151,7 @@ class Openings:
 
     @classmethod
     def in_scene(cls, hand: HandModel, obj: ObjectModel, scene: Environment) -> Openings:
-        """Select pairs for fingertips that rest next to a flat object, or else for the pads."""
+        """Select pairs for fingertips that rest beside a flat object; if none fits, for the pads."""
         ends = flat_pinches(hand, float(np.ptp(obj.hull_vertices @ scene.up)))
         tip = thinnest_fingertip(hand)
         flat = cls.of(ends, obj, scene, tip=tip, upright=True)
@@ -160,7 +160,7 @@ class Openings:
 
 def end_clearance(pairs: Crossings, scene: Environment, width: float) -> Floats:
     """Return the least clearance (P,) of balls of diameter `width` at the ends of pairs [m].
-    Walls and neighbours count; the object's own support is ignored."""
+    Walls and neighbours count; half-spaces that face upwards, such as the table, are ignored."""
     out = np.full(len(pairs), np.inf)
     for obstacle in scene.obstacles:
         if not len(obstacle.corners) and float(obstacle.planes[0, :3] @ scene.up) > STEEP:
@@ -172,7 +172,7 @@ def end_clearance(pairs: Crossings, scene: Environment, width: float) -> Floats:
 
 @dataclass(frozen=True)
 class AntipodalHands:
-    """n hands with fingers on both sides of the object, orientation (n, 3, 3); they retreat along `away` (n, 3)."""
+    """n hands with fingers on both sides of the object: rotations (n, 3, 3), retreat directions (n, 3)."""
 
     known: Oppositions
     posture: NDArray[np.intp]
@@ -189,8 +189,8 @@ class AntipodalHands:
         return np.clip(known + NOISE * hand.span * normal, hand.lower, hand.upper)
 
     def pad_distance(self, moved: Floats) -> Floats:
-        """Return the distance (n, ...) of the pair from pads that have moved by (n, ..., 3), sideways or ahead [m].
-        A pair nearer to the palm is also between the fingers."""
+        """Return the distance (n, ...) of the pair from the pads after motions `moved` (n, ..., 3) [m].
+        Distance towards the palm does not count, since such a pair is also between the fingers."""
         away = self.away.reshape(len(self.deep), *(1,) * (moved.ndim - 2), 3)
         off = moved - self.deep.reshape((*away.shape[:-1], 1)) * away
         along = np.einsum("n...i,ni->n...", off, self.away)
@@ -198,7 +198,7 @@ class AntipodalHands:
 
 
 def place_across(hand: HandModel, obj: ObjectModel, opening: Openings, uniform: Floats, ways: Floats) -> AntipodalHands:
-    """Place hands across pairs by random numbers (n, 6); `ways` (K, 3) are free directions away from the object."""
+    """Place hands across pairs by random numbers (n, 6); `ways` (K, 3): free directions of retreat."""
     known = opening.known
     if opening.upright and (upright := ways @ opening.up > UPRIGHT).any():
         ways = ways[upright]
@@ -233,8 +233,8 @@ def select_draws(
     room: float,
     keep: int,
 ) -> tuple[NDArray[np.intp], Floats]:
-    """Select the `keep` of C draws per hand that need the least rise to clear the obstacles, (n, keep).
-    Also return the distance of the pair from the middle of the pads (n, keep) [m]. Draws below `NEAR_M` keep their
+    """Select `keep` of C draws per hand: those with pads nearest to the pair after rising off obstacles.
+    Return their indices and the distance of the pair from the pads (n, keep) [m]. Draws below `NEAR_M` keep their
     order. For `uniform` (n, C, 6) and `ways` see `place_across`; `room` is clearance in addition to the margin [m]."""
     count, draws, _ = uniform.shape
     outlines, off = posture_outlines(hand, opening.known.q), np.zeros((count, draws))
@@ -256,7 +256,7 @@ def frames(first: Floats, second: Floats) -> Floats:
     return np.stack([first, y, np.cross(first, y)], axis=-1)
 
 
-#: Number of directions of outermost points, for the fingertips and for the rest of the hand.
+#: Number of outermost points of the fingertips, and of the rest of the hand.
 DIRECTIONS: Final = 20
 
 
@@ -274,7 +274,7 @@ class PostureOutlines:
     def missing_clearance(
         self, posture: NDArray[np.intp], turn: Floats, centre: Floats, scene: Environment, *, room: float
     ) -> Floats:
-        """Return the clearance (n,) missing at hands and mountings, relative to the margin plus `room` [m]; at least 0.
+        """Return by how much (n,) hands and mountings miss the margin plus `room` [m]; at least 0.
         Hands have postures (n,), rotations (n, 3, 3) and palm centres (n, 3), object frame [m]."""
         place = np.matmul(self.points[posture], np.swapaxes(turn, -1, -2)) + centre[:, None]
         lack = np.zeros(len(posture))
@@ -284,7 +284,7 @@ class PostureOutlines:
         return np.maximum(lack, self._missing_mounting_clearance(turn, centre, scene, MARGIN_M + room))
 
     def _missing_mounting_clearance(self, turn: Floats, centre: Floats, scene: Environment, wanted: float) -> Floats:
-        """Return the clearance (n,) missing at mountings relative to `wanted`, at their best wrist position [m]."""
+        """Return by how much (n,) mountings miss clearance `wanted` at their best wrist position [m]."""
         least = np.full(len(turn), np.inf if len(self.mounting) else 0.0)
         for points in self.mounting:
             rows = np.flatnonzero(least > 0.0)
@@ -311,7 +311,7 @@ def posture_outlines(hand: HandModel, q: Floats) -> PostureOutlines:
     return PostureOutlines(np.concatenate(points, axis=1) - hand.palm.centre, np.concatenate(tips), mounting)
 
 
-#: Gaps are capped at this width; resolution of narrower gaps [m].
+#: Largest gap that is measured, and resolution of smaller gaps [m].
 WIDEST_M: Final = 0.064
 EXACT_M: Final = 0.0005
 
@@ -330,21 +330,21 @@ def narrow_reason(hand: HandModel, obj: ObjectModel, scenes: Sequence[Environmen
     height = max(float(np.ptp(obj.hull_vertices @ scene.up)) for scene in scenes)
     if height <= HEIGHTS_M[-1] and not len(flat_pinches(hand, height)):
         return (
-            f"{obj.name} is {1e3 * height:.0f} mm high, and fingertips of {hand.name} that rest beside it do not face "
-            "each other this close to their ends"
+            f"{obj.name} is {1e3 * height:.0f} mm high: fingertips of {hand.name} that rest beside it face each "
+            "other only at a larger height"
         )
     thin = thinnest_fingertip(hand)
     gap = max(_widest_gap(pairs, fits, scene, thin) for scene in scenes)
     if gap >= thin + CLEAR_M:
         return None
     return (
-        f"the gap of about {1e3 * gap:.0f} mm beside {obj.name} is thinner than the thinnest fingertip of {hand.name}, "
-        f"{1e3 * thin:.0f} mm, with its clearance of {1e3 * CLEAR_M:.0f} mm"
+        f"the gap beside {obj.name} is about {1e3 * gap:.0f} mm wide; the thinnest fingertip of {hand.name} needs "
+        f"{1e3 * thin:.0f} mm and a clearance of {1e3 * CLEAR_M:.0f} mm"
     )
 
 
 def _widest_gap(pairs: Crossings, fits: NDArray[np.bool_], scene: Environment, thin: float) -> float:
-    """Return the diameter of the widest ball next to both ends of a pair [m]; steep pairs need space below."""
+    """Return the largest diameter of balls next to both ends of a pair [m]; steep pairs need space below."""
     level, above = np.abs(pairs.axis @ scene.up) < STEEP, np.ones(len(pairs), bool)
     for obstacle in scene.obstacles:
         above &= np.minimum(*(obstacle.distance(end) for end in pairs.ends())) >= thin
@@ -359,7 +359,7 @@ def _widest_gap(pairs: Crossings, fits: NDArray[np.bool_], scene: Environment, t
     return low
 
 
-#: Number of draws per start, and number of draws clear by the ball test that the simulation checks.
+#: Largest number of draws per start, and of draws that pass the ball test and are then tested exactly.
 DRAWS: Final = 512
 LOOKS: Final = 8
 #: Probability of a pair far from the centre of mass, relative to a pair through it.
@@ -388,8 +388,8 @@ class ReachSampling:
         return None if known is None else cls(model, *known)
 
     def starts(self, seeds: NDArray[np.int32], first: NDArray[np.int32], retreats: Floats) -> tuple[HandState, Any]:
-        """Return hands (n,) of the first draws that pass the ball test; draws are numbered from `first` (n,).
-        Also return the draws' numbers (n,), -1 if there is none. `retreats`: ascending steps from the object [m]."""
+        """Return each start's first draw that passes the ball test, from draw number `first` (n,) on.
+        Also return the draws' numbers (n,), -1 if none passes. `retreats`: ascending distances of retreat [m]."""
         m, count = self.model, len(seeds)
         with wp.ScopedDevice(m.device):
             number = wp.empty(count, dtype=wp.int32)
@@ -404,7 +404,7 @@ class ReachSampling:
 
 
 def classify_size(hand: HandModel, width: Floats) -> Size | None:
-    """Classify an object with pair widths (P,) as too small or wide for the pads; None if a pair fits."""
+    """Classify an object of pair widths (P,) as too small or too wide for the pads; None if neither."""
     known = oppositions_of(hand)
     if not len(known) or not len(width):
         return None
@@ -414,7 +414,7 @@ def classify_size(hand: HandModel, width: Floats) -> Size | None:
 
 
 def _postures(hand: HandModel, width: Floats, size: Size | None) -> Oppositions:
-    """Return the postures for pairs of the widths (P,), empty if none fits a pair."""
+    """Return postures for pairs of these widths (P,); empty if no posture fits a pair."""
     if size == "wide" and width.min() + 2 * ROOM_M[0] > largest_width(hand):
         return Oppositions.empty(hand)
     known = oppositions_of(hand) if size is None else postures_for_size(hand, size)

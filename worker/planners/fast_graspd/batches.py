@@ -28,7 +28,7 @@ class Batches:
     """Grasps of several batches, one batch after the other; a row is a grasp."""
 
     def __init__(self, asked: Sequence[BatchRequest], obj: ObjectModel, warm: WarmStart | None = None) -> None:
-        """All batches have one fidelity. Either all or none are in scenes, with the same supports and neighbours.
+        """All batches have one fidelity; all or none are in scenes, with the same supports and neighbours.
         In scenes, `warm` proposes the starts of hands; None: `scene_starts` finds them."""
         self.asked, self.warm = asked, warm
         wanted = [one.wanted for one in asked]
@@ -58,7 +58,7 @@ class Batches:
         """Free directions of each scene."""
         for owner, scenes in enumerate(placed):
             try:
-                # Either all batches have scenes or none has: the number of a scene selects its directions.
+                # All batches have scenes here, so `owner` is the number of the batch.
                 self.ways += [free_directions(scene, obj) for scene in scenes.scenes]
             except InputError as error:
                 self.ways += [np.zeros((0, 3))] * len(scenes.scenes)
@@ -66,7 +66,7 @@ class Batches:
 
     @property
     def has_rollout(self) -> bool:
-        """Whether candidates are tested in rollouts; for a free object only if the fidelity has several finalists."""
+        """Whether candidates are tested in rollouts; for a free object only with several finalists."""
         first = self.asked[0].wanted
         several = first.placed is not None or first.fidelity.finalists > 1
         return several and all(one.wanted.rollout is not None for one in self.asked)
@@ -79,7 +79,7 @@ class Batches:
         return ~np.isin(self.owner[rows], list(self.errors))
 
     def active_rows(self) -> Rows:
-        """Return the rows of the batches that are still planned; raise the first batch's error if all have stopped."""
+        """Return rows of batches that are still planned; raise the first batch's error if all have stopped."""
         rows = np.flatnonzero(self.is_active(np.arange(len(self.owner))))
         if not len(rows):
             raise self.errors[min(self.errors)]
@@ -99,7 +99,7 @@ class Batches:
             raise self.errors[min(self.errors)]
 
     def generators(self, rows: Rows, attempt: Rows) -> list[np.random.Generator]:
-        """Return generators for the starts of these rows at attempts (n,); generators of one grasp are adjacent."""
+        """Return generators for starts of these rows at attempts (n,); those of one grasp are adjacent."""
         starts = self.fidelity.starts
         wanted = [self.asked[owner].wanted for owner in self.owner[rows].tolist()]
         numbers = zip(wanted, self.index[rows].tolist(), attempt.tolist(), strict=True)
@@ -110,8 +110,8 @@ class Batches:
         ]
 
     def rollout(self, grasps: GraspSet, rows: Rows, beat: Floats) -> Floats:
-        """Score (n,) grasps of these rows by their batches' rollouts; `beat` (n,): scores to beat.
-        Grasps of stopped batches count as good enough."""
+        """Return scores (n,) of grasps of these rows in their batches' rollouts; `beat` (n,): scores to beat.
+        Grasps of stopped batches have score 0."""
         owners, scores = self.owner[rows], np.zeros(len(grasps))
         placed = self.placed.take(rows) if self.placed is not None else None
         for owner in sorted(set(owners.tolist())):

@@ -1,4 +1,4 @@
-"""Candidates of a grasp: ranked by contact balance, then simulated one by one until one is good enough."""
+"""Candidates of a grasp: ranked by contact balance, then simulated in turn until one is good enough."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from graspd.worker.simulation.environment import PlacedGrasps
 
 #: Number of candidates of a grasp in one fine phase. Their refinement costs half of a rollout.
 TOGETHER: Final = 2
-#: Largest merit of a refined hand with a rollout, if its grasp has another candidate. Of 176 Allegro and Shadow hands
-#: above it, 3 lifted at half friction.
+#: Merit from which on a refined hand has no rollout, unless its grasp's best score exceeds `POOR`. Of 176 Allegro and
+#: Shadow hands above it, 3 lifted at half friction.
 HOPEFUL: Final = 0.3
 #: Scores above this mean a lost object or a blocked trajectory.
 POOR: Final = 7.0
@@ -28,13 +28,13 @@ POOR: Final = 7.0
 #: lift with the whole force, .83 with half of it, .92 with the best of six forces.
 GENTLER: Final = 0.5
 NEARLY: Final = 2.5
-#: Score below which no further candidate is simulated: of a free grasp, and in scenes. Scores below 1 mean that the
-#: object holds in short pushes at half friction. For free grasps, a limit of 0.5 takes a tenth more time than 1. The
+#: Score below which no further candidate is simulated, for free grasps and in scenes. Scores below 1 mean that the
+#: grasp holds in a short test at half friction. For free grasps, a limit of 0.5 takes a tenth more time than 1. The
 #: share that holds in validation at half friction rises: Shadow .70 to .76, Allegro .81 to .88, Barrett .83 to .92.
 GOOD: Final = 0.5
 GOOD_IN_SCENES: Final = 0.995
-#: Penalty on the merit of a hand in a scene if a finger stands off the object. Then its best score, which exceeds the
-#: scores of all other hands that lift at half friction.
+#: Penalty on the merit of a hand in a scene if a finger stands off the object, and least score of such a hand. Other
+#: hands that lift at half friction have lower scores.
 STANDING_OFF: Final = 0.2
 BEST_OFF: Final = 0.999
 #: Score of candidates without a rollout.
@@ -63,7 +63,7 @@ class Refinements:
     losses: Floats
     merit: Floats
     infeasible: NDArray[np.bool_]
-    """Whether the penetration depth or the number of touching links fails the geometric gate; then without rollout."""
+    """Whether penetration depth or number of touching links fails the geometric gate; no rollout follows."""
     off: NDArray[np.bool_]
     """Whether a finger stands off an object in a scene. Such hands are simulated last."""
 
@@ -73,12 +73,12 @@ Seat = Callable[[NDArray[np.intp], NDArray[np.intp]], Refinements]
 """Runs the fine phase for some grasps (n,), given the rows (n, each) of their starts."""
 
 RolloutOf = Callable[[GraspSet, NDArray[np.intp], Floats], Floats]
-"""Scores (k,) grasps of the numbers (k,) against the scores to beat; see `worker.planners.Rollout`."""
+"""Scores (k,) grasps, given their numbers (k,) and the scores to beat (k,); see `worker.planners.Rollout`."""
 
 
 @dataclass
 class Selection:
-    """Best candidate of each of n grasps so far; none where `score` is inf."""
+    """Best candidate so far of each of n grasps; grasps without a candidate are not in `grasps`."""
 
     state: HandState
     losses: Floats
@@ -87,7 +87,7 @@ class Selection:
 
     @classmethod
     def none(cls, beat: Floats, dofs: int) -> Selection:
-        """Return a selection without candidates; only scores below `beat` (n,) will count."""
+        """Return a selection without candidates; its scores are `beat` (n,)."""
         count = len(beat)
         empty = HandState(np.zeros((count, 3)), np.zeros((count, 4)), np.zeros((count, dofs)))
         return cls(empty, np.zeros(count), beat.copy(), {})
@@ -98,7 +98,7 @@ class Selection:
     def take(
         self, found: GraspSet, refined: Refinements, rows: NDArray[np.intp], which: NDArray[np.intp], score: Floats
     ) -> None:
-        """Store candidates `rows` (k,) of the grasps `which` (k,) where they are better, or the first ones."""
+        """Store candidates `rows` (k,) of the grasps `which` (k,) if better or the grasp's first."""
         state, losses = refined.state[rows], refined.losses[rows]
         for k in np.flatnonzero((score < self.score[which]) | ~self.has(which)):
             grasp = int(which[k])
@@ -123,10 +123,10 @@ def select_by_rollout(
     together: int = TOGETHER,
     device: str = "cpu",
 ) -> Selection:
-    """Return the first candidate of each grasp with a good enough rollout, or else the one with the smallest score.
+    """Return each grasp's first candidate with a good enough rollout, else the one with the least score.
     `order` (n, each) lists the candidates by merit. `together` candidates of each grasp are refined and simulated, then
-    further ones of grasps without a good candidate. Unbalanced or infeasible hands have no rollout, but the first hand
-    of a grasp is returned if no other is. Scores `beat` (n,) of earlier attempts change only for better candidates."""
+    further ones of grasps without a good candidate. Unbalanced or infeasible hands have no rollout; a grasp of only
+    such hands gets its first hand. Scores `beat` (n,) of earlier attempts change only if a candidate is better."""
     good = GOOD if placed is None else GOOD_IN_SCENES
     beat = np.full(len(order), np.inf) if beat is None else beat
     taken, left = Selection.none(beat, hand.dofs), np.arange(len(order))
@@ -188,8 +188,8 @@ def _reduce_squeeze(
 
 #: Friction coefficient in the balance of contact forces. It is below those of all tests, as a reserve.
 FRICTION: Final = 0.3
-#: The same in scenes. Hands that balance at this friction mostly lift at half friction: AUC .80 for refined Allegro and
-#: Shadow hands with a merit below .1, and .74 with `FRICTION`.
+#: The same in scenes. The merit with this friction predicts lifts at half friction with AUC .80, with `FRICTION` with
+#: .74 (refined Allegro and Shadow hands with a merit below .1).
 SCENE_FRICTION: Final = 0.15
 #: Weight of L_stable relative to the residual of the balance.
 STABILITY: Final = 0.05
@@ -218,8 +218,8 @@ def merits(
     device: str = "cpu",
 ) -> Floats:
     """Compute merits (n,); smaller is better.
-    A merit is the residual of the force balance with `friction`, plus weighted L_stable (n,) and penetration `depths`
-    (n,) [m]."""
+    A merit is the residual of the force balance with `friction`, plus weighted `losses` (n,) (L_stable) and penetration
+    `depths` (n,) [m]."""
     holds = hold_forces(hand, obj, posture_of(hand, obj, state), friction=friction, device=device)
     merit = holds.residual + STABILITY * losses
     if depths is not None:
@@ -228,7 +228,7 @@ def merits(
 
 
 def rank_hands(merit: Floats, grasps: int) -> NDArray[np.intp]:
-    """Return the row numbers (grasps, each) of hands, the best of each grasp first; its hands are adjacent."""
+    """Return row numbers (grasps, each) of hands, best first; in `merit` hands of a grasp are adjacent."""
     each = merit.reshape(grasps, -1)
     # The stable sort keeps hands of equal merit in the order of their starts.
     return np.argsort(each, axis=1, kind="stable") + np.arange(grasps)[:, None] * each.shape[1]

@@ -19,12 +19,12 @@ from graspd.worker.simulation.sampling import object_samples
 
 #: Cell of the coarse distance grid [m].
 FIELD_CELL: Final = 0.005
-#: Number of hand points, and of object samples, tested against links in the coarse phase and in the fine phase.
+#: Number of hand points tested against other links, in the coarse and the fine phase; object samples in the coarse one.
 COARSE_SELF_POINTS: Final = 400
 FINE_SELF_POINTS: Final = 1000
 COARSE_SAMPLES: Final = 1500
-#: Factor on the fidelity's object samples around a free object, and their maximum. Penetration between two samples is
-#: not detected; with the fidelity's own number its median is .2 mm.
+#: Factor on the fidelity's number of object samples around a free object, and largest number. Penetration between two
+#: samples is not detected; with the fidelity's own number the median of such penetration is .2 mm.
 DENSER, DENSEST = 3, 12_000
 #: Number of pairs cached on the device.
 KEPT: Final = 4
@@ -48,14 +48,14 @@ class Pair:
     hand: DeviceHand
 
     def model(self, side: PhaseGeometry, obstacles: DeviceObstacles | None = None, *, pulled: bool = True) -> Model:
-        """Return the model of hand and object for a phase; among obstacles it has no attraction term.
-        With attraction, fingers that could enclose the object would collide with the table."""
+        """Return the model of a phase; among obstacles, or unless `pulled`, it has no attraction term.
+        The term would pull fingers that enclose the object into the table."""
         options = self.options if obstacles is None and pulled else replace(self.options, pull=0.0)
         return Model.create(self.hand, side.obj, side.points, side.own, options, obstacles)
 
 
 def pair_of(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, device: str, *, in_scenes: bool = False) -> Pair:
-    """Return the pair, cached. A projection out of a free object uses more object samples than `fidelity` states."""
+    """Return the pair, cached. Projections around a free object use more samples than `fidelity` states."""
     count = fidelity.object_points
     if fidelity.polish_iterations and not in_scenes:
         count = max(count, min(DENSER * count, DENSEST))

@@ -63,15 +63,15 @@ PART: Final = 4
 SET_OUT_AGAIN: Final = 0.05
 #: Grasps with a larger rollout score (`worker.planners.port.Rollout`) are retried. A tenth to a quarter of them hold.
 FAILED: Final = 2.0
-#: Score of a free grasp that holds without contact at one finger.
+#: Least score of a free grasp with a finger off the object.
 STANDS: Final = 1.99
 #: Free grasps with larger scores are retried; one limit for each attempt. Grasps that may slip at half friction exceed
-#: the first limit, those with a finger off the object also the second. Later attempts are as productive as the first,
-#: so they hardly change the yield per second, but fewer grasps of hard pairs fail.
+#: the first limit; grasps with a finger off the object also exceed the second. Later attempts are as productive as the
+#: first. They hardly change the yield per second, but fewer grasps of hard pairs of hand and object fail.
 FREE: Final = (GOOD, STANDS, *(FAILED,) * 18)
-#: Grasps in scenes with larger scores are retried; one limit for each attempt. Grasps with a finger off the object
-#: exceed only the first limit, those that lift at full friction only the first five. Five attempts instead of two raise
-#: the share that lifts at half friction from .63 to .67 (Allegro, 12 objects of their own mass), at 3 % more time.
+#: Grasps in scenes with larger scores are retried; one limit for each attempt. A grasp with a finger off the object
+#: exceeds only the first limit; a grasp that fails only at half friction exceeds the first five. Five attempts instead
+#: of two raise the share that lifts at half friction from .63 to .67 at 3 % more time (Allegro, 12 objects, own mass).
 IN_SCENES: Final = (GOOD_IN_SCENES, *(1.0,) * 4, FAILED)
 #: Largest number of attempts of one grasp at once.
 AHEAD: Final = 4
@@ -158,7 +158,7 @@ def optimise_batch(hand: HandModel, obj: ObjectModel, wanted: PlanRequest, run: 
 
 
 def optimise_pair(pair: Pair, wanted: PlanRequest, run: ExecutionContext) -> list[LaunchPart]:
-    """Run `optimise_batch` for a pair on `run.device`; its geometry may differ from the fidelity's."""
+    """Run `optimise_batch` for a pair on `run.device`; the pair's geometry may differ from the fidelity's."""
     batches = Batches([BatchRequest(wanted, run)], pair.fine.obj.model)
     parts = optimise(pair, batches, run)
     batches.active_rows()
@@ -190,7 +190,7 @@ def optimise(pair: Pair, batches: Batches, run: ExecutionContext, *, postures: b
 
 @dataclass(frozen=True)
 class _Launch:
-    """Models of a pair for each phase and the batches planned with them; all threads share it."""
+    """Models of a pair for each phase, and the batches planned with them; shared by all threads."""
 
     pair: Pair
     batches: Batches
@@ -219,7 +219,7 @@ class _Launch:
         return merits(hand, obj, state, losses, depths, friction=friction, device=device)
 
     def closed(self, state: HandState, rows: Rows) -> HandState:
-        """Close fingers that stand off the objects of scenes; `rows` (n,) are the grasps of the hands."""
+        """In scenes, close fingers that stand off the object; `rows` (n,) are the grasps of the hands."""
         if self.batches.placed is None:
             return state
         hand, obj, device = self.pair_on_device()
@@ -227,14 +227,14 @@ class _Launch:
         return HandState(state.pivot, state.rotation, hand.reduce(grasp.joint_positions))
 
     def stand_off(self, state: HandState) -> NDArray[np.bool_]:
-        """Check (n,) whether a finger stands off the object in a scene."""
+        """Return a mask (n,) of hands in scenes with a finger that stands off the object."""
         if self.batches.placed is None:
             return np.zeros(len(state.pivot), bool)
         hand, obj, device = self.pair_on_device()
         return fingers_off_object(hand, obj, posture_of(hand, obj, state), device=device)
 
     def infeasible(self, state: HandState, depths: Floats) -> NDArray[np.bool_]:
-        """Check (n,) whether hands of these depths [m] fail the geometric gate; such hands have no rollout."""
+        """Return a mask (n,) of hands that get no rollout, as they fail the geometric gate; `depths` (n,) [m]."""
         if not self.batches.has_rollout:
             return np.zeros(len(depths), bool)
         hand, obj, device = self.pair_on_device()
@@ -250,7 +250,7 @@ class _Starts:
     state: HandState
     depth: Floats
     touch: Floats | None
-    """Share of the dilation at which each hand touches; None: the whole dilation."""
+    """Initial dilation for each hand, as a share of `DILATION`: the object just touches it. None: 1."""
 
     def take(self, which: NDArray[np.intp], each: int) -> _Starts:
         hands = (which[:, None] * each + np.arange(each)).ravel()
@@ -280,7 +280,7 @@ def _draw_starts(launch: _Launch, rows: Rows, attempt: Rows) -> _Starts:
     fidelity, placed, generators = batches.fidelity, launch.placed(rows), batches.generators(rows, attempt)
     if placed is None:
         state, depth = starts.clear_starts(coarse, generators, each=fidelity.starts)
-        # In later attempts only grasps that opened in the first may open; the others have clear starts.
+        # Only grasps that opened further in their first attempt may do so later; the others have clear starts.
         may_open = np.repeat(batches.opened[rows] | (attempt == 0), fidelity.starts)
         opened = starts.open_further(coarse, generators, state, depth, may_open)
         batches.opened[rows] |= opened.reshape(len(rows), -1).any(axis=1)
@@ -293,7 +293,7 @@ def _draw_starts(launch: _Launch, rows: Rows, attempt: Rows) -> _Starts:
 
 def _rows_with_starts(launch: _Launch, begun: _Starts) -> Rows:
     """Return the rows of the batches that found starts.
-    Around a free object every grasp must have one. In scenes one per batch suffices, in this part or in another."""
+    Around a free object every hand must have a start. In scenes one per batch suffices, in this part or another."""
     batches = launch.batches
     deep = begun.depth.reshape(len(begun.rows), -1)
     owners = batches.owner[begun.rows]
@@ -307,7 +307,7 @@ def _rows_with_starts(launch: _Launch, begun: _Starts) -> Rows:
 
 
 def _optimise_part(launch: _Launch, begun: _Starts, beat: Floats | None = None) -> LaunchPart:
-    """Optimise hands and select one per grasp; with rollouts, the scores `beat` (n,) count as selected before."""
+    """Optimise hands and select one per grasp; with rollouts, `beat` (n,) are the scores to beat."""
     batches, pair, rows = launch.batches, launch.pair, begun.rows
     fidelity, placed, n = batches.fidelity, launch.placed(rows), len(rows)
     hand, obj, last = pair.hand.model, pair.fine.obj.model, finalists(fidelity)
@@ -351,7 +351,7 @@ def _optimise_part(launch: _Launch, begun: _Starts, beat: Floats | None = None) 
 
 
 def _retry(launch: _Launch, part: LaunchPart, run: ExecutionContext) -> LaunchPart:
-    """Retry grasps that fail their rollout or, if free, have poor balance; select the first good or the best attempt.
+    """Retry grasps with a poor score or merit; select the first good attempt, else the best one.
     The last few grasps would leave cores idle, and a hand costs a third more in a small launch. Several of their
     attempts therefore run at once. Attempts after a good one are dropped, so the result equals sequential attempts."""
     limits: tuple[float, ...] = FREE if launch.batches.has_rollout else (SET_OUT_AGAIN,)
@@ -374,7 +374,7 @@ def _retry(launch: _Launch, part: LaunchPart, run: ExecutionContext) -> LaunchPa
 
 
 def _run_attempts(launch: _Launch, rows: Rows, attempt: Rows, merit: Floats, run: ExecutionContext) -> LaunchPart:
-    """Run later attempts (n,) of grasps with merits (n,) so far; the merit of grasps without a start is inf.
+    """Run later attempts (n,) of grasps with merits (n,) so far; a grasp without a start gets merit inf.
     The attraction term is off: with it, half as many grasps hold on a bowl's wall."""
     launch = replace(launch, pulled=False)
 
@@ -383,7 +383,7 @@ def _run_attempts(launch: _Launch, rows: Rows, attempt: Rows, merit: Floats, run
         begun = _draw_starts(launch, rows[some], attempt[some])
         # Attempts at failed grasps may run at once, so they do not depend on each other's scores.
         made = _optimise_part(launch, begun, np.where(merit[some] < STANDS, merit[some], np.inf))
-        # As in the first attempt: around a free object every hand needs a start, in scenes one hand per grasp.
+        # Around a free object every hand needs a start; in scenes one hand of a grasp suffices.
         deep = begun.depth.reshape(len(made.rows), -1)
         lost = (deep.max(axis=1) if launch.batches.placed is None else deep.min(axis=1)) > NO_PLACE
         return replace(made, merit=np.where(lost, np.inf, made.merit))
@@ -406,7 +406,7 @@ class _FinePhase:
     state: HandState
     losses: Floats
     curve: list[Floats]
-    """Loss curve, continued by the first hands in the fine phase."""
+    """Loss curve; only the first call of `refine` continues it."""
 
     def refine(self, rows: NDArray[np.intp], which: NDArray[np.intp]) -> Refinements:
         launch, flat = self.launch, rows.ravel()
@@ -420,9 +420,9 @@ class _FinePhase:
         state = _descend(launches, data, launch.batches, mine, fidelity.fine_iterations, "refinement", curve)
         if fidelity.fine_iterations:
             losses = _losses(data, len(flat))
-        # Without iterations this only measures the depth of each hand.
         options = AROUND if launch.batches.placed is None else ProjectionOptions()
         state = launch.closed(state, np.repeat(mine, rows.shape[1]))
+        # Without iterations the projection only measures the depth of each hand.
         state, depths = Projection(launch.fine, data, options).run(state, fidelity.polish_iterations)
         merit = launch.merits(state, losses, depths) if rows.shape[1] > 1 else np.zeros(len(flat))
         return Refinements(state, losses, merit, launch.infeasible(state, depths), launch.stand_off(state))
@@ -441,7 +441,7 @@ def _losses(data: Data, n: int) -> Floats:
 def _descend(
     launches: Launches, data: Data, batches: Batches, rows: Rows, iterations: int, name: str, curve: list[Floats]
 ) -> HandState:
-    """Optimise the hands of grasps `rows` for a number of iterations; batches that stop meanwhile are excluded."""
+    """Optimise the hands of grasps `rows`; exclude batches that stop meanwhile."""
     done, out = 0, len(batches.errors)
     each = data.capacity // len(rows)
     while done < iterations:

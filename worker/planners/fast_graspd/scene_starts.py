@@ -1,9 +1,9 @@
-"""Sampling of starts in scenes from the free approach directions, for all hands at once.
+"""Starts in scenes, sampled along free approach directions for all hands at once.
 Most starts are antipodal; in the others the palm faces a random point of the object, as in `starts`.
-A start has `ROOM` more clearance from obstacles than the later margin, so that the optimisation can rotate the hand.
+A start has `ROOM` more clearance from obstacles than required later, so that the optimisation can rotate the hand.
 
-Before the expensive phases `obstruction` tests whether each hand can leave its grasp: open, along the approach, and
-closed, by the lift. A hand hooked around an edge holds well but cannot reach its grasp. A hand close below a board
+Before the fine phase `obstruction` tests whether each hand can leave its grasp, both open along the approach and closed
+on the lift. A hand hooked around an edge holds well but cannot reach its grasp. A hand close below a board
 cannot lift."""
 
 from __future__ import annotations
@@ -52,15 +52,15 @@ from graspd.worker.simulation.environment import RISE_M, STANDOFF_M, Environment
 from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.mounting import missing_mounting_clearance
 
-#: Clearance of a start from obstacles in addition to the later margin [m].
+#: Clearance of a start from obstacles in addition to the margin [m].
 ROOM: Final = 0.006
 #: Nearest and farthest distance of a palm from the random point in front of it [m].
 GAP: Final = (0.004, 0.02)
-#: Retreat steps after contact [m]. They are longer than for a free object, since fingers must not reach the table.
+#: Retreats at which a draw is tested [m]. They are longer than for a free object, so that fingers clear the table.
 RETREATS: Final = (0.0, 0.01, 0.02, 0.035, 0.055, 0.08, 0.11)
 #: Draws per start before the least penetrating one is selected.
 DRAWS: Final = 96
-#: Draws whose random numbers are drawn together.
+#: Number of draws whose normal random numbers are generated together.
 DRAWN: Final = 8
 #: Half the width of a palm [m], number of approach directions, and least cosine with the nearest free direction.
 PALM_RADIUS: Final = 0.04
@@ -81,8 +81,8 @@ _AcrossPairs = list[tuple[NDArray[np.intp], AntipodalHands]]
 
 def free_directions(scene: Environment, obj: ObjectModel) -> Floats:
     """Return free approach directions (K, 3), unit vectors in the object frame.
-    Along a free direction, a ball of a palm's width can move from the object by `STANDOFF_M` without contact with an
-    obstacle. Raises InputError: there is no free direction."""
+    Along a free direction, a ball of half a palm's width can move from the object by `STANDOFF_M` without contact with
+    an obstacle. Raises InputError: there is no free direction."""
     ways = spread_directions(DIRECTIONS)
     out = ((obj.hull_vertices - obj.centre_of_mass) @ ways.T).max(axis=0)
     path = out[:, None] + PALM_RADIUS + np.linspace(0.0, STANDOFF_M, 9)
@@ -107,9 +107,9 @@ def clear_scene_starts(
     model: Model, generators: list[np.random.Generator], *, each: int, placed: PlacedGrasps, ways: Sequence[Floats]
 ) -> tuple[HandState, Floats]:
     """Return a start for each generator, `each` per grasp, and its depth (n,) [m].
-    The start is the first clear draw, or the least deep one; antipodal starts take the clear draw with the best placed
-    pair. In a narrow scene some grasps find no clear start: they are returned as blocked, and the other grasps form the
-    batch. `ways` are the `free_directions` of each scene."""
+    The start is the first clear draw, or the least deep one; an antipodal start is the clear draw with its pair nearest
+    to the pads. In a narrow scene some grasps find no clear start; the batch still contains them, as blocked grasps.
+    `ways` are the `free_directions` of each scene."""
     hand, obj = model.hand.model, model.obj.model
     probe = Probe(model, len(generators), room=ROOM)
     used = set(placed.index.tolist())
@@ -131,7 +131,7 @@ def clear_scene_starts(
         if not len(rows):
             break
         if number == normal.shape[1]:
-            # Most starts need a few draws, so random numbers of later draws are generated on demand.
+            # Most starts need few draws, so random numbers of later draws are generated on demand.
             normal = np.concatenate([normal, _normal(generators, rows, hand.dofs)], axis=1)
         reach = reaching[rows] & (number < REACHES)
         numbers = np.where(reach, order[rows, min(number, REACHES - 1)], number)
@@ -163,8 +163,8 @@ def _normal(generators: list[np.random.Generator], rows: NDArray[np.intp], dofs:
 def _depths(
     probe: Probe, states: HandState, placed: PlacedGrasps, scene: NDArray[np.intp], worth: NDArray[np.bool_]
 ) -> Floats:
-    """Return depths (n, len(RETREATS)) [m] of hands and mountings in scenes (n,); inf if not computed. Depths are
-    computed inwards, from the farthest distance with `worth` (n, len(RETREATS)), while they are clear.
+    """Return depths (n, len(RETREATS)) [m] of hands and mountings in scenes (n,); inf if not computed.
+    Only retreats with `worth` (n, len(RETREATS)) are computed, from the farthest inwards, until one is not clear.
     Most draws fail for reasons that no retreat fixes. A draw that is not clear at one distance is hardly ever clear at
     a smaller one."""
     found, open_ = np.full((len(scene), len(RETREATS)), np.inf), np.ones(len(scene), bool)
@@ -184,7 +184,7 @@ def _depths(
 def _missing_mounting_clearance(
     probe: Probe, states: HandState, placed: PlacedGrasps, scene: NDArray[np.intp], *, exact: bool
 ) -> Floats:
-    """Return the clearance (n,) missing at mountings in scenes (n,), relative to the margin plus `ROOM` [m]."""
+    """Return by how much (n,) mountings in scenes (n,) miss the margin plus `ROOM` [m]; at least 0."""
     hand, obj = probe.model.hand.model, probe.model.obj.model
     poses = posture_of(hand, obj, states).hand_pose
     return missing_mounting_clearance(hand, poses, placed.scenes, scene, room=ROOM, exact=exact)
@@ -198,7 +198,7 @@ def _raise_draws(
     scene: NDArray[np.intp],
     probe: Probe,
 ) -> Floats:
-    """Raise draws `rows` in scenes (n,), at all distances, by the clearance missing at the nearest distance.
+    """Raise draws `rows` in scenes (n,), at all retreats, by the clearance missing at the nearest.
     Return the distance (n, len(RETREATS)) of their pairs from the middle of the pads [m], 0 for other draws. Retreat
     steps alone are too coarse for low objects: fingers would end above the object, not beside it."""
     off = np.zeros((len(scene), len(RETREATS)))
@@ -228,7 +228,7 @@ class _SceneDraws:
     def order(
         self, uniform: Floats, scene: NDArray[np.intp], reaching: NDArray[np.bool_], placed: PlacedGrasps
     ) -> tuple[NDArray[np.intp], Floats]:
-        """Return draws (n, REACHES) of antipodal hands, see `select_draws`; inf for other hands."""
+        """Return draws and distances (n, REACHES) of `select_draws`; 0 and inf for hands not `reaching`."""
         order, least = np.zeros((len(scene), REACHES), np.intp), np.full((len(scene), REACHES), np.inf)
         for s in np.unique(scene[reaching]):
             rows = np.flatnonzero(reaching & (scene == s))
@@ -241,8 +241,8 @@ class _SceneDraws:
     def draws(
         self, uniform: Floats, normal: Floats, scene: NDArray[np.intp], reach: NDArray[np.bool_]
     ) -> tuple[HandState, _AcrossPairs]:
-        """Return hands drawn in scenes (n,), n * len(RETREATS) at each distance; and the antipodal hands, `reach` (n,).
-        Hands depend on uniform (n, 7) and normal (n, 2 + D) random numbers."""
+        """Return hands (n * len(RETREATS)) drawn in scenes (n,) at all retreats, and the antipodal hands.
+        `reach` (n,): whether a hand is antipodal. Random numbers: uniform (n, 7), normal (n, 2 + D)."""
         n, dofs = len(uniform), self.hand.dofs
         pivot, rotation, q, away = np.zeros((n, 3)), np.zeros((n, 4)), np.zeros((n, dofs)), np.zeros((n, 3))
         reaching = []
@@ -262,7 +262,7 @@ class _SceneDraws:
         return at_distances(pivot, rotation, q), reaching
 
     def _towards(self, uniform: Floats, normal: Floats, ways: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Place hands with palms towards surface points drawn at random, as `place_across` does, without a pair."""
+        """Place palms towards random surface points; return pivots, rotations, dofs, directions of retreat."""
         hand, obj = self.hand, self.obj
         corners, normals, sums = surface_of(obj)
         face = np.minimum(np.searchsorted(sums, uniform[:, 0]), len(sums) - 1)
@@ -278,7 +278,7 @@ class _SceneDraws:
 
 
 def _turned(away: Floats, ways: Floats, random: Floats) -> Floats:
-    """Return `away` (3,) if it is near a free direction; else rotate it towards a random free direction until it is."""
+    """Return `away` (3,), rotated towards a random free direction until it is near any free direction."""
     if (ways @ away).max() >= NEAR_WAY:
         return away
     goal = ways[int(random[1] * len(ways))]
@@ -302,8 +302,8 @@ def _tilted(normals: Floats, angles: Floats) -> Floats:
 OUT: Final = ((0.2, 0.0), (0.3, 0.015), (0.4, 0.04))
 #: Tolerated depth [m]: the real opening of a hand can differ from this simple motion.
 TOLERATED_M: Final = 0.001
-#: Merit lost per metre of depth [1/m]. The weight is small: hands that hold well enclose the object, and most of them
-#: can leave it along another trajectory.
+#: Penalty on the merit per metre of depth [1/m]. The weight is small: hands that hold well enclose the object, and most
+#: of them can leave it along another trajectory.
 WEIGHT: Final = 25.0
 DEEPEST_M: Final = 0.01
 #: Shares of the lift at which obstacles above are checked.
@@ -311,9 +311,9 @@ UP: Final = (0.5, 1.0)
 
 
 def obstruction(model: Model, state: HandState, placed: PlacedGrasps) -> Floats:
-    """Compute the merit (n,) that hands lose for a blocked retreat or lift in their scenes.
-    The loss grows with the depth of the hand in object or obstacles on the trajectory, and of its mounting at the
-    grasp."""
+    """Compute the penalty (n,) on the merits of hands whose retreat or lift is blocked in their scenes.
+    The penalty grows with the depth of the hand in object or obstacles on the trajectory, and with the clearance that
+    its mounting misses at the grasp."""
     hand, obj = model.hand.model, model.obj.model
     mounted = missing_mounting_clearance(hand, posture_of(hand, obj, state).hand_pose, placed.scenes, placed.index)
     deep = np.maximum(_retreat_obstruction(model, state, placed.index), mounted)

@@ -1,4 +1,4 @@
-"""Weights per iteration, and the interface of starts that another method proposes.
+"""Weights per iteration, and the interface for another method that proposes starts.
 The coarse phase shrinks the dilation; the fine phase brings the hand into contact."""
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ PAPER_RATES: Final = (1e-3, 1e-3, 1e-3)
 #: Largest dilation of the object [m].
 DILATION: Final = 0.01
 SELF_WEIGHT: Final = 2e4
-#: Length of the attraction term, see `LossOptions` [m]. The term favours enclosing grasps, of which more hold at half
-#: friction. Half this length hardly changes results of a Barrett hand. Twice this length pulls the slender fingers of a
-#: Shadow hand into thin walls.
+#: Length of the attraction term, see `LossOptions` [m]. The term favours enclosing grasps, and more of these hold at
+#: half friction. Half this length hardly changes results of a Barrett hand. Twice this length pulls the slender fingers
+#: of a Shadow hand into thin walls.
 PULL: Final = 3e-4
-#: Projection around a free object. Points are attracted from farther away than among obstacles, so more of the hand
-#: touches. This adds about half of the penetration that the samples of `pairs.DENSER` remove.
+#: Projection around a free object. Points are attracted from farther away than among obstacles, so more points of the
+#: hand touch. Penetration grows by about half of what the additional samples of `pairs.DENSER` remove.
 AROUND: Final = ProjectionOptions(hold=5e-3)
 
 
 def loss_options(fidelity: Fidelity) -> LossOptions:
-    """Return the simulation options of a fidelity. As in the paper, plain gradient descent has limits as a penalty."""
+    """Return the loss options of a fidelity; gradient descent has the paper's penalty on joint limits."""
     paper = fidelity.optimizer == "gd"
     return LossOptions(
         contact_solver=fidelity.contact_solver,
@@ -72,7 +72,7 @@ def _decayed(rates: tuple[float, float, float], count: int, to: float) -> Floats
 
 
 def coarse_schedule(fidelity: Fidelity) -> Schedule:
-    """Return weights: over the first four fifths the dilation falls to 0 and the penetration weight grows tenfold."""
+    """Return the schedule: dilation falls to 0 at four fifths; Adam's penetration weight grows tenfold."""
     n = fidelity.coarse_iterations
     dilation = DILATION * np.clip(1.0 - np.arange(n) / max(0.8 * n, 1.0), 0.0, 1.0)
     if fidelity.optimizer == "gd":
@@ -92,11 +92,10 @@ def fine_schedule(fidelity: Fidelity) -> Schedule:
 
 
 class WarmStart(Protocol):
-    """Starts of grasps in scenes."""
+    """Proposes starts of grasps in scenes."""
 
     def adapted(self, fidelity: Fidelity) -> Fidelity:
-        """Return the fidelity of `schedule.in_scene` with the numbers of starts and finalists that these starts
-        need."""
+        """Return `fidelity`, a result of `in_scene`, with its numbers of starts and finalists adapted."""
 
     def __call__(
         self,

@@ -1,7 +1,7 @@
-"""Starts of hands. In every second start of a grasp the palm faces a random surface point nearby. The other starts are
-antipodal (`ReachSampling`). All are antipodal if the object is too small or too wide for the pads.
+"""Starts of hands around a free object. In every second start of a grasp the palm faces a random surface point. The
+other starts are antipodal (`ReachSampling`). All are antipodal if the object is too small or too wide for the pads.
 
-A start must be free of contact, since hands that start inside a thin wall never leave it.
+A start must not penetrate the object deeply, since hands that start inside a thin wall never leave it.
 
 For a gripper a pair of opposite surface points is drawn. The jaws open slightly wider than the pair and are placed
 around it, at a random angle about the line through the points."""
@@ -34,20 +34,20 @@ from graspd.worker.simulation.data import Data, HandState
 from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.record import record_placement
 
-#: Distance of the palm from the surface: nearest and farthest [m]; then the retreat steps after contact.
+#: Nearest and farthest distance of the palm from the surface; retreats of hands that are not clear [m].
 GAP: Final = (0.002, 0.012)
 RETREATS: Final = (0.0, 0.01, 0.02, 0.03)
-#: Palm distance of hands that open further to find a start, with the object already between their fingers [m].
+#: Nearest and farthest distance of the palm for hands that open further than their pre-shape [m].
 OPENED_GAP: Final = (0.004, 0.02)
 #: Tilt of the approach away from the surface normal, standard deviation [rad].
 TILT: Final = 0.25
 #: Noise of the pre-shape, standard deviation as a share of the joint's range.
 POSTURE_NOISE: Final = 0.08
-#: Deepest penetration of a start [m].
+#: Largest penetration at which a draw counts as clear [m].
 CLEAR: Final = 0.001
-#: Draws per grasp before the least penetrating one is selected.
+#: Draws per start before the least penetrating one is selected.
 DRAWS: Final = 48
-#: Opening of hands without a start in their pre-shape, as shares of the remaining range, and number of draws at each.
+#: Openings of hands that find no start in their pre-shape, as shares of the remaining range; draws at each opening.
 OPENED: Final = (0.5, 1.0)
 OPENED_DRAWS: Final = 24
 #: Depth above which a start is rejected [m].
@@ -67,12 +67,12 @@ def frames_about(z: Floats) -> Floats:
 
 
 class _Pair:
-    """Data for all draws of a hand around an object: its faces (F), the distance `gap` of the palm [m]."""
+    """Data that all draws of a hand around an object share; `gap`: palm's nearest, farthest distance [m]."""
 
     def __init__(self, hand: HandModel, obj: ObjectModel, gap: tuple[float, float] = GAP) -> None:
         self.hand, self.centre, self.gap = hand, obj.centre_of_mass, gap
         self.corners = obj.vertices[obj.faces]
-        #: Normals (F, 3) of twice the faces' area [m^2].
+        #: Normals (F, 3) of the faces; their length is twice the area [m^2].
         self.across = np.cross(self.corners[:, 1] - self.corners[:, 0], self.corners[:, 2] - self.corners[:, 0])
         self.area = np.linalg.norm(self.across, axis=1)
         share = np.cumsum(self.area / self.area.sum())
@@ -81,8 +81,8 @@ class _Pair:
 
 
 def _numbers(generators: list[np.random.Generator], dofs: int) -> tuple[Floats, Floats]:
-    """Return random numbers of draws, in the order of their generation.
-    Uniform (n, 5): face, two for the point, roll, gap. Normal (n, 2 + D): tilt, then noise of the pre-shape."""
+    """Return the random numbers of n draws.
+    Uniform (n, 5): face, point (two numbers), roll, gap. Normal (n, 2 + D): tilt, then noise of the pre-shape."""
     uniform, normal = np.empty((len(generators), 5)), np.empty((len(generators), 2 + dofs))
     for i, rng in enumerate(generators):
         uniform[i, :3] = rng.random(3)
@@ -94,7 +94,7 @@ def _numbers(generators: list[np.random.Generator], dofs: int) -> tuple[Floats, 
 
 
 def draw(pair: _Pair, generators: list[np.random.Generator]) -> tuple[HandState, Floats]:
-    """Draw one start per generator, at its nearest distance; also return the palms' directions (n, 3)."""
+    """Draw one start per generator, before any retreat; also return the palms' approaches (n, 3)."""
     hand, (uniform, noise) = pair.hand, _numbers(generators, pair.hand.dofs)
     face = pair.share.searchsorted(uniform[:, 0], side="right")
     point = points_in(pair.corners[face], uniform[:, 1:2], uniform[:, 2:3])
@@ -140,7 +140,7 @@ class Probe:
         return self.data.deepest(len(states.pivot)).astype(float)
 
     def nearest(self, states: HandState) -> Floats:
-        """Return the distance (n,) of each hand's nearest point from the object [m], at most the model's band."""
+        """Return each hand's least distance (n,) from the object [m], at most `LossOptions.band`."""
         self.data.set_state(states)
         self._placement.run()
         n = len(states.pivot)
@@ -151,8 +151,8 @@ class Probe:
 
 
 def sample_starts(model: Model, *, seed: int, batch: int, indices: range, each: int) -> HandState:
-    """Sample collision-free starts of the grasps `indices` of a batch, `each` per grasp side by side.
-    Raises InputError: no draw of some grasp came within 10 mm of being clear."""
+    """Sample starts of the grasps `indices` of a batch; the `each` starts of a grasp are adjacent.
+    Raises InputError: every draw of some start penetrates by more than `NO_PLACE`."""
     generators = [start_generator(seed, batch, i, k) for i in indices for k in range(each)]
     state, depth = clear_starts(model, generators, each=each)
     open_further(model, generators, state, depth, np.ones(len(depth), bool))
@@ -170,7 +170,7 @@ def no_start_error(model: Model) -> InputError:
 
 
 def clear_starts(model: Model, generators: list[np.random.Generator], *, each: int = 1) -> tuple[HandState, Floats]:
-    """Return a start per generator, the least deep of its draws, and its depth (n,) [m]; most are clear.
+    """Return a start per generator and its depth (n,) [m]: the first clear draw, else the least deep one.
     The second, fourth, ... of the `each` starts of a grasp are antipodal if possible. All are antipodal if the object
     is too small or too wide for the hand's pads."""
     hand, obj = model.hand.model, model.obj.model
@@ -198,9 +198,9 @@ def clear_starts(model: Model, generators: list[np.random.Generator], *, each: i
 def open_further(
     model: Model, generators: list[np.random.Generator], state: HandState, depth: Floats, wanted: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """Retry starts that were not clear, among the `wanted` ones (n,), with hands further open.
-    The pre-shape of some hands leaves no gap as wide as the object. `generators` continue from the state after
-    `clear_starts`; better starts replace its results. Return a mask (n,) of the opened starts."""
+    """Retry `wanted` starts (n,) deeper than `NO_PLACE` with hands further open; return their mask (n,).
+    The pre-shape of some hands leaves no gap as wide as the object. `generators` continue from
+    `clear_starts`. Better starts replace those in `state`, and their depths those in `depth`."""
     hand, obj = model.hand.model, model.obj.model
     lost = wanted & (depth > NO_PLACE)
     if not lost.any() or JawStarts.of(hand, obj) is not None:
@@ -227,8 +227,8 @@ def _draw_until_clear(
     best: HandState,
     deepest: Floats,
 ) -> None:
-    """Store the nearest clear start of each of `rows`, or the least deep, in `best` and `deepest`.
-    `drawn` draws the given rows at each retreat distance."""
+    """Draw starts of `rows` until they are clear; store the best in `best`, their depths in `deepest`.
+    `drawn` returns hands for the given rows at each retreat distance."""
     for _ in range(draws):
         if not len(rows):
             return
@@ -253,7 +253,7 @@ def _draw_antipodal(
     best: HandState,
     deepest: Floats,
 ) -> None:
-    """Store clear antipodal starts among `rows` in `best` and `deepest`."""
+    """Store clear antipodal starts of `rows` in `best`, and their depths in `deepest`."""
     seeds = np.array([generators[i].integers(2**31) for i in rows], np.int32)
     first = np.zeros(len(rows), np.int32)
     left = np.arange(len(rows))
@@ -279,12 +279,12 @@ def store_states(states: HandState, rows: NDArray[np.intp], others: HandState) -
 
 #: Clearance between each pad and the object [m]: least and most.
 ROOM_M: Final = (0.002, 0.005)
-#: Range of the pair's position ahead of the middle of the pads, as a share of their length. Then the further retreat of
-#: the hand on contact [m].
+#: Range of the pair's position ahead of the middle of the pads, and further retreats of hands that are not clear. Both
+#: are shares of the pads' length.
 AHEAD: Final = (-0.25, 0.25)
 
 JAW_RETREATS: Final = (0.0, 0.25, 0.5, 0.75)
-#: Shortest and longest pad length to which this share refers [m].
+#: Shortest and longest pad length to which these shares refer [m].
 LENGTH_M: Final = (0.01, 0.05)
 #: Uniform numbers of one draw: pair, side, angle, clearance, place.
 UNIFORM: Final = 5
@@ -313,7 +313,7 @@ class JawStarts:
         return cls(hand, obj, jaws, pairs, np.cumsum(weight) / weight.sum())
 
     def draw(self, uniform: Floats) -> HandState:
-        """Return hands for random numbers (n, `UNIFORM`) in [0, 1) at each retreat, n * len(RETREATS)."""
+        """Return hands (n * len(JAW_RETREATS)) at each retreat, from random numbers (n, `UNIFORM`) in [0, 1)."""
         pick = np.minimum(np.searchsorted(self.sums, uniform[:, 0]), len(self.sums) - 1)
         start, end = self.pairs.start[pick], self.pairs.end[pick]
         swap = (uniform[:, 1] < 0.5)[:, None]
