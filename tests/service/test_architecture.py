@@ -1,5 +1,6 @@
 """ARCHITECTURE.md and docs say what the code does: tests, layers, files."""
 
+import ast
 import importlib
 import inspect
 import re
@@ -80,6 +81,13 @@ def test_the_product_stays_within_its_budget(what: str, budget: int, product: di
         "lines that the formatter skips": sum(text.count("fmt: skip") for text in product.values()),
     }
     assert 0 < found[what] <= budget
+
+
+def test_first_lines_of_docstrings_are_short(product: dict[str, str]) -> None:
+    owners = (ast.Module, ast.ClassDef, ast.FunctionDef)
+    nodes = ((file, node) for file, text in product.items() for node in ast.walk(ast.parse(text)))
+    docs = ((file, ast.get_docstring(node)) for file, node in nodes if isinstance(node, owners))
+    assert [f"{file}: {text}" for file, text in docs if text and len(text.partition("\n")[0]) > 100] == []
 
 
 def test_no_line_spells_a_key_of_rq(product: dict[str, str]) -> None:
