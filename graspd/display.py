@@ -86,7 +86,7 @@ def viewer_of(grasps: Grasps, *, host: str, port: int) -> Viewer:
 
 
 def sheet_of(grasps: Grasps, count: int, edge: int, limit_s: float = math.inf) -> bytes:
-    """Return a PNG sheet of the best grasps, `edge` pixels each; errors as in `Grasps.plot`, and TaskCancelled."""
+    """Return a PNG of the best grasps, `edge` pixels each; errors as in `Grasps.plot`, and TaskCancelled."""
     from graspd.commands.grasp_sheet import GraspSheet
     from graspd.worker.engines.devices import Device
     from graspd.worker.execution_context import ExecutionContext

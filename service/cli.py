@@ -62,7 +62,7 @@ class CommandGroup(typer.Typer):
 
 
 def run_command_line(command: Callable[[], object]) -> None:
-    """Run the command line; report system errors in one line. Other exceptions are bugs and show their trace."""
+    """Run the command; report system errors in one line; other exceptions are bugs and show their trace."""
     for descriptor in range(3):
         try:
             os.fstat(descriptor)
@@ -126,7 +126,7 @@ def write_output(path: Path, content: bytes) -> None:
 
 @contextlib.contextmanager
 def catch_stop_signals() -> Iterator[list[int]]:
-    """Yield a list that receives the first stop signal (Ctrl-C, SIGTERM); a second signal ends the process."""
+    """Yield a list for the first stop signal (Ctrl-C, SIGTERM); a second signal ends the process."""
     asked: list[int] = []
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 

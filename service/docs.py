@@ -1,4 +1,4 @@
-"""`python -m graspd.service.docs` rewrites the tables of the documentation and the type stubs of keywords."""
+"""Update of the documentation's tables and keyword stubs: `python -m graspd.service.docs`."""
 
 from __future__ import annotations
 

@@ -56,7 +56,7 @@ def write(file: Path, schema: Any, groups: Iterable[Sequence[Mapping[str, Any]]]
 
 
 def read(file: Path, wanted: Iterable[str]) -> dict[str, list[Any]]:
-    """Read the wanted columns that a file has; InputError if it is no Parquet file or larger than `LARGEST`."""
+    """Read the wanted columns that a file has; InputError: no Parquet file, or larger than `LARGEST`."""
     pa = arrow()
     try:
         with pa.parquet.ParquetFile(file) as found:

@@ -176,7 +176,7 @@ class Settings(BaseSettings):
 
 
 def sqlite_url(path: Path) -> URL:
-    """Return SQLAlchemy's URL of a file with any path: in a text URL the path would end at a question mark."""
+    """Return SQLAlchemy's URL of a file with any path; a text URL's path would end at a question mark."""
     from sqlalchemy import URL  # Only API and controller need this slow import.
 
     return URL.create("sqlite", database=str(path))

@@ -38,7 +38,7 @@ View = TypeVar("View", bound=BaseModel)
 
 
 class Client(AbstractContextManager["Client"]):
-    """Connection to one graspd API. Usable as a context manager. `transport` replaces the network in tests."""
+    """Connection to one graspd API; `transport` replaces the network in tests."""
 
     def __init__(self, url: str, *, key: str | None = None, transport: httpx.BaseTransport | None = None) -> None:
         address = _address(url.strip().rstrip("/"))

@@ -79,7 +79,7 @@ def print_rows(
     empty: str = "",
     json: bool,
 ) -> None:
-    """Print a list as JSON or a table; `empty` replaces a table without rows; columns `whole` are not wrapped."""
+    """Print a list as JSON or a table; `empty` replaces an empty table; columns `whole` are not wrapped."""
     if json:
         emit(document)
         return

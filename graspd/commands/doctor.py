@@ -1,4 +1,4 @@
-"""Checks of GPUs and kernels for `graspd doctor`, each in its own process, because a driver may crash it."""
+"""Checks of GPUs and kernels for `graspd doctor`, each in its own process: a driver may crash it."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def run_child(arguments: Sequence[str]) -> subprocess.CompletedProcess[str]:
 
 
 def gpu(settings: Settings, *, child: Child = run_child, has_driver: Callable[[], bool] | None = None) -> Finding:
-    """Check which GPUs Warp finds, and whether their memory is free; `has_driver`: a driver seems to be installed."""
+    """Check which GPUs Warp finds, and their free memory; `has_driver`: a driver seems to be installed."""
     found, wrong = _run_check(child, ["gpus"])
     if wrong:
         return bad(

@@ -88,7 +88,7 @@ def evaluate_command(
     threads: Annotated[int, typer.Option(min=0, help="CPU threads; 0: one per core.")] = 0,
     json: JsonFlag = False,
 ) -> None:
-    """Measure grasps and validate them in an independent engine. Metrics are medians; ε and areas are those at 5 mm."""
+    """Measure grasps (medians; ε and areas at 5 mm) and validate them in an independent engine."""
     level = _validate_level(protocol, level)
     if robust and protocol == "displacement":
         raise InputError(

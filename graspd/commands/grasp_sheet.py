@@ -1,4 +1,4 @@
-"""Sheets and animations of the grasps of a base shard: at the grasp, in the scene, or along the trajectory."""
+"""Sheets and animations of a base shard's grasps: at the grasp, in the scene, or along the trajectory."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Connection to the index database: SQLite in WAL mode, or PostgreSQL. The first open makes the tables.
+"""Connection to the index database, SQLite in WAL mode or PostgreSQL; the first open makes the tables.
 
 There are no migrations, because the index follows from the store: `graspd admin index rebuild` replaces an index of
 another revision. Columns of new metrics are added when it opens; grasps without such a value have NULL. The column of
@@ -216,7 +216,7 @@ def rows_in(
 
 
 def _file_of(url: str | URL) -> SqliteFile | None:
-    """Return the file of an SQLite index; None for another database or one in memory; InputError for an invalid URL."""
+    """Return the file of an SQLite index; None if in memory or another database; InputError: invalid URL."""
     try:
         parsed = make_url(url)
         is_file = parsed.get_backend_name() == "sqlite" and parsed.database and parsed.database != ":memory:"
@@ -481,7 +481,7 @@ def page_rows(
     cursor: str | None,
     descending: bool = True,
 ) -> tuple[Sequence[RowMapping], str | None]:
-    """Return the rows of a page in the order of a key, and the next page's cursor; InputError as in `decode`."""
+    """Return a page's rows in the order of a key, and the next page's cursor; InputError as in `decode`."""
     size = page_size(limit)
     if cursor is not None:
         start = decode(cursor, *(part.type.python_type for part in key))

@@ -22,7 +22,7 @@ GROUP: Final = 20_000
 
 
 def export(database: Database, folder: Path) -> dict[str, int]:
-    """Write each of `TABLES` as `folder/NAME.parquet`, from one snapshot; return the number of rows of each.
+    """Write each of `TABLES` as `folder/NAME.parquet`, from one snapshot; return their row counts.
 
     Integers are int64, other numbers float64, JSON is text. Rows are ordered by primary key. Raises InputError without
     pyarrow.

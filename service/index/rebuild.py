@@ -206,7 +206,7 @@ def differences(index: Index, store: Store) -> list[str]:
 
 
 def missing_names(index: Index, store: Store) -> list[str]:
-    """Return shards and jobs that only the index or only the store has, one line each, without reading records."""
+    """List shards and jobs that only index or only store has, one line each, without reading records."""
     gone = {f"jobs {name}" for what, name in pending(store) if what == "job"}
     stored = {
         f"shards {entry.key.rpartition('/')[2].removesuffix('.json')}"

@@ -271,7 +271,7 @@ class DeliveryView(View):
 
 
 class UsageDay(View):
-    """Usage of a project on a day: tasks that ended on this day, counted for the project that first requested them."""
+    """Daily usage of a project: tasks ended that day, counted for the project that first requested them."""
 
     project: str = Field(description="empty: the unnamed project")
     day: str = Field(description="UTC day, from midnight to midnight")

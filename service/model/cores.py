@@ -27,7 +27,7 @@ def _quota_cache(root: Path, moment: int) -> list[float]:
 
 
 def _quotas(root: Path) -> Iterator[float]:
-    """Yield the quotas [cores] of this process's control group and its ancestors; unlimited ones are omitted."""
+    """Yield the quotas [cores] of this process's control group and its ancestors, except unlimited ones."""
     for text in _limits(root, "cpu.max"):
         try:
             quota, period = map(int, text.split())

@@ -52,7 +52,7 @@ def shard_id(
     revision: int,
     inputs: Iterable[str] = (),
 ) -> str:
-    """Return the id of the shard that a stage makes from its inputs; only inputs that affect the result count."""
+    """Return the id of the shard that a stage makes; only inputs that affect the result count."""
     inputs_of: dict[str, object] = {
         "stage": stage,
         "revision": revision,

@@ -412,7 +412,7 @@ def batches_of(grasps: int) -> int:
 
 
 def check_digests(options: JobOptions) -> None:
-    """Raise ValueError if a neighbour or the network has no digest: its name may later refer to other files."""
+    """Raise ValueError if a neighbour or the network has no digest; its name may later mean other files."""
     if any(one.digest is None for one in options.beside):
         raise ValueError("each neighbour of a stored job has the digest of its files")
     if options.network and not re.fullmatch(DIGEST, options.network):

@@ -1,4 +1,4 @@
-"""Metadata of job options besides type, default, bounds and description; tables derived from the options.
+"""Metadata of job options besides type, default, bounds and description; tables of the options.
 
 Command line, dashboard forms, Python signatures and tables of the docs derive from `rows`.
 """

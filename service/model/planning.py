@@ -30,7 +30,7 @@ MAX_BACKOFF_S: Final = 300.0
 
 @dataclass(frozen=True)
 class PlannedTask:
-    """Task of a job: batches from number `batch` on, `count` grasps in all. `inputs` and `output` are shard ids."""
+    """Task of a job: batches from `batch` on, `count` grasps in all; `inputs` and `output` are shard ids."""
 
     id: str
     stage: Stage
@@ -205,7 +205,7 @@ def share_of(project: str, key: str) -> str:
 
 
 class RoundRobin:
-    """Fair scheduling: order of the latest turns. They are lost when the process ends, which costs at most one turn."""
+    """Fair scheduling by order of the latest turns; losing them at process end costs at most one turn."""
 
     def __init__(self) -> None:
         self._served: dict[str, int] = {}
@@ -285,7 +285,7 @@ def shortfall(
 
 
 def limit_text(hand: str, friction: float, grasps: int, lifts: float, bound: float, wanted: float | None = None) -> str:
-    """Describe a hand's payload limit in a sentence; `bound` [kg] follows from actuators and friction, inf: none."""
+    """Describe a hand's payload limit; `bound` [kg] follows from actuators and friction, inf: none."""
     most = f", and at most {bound:.2g} kg by actuator effort" if math.isfinite(bound) else ""
     less = "" if wanted is None else f"; {wanted:.3g} kg are wanted"
     return f"{hand} lifts {lifts:.2g} kg at friction {friction:g} in the best of {grasps} grasps{most}{less}"

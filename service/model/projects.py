@@ -33,5 +33,5 @@ EVERYTHING: Final = ProjectScope()
 
 
 def project_mark(files: Mapping[str, bytes], project: str) -> dict[str, bytes]:
-    """Return the mark of a private upload; for a shared upload, an empty file that replaces an existing mark."""
+    """Return a private upload's mark; for a shared upload, an empty file replacing an existing mark."""
     return {MARK: project.encode()} if project or MARK in files else {}

@@ -1,4 +1,4 @@
-"""Names of graspd 0.2, which readers accept everywhere; only tasks for workers of 0.2 are written with them."""
+"""Names of graspd 0.2, accepted by all readers; only tasks for workers of 0.2 are written with them."""
 
 from __future__ import annotations
 

@@ -133,7 +133,7 @@ class SceneSpec(Model):
 def parse_scene(
     text: str, *, faces: str = "drawn", touch: float | None = None, beside: Sequence[str] = ()
 ) -> SceneSpec:
-    """Parse a user's scene: one of `KINDS`, or a file. `touch` None: the file's value. InputError if it is invalid."""
+    """Parse a scene, one of `KINDS` or a file; `touch` None: the file's value; InputError if invalid."""
     if faces not in ("drawn", "all"):
         raise InputError(f"unknown faces {faces!r}; choose drawn or all")
     path = Path(text)
@@ -300,7 +300,7 @@ def scene_of(
 
 
 def known_name(text: str) -> str:
-    """Return the name of an object; InputError for a file, because a job needs a name known to the service."""
+    """Return the name of an object; InputError for a file, because jobs need names known to the service."""
     if "/" in text or Path(text).is_file():
         raise InputError(f"the neighbour {text} is a file: `graspd objects add {text}` first, then give its name")
     return text
@@ -309,7 +309,7 @@ def known_name(text: str) -> str:
 def scene_option(
     text: str, *, beside: Path | None = None, named: Callable[[str], str] = known_name
 ) -> str | dict[str, Any]:
-    """Return the scene of a request from a user's text; `named` maps neighbours in a file to names in the service."""
+    """Return a request's scene from a user's text; `named` maps neighbours in a file to service names."""
     if text in KINDS:
         return text
     is_file = Path(text).suffix.lower() in SCENE_FILES

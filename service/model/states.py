@@ -37,7 +37,7 @@ class AssetKind(StrEnum):
 
 
 class Priority(StrEnum):
-    """Priority of a task. `interactive` tasks precede `bulk` ones, except in every fourth task of a worker."""
+    """Priority of a task; `interactive` precedes `bulk`, except in every fourth task of a worker."""
 
     INTERACTIVE = "interactive"
     BULK = "bulk"

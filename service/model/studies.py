@@ -146,7 +146,7 @@ def tick(value: float | str) -> str:
 
 
 def between(ticks: Sequence[Any], value: float) -> float:
-    """Return the position of a value on logarithmic ticks, in steps from the first tick, extrapolated beyond them."""
+    """Return a value's position on logarithmic ticks, in steps from the first, extrapolated beyond them."""
     logs, at = [math.log(tick) for tick in ticks], math.log(value)
     if len(logs) < 2:
         return 0.0

@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Services:
-    """Store, index and queue. Only API and controller open the index; workers use `open_store` and the queue."""
+    """Store, index and queue; only API and controller open the index; workers use `open_store` and queue."""
 
     settings: Settings
     store: Store

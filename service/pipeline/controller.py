@@ -148,9 +148,7 @@ class Controller:
                 self._mark()
 
     def round(self, *, wait_s: float = 0.0) -> None:
-        """Index new events, then check queue, leases and workers; BusyError if another service has taken over the
-        store.
-        """
+        """Index new events, then check queue, leases and workers; BusyError if another service took the store."""
         self._identify()
         self._ensure_index()
         away: list[UnavailableError] = []
@@ -163,7 +161,7 @@ class Controller:
             raise away[0]
 
     def _mark(self) -> None:
-        """Renew the mark of index and store after changes; an older copy of the index is then detected and rebuilt."""
+        """Renew the mark of index and store after changes, to detect and rebuild an older copy of the index."""
         notes = self._services.index.notes
         present, changes = notes.marked(), notes.changes()
         if changes != present.changes or self._made:
@@ -186,7 +184,7 @@ class Controller:
         return self._has_plans
 
     def _enter_large_job(self) -> None:
-        """Enter the next tasks of a job that is too large for one transaction; other writers can run in between.
+        """Enter the next tasks of a job too large for one transaction; other writers can run in between.
 
         Such jobs alternate. A note in the index stores the position, so another controller can continue.
         """

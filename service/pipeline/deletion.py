@@ -72,7 +72,7 @@ def delete_asset(
 
 
 def delete_job(services: Services, job_id: str, *, owner: str = "") -> None:
-    """Delete a job; shards that no other job needs are deleted later. ConflictError: unfinished, or in a dataset."""
+    """Delete a job, and later the shards that only it needs; ConflictError: unfinished, or in a dataset."""
     job = services.index.jobs.get(job_id)
     try:
         record = read_record(JobRecord, services.store, names.job_record(job_id))
@@ -89,7 +89,7 @@ def delete_job(services: Services, job_id: str, *, owner: str = "") -> None:
 
 
 def delete_dataset(services: Services, name: str, *, owner: str = "", with_snapshots: bool = False) -> None:
-    """Delete a dataset, and the jobs planned for it alone. ConflictError: unfinished, or with unconfirmed snapshots."""
+    """Delete a dataset and jobs for it alone; ConflictError: unfinished, or with unconfirmed snapshots."""
     dataset = services.index.datasets.get(name)
     if not dataset.state.is_final:
         raise ConflictError(f"dataset {name!r} is {dataset.state}; cancel it first: graspd datasets cancel {name}")
@@ -106,7 +106,7 @@ def delete_dataset(services: Services, name: str, *, owner: str = "", with_snaps
 
 
 def move_to_removed(services: Services, deletion: Deletion) -> None:
-    """Move the deleted objects below `removed/`, the deletion's record last; nothing if the resource was restored."""
+    """Move deleted objects below `removed/`, resource record last, unless the resource was restored."""
     record = _record_of(deletion)
     with services.index.database.writing():
         if not services.store.exists(names.deletion(deletion.what, deletion.id)):

@@ -70,7 +70,7 @@ class Resolver:
         return self.choose(request)[0]
 
     def choose(self, request: JobRequest) -> tuple[JobRequest, Choice | None]:
-        """Return the request with `auto` replaced, and the reason (None without `auto`); InputError without a match."""
+        """Return the request with `auto` replaced, and why (None without `auto`); InputError without a match."""
         if request.fidelity != AUTO:
             return request, None
         chart = self._chart(request)

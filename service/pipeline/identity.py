@@ -79,7 +79,7 @@ def identify(
     take_over: bool = False,
     holds_redis: bool = False,
 ) -> str:
-    """Check that store, index and Redis belong to one service; write its id where it is missing; return the id.
+    """Check that store, index and Redis belong to one service; write its id where missing; return the id.
 
     Args:
         folder: data folder that also stores the id.
@@ -128,7 +128,7 @@ def identify_if_redis_answers(services: Services, *, folder: Path | None = None,
 
 
 def check_service(store: Store, redis: str | None) -> bool:
-    """Check whether Redis already has the id of the store's service; BusyError if it belongs to another one."""
+    """Return whether Redis already has the store's service id; BusyError if it has another service's."""
     if redis is not None and redis not in service_ids(store):
         raise BusyError(_REDIS)
     return redis is not None

@@ -47,9 +47,7 @@ class Indexer:
         self._readers = ThreadPoolExecutor(_READERS, thread_name_prefix="manifests")
 
     def apply(self, events: Sequence[Event]) -> list[int]:
-        """Update the index idempotently; return the positions of events that need the unavailable store, to repeat
-        later.
-        """
+        """Update the index idempotently; return the positions of events to repeat when the store is available."""
         started: dict[str, str] = {}
         finished: list[int] = []
         left: list[str] = []
@@ -225,7 +223,7 @@ OTHER_KIND: Final = "other"
 
 
 class Tally:
-    """Counts for `/metrics` in memory; `flush` adds them to the sums in Redis, which all API processes show.
+    """In-memory counts for `/metrics`; `flush` adds them to the sums in Redis that all API processes show.
 
     A loss of Redis resets the sums, which Prometheus counts as a restart. A repeated event counts twice.
     """

@@ -264,7 +264,7 @@ class IntegrityScan:
         return True
 
     def advance(self) -> bool:
-        """Read further objects; return False while no round is due. Interrupted: `store verify` reads the store."""
+        """Read further objects; False while no round is due; Interrupted while `store verify` reads the store."""
         self._recheck_if_due(None)
         note = self._services.index.notes.scan_note()
         if note.folder >= len(FOLDERS):
@@ -322,7 +322,7 @@ class IntegrityScan:
 
 
 def repair(services: Services, found: Sequence[Damage]) -> tuple[list[Damage], list[Damage]]:
-    """Move damaged objects below `damaged/`, and queue what can be made again; return repaired objects, and the rest.
+    """Move damaged objects below `damaged/` and queue what can be made again; return repaired and others.
 
     A worker stores a repaired shard only if its checksum equals the manifest's.
     """

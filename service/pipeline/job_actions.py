@@ -159,7 +159,7 @@ def with_network(
 
 
 def submit(services: Services, request: JobRequest, *, priority: Priority | None = None) -> tuple[JobView, bool]:
-    """Call `prepare`, then `enter`. Equal requests give the same job; for a failed or cancelled job see `retry`."""
+    """Call `prepare`, then `enter`; equal requests give one job; if failed or cancelled, see `retry`."""
     return enter(services, prepare(services, request, priority=priority))
 
 
@@ -203,10 +203,11 @@ def prepare(
 
 
 def enter(services: Services, record: JobRecord, *, keeps_assets: bool = False) -> tuple[JobView, bool]:
-    """Record a planned job and queue its first tasks; return it, and whether it is new. The controller enters the rest.
+    """Record a planned job and queue its first tasks; return the job, and whether it is new.
 
-    With `keeps_assets` a dataset protects hand, object, neighbours and network from deletion meanwhile. NotFoundError:
-    one of them was deleted. ConflictError: the same job was deleted, and its objects are still being removed.
+    The controller enters the rest. With `keeps_assets` a dataset protects hand, object, neighbours and network from
+    deletion meanwhile. NotFoundError: one of them was deleted. ConflictError: the same job was deleted, and its objects
+    are still being removed.
     """
     key = names.job_record(record.id)
     # A dataset needs its jobs even after an interruption, and must not hold the lock while it accesses the store.
@@ -277,7 +278,7 @@ class Routes:
 
 
 def queue_tasks(services: Services, ready: Sequence[ReadyTask], *, routes: Routes, again: bool = False) -> set[str]:
-    """Queue tasks and mark them in the index; tasks without a capable worker wait. Return the reasons of waiting.
+    """Queue tasks with a capable worker and mark them in the index; return why the others wait.
 
     The mark comes first: the controller queues marked tasks that are missing; unmarked ones might run twice.
     """
@@ -355,7 +356,7 @@ def _publish_state(services: Services, job_id: str) -> JobView:
 
 
 def check_scene(options: JobOptions, obj: AssetView, beside: Sequence[AssetView] = ()) -> None:
-    """Raise SceneError if an object's centre of mass lies in a support, because its hull then penetrates the support.
+    """Raise SceneError if an object's centre of mass lies in a support, which its hull then penetrates.
 
     Without a measured centre, and for checks that need meshes, the first task reports the error.
     """

@@ -95,7 +95,7 @@ class LeaseReaper:
             self._indexer.tell(self._services.index.live.set_waiting(again))
 
     def _find(self, task_id: str, stage: Stage, shard: str) -> bool:
-        """Index an existing shard, and return whether it exists; a damaged manifest fails its task permanently."""
+        """Index an existing shard; return whether it exists; a damaged manifest fails its task permanently."""
         try:
             self._indexer.made(load_manifest(self._services.store, stage, shard))
         except NotFoundError:

@@ -1,4 +1,4 @@
-"""Webhook dispatcher: signed reports of ended jobs and datasets, one per address at a time, with retries.
+"""Webhooks: signed reports of ended jobs and datasets, one per address at a time, with retries.
 
 A failed delivery pauses all deliveries to its address. Projects take turns; within a project, the least recently used
 address comes first. Addresses whose last delivery failed share half of the slots, so the others are not delayed.
@@ -100,7 +100,7 @@ def is_public(address: Address) -> bool:
 
 
 def reachable(host: str, port: int, allowed: Networks) -> list[str]:
-    """Return a host's addresses; RefusedAddress unless all are public or in `allowed`, OSError without any."""
+    """Return a host's addresses; RefusedAddress unless all are public or in `allowed`, OSError if none."""
     found = list(dict.fromkeys(str(info[4][0]) for info in _resolve_host(host, port)))
     for one in found:
         address = ipaddress.ip_address(one.partition("%")[0])
@@ -159,7 +159,7 @@ def post(
 
 
 class _Connection(http.client.HTTPConnection):
-    """Connection to one of the checked addresses, within `patience_s`; `http.client` would resolve it again."""
+    """Connection to one of the checked addresses, within `patience_s`, without resolving the host again."""
 
     def __init__(self, scheme: str, host: str, port: int, addresses: Sequence[str], patience_s: float) -> None:
         super().__init__(host, port)

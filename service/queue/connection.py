@@ -64,7 +64,7 @@ def password_file(data_dir: Path) -> Path:
 
 
 def socket_path(data_dir: Path) -> Path:
-    """Return the socket of a data folder's embedded Redis: in the folder; for a long path, in a private folder."""
+    """Return the socket of a data folder's Redis: in the folder, or for a long path in a private folder."""
     path = data_dir.resolve() / "redis" / "redis.sock"
     if len(os.fsencode(path)) <= _MAX_SOCKET_PATH:
         return path

@@ -1,4 +1,4 @@
-"""Entries in Redis: lists of waiting tasks, parsing of messages, restriction of jobs to graspd's own task.
+"""Entries in Redis: lists of waiting tasks, parsing of messages, jobs restricted to graspd's own task.
 
 Any client can write any value under any name. Unreadable entries are skipped; `sweep` removes permanent obstacles. RQ
 imports and calls any function or callback named in a job's hash, even with the JSON serializer, and posts to any

@@ -79,7 +79,7 @@ Place = tuple[Priority, Stage]
 
 @dataclass(frozen=True)
 class QueueStatus:
-    """Numbers of waiting and running tasks; living workers, with seconds since their heartbeat by Redis's clock."""
+    """Numbers of waiting and running tasks; living workers, with heartbeat age [s] by Redis's clock."""
 
     depth: Mapping[Place, int] = field(default_factory=dict)
     oldest_s: Mapping[Place, float] = field(default_factory=dict)

@@ -239,7 +239,7 @@ class RqQueue:
             self.connection.set(_SERVICE, identity, nx=not instead)
 
     def lead(self, holder: str, seconds: float) -> bool:
-        """Acquire or renew the leadership of the controllers for some seconds; False if another controller leads."""
+        """Acquire or renew the controllers' leadership for some seconds; False if another controller leads."""
         with _convert_errors():
             new = self.connection.lock(LEAD, timeout=seconds, thread_local=False)
             lease = self._leases.setdefault(holder, new)
@@ -377,7 +377,7 @@ def cancel_key(task_id: str) -> str:
 
 
 def lease_state(connection: Any, job: Job, execution: Execution) -> tuple[bool, bool]:
-    """Return whether the worker has the lease of a task, and whether the task is cancelled; reading changes nothing."""
+    """Return whether the worker has a task's lease, and whether the task is cancelled; change nothing."""
     with connection.pipeline(transaction=False) as pipe:
         pipe.zscore(job.started_job_registry.key, execution.composite_key)
         pipe.exists(cancel_key(entries.task_of(job.id)[0]))

@@ -56,7 +56,7 @@ class ShardCache:
         self.__dict__.update(state, _process=os.getpid())
 
     def fetch(self, store: Store, key: str, sha256: str) -> Path:
-        """Return the local path of a file of the store, downloaded if necessary; DamagedShard if missing or damaged."""
+        """Return the local path of a store's file, downloaded if needed; DamagedShard if missing or damaged."""
         path = self.folder / f"{sha256}.h5"
         if not self._is_intact(path, sha256):
             write_atomically(path, self._checked(store, key, sha256))

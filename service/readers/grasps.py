@@ -36,7 +36,7 @@ _KEPT: Final = 256
 
 
 class Grasps(Sequence[dict[str, Any]]):
-    """Grasps of base shards. `grasps[i]` is a dictionary of column rows and `hand`, `object`, `shard_id`, `row`.
+    """Grasps of base shards; `grasps[i]` is a dict of column rows and `hand`, `object`, `shard_id`, `row`.
 
     Columns are described in docs/reference/dataset.md; swept metrics have one value per contact threshold of the shard.
     """
@@ -95,7 +95,7 @@ class Grasps(Sequence[dict[str, Any]]):
         raise InputError(f"no shard is of the hand {hand!r}")
 
     def arrays(self, *columns: str) -> dict[str, Array]:
-        """Return columns of all grasps, by default those of samples; InputError if they do not fit into one array."""
+        """Return columns of all grasps, by default those of samples; InputError unless they fit in one array."""
         wanted = columns or self.columns
         parts: dict[str, list[Array]] = {name: [] for name in (*wanted, "hand", "object")}
         for file, rows in zip(self._files, self._rows, strict=True):

@@ -44,7 +44,7 @@ def collate(samples: Sequence[Sample]) -> Sample:
 
 
 class Samples(Dataset[Sample]):
-    """Map-style dataset of `Grasps`, `Pictures` or `Clouds` for a `DataLoader`, also with worker processes."""
+    """Map-style dataset of `Grasps`, `Pictures` or `Clouds`, for a `DataLoader` with or without workers."""
 
     def __init__(self, source: Sequence[Sample], transform: Callable[[Sample], Sample] = tensors) -> None:
         self._source, self._transform = source, transform

@@ -56,7 +56,7 @@ def trajectory_of(shard: Shard, row: int) -> list[Waypoint]:
 
 
 def slider_axis(way: Sequence[Waypoint]) -> Floats:
-    """Return the slider position (W,) of each waypoint: 0, 1, 2, ... for stops, evenly spaced between them."""
+    """Return each waypoint's slider position (W,): 0, 1, 2, ... for stops, evenly spaced between them."""
     stops = [k for k, point in enumerate(way) if point.name]
     return np.interp(np.arange(len(way)), stops, np.arange(len(stops)))
 

@@ -28,7 +28,7 @@ _FLAGS: Final = {"held": "quality/success", "lift": "quality/lift_outcome", "lif
 
 
 def parse(text: str) -> Test:
-    """Compile an expression to a test, or raise InputError; comparisons with a missing metric or nan are false."""
+    """Compile an expression, or raise InputError; comparisons with a missing metric or nan are false."""
     tree = parse_where(text)
     return lambda columns, said: _mask(tree, columns, said)
 

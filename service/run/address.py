@@ -39,8 +39,7 @@ def local_url(host: str, port: int) -> str:
 
 
 def bind(host: str, port: int) -> socket.socket:
-    """Bind a socket to the port, or to a free one for 0; BusyError if it is taken, InputError if the address is
-    unusable.
+    """Bind a socket to the port (0: a free one); BusyError if it is taken, InputError: unusable address.
 
     While it is open, the API of a child process can listen there, and no other process gets the port.
     """
@@ -103,7 +102,7 @@ class ListenAddress:
         return f"redis://:{self.password}@{self.host}:{self.port}/0"
 
     def write(self, settings: Settings, api_url: str) -> None:
-        """Write the settings for workers, as lines for a shell and for `--env-file`; UnavailableError if refused."""
+        """Write the settings for workers, as lines for a shell and `--env-file`; UnavailableError if refused."""
         said = {
             "GRASPD_REDIS_URL": self.redis_url,
             "GRASPD_STORE_URL": settings.resolved_store_url,

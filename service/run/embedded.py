@@ -76,14 +76,14 @@ def server_command(settings: Settings, joining: ListenAddress | None = None) -> 
 
 
 def own_redis(settings: Settings) -> IO[str]:
-    """Lock a data folder's Redis folder, until the returned file is closed; BusyError if another process runs it."""
+    """Lock a data folder's Redis until the returned file is closed; BusyError if another process runs it."""
     folder = settings.data_dir.resolve() / "redis"
     _private_folder(folder)
     return lock_file(folder / "lock", f"the Redis of {settings.data_dir}")
 
 
 def move_broken_log(settings: Settings, output: Path) -> None:
-    """Move the append-only log aside after a failed start, if Redis reports in `output` that the log is broken.
+    """Move the append-only log aside after a failed start, if Redis reports in `output` that it is broken.
 
     All content of Redis is queued again from the index, so an empty Redis is better than none.
     """

@@ -1,4 +1,4 @@
-"""Hands and objects: reproducible ZIPs (sorted names, fixed times) in the store, and the built-in ones on disk."""
+"""Hands and objects: reproducible ZIPs (sorted names, fixed times) in the store, built-ins on disk."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def pack_into(files: Mapping[str, bytes], target: IO[bytes]) -> None:
 
 
 def unpack(data: bytes, *, limit_bytes: int) -> dict[str, bytes]:
-    """Unpack a ZIP in memory; InputError for a bad archive or name, LimitError above `limit_bytes` or `MAX_FILES`."""
+    """Unpack a ZIP; InputError for a bad archive or name, LimitError above `limit_bytes` or `MAX_FILES`."""
     return dict(ZipFiles(io.BytesIO(data), limit_bytes=limit_bytes))
 
 
@@ -75,7 +75,7 @@ def without_common_folder(files: dict[str, _T]) -> dict[str, _T]:
 
 
 class ZipFiles(MutableMapping[str, bytes]):
-    """Files of a ZIP on disk, unpacked in pieces on demand; digests cover the unpacked contents. Files can be added."""
+    """Files of a ZIP on disk, unpacked in pieces on demand, and added ones; digests are of the contents."""
 
     def __init__(self, file: IO[bytes], *, limit_bytes: int) -> None:
         self._archive = _open_zip(file)
@@ -187,7 +187,7 @@ def _builtin_folder(kind: AssetKind | Literal["model"]) -> Path:
 
 
 def builtin_files(kind: AssetKind, name: str) -> dict[str, bytes]:
-    """Load the files of a built-in hand or object: `asset.json` with URDF or mesh; NotFoundError if there is none."""
+    """Load a built-in hand or object: `asset.json` with URDF or mesh; NotFoundError if there is none."""
     folder = _builtin_folder(kind) / name
     if not (folder / "asset.json").is_file():
         known = ", ".join(builtin_names(kind))

@@ -150,7 +150,7 @@ def description_of(facts: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def corrected(said: Mapping[str, Any], facts: HandFacts, corrections: HandCorrections) -> dict[str, Any]:
-    """Return an `asset.json` with all given, found and corrected values; InputError for a value out of range."""
+    """Return an `asset.json` with given, found and corrected values; InputError if one is out of range."""
     _check(facts, corrections)
     found = description_of(facts.model_dump())
     turned = {name for name, way in corrections.closing.items() if way != facts.closing[name]}

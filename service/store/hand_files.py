@@ -194,7 +194,7 @@ def text_of(data: bytes) -> str:
 
 
 def main_of(files: Mapping[str, bytes], wanted: str = "", *, where: str = "the hand") -> str:
-    """Return the file that describes the hand; InputError unless exactly one matches `wanted`, a part of its name."""
+    """Return the hand's description file; InputError unless exactly one matches `wanted`, part of a name."""
     known = {name: kind for name in sorted(files) if (kind := format_of(name, _description_head(files, name)))}
     if wanted:
         return _match_name(wanted, [name for name in sorted(files) if name in known or name == wanted], where)

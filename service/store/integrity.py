@@ -122,7 +122,7 @@ def _block_digest(data: bytes) -> bytes:
 
 
 def check_file(path: Path) -> None:
-    """Check a shard in a folder against its manifest or checksum list, if any; once per version of the file."""
+    """Check a shard in a folder by its manifest or checksum list, if any; once per version of the file."""
     if _known.get(path) != _file_stamp(path):
         check_content(path, _expected(path))
 
@@ -204,7 +204,7 @@ def put_document(store: Store, key: str, document: Mapping[str, Any]) -> bool:
 
 
 def get_document(store: Store, key: str) -> dict[str, Any]:
-    """Read the JSON of `put_document`; errors as in `get_sealed`; DamagedError also if it is not a JSON object."""
+    """Read the JSON object of `put_document`; errors as in `get_sealed`; other content: DamagedError."""
     try:
         found = json.loads(get_sealed(store, key))
     except ValueError:
@@ -241,7 +241,7 @@ def seal_archive(file: BufferedRandom) -> None:
 
 
 def is_sealed(key: str, chunks: Iterable[bytes], size: int) -> bool:
-    """Check for a valid seal; False if graspd 0.2 wrote the object without one; DamagedError if it does not match."""
+    """Check the seal; False if graspd 0.2 wrote the object without one; DamagedError if it does not match."""
     is_zip = key.endswith((".zip", ".npz"))
     before, start = (_GLB, _GLB_AT) if key.endswith(".glb") else (_JSON, 0)
     at = size - len(_ZEROS) if is_zip else start + len(before)

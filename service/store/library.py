@@ -27,7 +27,7 @@ UNPACKED_LIMIT_BYTES: Final = 2 * 2**30
 def publish_asset(
     store: Store, kind: AssetKind, name: str, files: Mapping[str, bytes], said: Mapping[str, object] | None = None
 ) -> Asset:
-    """Publish a hand or object: the archive by `store_files`, then the record by `record_asset`. Idempotent."""
+    """Publish a hand or object idempotently: archive by `store_files`, then record by `record_asset`."""
     return record_asset(store, store_files(store, kind, name, files, said))
 
 
@@ -58,7 +58,7 @@ def _is_damaged(store: Store, key: str) -> bool:
 
 
 def record_asset(store: Store, asset: Asset, put: Put | None = None) -> Asset:
-    """Write the record, with `put` if given; ConflictError if the content has another name, or is being removed."""
+    """Write the record, by `put` if any; ConflictError: content has another name, or is being removed."""
     record = names.asset_record(asset.kind, asset.digest)
     new = put(record, asset) if put is not None else put_record(store, record, asset)
     if store.exists(names.deletion(asset.kind.value, asset.digest)):

@@ -203,7 +203,7 @@ def shard_exists(store: Store, stage: Stage, shard: str) -> bool:
 
 
 def rebuild_manifest(said: Mapping[str, Any], data: bytes) -> ShardManifest:
-    """Rebuild the manifest of a file; `said`, the shard's existing manifest as JSON, provides the other fields."""
+    """Rebuild a file's manifest; `said`, the shard's existing manifest as JSON, gives the other fields."""
     pictures = tuple(path for path in SCHEMAS["views"] if path.startswith("image/"))
     shard = read_shard(data, without=pictures, name=said["key"])
     told = {"sha256": hashlib.sha256(data).hexdigest(), "size_bytes": len(data)}

@@ -97,7 +97,7 @@ def reference_of(text: bytes) -> str:
 
 
 def resolve(name: str, reference: str, there: Callable[[str], bool]) -> str | None:
-    """Resolve a mesh's reference by path, or by name in its folder; None if `there` finds no picture or library."""
+    """Resolve a mesh's reference by path or name in its folder; None if no picture or library is `there`."""
     folder = posixpath.dirname(name)
     said = reference.replace("\\", "/").partition("://")[2] or reference.replace("\\", "/")
     if not said.lower().endswith(_TAKEN) or "\0" in said:

@@ -36,7 +36,7 @@ def files_of_set(path: Path) -> Objects | None:
 
 
 def object_set(files: Mapping[str, bytes]) -> Objects:
-    """Group files by the objects of a set; return sorted names, each with its mesh and its `asset.json`, if any."""
+    """Group files by objects of a set; return sorted names, each with its mesh and `asset.json`, if any."""
     meshes = sorted(name for name in files if PurePosixPath(name).suffix.lower() in SUFFIXES)
     if not meshes:
         raise InputError(f"no mesh among {len(files)} files; a set holds {', '.join(SUFFIXES)}")
@@ -55,7 +55,7 @@ def object_set(files: Mapping[str, bytes]) -> Objects:
 
 
 def read_set(path: Path, *, limit_bytes: int) -> dict[str, bytes]:
-    """Read the files of a folder or ZIP, up to `limit_bytes`; links to targets outside the folder are ignored."""
+    """Read the files of a folder or ZIP, up to `limit_bytes`; ignore links to targets outside the folder."""
     if path.is_file():
         return unpack(path.read_bytes(), limit_bytes=limit_bytes)
     if not path.is_dir():
@@ -88,7 +88,7 @@ def _common(owners: Mapping[tuple[str, ...], list[str]]) -> tuple[str, ...]:
 
 
 def _variants(names: list[str]) -> bool:
-    """Check whether the meshes of a folder belong to one object: a single mesh, or names of processing steps."""
+    """Check whether a folder's meshes belong to one object: a single mesh, or names of processing steps."""
     stems = [PurePosixPath(name).stem.lower() for name in names]
     return len(stems) == 1 or any(stem in PREFERRED for stem in stems)
 

@@ -50,10 +50,10 @@ def has_packs(store: Store) -> bool:
 
 
 def unpack_all(store: Store) -> Iterator[ShardManifest]:
-    """Replace each pack by a file and a manifest per shard; yield the manifests. An interrupted call can be repeated.
+    """Replace each pack by a file and a manifest per shard; yield the manifests.
 
-    Damaged packs are moved to `damaged/`. For a damaged file only the manifest is stored, so that its replacement must
-    match the checksum.
+    An interrupted call can be repeated. Damaged packs are moved to `damaged/`. For a damaged file only the manifest is
+    stored, so that its replacement must match the checksum.
     """
     keys = sorted(entry.key for entry in store.list(_FOLDER))
     for key in keys:

@@ -171,7 +171,7 @@ STABILITY: Final = "stability"
 
 
 def charts_of(place: SceneSpec) -> str:
-    """Return the kind of charts for a scene; a scene file is identified by its supports and the target's pose."""
+    """Return the kind of charts for a scene; supports and the target's pose identify a scene file."""
     if place.kind == "free":
         return CHARTS
     if place.kind != "file":

@@ -40,7 +40,7 @@ _UNREADABLE: Final = (OSError, KeyError, ValueError, TypeError, RuntimeError, Ov
 
 
 def write_shard(kind: ShardKind, arrays: Arrays, attributes: Mapping[str, Attribute]) -> bytes:
-    """Write a shard; return its HDF5 bytes. InputError if a column or an attribute does not fit the schema.
+    """Write a shard; return its HDF5 bytes; InputError if a column or attribute does not fit the schema.
 
     `created` and `code_version` replace the current values; `joint_names` is also an attribute of the joint datasets.
     """
@@ -102,7 +102,7 @@ class Shard:
 def read_shard(
     source: bytes | Path, *, kind: ShardKind | None = None, without: tuple[str, ...] = (), name: str = ""
 ) -> Shard:
-    """Read a shard, except the datasets in `without`; InputError for another kind of shard, DamagedShard for damage."""
+    """Read a shard except datasets `without`; InputError for another kind, DamagedShard for damage."""
     name = name or ("shard" if isinstance(source, bytes) else str(source))
     with open_shard(source, name=name) as file:
         found = kind_of(file, name)
@@ -148,7 +148,7 @@ def open_shard(source: bytes | Path, *, name: str = "") -> Iterator[h5py.File]:
 
 
 def _check_contents(file: h5py.File, name: str) -> None:
-    """Raise InputError if a file has external data or claims more than it can contain: HDF5 follows any link."""
+    """Raise InputError if a file has external data or claims more than it can hold: HDF5 follows any link."""
     claimed = held = 0
     seen, waiting = {h5py.h5o.get_info(file["/"].id).addr}, [(file, "")]
     while waiting:

@@ -177,7 +177,7 @@ def open_store(url: str, *, public_endpoint: str | None = None, make: bool = Tru
 
 
 def local_folder(url: str) -> Path | None:
-    """Return the folder of a local store, None for others; InputError unless the path is absolute and plain."""
+    """Return a local store's folder, None for others; InputError unless the path is absolute and plain."""
     parts = urlsplit(url)
     if parts.scheme != "file":
         return None

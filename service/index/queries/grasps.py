@@ -371,7 +371,7 @@ def _missing_column_error(name: str) -> InputError:
 
 
 class GraspFilter(Model):
-    """Conjunction of filters. `at_least` and `at_most` are inclusive bounds of metrics; missing values fail."""
+    """Conjunction of filters; `at_least` and `at_most` are inclusive metric bounds; missing values fail."""
 
     hand: str | None = None
     object: str | None = None

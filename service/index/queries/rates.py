@@ -229,7 +229,7 @@ def _rate_on_machine(machine: Machine, stored: StageRate) -> StageRate:
 
 
 def scene_rate(batches: Iterable[BatchCost], options: JobOptions, machine: Machine) -> StageRate:
-    """Return seconds per batch and scene. Bytes are per grasp and scene, or per scene for grasps planned in scenes."""
+    """Return seconds per batch and scene; bytes: per grasp and scene, or per scene if planned in scenes."""
     found = [batch for batch in batches if batch.request.scenes and batch.request.in_scene == options.in_scene]
     rows = sum(batch.count for batch in found)
     if not rows:

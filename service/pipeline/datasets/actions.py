@@ -1,4 +1,4 @@
-"""Actions of users on datasets: create, cancel, retry, snapshot; the controller carries out a part in each round.
+"""Actions of users on datasets: create, cancel, retry, snapshot; the controller does a part per round.
 
 The index records which cells have a job, and a job's event names the causing event of the dataset. Another controller
 can therefore continue without applying an event twice.
@@ -103,7 +103,7 @@ def cancel(services: Services, name: str) -> DatasetView:
 
 
 def retry(services: Services, name: str) -> DatasetView:
-    """Restart failed and cancelled cells of a dataset with fresh attempts; ConflictError if there are none."""
+    """Restart a dataset's failed and cancelled cells with fresh attempts; ConflictError if it has none."""
     with recording(services) as (connection, put):
         dataset = services.index.datasets.get(name)
         if not dataset.cancelled and not dataset.states[State.FAILED] and not dataset.states[State.CANCELLED]:
@@ -113,7 +113,7 @@ def retry(services: Services, name: str) -> DatasetView:
 
 
 def snapshot(services: Services, name: str) -> tuple[Snapshot, bool]:
-    """Record the present shards; return the snapshot, and whether it is new. ConflictError without a shard."""
+    """Record the present shards; return the snapshot, and whether it is new; ConflictError without shards."""
     dataset = services.index.datasets.get(name)
     held = tuple(services.index.datasets.shards(name))
     if not held:

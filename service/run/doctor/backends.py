@@ -250,7 +250,7 @@ def index_identity(settings: Settings) -> Finding:
 
 
 def index_is_store(settings: Settings, *, full: bool = False, settles_s: float = _SETTLES_S) -> Finding:
-    """Compare the rows with the store. A difference in only one of two comparisons is an event in progress."""
+    """Compare rows with the store; a difference in only one of two comparisons is an event in progress."""
     if why := _index_problem(settings):
         return skipped(why)
     store = open_store(settings.resolved_store_url)
