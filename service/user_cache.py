@@ -42,14 +42,14 @@ def load(file: Path) -> bytes | None:
 
 
 def store(file: Path, content: bytes, *, limit_bytes: int = _LIMIT_BYTES) -> None:
-    """Write an entry with its SHA-256; remove the least recently used entries of its folder above `limit_bytes`."""
+    """Write an entry with its SHA-256; evict the folder's least recently used entries above `limit_bytes`."""
     with suppress(OSError):
         write_atomically(file, [hashlib.sha256(content).digest(), content])
         evict(file.parent, file.suffix, limit_bytes, keep=file)
 
 
 def write_atomically(file: Path, pieces: Iterable[bytes]) -> None:
-    """Write a file atomically, readable by this user only, and create its folder; nothing if the iteration raises."""
+    """Create the folder and write a file atomically, readable by this user only; none if `pieces` raises."""
     file.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(dir=file.parent, suffix=".part")
     partial = Path(name)

@@ -43,7 +43,7 @@ def validated_batches(
     checked: Callable[[int, ValidatedBatch], None] | None = None,
     empty_on: tuple[type[Exception], ...] = (),
 ) -> list[ValidatedBatch]:
-    """Plan consecutive batches of a job from number `first`; each has the same result as with `validated_grasps`.
+    """Plan consecutive batches of a job from number `first`, each with the result of `validated_grasps`.
     `join` batches are planned in one launch. `scenes` are common to all batches, or one per batch. With `partial`, a
     cancellation returns the batches validated so far. `checked` receives each finished batch and may raise. An error in
     `empty_on` gives a batch without grasps, except the job's first batch. Other errors cancel all other batches."""

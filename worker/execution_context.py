@@ -1,4 +1,4 @@
-"""Execution context of a computation (device, progress, cancellation, shared cores), and parallel maps."""
+"""Execution context of a computation (device, progress, cancellation, shared cores); parallel maps."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Cancelled = Callable[[], bool]
 
 
 class CoreSharing:
-    """Number of parallel parts that share the cores; a finished part frees its cores for the remaining parts."""
+    """Number of parallel parts that share the cores; a finished part frees its cores for the others."""
 
     def __init__(self, members: int) -> None:
         self.members = members

@@ -125,7 +125,7 @@ def validated_grasps(
 
 
 def require_graspable(hand: HandModel, obj: ObjectModel) -> None:
-    """Raise HandError if no two digits oppose each other, InputError if the object does not fit into the gripper."""
+    """Raise HandError if no two digits oppose, InputError if the object does not fit into the gripper."""
     require_opposing(hand)
     fitting_pairs(hand, obj.centred)
 
@@ -397,7 +397,7 @@ class Batch:
         self.needed = next(self._needs, None)
 
     def _is_unreachable(self) -> bool:
-        """Check whether the latest grasps, none of them selected, show that the hand lifts far less than wanted."""
+        """Check whether the latest grasps, none selected, show that the hand lifts far less than wanted."""
         scoring = self.scoring
         if scoring.pieces is None or (self.limit is not None and self.limit.grasps >= ENOUGH):
             return False

@@ -87,7 +87,7 @@ def expected_need(wanted: int, valid: int, candidates: int) -> int:
 
 
 def parts_of(rows: range, cores: int) -> list[range]:
-    """Split rows into contiguous, nearly equal parts: one per core, each of at least `SMALLEST_PART` grasps."""
+    """Split rows into contiguous, nearly equal parts: up to one per core, of `SMALLEST_PART` rows or more."""
     bounds = np.linspace(rows.start, rows.stop, max(1, min(cores, len(rows) // SMALLEST_PART)) + 1).astype(int)
     return [range(int(low), int(high)) for low, high in pairwise(bounds)]
 

@@ -59,7 +59,7 @@ class Store:
         self._root = Path(backend.prefix) if isinstance(backend, LocalStore) and backend.prefix is not None else None
 
     def put(self, key: str, data: bytes) -> bool:
-        """Write an object atomically; False if the key exists (content-addressed keys then have the same bytes)."""
+        """Write an object atomically; False if the key exists (with the same bytes if content-addressed)."""
         return self.put_file(key, io.BytesIO(data))
 
     def put_file(self, key: str, file: IO[bytes]) -> bool:

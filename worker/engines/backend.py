@@ -114,7 +114,7 @@ def _has_kernels(name: str) -> bool:
 def compile_modules(
     names: Iterable[str], *, architectures: Sequence[int] = ARCHITECTURES, cpu: bool = True
 ) -> list[Path]:
-    """Compile modules into Warp's cache for these architectures and this CPU; return all files. No GPU is needed."""
+    """Compile modules into Warp's cache for `architectures` and this CPU, without a GPU; return all files."""
     for name in names:
         module = import_module(name)
         if architectures:
@@ -139,7 +139,7 @@ def copy_compiled(cache: Path) -> None:
 
 
 def binary_name(module: ModuleType) -> str:
-    """Return the identity of a module's kernels on this CPU; processes with equal identities run the same code."""
+    """Return the identity of a module's kernels on this CPU; equal identities mean the same code."""
     known = wp.get_module(module.__name__)
     # A launch on the CPU has blocks of one thread.
     name = known._get_compile_output_name(wp.get_device("cpu"), block_dim=1)

@@ -150,7 +150,7 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 
 def check_device(device: str) -> None:
-    """Wait for all launches on a device; raise DeviceLost for an error from which its context cannot recover."""
+    """Wait for all launches on a device; raise DeviceLost on an error that its context does not survive."""
     if not device.startswith("cuda"):
         return
     import warp as wp

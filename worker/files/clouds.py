@@ -26,7 +26,7 @@ _WORDS = ("hand", "object", "shard_id", "base_id")  # keys of a sample that stat
 
 
 def write_clouds(clouds: Clouds, folder: Path, said: Mapping[str, Any]) -> dict[str, int]:
-    """Write all clouds: `clouds-NNNNN.npz`, and `clouds.json` with `said` and the returned numbers of files and clouds.
+    """Write `clouds-NNNNN.npz`, and `clouds.json` with `said` and the returned counts of files and clouds.
     An npz has the keys of a sample (docs/how-to/clouds.md), stacked over its C clouds. Arrays with a row per grasp are
     concatenated; `grasp/count` (C,) is the number of rows of each cloud.
     Raises ConflictError: the folder exists and is not empty."""

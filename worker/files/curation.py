@@ -86,7 +86,7 @@ def _down_directions(shard: Shard) -> NDArray[np.float64]:
 
 
 def face_numbers(down: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return face numbers (N,) of down directions (N, 3); a face covers 20 degrees about its first direction."""
+    """Number the faces (N,) of down directions (N, 3); a face covers 20 degrees about its first direction."""
     seen = np.zeros((0, 3))
     found = np.full(len(down), -1, np.int64)
     for row in np.flatnonzero(np.linalg.norm(down, axis=1) > 0):

@@ -44,7 +44,7 @@ SQUARE: Final = 0.7
 
 
 def flat_pinches(hand: HandModel, height: float) -> Oppositions:
-    """Return postures for objects of a height [m]; none for one finger, or for objects as high as the pads.
+    """Return postures for objects of a height [m]; none for one finger or objects as high as the pads.
     The component of the palm's approach perpendicular to `axis` points at the plane, half the height below `middle`."""
     known = [h for h in HEIGHTS_M if h >= height]
     return _cached_pinches(hand, known[0]) if known and len(hand.fingertips) > 1 else Oppositions.empty(hand)

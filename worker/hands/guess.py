@@ -82,7 +82,7 @@ def _with_palm(hand: HandModel, tree: Tree, options: HandOptions) -> HandModel:
 
 
 def _gripper(hand: HandModel, jaws: Jaws, tree: Tree, options: HandOptions) -> HandModel:
-    """Set up a gripper from its jaws: open on the approach, with the palm behind the point between the pads."""
+    """Set up a gripper from its jaws: open on the approach, palm behind the point between the pads."""
     approach = _stated_approach(hand, tree, options)
     if approach is None:
         approach = _approach_of_jaws(hand, jaws)

@@ -52,7 +52,7 @@ class HandMatch:
 
     @cached_property
     def bodies(self) -> NDArray[np.intp]:
-        """(L',) for each body of `theirs`, the body of `ours` that the same joint carries; the root for the root."""
+        """(L',) for each body of `theirs`, the body of `ours` with the same joint; the root for the root."""
         out = np.zeros(self.theirs.bodies, np.intp)
         out[self.theirs.joint_body] = self.ours.joint_body[self.joints]
         return out
@@ -143,7 +143,7 @@ def _body_centre(hand: HandModel, body: int) -> Floats:
 
 
 def _fit(where: Floats, poses: Floats, guess: Floats) -> tuple[Floats, Floats]:
-    """Fit the pose (7,) of the other base, and positions (T, 3) of fingertips in the other model's body frames.
+    """Fit the other model's base pose (7,), and its fingertip positions (T, 3) in its body frames.
     `where` are fingertips (N, T, 3) in the own base frame, `poses` bodies (N, T, 7) in the other base frame, `guess`
     approximate positions (T, 3)."""
     from scipy.optimize import least_squares  # slow to load

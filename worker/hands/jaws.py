@@ -92,7 +92,7 @@ class Jaws:
 
 
 def closing_by_geometry(hand: HandModel) -> Floats:
-    """Return the direction (D,) in which each dof brings opposing surfaces together: +1 or -1; 0: no direction.
+    """Return each dof's direction (D,) that brings opposing surfaces together: +1 or -1; 0: no direction.
     The sign is opposite to that of a sum over postures, from all dofs at their lower limits to all at their upper
     limits. Each summand is the area of facing surfaces times the speed at which they separate."""
     points = _points(hand)
@@ -165,7 +165,7 @@ def _normal_speed(motion: Floats, normal: Floats) -> Floats:
 
 
 def _facing(place: Floats, normal: Floats, points: SurfacePoints, among: Ints) -> tuple[Ints, Ints, Floats]:
-    """Return the points of `among` that face another body, the nearest point that each faces, and the gap [m]."""
+    """Return the points of `among` that face another body, the nearest point each faces, and the gap [m]."""
     aside = _ASIDE * np.sqrt(points.area.sum() / len(points))
     first, second, gaps = [], [], []
     for i in among:

@@ -49,7 +49,7 @@ DENSITY = 1000.0
 def load_hand(
     files: Mapping[str, bytes], *, name: str, digest: str, options: Mapping[str, Any] | None = None, drag: bool = False
 ) -> HandModel:
-    """Load the hand in `files`: its URDF, its meshes and optionally `asset.json` or `hand.json` (see `parse_options`).
+    """Load a hand from URDF or MJCF, meshes, and optional `asset.json` or `hand.json` (`parse_options`).
     `digest` is that of the files; `options` are keys that override those in the files. With `drag`, its joints have the
     armature and dry friction in the files.
     Raises HandError: the files describe no usable hand; the message names the fault and the fix."""

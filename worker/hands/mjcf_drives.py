@@ -1,4 +1,4 @@
-"""Drives and couplings of the joints of an MJCF model, from actuators, equalities, fixed tendons and closed loops.
+"""Drives and couplings of an MJCF model's joints: actuators, equalities, fixed tendons, closed loops.
 
 Couplings are linear in their drivers. A four-bar linkage is a tree with ends connected by `connect` constraints. The
 loops are solved over the drivers' ranges. A line approximates each passive joint, and a note reports its error."""
@@ -101,10 +101,9 @@ class Couplings:
         return False
 
     def _couple_on_tendon(self, length: float, pulled: list[tuple[int, float]]) -> None:
-        """Couple two joints on a fixed tendon: c1 (q1 - q1_0) + c2 (q2 - q2_0) = length; the joint without actuator
-        follows.
-        Limits take precedence over the tendon: a follower at its limit does not move, as in a finger with a compliant
-        end."""
+        """Couple two joints on a fixed tendon: c1 (q1 - q1_0) + c2 (q2 - q2_0) = length.
+        The joint without actuator follows. Limits take precedence over the tendon: a follower at its limit does not
+        move, as in a finger with a compliant end."""
         free = [pair for pair in pulled if pair[0] not in self.follows and pair[0] not in self._actuated]
         if not free or abs(free[-1][1]) < 1e-9:
             self.notes.append(f"a tendon of {' and '.join(self.name(joint) for joint, _ in pulled)} was left out")

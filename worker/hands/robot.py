@@ -1,4 +1,4 @@
-"""Common result of the readers of URDF and MJCF, with checked values: links with shapes, and a tree of joints."""
+"""Common, checked result of the URDF and MJCF readers: links with shapes, and a tree of joints."""
 
 from __future__ import annotations
 

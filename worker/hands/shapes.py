@@ -37,7 +37,7 @@ Hulls = dict[tuple[str, tuple[float, ...]], list[tuple[Floats, Ints]]]
 def make_pieces(
     shape: Shape, *, body: int, pose: Floats, link: str, files: Mapping[str, bytes], base: str, hulls: Hulls
 ) -> list[ConvexPiece]:
-    """Make the convex pieces of a collision element at `pose` (7,) in the body frame; several for a mesh with hollows.
+    """Make the convex pieces of a shape at `pose` (7,) in the body frame; several for a mesh with hollows.
     `hulls` are those of this hand's meshes so far, by name and scale: fingers often share a fingertip mesh.
     Raises HandError: a mesh is missing, outside the upload, unreadable, flat or far too large."""
     if shape.kind != "mesh":
@@ -226,7 +226,7 @@ class _OpenSurface:
 
 
 def _hits(points: Floats, direction: Floats, corners: Floats) -> NDArray[np.bool_]:
-    """Return a mask (P,) of rays from points that hit one of the triangles (F, 3, 3) (Moeller and Trumbore 1997)."""
+    """Return a mask (P,) of the rays that hit any triangle (F, 3, 3) (Moeller and Trumbore 1997)."""
     a, first, second = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     across = np.cross(direction, second)
     determinant = np.einsum("ij,ij->i", first, across)

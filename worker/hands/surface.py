@@ -147,7 +147,7 @@ def _is_buried(hand: _Shapes, own: int, position: Floats, normal: Floats) -> NDA
 
 
 def apportion(weights: Floats, count: int, available: NDArray[np.intp]) -> NDArray[np.int64]:
-    """Distribute `count` by largest remainder in proportion to weights (L,), within the available numbers (L,)."""
+    """Distribute `count` by largest remainder in proportion to weights (L,), up to `available` (L,) each."""
     seats = np.zeros(len(weights), dtype=np.int64)
     while (left := count - int(seats.sum())) > 0:
         open_weights = np.where(seats < available, weights, 0.0)

@@ -1,4 +1,4 @@
-"""Tendons: drives that pull several joints. A drive commands the sum of the joints; contact determines their shares."""
+"""Tendons: drives that pull several joints and command their sum; contact determines each share."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def actuators(tendons: tuple[Tendon, ...], dofs: int) -> Floats:
 def tendons_of(
     robot: Robot, stated: Mapping[str, Mapping[str, float]] | None, dof_names: tuple[str, ...]
 ) -> tuple[Tendon, ...]:
-    """Return the tendons of a hand: the stated ones, else the description's, else the known ones of a Shadow hand.
+    """Return a hand's tendons: the stated ones, else the description's, else those known of a Shadow hand.
     Only joints that are degrees of freedom of the hand count; fewer than two make no tendon."""
     said = stated if stated is not None else robot.tendons or shadow_tendons(robot)
     found = []

@@ -161,7 +161,7 @@ def _resolve(name: str, mimics: Mapping[str, Mimic | None], fixed: Mapping[str, 
 
 
 def _fold_limits(dof: str, moving: dict[str, Mimic], robot: Robot, options: HandOptions) -> tuple[float, float]:
-    """Return the range of a dof in which all its followers stay within their own limits; see `_limits_bind`."""
+    """Return a dof's range in which all its followers stay within their own limits; see `_limits_bind`."""
     lower, upper = -math.inf, math.inf
     narrowest = dof
     for name, drive in moving.items():
@@ -201,7 +201,7 @@ def _check_travel(dof: str, lower: float, upper: float, moving: dict[str, Mimic]
 
 
 def _limits_bind(joint: Joint, drive: Mimic, robot: Robot, options: HandOptions) -> bool:
-    """Check whether a joint's own limits bind it. A URDF follower's limits do not bind, as in ROS: most are wrong."""
+    """Check whether a joint's own limits bind; those of a URDF follower do not, as in ROS: most are wrong."""
     return joint.name == drive.joint or robot.format != "URDF" or joint.name in options.couplings
 
 
@@ -305,7 +305,7 @@ def pick_root(robot: Robot, options: HandOptions) -> str:
 
 
 def hand_links(tree: _JointTree, root: str) -> list[str]:
-    """Return the links, from the root down, at which a hand begins: two or more short fingers branch there."""
+    """Return the links, from the root down, at which a hand begins: several short fingers branch there."""
     found: list[str] = []
     queue = deque([root])
     while queue:
@@ -363,7 +363,7 @@ class _JointTree:
 
 
 def _below_arm(tree: _JointTree, root: str, options: HandOptions) -> str:
-    """Return the link at which a hand on an arm begins, below the last joint before the fingers; else the root."""
+    """Return the link at which a hand begins: below an arm's last joint before the fingers, else the root."""
     start, at = root, root
     palm = options.palm.link if options.palm else None
     while at != palm:

@@ -1,4 +1,4 @@
-"""Reader of URDF and XML from untrusted sources. It checks every value; later code relies on these checks.
+"""Reader of URDF and XML from untrusted sources; later code relies on its check of every value.
 
 The common URDF libraries accept reversed limits, NaN, unknown mimics and several roots; this reader refuses them with a
 message. Those libraries also resolve mimic chains wrongly."""

@@ -31,7 +31,7 @@ class WorkLimitExceeded(Exception):
 
 
 def coacd_parts(vertices: Floats, faces: NDArray[Any], options: Mapping[str, Any], cpu_s: int) -> tuple[Floats, ...]:
-    """Compute the corners (V, 3) of each convex piece with the arguments of `coacd.run_coacd`; none if CoACD fails.
+    """Compute corners (V, 3) of convex pieces by `coacd.run_coacd` with `options`; none if it fails.
     CoACD holds the interpreter lock, so it runs in a child and delays no heartbeat. The limit is one of CPU time [s]: a
     busy machine gives the same pieces as an idle one. Raises WorkLimitExceeded: CoACD needs more CPU time. OSError:
     CoACD could not start or was killed; without this error, the object would silently get another shape."""
@@ -79,7 +79,7 @@ def save_parts(file: Path, parts: tuple[Floats, ...]) -> None:
 
 
 def _decompose(cpu_s: int) -> None:
-    """Decompose the mesh on standard input to standard output, both npz; a signal ends the process after `cpu_s`."""
+    """Decompose a mesh from stdin to stdout, both npz; a signal ends the process after `cpu_s`."""
     hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
     resource.setrlimit(resource.RLIMIT_CPU, (cpu_s if hard == resource.RLIM_INFINITY else min(cpu_s, hard), hard))
     # The library prints to standard output, which carries the result: its output is redirected first.

@@ -106,7 +106,7 @@ def _write(file: Path, arrays: Arrays) -> None:
 
 @lru_cache(maxsize=16)
 def _revision(files: tuple[str, ...]) -> str:
-    """Compute a digest of source files, libraries, and the processor type, on which the last bits may depend."""
+    """Compute a digest of source files, libraries, and the processor type, which may affect the last bits."""
     whole = hashlib.sha256()
     for file in files:
         whole.update(Path(file).read_bytes())

@@ -57,7 +57,7 @@ class MeshDistance:
 
 
 def small_pieces(corners: Floats, factor: float, count: int) -> tuple[Floats, float, NDArray[np.int64]]:
-    """Halve triangles (F, 3, 3) until no side exceeds `factor` times the root of the mean area of `count` pieces.
+    """Halve triangles (F, 3, 3) until no side exceeds `factor` * sqrt(total area / `count`).
     Return the centres (P, 3) of the pieces, their largest radius, and the triangle (P,) of each."""
     a, b, c = np.moveaxis(corners, 1, 0)
     area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
@@ -91,7 +91,7 @@ def deviation(one: tuple[Floats, Indices], two: tuple[Floats, Indices], samples:
 
 
 def surface_points(vertices: Floats, faces: Indices, samples: int) -> Floats:
-    """Return points for the comparison of surfaces: vertices (every n-th if there are very many), and even samples."""
+    """Return points to compare surfaces: vertices (every n-th if there are very many) and even samples."""
     return np.concatenate(
         [vertices[:: max(1, len(vertices) // _MAX_VERTICES)], sample_faces(vertices, faces, samples)[0]]
     )

@@ -77,8 +77,7 @@ def _boxes_meet(corners: Floats, pairs: Indices) -> NDArray[np.bool_]:
 
 
 def _edges_pass(edges_of: Floats, triangles: Floats, depth: float) -> NDArray[np.bool_]:
-    """Return a mask (P,) of pairs in which an edge of one triangle (P, 3, 3) passes `depth` [m] deep through the
-    other."""
+    """Return a mask (P,): an edge of one triangle (P, 3, 3) passes `depth` [m] deep through the other."""
     a, b, c = np.moveaxis(triangles, 1, 0)
     normal = np.cross(b - a, c - a)
     square = np.maximum(np.einsum("ij,ij->i", normal, normal), 1e-300)

@@ -46,7 +46,7 @@ def stated_options(files: Mapping[str, bytes], error: type[AssetError]) -> dict[
 
 
 def for_request(obj: ObjectModel, request: JobOptions) -> ObjectModel:
-    """Return the object with the job's mass and friction, else its own; level dexgraspbench has the published values.
+    """Return the object with the job's mass and friction, else its own; dexgraspbench: the published ones.
     Raises MeshError: the mass would exceed 100 kg."""
     if request.validation == "dexgraspbench":
         return obj.for_dexgraspbench

@@ -1,4 +1,4 @@
-"""Prepare an object from its files: read, repair, simplify, add normals, hull and mass; cached by content."""
+"""Preparation of objects, cached by content: reading, repair, simplification, normals, hull and mass."""
 
 from __future__ import annotations
 
@@ -176,9 +176,8 @@ def name_of(path: Path) -> str:
 
 @lru_cache(maxsize=1)
 def revision() -> str:
-    """Compute a digest of this package's source, its libraries, and the processor type, on which the last bits may
-    depend.
-    A change of the preparation thus invalidates cached objects."""
+    """Compute a digest of this package's source, its libraries, and the processor type.
+    A change of the preparation thus invalidates cached objects. The last bits may depend on the processor."""
     whole = hashlib.sha256()
     for file in sorted(Path(__file__).parent.rglob("*.py")):
         whole.update(file.read_bytes())

@@ -132,7 +132,7 @@ def _resolution_note(given: CentredMesh, unit: float) -> str:
 
 
 def _fitting_units(extent: float) -> dict[str, float]:
-    """Return the units in which a length of the file suits a hand, each with the length [m]; the likeliest first."""
+    """Return the units in which `extent` suits a hand, each with the extent [m]; the likeliest first."""
     sizes = {unit: extent * metres for unit, metres in UNITS.items()}
     low, high = HAND_SIZES_M
     fitting = {unit: size for unit, size in sizes.items() if low <= size <= high}
@@ -247,7 +247,7 @@ def _accept_open(mesh: RepairedMesh, options: ObjectOptions) -> RepairedMesh:
 
 
 def _resolve_components(mesh: RepairedMesh, options: ObjectOptions) -> RepairedMesh:
-    """Drop debris, orient components outward, and unite overlapping ones; options select among several components."""
+    """Drop debris, orient components outward, and unite overlapping ones; options select among several."""
     shells = topology.components(mesh.faces)
     parts = [topology.compact(mesh.vertices, mesh.faces[shells == k]) for k in range(shells.max() + 1)]
     volumes = np.array([signed_volume(*part) for part in parts])

@@ -102,7 +102,7 @@ def repeated(faces: Indices) -> Mask:
 
 
 def _edge_keys(faces: Indices, *, directed: bool = False) -> Indices:
-    """Encode each edge (3F,) as a number, in the order of `directed_edges`; numbers sort far faster than pairs."""
+    """Encode edges as numbers (3F,) in the order of `directed_edges`; numbers sort far faster than pairs."""
     edges = directed_edges(faces)
     edges = edges if directed else np.sort(edges, axis=1)
     return (edges[:, 0] << 32) | edges[:, 1]
@@ -132,7 +132,7 @@ def open_edges(faces: Indices) -> int:
 
 
 def _by_edge(faces: Indices) -> tuple[Indices, Indices, Indices]:
-    """Return the directed edges (3F,) sorted by undirected edge, and each edge's first place and number (E,)."""
+    """Return directed edges (3F,) sorted by undirected edge, and each one's first place and count (E,)."""
     index, counts = edge_faces(faces)
     return np.argsort(index, kind="stable"), np.cumsum(counts) - counts, counts
 
@@ -148,7 +148,7 @@ def pair_faces(faces: Indices) -> tuple[Indices, Indices, Mask]:
 
 
 def parts_of_graph(one: Indices, other: Indices, count: int) -> NDArray[np.int32]:
-    """Number the connected parts (N,) of `count` nodes; edges join nodes `one` (E,) with nodes `other` (E,)."""
+    """Number the connected parts (N,) of `count` nodes; edges join nodes `one` (E,) with `other` (E,)."""
     from scipy.sparse import coo_matrix  # slow to load, and a prepared object needs none
     from scipy.sparse.csgraph import connected_components
 

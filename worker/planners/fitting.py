@@ -52,8 +52,8 @@ _CHUNK: Final = 64
 
 @dataclass(frozen=True)
 class Pairs:
-    """P pairs of points (P, 3), object frame [m]. The space between two points may be hollow: fingers grasp from
-    outside."""
+    """P pairs of points (P, 3), object frame [m].
+    The space between two points may be hollow: fingers grasp from outside."""
 
     start: Floats
     end: Floats
@@ -66,7 +66,7 @@ class Pairs:
 
 @cached_by_content(16)
 def antipodal_pairs(obj: ObjectModel) -> Pairs:
-    """Cast rays inwards from evenly spread surface points; each point where a ray leaves the solid gives a pair."""
+    """Pair evenly spread surface points with each point where a ray cast inwards leaves the solid."""
     rng = np.random.default_rng(0xA47)
     corners, normal, _ = surface_of(obj)
     start, face = even_points(obj, _POINTS, rng)
@@ -99,7 +99,7 @@ def even_points(obj: ObjectModel, count: int, rng: np.random.Generator) -> tuple
 
 
 def _exits(start: Floats, way: Floats, corners: Floats, normal: Floats) -> tuple[NDArray[np.intp], Floats]:
-    """Intersect rays (n, 3), (n, 3) with triangles (F, 3, 3); return ray index and distance [m] of the exit points.
+    """Intersect rays (n, 3), (n, 3) with triangles (F, 3, 3); return ray index and distance [m] of exits.
     A ray exits through a face whose normal points along the ray (Moeller and Trumbore 1997)."""
     edge1, edge2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     p = np.cross(way[:, None], edge2[None])

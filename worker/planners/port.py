@@ -1,4 +1,4 @@
-"""Interface of a grasp planner, implemented by `fast_graspd`, the baselines and planners of third parties."""
+"""Interface of a grasp planner, implemented by `fast_graspd`, baselines and third-party planners."""
 
 from __future__ import annotations
 

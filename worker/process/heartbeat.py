@@ -38,7 +38,7 @@ class Heartbeat:
         alive: Path | None = None,
         is_stopped: Callable[[], bool] = lambda: False,
     ) -> None:
-        """`lease_s` is the lifetime of the registration after a heartbeat [s]; each heartbeat touches the file `alive`.
+        """`lease_s` is the lifetime of the registration after a heartbeat [s]; each heartbeat touches `alive`.
         No heartbeat is sent while `is_stopped` returns True: the worker hangs, although this thread runs."""
         self._connection: Any = connect(url, patience=0, timeout_s=_ANSWER_S)
         self._facts, self._lease_s = asdict(beat), lease_s

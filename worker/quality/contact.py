@@ -20,7 +20,7 @@ MAX_CONTACTS: Final = 20
 
 
 def contact_area_cm2(distance: Floats, area: Floats, thresholds_m: Floats) -> Floats:
-    """Compute the hand area (B, T) within each threshold (T,) of the object's surface, on either side [cm^2].
+    """Compute the hand area (B, T) within thresholds (T,) of the object's surface, on either side [cm^2].
     The distances (B, N) are signed [m]; each point represents an `area` (N,) [m^2]."""
     near = np.abs(distance)
     # Sums of rows: the rounding of a matrix product would depend on its number of rows.
@@ -87,7 +87,7 @@ def finger_of_body(hand: HandModel) -> NDArray[np.int32]:
 
 
 def contact_distance_consistency_mm(hand: HandModel, body_distance: Floats) -> Floats:
-    """Compute CDC (B,): largest minus least finger distance, each capped to 0 .. 10 mm (DexGraspBench) [mm]."""
+    """Compute CDC (B,): largest minus least finger distance, each capped to 0 .. 10 mm (DexGraspBench)."""
     finger = finger_of_body(hand)
     least = [body_distance[:, finger == f].min(axis=1) for f in np.unique(finger[finger >= 0])]
     if not least:

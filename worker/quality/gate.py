@@ -1,4 +1,4 @@
-"""The geometric gate: rejects grasps with penetration of the object or the hand itself, regardless of the verdict."""
+"""Geometric gate against penetration of the object or the hand itself, regardless of the verdict."""
 
 from __future__ import annotations
 

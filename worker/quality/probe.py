@@ -200,7 +200,7 @@ class Probe:
         return facing
 
     def body_distance(self, found: Distances) -> Floats:
-        """Return the least distance (B, L) between each body and the object, from body points and object points [m]."""
+        """Return the least distance (B, L) [m] between each body and the object, from points of both."""
         least = np.full((len(found.bodies), self.hand.bodies), REACH_M)
         for body in range(self.hand.bodies):
             mine = self.points.body == body

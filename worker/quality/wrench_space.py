@@ -76,7 +76,7 @@ def measure_spaces(
 
 
 def _measure_by_qhull(edge_wrenches: Floats) -> tuple[float, float]:
-    """Compute epsilon and volume by Qhull where `measure_hulls` does not apply: few, flat, or too many contacts."""
+    """Compute epsilon and volume by Qhull where `measure_hulls` cannot: few, flat, or too many contacts."""
     from scipy.spatial import ConvexHull, QhullError
 
     points = edge_wrenches.reshape(-1, edge_wrenches.shape[-1])

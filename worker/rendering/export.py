@@ -25,7 +25,7 @@ _DISTANCES: Final = {"image/depth": "distance_to_image_plane", "image/distance":
 
 
 def export_images(views: Shard, folder: Path, *, depth: DepthFormat = "exr") -> list[Path]:
-    """Write every picture of a views shard, with the file names of Replicator's BasicWriter; return the files.
+    """Write every picture of a views shard under Replicator's BasicWriter file names; return the files.
     Per picture: `rgb_NNNN.png` (8 bits), `semantic_segmentation_NNNN.png` (8 bits, the labels themselves),
     `view_NNNN.json`, and the depth as `distance_to_image_plane_NNNN.exr` (float32 [m], channel Z, inf: nothing) or
     `.png` (16 bits, steps of 0.1 mm, 0: nothing). If the shard has them: `distance_to_camera_NNNN`, `normals_NNNN.exr`

@@ -56,7 +56,7 @@ def grasp_pictures(
     run: ExecutionContext = DEFAULT_CONTEXT,
     samples: int = SAMPLES,
 ) -> NDArray[np.uint8]:
-    """Render N grasps, root poses (N, 7) in the object frame and joints (N, J), from A sides: (N, A, H, W, 3) sRGB.
+    """Render root poses (N, 7) in the object frame and joints (N, J) from A sides: (N, A, H, W, 3) sRGB.
     Azimuths [rad] are about the object's z axis; 0 looks across the direction in which the palm approaches. Object and
     hand fill the picture of `size` [px]. Raises TaskCancelled: `run.cancelled()` returned True."""
     hand_pose = moved(np.atleast_2d(np.asarray(hand_pose, float)), np.negative(obj.centre))
@@ -118,7 +118,7 @@ def studio_shot(
     world: NDArray[np.intp] | None = None,
     toward_lamp: Floats = TOWARD_LAMP,
 ) -> CameraShot:
-    """Return cameras (V, 4, 4) in studio light that turns with azimuths (worlds,) [rad], so that no side is dark.
+    """Return cameras (V, 4, 4) in studio light that turns with `angles` (worlds,) [rad]: no side is dark.
     `world` (V,) is the world of each camera; by default, camera k is in world k."""
     return CameraShot(
         world=(np.arange(len(angles)) if world is None else world).astype(np.int32),

@@ -49,7 +49,7 @@ _OBJECT_AZIMUTHS: Final = tuple(np.radians([-50.0, 40.0, 130.0]).tolist())
 
 
 def hand_portrait(hand: HandModel) -> Image.Image:
-    """Draw the hand open, in its pre-shape and closing, from two sides; an arrow on the palm shows the approach."""
+    """Draw the hand open, in its pre-shape and closing, from two sides, with an arrow for the approach."""
     parts, upright = hand_parts(hand), _upright(hand)
     named = {
         "open": closing_posture(hand, 0.0),

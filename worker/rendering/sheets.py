@@ -108,7 +108,7 @@ def three_sides_sheet(
 
 
 def views_page(views: Arrays, *, title: str, subtitle: str = "") -> bytes:
-    """Return a PNG of a views shard: per placement both pictures, depth, segmentation, boxes, and the hand, if any."""
+    """Return a PNG of each placement's pictures, depth, segmentation, boxes, and the hand, if any."""
     eye = np.asarray(views["camera/eye"])
     stereo, first = bool((eye == 2).any()), np.flatnonzero(eye != 2)
     columns: dict[str, Callable[[int], Image.Image]] = {
@@ -141,7 +141,7 @@ def label_page(
     title: str,
     subtitle: str = "",
 ) -> bytes:
-    """Return a PNG of a table of pictures: column heads, and names, if any, below the first pictures of each row."""
+    """Return a PNG of pictures in rows under `heads`; `names`, if any, are below a row's first pictures."""
     width, height = rows[0][0].size
     line = height + (_NAME if names else 0)
     page, draw, top = _page(len(heads), len(rows), width, line, title, subtitle, head=_HEAD + 24)

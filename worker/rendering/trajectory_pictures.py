@@ -91,7 +91,7 @@ def trajectory_pictures(
     run: ExecutionContext = DEFAULT_CONTEXT,
     samples: int = SAMPLES,
 ) -> NDArray[np.uint8]:
-    """Render N grasps, F postures each in the frame of the object at rest, from A sides: (N, A, F, H, W, 3) sRGB.
+    """Render N grasps of F postures, frame of the object at rest, from A sides: (N, A, F, H, W, 3) sRGB.
     Sides are ordered by how much of object and fingers they show. `whole` frames the whole hand; otherwise parts far
     from the object may leave the picture. Raises TaskCancelled: `run.cancelled()` returned True."""
     if not frames:

@@ -120,7 +120,7 @@ def _neighbour_clearance(
 
 
 def _clearance(hand: HandModel, grasp: Posture, pregrasp: Posture, object_pose: Floats) -> Floats:
-    """Return the height (S, N, 2) of the hand's lowest point at contact, and on its approach, table frame [m]."""
+    """Return heights (S, N, 2) of the hand's lowest point at contact and on approach, table frame [m]."""
     features = PosedFeatures.of(hand, approach(grasp, pregrasp))
     on_path = np.array([features.distance(_TABLE.in_frame(pose)).min(axis=1) for pose in object_pose])
     on_path = on_path.reshape(len(object_pose), len(grasp), -1)
@@ -130,7 +130,7 @@ def _clearance(hand: HandModel, grasp: Posture, pregrasp: Posture, object_pose: 
 def _mounting_clearance(
     hand: HandModel, grasp: Posture, pregrasp: Posture, object_pose: Floats
 ) -> tuple[Floats, Floats]:
-    """Return wrist angles (S, N, K) and heights (S, N, 2) of the mounting's lowest point [m]; inf without a mounting.
+    """Return wrist angles (S, N, K) and lowest heights (S, N, 2) of the mounting [m]; inf without it.
     The heights are those at contact and on the approach, as in `_clearance`."""
     path = approach(grasp, pregrasp).hand_pose.reshape(len(grasp), PATH_POSTURES, 7)
     angles, heights = [], []

@@ -110,7 +110,7 @@ def move_inside(obj: ObjectModel, pose: Floats, size: tuple[float, float], rng: 
 
 
 def check_free(obj: ObjectModel, poses: Floats, supports: tuple[Obstacle, ...]) -> None:
-    """Raise SceneError where, at a pose (S, 7), the object penetrates a support by more than the rounding error."""
+    """Raise SceneError if the object at a pose (S, 7) penetrates a support by more than rounding errors."""
     for pose in poses:
         corners = quat_rotate(pose[3:], obj.hull_vertices) + pose[:3]
         for number, support in enumerate(supports):

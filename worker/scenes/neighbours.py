@@ -173,7 +173,7 @@ class _Heap:
 
 
 def neighbour_clearance(hand: HandModel, path: Posture, object_pose: Floats, neighbours: Neighbours) -> Floats:
-    """Compute signed distances (S, P) of the hand's pieces from neighbours' hulls [m], at most `FARTHEST_M`.
+    """Compute the hand's least signed distance (S, P) from neighbours' hulls [m], at most `FARTHEST_M`.
     `path` has P postures in the object frame, `object_pose` (S, 7) is in the table frame."""
     spec = mujoco.MjSpec()
     for k, piece in enumerate(hand.pieces):
@@ -294,7 +294,7 @@ class _Hulls:
         return np.asarray((quat_rotate(pose[3:], self.objects[number].centre_of_mass) + pose[:3])[:2])
 
     def room(self, number: int, pose: Floats) -> tuple[Floats, Floats]:
-        """Return the smallest and largest shift (2,), (2,) along x and y that keeps an object inside the walls."""
+        """Return the least and largest shift (2,), (2,) along x and y that keeps an object inside the walls."""
         corners = self._corners(number, pose)[:, :2]
         return -self._room - corners.min(axis=0), self._room - corners.max(axis=0)
 

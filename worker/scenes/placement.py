@@ -146,7 +146,7 @@ def _place_objects(
     count: int,
     seed: int,
 ) -> dict[str, Floats]:
-    """Place the object in its own rest pose and the neighbours beside it; move the object if they do not fit."""
+    """Place the object in its rest pose and the neighbours beside it; move the object if they do not fit."""
     poses = rest_poses(spec, obj, count=count, seed=seed)
     alone, size = poses["scene/object_pose"], walled_area(spec)
 

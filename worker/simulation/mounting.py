@@ -90,7 +90,7 @@ def _solve_wrist(
 def point_clearance(
     mounting: HandModel, poses: Floats, scenes: Sequence[Environment], which: NDArray[np.intp]
 ) -> Floats:
-    """Return the least clearance (N, W) of a mounting's points over root poses (N, P, 7), at W wrist positions [m].
+    """Return the points' least clearance (N, W) [m] over root poses (N, P, 7), at W wrist positions.
     Scenes are `which` (N,). The mounting's own clearance is at most this, except near edges and corners of solids."""
     points = points_of(mounting)
     out = np.full((len(poses), len(points)), np.inf)

@@ -75,7 +75,7 @@ class Projection:
             self._depth = wp.empty(B, dtype=wp.float64)
 
     def run(self, state: HandState, iterations: int) -> tuple[HandState, Floats]:
-        """Run at most `iterations` steps; return the best state of each hand, and its deepest penetration (n,) [m]."""
+        """Run at most `iterations` steps; return each hand's best state, and its deepest penetration (n,) [m]."""
         data, n = self.data, len(state.pivot)
         data.set_schedule(still_schedule())
         data.set_state(state)

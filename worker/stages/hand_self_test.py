@@ -111,7 +111,7 @@ def failed_facts(reason: str, says: str = "suspicious") -> dict[str, Any]:
 
 
 def self_test_facts(hand: Callable[[], HandModel], run: ExecutionContext = DEFAULT_CONTEXT) -> dict[str, Any]:
-    """Return the facts of a self-test; a test without a grasp, or with an error, is reported and not raised.
+    """Return the facts of a self-test; one without a grasp, or with an error, is reported and not raised.
     Raises TaskCancelled: `run.cancelled()` returned True."""
     try:
         return self_test(hand(), run).facts()
@@ -169,7 +169,7 @@ def _lost_in_closing(batch: ValidatedBatch) -> NDArray[np.bool_]:
 
 
 def _drive_compliance(hand: HandModel) -> float:
-    """Return the least fingertip motion [m] by which the torque of a closing dof rises from zero to its limit."""
+    """Return the least fingertip motion [m] that raises a closing dof's torque from zero to its limit."""
     if jaws_of(hand) is not None:
         return math.inf
     step = 1e-4

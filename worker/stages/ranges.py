@@ -37,7 +37,7 @@ def batches_of(message: TaskMessage) -> list[TaskMessage]:
 
 
 def joined(message: TaskMessage, made: Sequence[Output], *, base_rows: Sequence[range] = ()) -> Output:
-    """Join the outputs of batches, which have equal columns except for rechecks; a single output is unchanged.
+    """Join the outputs of batches, which have equal columns except for rechecks; one output is unchanged.
     Columns that refer to rows of the base shard follow `base_rows`, the rows of each batch in it."""
     if len(made) == 1:
         return made[0]
@@ -64,7 +64,7 @@ def joined(message: TaskMessage, made: Sequence[Output], *, base_rows: Sequence[
 
 
 def base_rows(base: Shard, message: TaskMessage) -> list[range]:
-    """Return the rows of each batch of a task in its base shard. Raises DamagedShard: the shard has other batches."""
+    """Return each batch's rows in a task's base shard. Raises DamagedShard: the shard has other batches."""
     said = base.attributes.get("batch_rows")
     counts = [len(base.arrays["grasp/hand_pose"])] if said is None else json.loads(str(said))
     if len(counts) != len(sizes_of(message)):

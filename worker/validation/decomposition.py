@@ -1,4 +1,4 @@
-"""Convex decomposition of objects by CoACD (Wei et al. 2022), with a check of its quality, cached on disk.
+"""Convex decomposition of objects by CoACD (Wei et al. 2022), with a quality check, cached on disk.
 
 The validator's engine simulates only the pieces. Pieces that fill a hollow therefore falsify every verdict on the
 object. Count, volume ratio and excess are stored with every verdict; pieces with a large excess are refused. The excess
@@ -99,7 +99,7 @@ def decompose(obj: ObjectModel, *, cache: Path | None = None) -> ConvexPieces:
 
 
 def piece_file(obj: ObjectModel, cache: Path | None = None) -> Path:
-    """Return the cache file of an object's pieces; its stem is a digest of everything that determines them."""
+    """Return the cache file of an object's pieces; its stem is a digest of all that determines them."""
     mesh = obj.centred
     shape = hashlib.sha256(mesh.vertices.tobytes() + mesh.faces.tobytes()).hexdigest()
     settings = [_COACD, THRESHOLDS, GOOD_EXCESS_M, version_of("coacd")]

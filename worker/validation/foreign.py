@@ -1,4 +1,4 @@
-"""Verdicts in another model of the same hand: grasps planned with one model are validated in the other model.
+"""Verdicts in another model of the same hand than the one with which the grasps were planned.
 
 The other model provides the mechanism: shapes, masses, joint frames, limits, couplings, armature and dry friction. The
 grasp's own model provides the controller: commanded postures, gains, damping and torque limits."""

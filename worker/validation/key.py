@@ -1,4 +1,4 @@
-"""Key of a verdict: digest of everything that affects it. Success rates with different keys are not comparable."""
+"""Key of a verdict: digest of all that affects it; success rates compare only between equal keys."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ LEVEL_MOVES: Final[dict[Level, dict[ModuleType, tuple[str, ...]]]] = {
 def verdict_key(
     hand: HandModel, obj: ObjectModel, level: Level, hard: bool, *, pieces: ConvexPieces, prefilter: Sequence[Any] = ()
 ) -> str:
-    """Return the digest of the terms of a verdict: everything that determines it except the grasp's postures.
+    """Return the digest of a verdict's terms: everything that determines it except the grasp's postures.
     Terms are level, friction, masses, gains, torque limits, shapes of the hand, convex pieces of the object, and the
     rules of pregrasp and squeeze. Further terms are the constants of `MOVES` and of the level, the version of the
     engine, and `prefilter`: the prefilter's terms if it is used."""
@@ -106,7 +106,7 @@ def postures_key(terms: str, grasps: GraspSet) -> str:
 
 
 def _values(names: dict[ModuleType, tuple[str, ...]]) -> dict[str, Any]:
-    """Return named constants by the last part of their module's name; constants of `opening` belong to `postures`."""
+    """Return named constants by the last part of their module's name; those of `opening` under `postures`."""
     out: dict[str, Any] = {}
     for part, there in names.items():
         group = out.setdefault((postures if part is opening else part).__name__.rpartition(".")[2], {})

@@ -1,4 +1,4 @@
-"""PLY (ASCII, binary of both byte orders), STL (binary, ASCII) and OFF; colours and normals are ignored."""
+"""PLY (ASCII, binary of both byte orders), STL (binary, ASCII) and OFF, but no colours or normals."""
 
 from __future__ import annotations
 

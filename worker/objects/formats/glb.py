@@ -152,7 +152,7 @@ def _accessor(document: dict[str, Any], binary: bytes, index: Any, shape: str) -
 
 
 def _refuse_extensions(part: dict[str, Any]) -> None:
-    """Refuse extensions that replace the vertices; other extensions that a file does not require are ignored."""
+    """Refuse extensions that replace the vertices; others that a file does not require are ignored."""
     for name in part.get("extensions", {}):
         if name.startswith(_GEOMETRY):
             raise _refusal(name)

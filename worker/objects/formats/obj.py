@@ -121,7 +121,7 @@ Nearby = Callable[[str], bytes | None]
 
 
 def read_materials(data: bytes, nearby: Nearby) -> dict[bytes, Floats]:
-    """Read each material's sRGB colour (3,), 0 .. 1. Pictures override numbers; unreadable pictures are skipped."""
+    """Read each material's sRGB colour (3,), 0 .. 1; readable pictures override numbers."""
     found: dict[bytes, Floats] = {}
     name: bytes | None = None
     pictures = 0

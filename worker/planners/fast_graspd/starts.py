@@ -1,5 +1,7 @@
-"""Starts of hands around a free object. In every second start of a grasp the palm faces a random surface point. The
-other starts are antipodal (`ReachSampling`). All are antipodal if the object is too small or too wide for the pads.
+"""Starts of hands around a free object.
+
+In every second start of a grasp the palm faces a random surface point. The other starts are antipodal
+(`ReachSampling`). All are antipodal if the object is too small or too wide for the pads.
 
 A start must not penetrate the object deeply, since hands that start inside a thin wall never leave it.
 

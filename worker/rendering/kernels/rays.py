@@ -82,8 +82,8 @@ def box_distance(half: wp.vec3f, origin: wp.vec3f, direction: wp.vec3f):
 def may_hit(
     placed: wp.array2d[PlacedSolid], world: wp.int32, origin: wp.vec3f, direction: wp.vec3f, spread: wp.float32
 ):
-    """Return a mask with bit k set if a unit ray within `spread` of this one may hit solid k. Solids from the 64th on
-    share bits."""
+    """Return a mask with bit k set if a unit ray within `spread` of this one may hit solid k.
+    Solids from the 64th on share bits."""
     inverse = inverse_of(direction)
     near = wp.uint64(0)
     for k in range(placed.shape[1]):

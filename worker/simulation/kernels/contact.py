@@ -201,7 +201,7 @@ def direct_gradient(
     adjoint_in: wp.array2d(dtype=vec6),
     contacts_inout: Contacts,
 ):
-    """Compute dL/drho of each contact after `direct`, over all simulations in order. Launch over (B, N / lane)."""
+    """Compute each contact's dL/drho after `direct`, over simulations in order. Launch over (B, N / lane)."""
     b, part = wp.tid()
     if hands_in.active[b] == 0:
         return

@@ -73,7 +73,7 @@ def finger_depth(
     piece_q_in: wp.array2d(dtype=wp.quat),
     jams_inout: FingerJams,
 ):
-    """Compute each finger's greatest depth in the rest of the hand, or of the rest in it. Launch over (B, L)."""
+    """Compute each finger's greatest depth in the rest of the hand, or vice versa. Launch over (B, L)."""
     b, body = wp.tid()
     if jams_inout.going[b] == 0 or points_in.first[body] == points_in.first[body + 1]:
         return

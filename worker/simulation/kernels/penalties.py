@@ -66,7 +66,7 @@ def joint_penalties(
 def near_share(
     reach_in: wp.float32, whole_in: wp.float32, contacts_in: Contacts, share_out: wp.array(dtype=wp.float32)
 ):
-    """Compute the share of the `whole` weight of a hand's points that is within `reach` [m]. Launch over B.
+    """Compute the share of the `whole` weight of hand points that is within `reach` [m]. Launch over B.
     Points are summed in order, so that the sum is the same on every device."""
     b = wp.tid()
     total = float(0.0)

@@ -51,7 +51,7 @@ class NearestObstacle:
 def tangent_intersection(
     t0: wp.float32, f0: wp.float32, g0: wp.float32, t1: wp.float32, f1: wp.float32, g1: wp.float32
 ):
-    """Return the place between t0 and t1 at which tangents of a convex function with slopes g0 < 0 < g1 intersect."""
+    """Return where between t0 and t1 the tangents of a convex function with slopes g0 < 0 < g1 intersect."""
     return wp.clamp((f1 - f0 + g0 * t0 - g1 * t1) / (g0 - g1), t0, t1)
 
 

@@ -247,7 +247,7 @@ def gather(
     hands_in: Hands,
     contacts_inout: Contacts,
 ):
-    """Pack candidate contacts per grasp: hand points closer than dilation + keep. Launch over (B, N / lane).
+    """Pack each grasp's candidate contacts: points closer than dilation + keep. Launch over (B, N / lane).
     `near` lists contacts with a gap of at most `near_gap`. If `mark` is not empty, each point is written with a mark
     to its own index, for `packing.pack`."""
     b, part = wp.tid()
