@@ -85,7 +85,7 @@ def minute(value: str | None) -> str:
 
 
 def stamp(value: str) -> str:
-    """Format an RFC 3339 time for readers without JavaScript; the script replaces it by the time relative to now."""
+    """Format an RFC 3339 time for readers without JavaScript; the script replaces it by a relative time."""
     return datetime.fromisoformat(value).strftime("%Y-%m-%d %H:%M UTC")
 
 

@@ -116,7 +116,7 @@ def describe(error: Exception) -> tuple[str, str, int, str]:
 
 
 def _is_full(error: BaseException | None) -> bool:
-    """Check whether the disk was full: FastAPI reports an error during the read of a body as a bad request."""
+    """Check whether the disk was full: FastAPI reports a failed read of a body as a bad request."""
     return isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
 
 

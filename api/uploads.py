@@ -28,7 +28,7 @@ _NAME: Final = re.compile(r"[^A-Za-z0-9._-]+")
 def files_of_upload(
     kind: AssetKind, filename: str, data: bytes | IO[bytes], *, limit_bytes: int, options: str = ""
 ) -> MutableMapping[str, bytes]:
-    """Return the files of an asset, including `asset.json`, from an upload; `options` override keys of `asset.json`."""
+    """Return the files of an uploaded asset, including `asset.json`; `options` override keys of this file."""
     leaf = PurePosixPath(filename.replace("\\", "/")).name
     file = io.BytesIO(data) if isinstance(data, bytes) else data
     size = file.seek(0, io.SEEK_END)

@@ -1,4 +1,4 @@
-"""Common parts of the baselines: hand and object on a device, collision-free starts, inner surfaces, grasp sets.
+"""Common parts of the baselines: hand and object, collision-free starts, inner surfaces, grasp sets.
 
 Baselines use flat triangles of the object (no Phong smoothing). Pregrasp, squeeze and quality come from the same code
 as in `fast_graspd`, and so do starts that a publication does not define."""
@@ -59,7 +59,7 @@ def load_pair(hand: HandModel, obj: ObjectModel, device: str, *kernels: ModuleTy
 
 
 def free_starts(pair: Pair, *, seed: int, batch: int, indices: range) -> HandState:
-    """Sample a collision-free start for each grasp, with the palm towards a random surface point (Grasp'D, 2022)."""
+    """Sample a collision-free start per grasp, the palm towards a random surface point (Grasp'D, 2022)."""
     return sample_starts(pair.model(pair.coarse), seed=seed, batch=batch, indices=indices, each=1)
 
 
@@ -71,7 +71,7 @@ def frame_along(z: Floats) -> Floats:
 
 
 def grasp_set(pair: Pair, state: HandState, began: float, info: dict[str, object]) -> GraspSet:
-    """Return hands as grasps with all postures; `began` is the planner's start time by `time.perf_counter`."""
+    """Return hands as grasps with all postures; `began` is the planner's start by `time.perf_counter`."""
     hand, obj, device = pair.hand.model, pair.fine.obj.model, pair.hand.device
     seconds = time.perf_counter() - began
     grasp = posture_of(hand, obj, state)
@@ -87,7 +87,7 @@ STEP: Final = 1e-4
 
 
 def inside_points(hand: HandModel, *, each: int, on_palm: int) -> SurfacePoints:
-    """Return evenly spread points on the inner side: at most `each` per closing link, `on_palm` on the palm."""
+    """Spread points evenly on the inner side: at most `each` per closing link, `on_palm` on the palm."""
     points = sample_surface(hand, SAMPLES)
     inside = _inside(hand, points)
     chosen: list[NDArray[np.intp]] = []

@@ -1,4 +1,4 @@
-"""Cached candidates of a hand on an object with their verdicts and metrics, shared by the studies of quality.
+"""Cached candidates of a hand on an object with verdicts and metrics, shared by studies of quality.
 
 A cell is a pair of hand and object, with a number of grasps and a revision of synthesize. Grasps are planned as in a
 job. A cell's folder caches all results, so an interrupted study resumes. Studies with equal numbers of grasps share
@@ -144,7 +144,7 @@ def write_json(file: Path, value: object) -> None:
 def cell_parser(
     doc: str | None, *, objects: Sequence[str] | None = None, grasps: int = 64, hands: bool = True
 ) -> argparse.ArgumentParser:
-    """Return a parser of `data`, `--work`, `--hands` (if `hands`), `--objects` and `--grasps` with these defaults."""
+    """Return a parser of data, --work, --hands (if `hands`), --objects and --grasps with these defaults."""
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path)
     parser.add_argument("--work", type=Path, default=Path("quality-work"))

@@ -1,4 +1,4 @@
-"""Cost of a valid grasp from the planner to its row in the shard, for two checkouts in one run; prints Markdown.
+"""Cost of a valid grasp from planner to shard row, for two checkouts in one run; prints Markdown.
 
 usage: python -m benchmarks.chain BEFORE AFTER DATA_DIR [--grasps 64] [--pairs allegro:mug shadow:bottle] [--json OUT]
        python -m benchmarks.chain BEFORE AFTER --service [--pictures] [--job JSON] [--after JSON] [--grasps 256] [...]

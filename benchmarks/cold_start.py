@@ -119,7 +119,7 @@ def first_job(root: Path, hand: str, obj: str) -> dict[str, float]:
 
 
 def head(title: str, names: Sequence[str]) -> list[str]:
-    """Return the head of a table with one column per checkout and, for several, the ratio of first to last."""
+    """Return a table's head with one column per checkout and, for several, the ratio of first to last."""
     cells = [title, *names, *(["ratio"] if len(names) > 1 else [])]
     return [f"| {' | '.join(cells)} |", "| --- |" + " --: |" * (len(cells) - 1)]
 

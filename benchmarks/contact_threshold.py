@@ -1,4 +1,4 @@
-"""Figure 3 of the Fast-Grasp'D paper with graspd's grasps: epsilon, wrench volume, contact area by threshold.
+"""Figure 3 of Fast-Grasp'D with graspd's grasps: epsilon, wrench volume, contact area by threshold.
 
 usage: python -m benchmarks.contact_threshold DATA_DIR [--work DIR] [--hands allegro ...] [--out DIR]
 DATA_DIR holds hands/ and objects/. Writes contact-threshold.json and contact-threshold.png to `--out`. Values are means
@@ -57,7 +57,7 @@ def sweep(cell: Cell) -> dict[str, Any]:
 
 
 def collect(args: argparse.Namespace) -> dict[str, Any]:
-    """Return hand -> friction -> metric -> {mean, low, high}: lists over thresholds; low and high are quartiles."""
+    """Return hand -> friction -> metric -> {mean, low, high}, lists over thresholds; low, high: quartiles."""
     out: dict[str, Any] = {}
     for hand in args.hands:
         found = []

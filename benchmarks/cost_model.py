@@ -1,4 +1,4 @@
-"""Cost of a dataset in workers, Redis operations, objects, bytes, index rows and money, from measured inputs.
+"""Cost of a dataset from measurements: workers, Redis operations, objects, bytes, index rows, money.
 
 usage: python -m benchmarks.cost_model [--grasps 1000000] [--grasps 100000000] [--days 7] [--scenes 2] [--views 3]
                                        [--core-hour 0.04] [--from-data DIR] [--json]
@@ -136,7 +136,7 @@ class Estimate:
 
 
 def estimate(work: Work, measured: Measured, prices: Prices, *, cores_per_worker: int = 4) -> Estimate:
-    """Return the cost of a dataset made by CPU workers, each with `cores_per_worker` threads and its own heartbeats."""
+    """Return the cost of a dataset by CPU workers with `cores_per_worker` threads and own heartbeats each."""
     scenes = work.batches * work.scenes
     core_s = (
         work.grasps * measured.core_s_per_grasp
@@ -200,8 +200,8 @@ def gpu_hours(work: Work, grasps_per_second: float) -> float:
 
 
 def sizes(data: Path) -> dict[str, float]:
-    """Return sizes in a data folder with a file store, as fields of `Measured`. Raises SystemExit: the folder has no
-    shard."""
+    """Return sizes in a data folder with a file store, as fields of `Measured`.
+    Raises SystemExit: the folder has no shard."""
     files = sorted((data / "store" / "shards").glob("*/*.json"))
     if not files:
         raise SystemExit(f"there is no shard below {data / 'store'}; give the data folder of a run")

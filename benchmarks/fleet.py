@@ -1,4 +1,4 @@
-"""Number of workers that a controller serves, with real Redis, PostgreSQL and store, and simulated workers.
+"""Number of workers that a controller serves: real Redis, PostgreSQL and store, simulated workers.
 
 usage: python -m benchmarks.fleet [--workers 64 512 4096] [--seconds 20] [--tasks 6000]
                                   [--sqlite] [--s3] [--json FILE]

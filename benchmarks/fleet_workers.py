@@ -1,4 +1,4 @@
-"""N simulated workers in one process: they send Redis the same commands as real workers, at the same rates.
+"""N simulated workers in one process that send Redis the commands of real workers at the same rates.
 
 usage: python -m benchmarks.fleet_workers WORKERS TASK_S      (settings from the environment)
 

@@ -1,4 +1,4 @@
-"""Fill an index with a million grasps in a minute, with rows as from the pipeline but without shard files.
+"""Index with a million grasps, filled in a minute: rows as from the pipeline, but no shard files.
 
 usage: python -m benchmarks.large_index --data-dir DIR [--grasps 1000000] [--jobs 1000] [--index-url URL]
 

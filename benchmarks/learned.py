@@ -1,4 +1,4 @@
-"""Planner seeds from a network compared with fast_graspd's own: time to the first valid grasp, and rate.
+"""Planner seeds from a network against fast_graspd's own: time to the first valid grasp, and rate.
 
 usage: python -m benchmarks.learned --network NET.npz [OTHER.npz ...] [--data DATA_DIR] [--objects NAME ...]
            [--many 32] [--seeds 5] [--starts 4 ...] [--out FOLDER]
@@ -58,7 +58,7 @@ TITLES = {
 def study(
     hand: HandModel, obj: ObjectModel, methods: dict[str, dict[str, Any]], *, many: int, seeds: int
 ) -> list[dict[str, Any]]:
-    """Return a row per method: the first valid grasp of each seed, and one batch of `many`, in the same scenes."""
+    """Return a row per method: first valid grasp of each seed and a batch of `many`, in the same scenes."""
     pieces = decompose(obj)
     tables = [scenes_of(SceneSpec(kind="table"), obj, [], count=4, seed=SEED + k)[0] for k in range(seeds)]
     found: dict[str, list[Any]] = {name: [] for name in methods}

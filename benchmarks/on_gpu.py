@@ -72,7 +72,7 @@ def quality(hand: HandModel, obj: ObjectModel, device: str, count: int) -> dict[
 
 
 def stages(hand: HandModel, obj: ObjectModel, device: str, batch: int) -> dict[str, float]:
-    """Return wall ms of each stage per grasp of a launch, the held share, and the largest shift of a hand [mm].
+    """Return wall ms of each stage per grasp, the held share, and the largest shift of a hand [mm].
     The shift is the distance between the hands of two equal launches."""
     run, wanted = ExecutionContext(device), PlanRequest(batch, FIDELITY, SEED)
     parts = planner.optimise_batch(hand, obj, wanted, run)

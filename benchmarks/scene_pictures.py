@@ -92,7 +92,7 @@ def _hands(hands: Sequence[HandModel], objects: Sequence[ObjectModel], device: s
 
 
 def _fitting(hand: HandModel, obj: ObjectModel, device: str, seed: int) -> tuple[DrawnHand, Floats, int, int]:
-    """Return the grasp with the largest clearance, the object's pose, and the numbers of clear and of all grasps."""
+    """Return the grasp with largest clearance, the object's pose, and the numbers of clear and all grasps."""
     scenes = drop(obj, count=SCENES, seed=seed)["scene/object_pose"]
     kept, tried, best = 0, 0, -np.inf
     for batch in range(ROUNDS):

@@ -1,4 +1,4 @@
-"""Cost of the service besides the engine: queue, indexer, workers, API with a million grasps; prints Markdown.
+"""Cost of the service alone: queue, indexer, workers, API with a million grasps; prints Markdown.
 
 usage: python -m benchmarks.service_load queue|workers|indexer|api|beside [--index-url URL] [--data-dir DIR]
 

@@ -1,4 +1,4 @@
-"""Discrete-event simulation of a week on a thousand preemptible nodes: lost work, repeated tasks, idle time.
+"""Discrete-event simulation of a week on 1000 preemptible nodes: lost work, repeated tasks, idle time.
 
 usage: python -m benchmarks.week [--nodes 1000] [--days 7] [--cores 1] [--seed 0] [--rates cloud|harsh] [--json FILE]
 

@@ -60,7 +60,7 @@ def size_mb(name: str) -> float:
 
 
 def import_seconds(code: str, runs: int) -> float:
-    """Return processor seconds of a new process that runs the code: the least of the runs, after an untimed one."""
+    """Return processor seconds of a new process with this code: least of the runs after an untimed one."""
     times = []
     for _ in range(runs + 1):
         before = resource.getrusage(resource.RUSAGE_CHILDREN)

@@ -1,1 +1,1 @@
-"""Conversion of grasps: importers return postures in graspd's frames; exporters convert graspd's shards."""
+"""Conversion of grasps: importers return postures in graspd's frames, exporters convert its shards."""

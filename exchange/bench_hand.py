@@ -183,7 +183,7 @@ _FOLDERS: Final = (GRASPS, COLLECTED, "evaluation", "succgrasp")
 
 @dataclass(frozen=True)
 class HandMapping:
-    """Map between graspd's joints and `qpos`: the model's root pose (7,), then joints in the model's order."""
+    """Map between graspd's joints and `qpos`: root pose (7,) of the model, then joints in its order."""
 
     hand: str
     root_link: str

@@ -1,4 +1,4 @@
-"""Objects and scenes in DexGraspBench's layout, and grasps on a table in the format of its tabletop test.
+"""Objects and scenes in DexGraspBench's layout, and grasps on a table in its tabletop test's format.
 
 Files of an object are its mesh, convex pieces, measurements, and scenes. In a scene the object floats at scale 1 or is
 on a table. Poses on a table are in the table's frame: z up, top at z = 0, where the evaluator has a floor. Grasps on a
@@ -40,7 +40,7 @@ SCALE: Final = "scale100"
 
 
 def write_object(obj: ObjectModel, name: str, root: Path) -> tuple[Path, Path]:
-    """Write an object and its scene below `root`, laid out like a checkout; return folder and scene, both relative."""
+    """Write an object and its scene below `root` as in a checkout; return folder and scene, both relative."""
     folder, scene = SET / "processed_data" / name, SET / "scene_cfg" / name / "floating" / f"{SCALE}.npy"
     for part in (folder / "mesh", folder / "info", folder / "urdf" / "meshes", SET / "valid_split"):
         (root / part).mkdir(parents=True, exist_ok=True)
@@ -63,7 +63,7 @@ def write_object(obj: ObjectModel, name: str, root: Path) -> tuple[Path, Path]:
 
 
 def _facts(obj: ObjectModel, solid: float) -> dict[str, Any]:
-    """Return mass, density, bounds and centre of mass; the mass is the pieces' volume `solid` at density 1."""
+    """Return mass, density, bounds and centre of mass; mass is the pieces' volume `solid` at density 1."""
     _, extents = trimesh.bounds.oriented_bounds(obj.hull_vertices)
     return {
         "gravity_center": obj.centre_of_mass.tolist(),
@@ -75,7 +75,7 @@ def _facts(obj: ObjectModel, solid: float) -> dict[str, Any]:
 
 
 def write_table(name: str, pose: Floats, number: int, root: Path) -> Path:
-    """Write the scene of an exported object at `pose` (7,) on a table; return its file, relative to `root`."""
+    """Write the scene of an exported object at `pose` (7,) on a table; return its file relative to `root`."""
     place = f"{TABLETOP}/{SCALE}_pose{number:03}"
     file = SET / "scene_cfg" / name / f"{place}.npy"
     scene = _scene(name, place, pose)
@@ -159,7 +159,7 @@ def object_of_scene(file: Path, scene_path: str) -> Row:
 def with_trajectory(
     hand: HandModel, grasps: GraspSet, rows: Sequence[Row], obj_pose: Floats, mapping: HandMapping | None
 ) -> GraspSet:
-    """Add approach and lift from files, in the object frame, if waypoint numbers are equal and the hand stays open."""
+    """Add approach and lift in the object frame if waypoint numbers are equal and the hand stays open."""
     if not all({"approach_qpos", "lift_qpos"} <= set(row) for row in rows):
         return grasps
     ways = [np.asarray(row["approach_qpos"], float) for row in rows]

@@ -155,7 +155,7 @@ def convention(hand: HandModel) -> dict[str, Any]:
 
 
 def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[ImportedGrasps]:
-    """Read a record, a tar file of records, or a folder of tar files; without joints, fingers close until contact."""
+    """Read a record, a tar of records, or a folder of tars; without joints, fingers close until contact."""
     file, record = _found(path, object_name)
     try:
         scale, grasps = float(record["object"]["scale"]), record["grasps"]

@@ -61,7 +61,7 @@ def verdicts(values: Sequence[Any] | NDArray[Any]) -> NDArray[np.int8]:
 
 
 def joints_by_name(hand: HandModel, names: Sequence[str], values: Any, *, what: str) -> Floats:
-    """Return (N, J) joints of the hand from (N, n) values of `names`; other joints are at the middle of their range."""
+    """Return (N, J) joints of the hand from (N, n) values of `names`; other joints are at mid-range."""
     given = np.atleast_2d(np.asarray(values, float))
     if given.shape[1] != len(names):
         raise InputError(f"{what}: {given.shape[1]} joint values for {len(names)} joints")

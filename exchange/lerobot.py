@@ -1,4 +1,4 @@
-"""A LeRobot data set (v3.0): the trajectory of a grasp as an episode, with a picture taken before the motion.
+"""A LeRobot data set (v3.0): a grasp's trajectory as an episode, with a picture before the motion.
 
     meta/info.json, meta/stats.json                       features and counts; statistics of each feature
     meta/tasks.parquet, meta/episodes/chunk-000/...       texts of the tasks; position of each episode's frames

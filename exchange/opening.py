@@ -21,7 +21,7 @@ from graspd.service.parquet import arrow
 
 @contextmanager
 def check_written_files(folder: Path) -> Iterator[None]:
-    """Open all files written into a folder within this context. Raises GraspdError: a library cannot read a file."""
+    """Open all files written into a folder in this context; GraspdError: a library cannot read one."""
     before = _stamps(folder)
     yield
     for path, stamp in sorted(_stamps(folder).items()):

@@ -1,4 +1,4 @@
-"""Throughput of the planner over fidelities, batches, threads, hand points and object faces: table, JSON and plot.
+"""Planner throughput by fidelity, batch, threads, hand points and object faces: table, JSON and plot.
 
 Batches are timed as a whole, iterations launch by launch. Host time is measured apart from kernels."""
 
@@ -83,7 +83,7 @@ def bench(
 
 
 def _start_times(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, device: str) -> dict[str, float]:
-    """Return seconds to the first grasp of a fresh process, with kernels cached or compiled, and to the next grasp."""
+    """Return seconds to the first grasp (fresh process; kernels cached or compiled), and to the next one."""
     seconds = []
     for seed in (0, 1):
         began = time.perf_counter()
@@ -183,7 +183,7 @@ def _iterations_used(
 def _timed(
     model: Model, data: Data, state: HandState, schedule: Schedule, fidelity: Fidelity
 ) -> tuple[dict[str, float], HandState]:
-    """Return kernel seconds per iteration, medians over `SAMPLED` iterations in the middle of the schedule."""
+    """Return kernel seconds per iteration, medians over `SAMPLED` iterations in the schedule's middle."""
     data.set_schedule(schedule)
     data.set_state(state)
     launches = record_iteration(model, data, fidelity.optimizer)
@@ -221,7 +221,7 @@ def device_name(device: str) -> str:
 
 
 def clock_of(device: str) -> Callable[[], float]:
-    """Return a clock: core-seconds of all threads on a CPU (nearly independent of load), wall clock on a GPU."""
+    """Return a clock: core-seconds of all threads on a CPU (nearly load-independent), wall clock on a GPU."""
     return time.process_time if device == "cpu" else time.perf_counter
 
 

@@ -65,7 +65,7 @@ def evaluate(
     cache: Path | None = None,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> dict[str, Any]:
-    """Return one row of numbers; undefined ones are None, such as the success rate of an object too thin to validate.
+    """Return a row of numbers; undefined ones are None, such as gsr of an object too thin to validate.
 
     Level dexgraspbench uses the mass and friction of its protocol, other levels those of the object.
 
@@ -248,7 +248,7 @@ _MEDIANS: Final = (*COLUMNS, "cdc_mm", "sd_cm", "diversity")
 
 
 def combine(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Combine rows of several objects: rates over all grasps, osr over objects, medians of the rows' medians."""
+    """Combine rows of several objects: rates over all grasps, osr over objects, medians of their medians."""
     if len(rows) == 1:
         return dict(rows[0])
     out: dict[str, Any] = {"n": sum(row["n"] for row in rows)}

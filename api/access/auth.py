@@ -77,7 +77,7 @@ def is_still_authorized(request: HTTPConnection, scope: Scope) -> bool:
 
 
 def may_change(owner: str, project: str = "") -> bool:
-    """Check whether the present key may change a resource; without owner and project, only `admin` may change it."""
+    """Check whether the present key may change a resource; without owner and project, only `admin` may."""
     key = caller.get()
     if key is None or key.scope.includes(Scope.ADMIN):
         return True

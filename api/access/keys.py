@@ -149,7 +149,7 @@ class KeyFile:
         return token
 
     def rotate(self, name: str, *, grace: timedelta = timedelta(0), lifetime: timedelta | None = None) -> str:
-        """Return a new secret for a key; the old one stays valid for `grace`. Scope, project and limits persist."""
+        """Return a key's new secret; the old one stays valid for `grace`; scope, project and limits persist."""
         token = PREFIX + secrets.token_urlsafe(32)
         with self._changing() as document:
             old = _live(document, name)

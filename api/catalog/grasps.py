@@ -56,7 +56,7 @@ class Grasps:
         return self._index.grasps.page(self._filter(query), sort=sort, limit=limit, cursor=cursor)
 
     def members(self, query: models.GraspQuery) -> list[Grasp]:
-        """Return identifiers of all grasps that pass every filter; LimitError if they are too many for a selection."""
+        """Return identifiers of all grasps that pass every filter; LimitError: too many for a selection."""
         found = self._index.grasps.members(self._filter(query), limit=MOST_TAGGED + 1)
         if len(found) > MOST_TAGGED:
             raise LimitError(f"more than {MOST_TAGGED} grasps pass this filter, the maximum of a selection; narrow it")

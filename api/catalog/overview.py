@@ -1,4 +1,4 @@
-"""Overview of the service: workers, queue, statistics, health of its parts, usage of projects, and deletions."""
+"""Overview of the service: workers, queue, statistics, health, usage of projects, and deletions."""
 
 from __future__ import annotations
 

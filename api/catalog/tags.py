@@ -1,4 +1,4 @@
-"""Tags, which users give to grasps of their project, and exports of selected grasps as CSV, JSON or shards in a ZIP."""
+"""Tags for grasps of a project, and exports of selected grasps as CSV, JSON or shards in a ZIP."""
 
 from __future__ import annotations
 

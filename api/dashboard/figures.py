@@ -57,7 +57,7 @@ def minutes(values: Sequence[int], start: float) -> Plot:
 
 
 def bars(histogram: Histogram, path: str, where: dict[str, str]) -> list[Bar]:
-    """Return the bars of a histogram; each links to the page `path` of grasps in the bar's range that match `where`."""
+    """Return a histogram's bars; each links to the page `path` of grasps in its range that match `where`."""
     width, top = (histogram.high - histogram.low) / len(histogram.counts), max(histogram.counts) or 1
     made = []
     for index, number in enumerate(histogram.counts):

@@ -1,4 +1,4 @@
-"""Form of a job: estimated cost for each fidelity; submission, cancellation and retry. It needs no JavaScript."""
+"""Form of a job without JavaScript: estimated cost for each fidelity; submission, cancellation, retry."""
 
 from __future__ import annotations
 
@@ -213,7 +213,7 @@ class Expectations:
         self._lock = threading.Lock()
 
     def of(self, form: Mapping[str, Any]) -> list[tuple[str, str, Estimate | None]]:
-        """Return each offered fidelity, its description, and its estimate for a form; None if there is no estimate."""
+        """Return each offered fidelity, its description and its estimate for a form; None: no estimate."""
         wanted = {
             key: value for key, value in form.items() if key not in ("hand", "object", "fidelity") and value != ""
         }

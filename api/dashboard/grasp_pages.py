@@ -42,7 +42,7 @@ router = APIRouter(include_in_schema=False)
 def grasps_page(
     request: Request, grasps: GraspsOf, shards: ShardsOf, assets: AssetsOf, tags: TagsOf
 ) -> HTMLResponse | RedirectResponse:
-    """List all grasps with filters, order and pages. The URL contains these settings, without empty fields."""
+    """List grasps with filters, order and pages; the URL contains these settings, without empty fields."""
     given = {key: value for key, value in request.query_params.items() if value}
     if len(given) < len(request.query_params):
         # Forms send every field; the visible URL should be short.

@@ -1,4 +1,4 @@
-"""Pages of the whole service: home, workers, charts, failure maps, usage, deletions, problem types, and the session.
+"""Pages of the service: home, workers, charts, failure maps, usage, deletions, problem types, session.
 
 Sign-in with a key sets a signed cookie. It is valid for at most 12 hours, and only while the key is valid.
 """
@@ -143,13 +143,13 @@ def stability_page(request: Request, store: StoreOf) -> HTMLResponse:
 
 
 def is_recent(worker: WorkerView) -> bool:
-    """Check whether to show a worker; a lost worker stays visible for a while, so that users notice its loss."""
+    """Check whether to show a worker; a lost one stays visible for a while, so that users notice its loss."""
     age = datetime.now(UTC) - datetime.fromisoformat(worker.seen)
     return worker.state != "lost" or age < _LOST_SHOWN
 
 
 def stage_depths(overview: Overview) -> list[tuple[str, int]]:
-    """Return waiting tasks by stage; empty if Redis does not answer, which another part of the page reports."""
+    """Return waiting tasks by stage; empty if Redis does not answer, which the page reports elsewhere."""
     try:
         depths = overview.depths()
     except UnavailableError:

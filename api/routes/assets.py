@@ -112,7 +112,7 @@ def asset_router(kind: AssetKind) -> APIRouter:
         "/{name}", status_code=204, dependencies=SUBMIT, responses=responses(404, 409), name=f"delete_{kind}"
     )
     def delete_asset(name: str, assets: AssetsOf) -> None:
-        """Delete an asset; refused while a job, a dataset or a set of objects needs it. `name` may be a digest."""
+        """Delete an asset; refused while a job, dataset or set of objects needs it. `name` may be a digest."""
         assets.delete(kind, name)
 
     return router

@@ -174,6 +174,6 @@ def is_unmodified(headers: Headers, etag: str) -> bool:
 
 
 def range_applies(headers: Headers, etag: str) -> bool:
-    """Check whether Range applies: If-Range is absent or has this file's tag. Dates are neither sent nor matched."""
+    """Check whether Range applies: If-Range is absent or has the tag; dates are neither sent nor matched."""
     given = headers.get("if-range")
     return given is None or given.strip() == etag

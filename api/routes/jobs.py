@@ -79,7 +79,7 @@ def retry(job_id: str, jobs: JobsOf) -> JobDetail:
 
 @router.delete("/{job_id}", status_code=204, dependencies=SUBMIT, responses=responses(404, 409))
 def delete(job_id: str, jobs: JobsOf) -> None:
-    """Delete an ended job; `POST .../restore` restores it. Shards that no other job needs stay for a grace time."""
+    """Delete an ended job; `POST .../restore` restores it. Shards that only it uses stay for a grace time."""
     jobs.delete(job_id)
 
 

@@ -173,7 +173,7 @@ async def stream_ends(
     since: AfterEnd = 0,
     last_event_id: Annotated[str | None, Header(max_length=20, description="takes precedence over `since`")] = None,
 ) -> AsyncIterable[ServerSentEvent]:
-    """Stream ended jobs and datasets, one `end` event each. A client that reconnects continues where it stopped."""
+    """Stream an `end` event per ended job or dataset; a client that reconnects continues where it stopped."""
     start = int(last_event_id) if last_event_id and last_event_id.isascii() and last_event_id.isdigit() else since
     async for event in events.ends(webhooks, min(start, 2**62), request):
         yield event

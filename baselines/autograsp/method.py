@@ -1,4 +1,4 @@
-"""GraspIt!'s autograsp: random collision-free start, approach to the object, closing of the fingers until contact.
+"""GraspIt!'s autograsp: random collision-free start, approach, closing of the fingers until contact.
 
 GraspIt! closes joints in small steps and moves back after a collision. Here step lengths follow from distances. The
 result is the same: contact within `TOUCH_M`. No step tunnels through the object."""

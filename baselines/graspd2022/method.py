@@ -1,4 +1,4 @@
-"""Grasp'D: collision-free starts and descent with relaxed forces; no selection or repair, as published.
+"""Grasp'D: collision-free starts, descent with relaxed forces; no selection or repair, as published.
 
 The object is a grid of signed distances with trilinear interpolation. Its error is of second order in the cell size."""
 
@@ -49,7 +49,7 @@ class Search:
         self.points = sample_surface(pair.hand.model, POINTS)
 
     def run(self, starts: HandState, *, steps: int, tell: StepCounter) -> tuple[HandState, Floats]:
-        """Return hands after `steps` iterations, and the force residuals (n,) of their tasks; 1: no contact force."""
+        """Return hands after `steps` iterations, and force residuals (n,) of their tasks; 1: no contact force."""
         n = len(starts.pivot)
         back = quat_rotate(starts.rotation, self.pair.hand.model.palm.approach)
         batch = _Batch(self, replace(starts, pivot=starts.pivot - BACKOFF_M * back), steps)
@@ -117,7 +117,7 @@ PAD_M: Final = 0.10
 
 
 def schedule(steps: int) -> Schedule:
-    """Return the schedule: dilation falls to 0 over the first half; rates grow during the first `WARMUP` iterations."""
+    """Return the schedule: dilation falls to 0 over the first half; rates grow for `WARMUP` iterations."""
     at = np.arange(steps)
     dilation = MAX_DILATION * np.clip(1.0 - at / max(0.5 * steps, 1.0), 0.0, 1.0)
     rates = np.minimum(at / WARMUP, 1.0)[:, None] * np.array(RATES)

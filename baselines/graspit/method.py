@@ -183,7 +183,7 @@ def clash_grid(pair: Pair, eigen: Eigengrasps) -> NDArray[np.int32]:
 
 
 def _sorted(best: Floats, energy: Floats, begun: Floats) -> Floats:
-    """Return states (chains * keep, 8), best first; missing ones repeat the chain's last one, or its start."""
+    """Return states (chains * keep, 8), best first; missing ones repeat a chain's last one, or its start."""
     out = np.empty_like(best)
     for c, (states, energies) in enumerate(zip(best, energy, strict=True)):
         found = [k for k in np.argsort(energies, kind="stable") if energies[k] < NOT_YET / 2]

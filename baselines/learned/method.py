@@ -122,7 +122,7 @@ class Seeds:
     def _proposed(
         self, model: Model, generators: list[np.random.Generator], each: int, placed: PlacedGrasps
     ) -> tuple[HandState, Floats]:
-        """Return open hands (n * draws), grouped by start, and retreat directions (n * draws, 3); object frame."""
+        """Return open hands (n * draws) grouped by start, and retreat directions (n * draws, 3); object frame."""
         hand, obj, table = model.hand.model, model.obj.model, table_height(placed.supports)
         seen, draws = SurfaceView.of(obj), max(1, PROPOSALS // each)
         pivot, rotation, q, away = [], [], [], []
@@ -156,7 +156,7 @@ def table_height(supports: Sequence[Obstacle]) -> float:
 def _clear(
     model: Model, drawn: HandState, away: Floats, scene: NDArray[np.intp], placed: PlacedGrasps
 ) -> tuple[HandState, Floats]:
-    """Return the collision-free hand of each start (n) that retreats least, and its depth [m]; inf if none.
+    """Return, per start (n), the collision-free hand that retreats least, and its depth [m]; inf: none.
     A hand that lacks clearance from obstacles is raised first."""
     count, probe = len(scene), Probe(model, len(scene), room=ROOM)
     draws = len(drawn.pivot) // count

@@ -41,7 +41,7 @@ _TINY: Final = 1e-6
 
 @dataclass(frozen=True)
 class Proposals:
-    """n grasps in the frame of the cloud. Joint positions may exceed limits, which are no input of the network."""
+    """n grasps in the cloud's frame; joint positions may exceed limits, which are no network input."""
 
     hand_pose: Floats
     """(n, 7) pose of the hand's root link at the grasp: x y z [m], quaternion w x y z."""

@@ -102,7 +102,7 @@ def mean(values: Floats) -> Row:
 
 
 def auc(score: Floats, held: Bools) -> float:
-    """Return the probability that a held grasp scores higher than a failed one (Mann-Whitney); 0.5: no information."""
+    """Return the probability that a held grasp outscores a failed one (Mann-Whitney); 0.5: no information."""
     good, bad = int(held.sum()), int((~held).sum())
     if not good or not bad:
         return float("nan")

@@ -1,4 +1,4 @@
-"""Drops of the convex hull compared with drops of convex pieces, and grasps that a forearm would block."""
+"""Drops of the convex hull against drops of convex pieces, and grasps that a forearm would block."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def _distance(faces: RestingFaces, a: Any, b: Any) -> float:
 
 
 def forearm(root: Floats, palm: Floats) -> tuple[Floats, Floats]:
-    """Return the lowest height (K,) of the ends of forearms at poses (K, 7), and the sine (K,) of their slopes."""
+    """Return the lowest height (K,) of forearm ends at poses (K, 7), and the sine (K,) of their slopes."""
     far = quat_rotate(root[:, 3:], np.tile(palm + FOREARM_M * AWAY, (len(root), 1)))[:, 2]
     slope = quat_rotate(root[:, 3:], np.tile(AWAY, (len(root), 1)))[:, 2]
     # Lowest point on the rim of the end.

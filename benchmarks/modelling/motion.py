@@ -90,7 +90,7 @@ def _hull(subject: Subject) -> ConvexPieces:
 
 
 def engines() -> dict[str, tuple[MujocoOptions, Callable[[Scene], None] | None, bool]]:
-    """Return variants of the validator: physics, change of the compiled scene, whether the object is one hull."""
+    """Return validator variants: physics, change of the compiled scene, whether the object is one hull."""
     base = MujocoOptions()
     slide, _ = base.friction
     return {

@@ -1,4 +1,4 @@
-"""Influence of shadows, samples, back faces and mesh faces on pictures, and error of depth against the mesh."""
+"""Influence of shadows, samples, back faces and mesh faces on pictures; depth error against the mesh."""
 
 from __future__ import annotations
 

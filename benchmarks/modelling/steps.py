@@ -1,4 +1,4 @@
-"""Several steps of the contact simulation instead of one; the object moves and contacts are recomputed.
+"""Several steps of the contact simulation instead of one; the object moves, contacts are recomputed.
 
 The step is the planner's (worker/simulation/kernels/contact.py, `direct`) in float64, for one grasp and one velocity at
 a time, with distances to the mesh. The hand is fixed, as in the loss."""
@@ -37,7 +37,7 @@ def forward_simulation(probe: Probe, grasp: Posture, world: World, steps: tuple[
 def _follow(
     probe: Probe, points: Floats, weight: Floats, motion: Floats, world: World, steps: tuple[int, ...]
 ) -> list[float]:
-    """Return losses after each of `steps`; the object starts in its pose with free motion `motion` of one step."""
+    """Return losses after each of `steps`; the object starts with the free motion `motion` of one step."""
     place, rotation, turned = np.zeros(3), np.eye(3), np.zeros(3)
     losses = []
     for number in range(1, max(steps) + 1):

@@ -62,7 +62,7 @@ def faults(docs: Path, records: Mapping[str, dict[str, Any]]) -> list[str]:
 
 
 def there(docs: Path) -> set[str]:
-    """Return all results, pictures and other files of studies under a folder of the docs, except raw results."""
+    """Return all results, pictures and other files of studies in a docs folder, except raw results."""
     files = [file for place in ("results", "images") for file in (docs / place).rglob("*") if file.is_file()]
     files += [file for study in STUDIES for file in files_of(study, docs)]
     paths = {str(file.relative_to(docs)) for file in files} - {MANIFEST, INDEX}

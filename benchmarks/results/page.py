@@ -22,7 +22,7 @@ _CITED: Final = re.compile(r"(?:\]\(|src=\")(?:\.\./)*(?:docs/)?((?:results|imag
 
 
 def index(records: Mapping[str, dict[str, Any]]) -> str:
-    """Return the page of all studies: files, date, revision, and whether the algorithms have changed since."""
+    """Return the page of all studies: files, date, revision, and whether algorithms have changed since."""
     lines = [
         "# Where figures come from",
         "",

@@ -71,7 +71,7 @@ class Runner:
         return f"needs {', '.join(gone)}" if gone else ""
 
     def holds(self, study: Study) -> bool:
-        """Return whether the files are current: recorded for this study, its commands and the current revisions."""
+        """Return whether files are current: recorded for this study, its commands and the current revisions."""
         record = self.records.get(study.name)
         return (
             record is not None

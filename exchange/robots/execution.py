@@ -149,7 +149,7 @@ def parse_pose(text: str, what: str) -> Floats:
 
 
 def tool_frame(text: str | None, root_link: str, links: Mapping[str, tuple[int, Floats]]) -> ToolFrame:
-    """Return the user's tool frame: a link that no finger moves, or a pose in the root link's frame (the default).
+    """Return the tool frame: a link that no finger moves, or a pose in the root link's frame (default).
     `links` has body and pose of each link, see `Description`."""
     if not text or text == root_link:
         return ToolFrame(root_link, IDENTITY_POSE.copy())

@@ -1,4 +1,4 @@
-"""An arm that carries a hand, and the grasps that it can execute: inverse kinematics, limits, MuJoCo collisions.
+"""An arm with a hand, and grasps that it can execute: inverse kinematics, limits, MuJoCo collisions.
 
 Inverse kinematics are differential, by mink. Each step is a quadratic program in the joints' increments that respects
 the joints' limits. Between consecutive poses of the trajectory the arm must not jump."""
@@ -209,7 +209,7 @@ class ReachSearch:
         return np.array(rows)
 
     def _solve(self, q: Floats, root_pose: Floats, steps: int) -> Floats | None:
-        """Return dofs (A,) within limits that reach a pose (7,) of the hand's root link; None if none are found."""
+        """Return dofs (A,) within limits that reach a pose (7,) of the hand's root link; None: none found."""
         mink, configuration, task = self._mink, self._configuration, self._task
         full = np.zeros(self._model.nq)
         full[self._order] = self.arm.model.expand(q)

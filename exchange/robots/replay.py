@@ -109,7 +109,7 @@ class Replay:
             self.run(STAGE_S)
 
     def hold(self, goal: Any) -> str:
-        """Hold as the validator does. End once the object's present velocities keep it within half of its limits."""
+        """Hold as the validator does; end once the object's velocities keep it within half of its limits."""
         self.run(FIRST_LOOK_S - LOOK_S)
         elapsed, before = FIRST_LOOK_S - LOOK_S, self.offset(goal)
         while elapsed < HOLD_S - 1e-9:

@@ -172,7 +172,7 @@ _ATTRIBUTES: Final = (
 
 
 def tally_of(contents: Contents, pieces: Iterable[ShardContents]) -> Tally:
-    """Sum all pieces; the pieces of a batch must be in the order base, scene, views, as from `read_shards`."""
+    """Sum all pieces; those of a batch must be in the order base, scene, views, as from `read_shards`."""
     tally = Tally()
     valid: dict[str, Array] = {}
     batch_now: tuple[Pair, int] | None = None

@@ -78,7 +78,7 @@ def draw_hands(
     words: tuple[str, str],
     label: PointLabel | None = None,
 ) -> None:
-    """Plot a panel per hand, accuracy over speed; `words` has the axis labels, `label` returns a point's label."""
+    """Plot a panel per hand, accuracy over speed; `words` has the axis labels, `label` labels a point."""
     columns = min(3, len(by_hand))
     lines = -(-len(by_hand) // columns)
     figure = new_figure(5.4 * max(columns, 2), 4.6 * lines)
@@ -208,7 +208,7 @@ def _error(row: Row, key: str) -> list[list[float]]:
 
 
 def _label(row: Row, rows: Sequence[Row]) -> str:
-    """Return the fidelity, with the batch size if there are several; for a method with one setting its name."""
+    """Return the fidelity, plus batch size if there are several; a method with one setting: its name."""
     own = [r for r in rows if r["method"] == row["method"]]
     if len(own) == 1:
         return str(row["method"])

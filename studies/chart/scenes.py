@@ -1,4 +1,4 @@
-"""Comparison of grasps planned in a scene with grasps of a free object that are filtered in the same scene.
+"""Comparison of grasps planned in a scene with grasps of a free object filtered in the same scene.
 
 Methods that plan in scenes run in both modes, other methods only in the second. In both modes the grasps use the
 scenes of an object in turn. The tests are equal: clear trajectory, lift, lift under the unmodified protocol,
@@ -192,7 +192,7 @@ def _plan_grasps(
 
 
 class ValidatedGrasps:
-    """Grasps with trajectories and lift verdicts. Lifted grasps are measured, since the timing includes metrics."""
+    """Grasps with trajectories and lift verdicts; lifted ones are measured, since timing includes metrics."""
 
     def __init__(self, hand: HandModel, place: ObjectScenes, grasps: GraspSet, placed: PlacedGrasps) -> None:
         way = plan_trajectory(hand, place.true, grasps, placed)
@@ -210,7 +210,7 @@ class ValidatedGrasps:
         return rows[found.success == 1]
 
     def counts(self, models: int) -> Row:
-        """Count grasps that are clear, lifted, lifted by DexGraspBench's protocol, and lifted at half friction.
+        """Count grasps that are clear, lifted, lifted by DexGraspBench's protocol and lifted at half friction.
         Also sum, over lifted grasps, the shares of models in which they are lifted."""
         lifted = self.lifted
         grasps, placed = self.grasps.take(lifted), self.placed.take(lifted)

@@ -64,7 +64,7 @@ def widen_speed(row: dict[str, Any], key: str, valid: int, grasps: int, per_seco
 
 
 def _strict_success(cell: Rollout) -> dict[str, Any]:
-    """Return success by DexGraspBench's protocol and at half friction, and the robust share of held grasps."""
+    """Return success by DexGraspBench's protocol and at half friction, and robust share of held grasps."""
     row: dict[str, Any] = {}
     for key, verdicts in (("dexgraspbench", cell.dexgraspbench), ("hard", cell.hard)):
         held = np.concatenate(verdicts) == 1
@@ -139,7 +139,8 @@ def summed(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def mark_fronts(rows: Sequence[dict[str, Any]], metrics: Mapping[str, bool]) -> None:
-    """Add `front`: the accuracies in which no faster row (end to end) is better. `metrics`: True if more is better."""
+    """Add `front`: the accuracies in which no faster row (end to end) is better.
+    `metrics`: True if more is better."""
     for row in rows:
         row["front"] = []
     for key, more in metrics.items():

@@ -101,7 +101,7 @@ def sweep(
     knobs: Sequence[str],
     say: Callable[[str], None],
 ) -> list[dict[str, Any]]:
-    """Return one row per setting (`knob`) and value: `knob`, `value`, `default`, `speedup` and a run's figures.
+    """Return a row per setting (`knob`) and value: `knob`, `value`, `default`, `speedup`, a run's figures.
     Values are interleaved, repeat by repeat. `speedup` is the ratio of the default's cost to the value's. The cost is
     in core-seconds on a CPU, independent of other load, and in wall-clock seconds on a GPU."""
     wp.load_module(module=kernels, device=run.device)

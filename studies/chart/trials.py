@@ -143,7 +143,7 @@ class Rollout:
         self.columns.append(columns)
 
     def _validate_and_measure(self, found: GraspSet) -> tuple[NDArray[np.int8], NDArray[np.int8], dict[str, Floats]]:
-        """Validate and measure planned grasps as in a job: return verdicts, valid flags, and columns of held grasps."""
+        """Validate and measure grasps as in a job: return verdicts, valid flags, and columns of held grasps."""
         success = validate(self.hand, self.true, found, pieces=self.pieces, run=self.setting.run).success
         held = np.flatnonzero(success == 1)
         table = self._measured(found.take(held))

@@ -1,4 +1,4 @@
-"""Difficult scenes: flat and tall objects on a table, walls and neighbours, too small and too large objects."""
+"""Difficult scenes: flat and tall objects on a table, walls and neighbours, too small or big objects."""
 
 from __future__ import annotations
 

@@ -109,7 +109,7 @@ def validate_lifts(
 
 
 def lift_digest(grasps: GraspSet, row: int, placed: PlacedGrasps, *, hard: bool) -> str:
-    """Return the digest of everything that determines a lift besides hand, object, level and fixed obstacles."""
+    """Return the digest of all that determines a lift besides hand, object, level and fixed obstacles."""
     number = int(placed.index[row])
     around = [array[row] for array in (grasps.approach, grasps.coming) if array is not None]
     around += [placed.object_pose[number], placed.scenes[number].up, *placed.neighbours_of(number)]

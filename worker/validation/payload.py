@@ -1,4 +1,4 @@
-"""Payload of grasps: heaviest mass that each grasp lifts or holds; shake test; limit and load capacity.
+"""Payload of grasps: heaviest mass that each lifts or holds; shake test; limit and load capacity.
 
 The hand closes once around the object at its own mass. Then the mass is varied: the object hangs, or is pushed, until
 its motion decides. The search begins near the mass that the contact forces of the closed hand bear. Each hanging test
@@ -169,7 +169,7 @@ def payloads(
     held: NDArray[np.bool_] | None = None,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Floats:
-    """Compute payloads (N,) of grasps [kg], at least the object's mass; nan: not `held` (N,), or not lifted.
+    """Compute payloads (N,) [kg], at least the object's mass; nan: not `held` (N,), or not lifted.
     Grasps lift in the scenes `placed`; None: a free object is pushed in six directions."""
 
     def make() -> LiftPayload | PushPayload:
@@ -288,8 +288,8 @@ def shake_margins(
     held: NDArray[np.bool_] | None = None,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Floats:
-    """Return shake margins (N,): largest ratio of displacement or rotation to its limit; below 1 the grasp holds.
-    nan: grasps that are not `held` (N,)."""
+    """Return shake margins (N,): largest ratio of displacement or rotation to its limit.
+    Below 1 the grasp holds; nan: grasps that are not `held` (N,)."""
 
     def make() -> Shake:
         return Shake(scene_of(hand, obj, pieces, LIFTING, placed.supports, placed.neighbours), placed)

@@ -172,7 +172,7 @@ class Test:
         return float(depth[hand & ~within].max(initial=0.0)), float(depth[hand & within].max(initial=0.0))
 
     def _close(self, grasps: GraspSet, row: int, *, give_up: bool = False, stages: int = STAGES) -> bool:
-        """Move from pregrasp through grasp to squeeze, each in `stages` stages; return whether the object stayed.
+        """Move from pregrasp through grasp to squeeze, each in `stages` stages.
         With `give_up`, return False as soon as the object is lost; without, always return True."""
         self._put(grasps.pregrasp.hand_pose[row], grasps.pregrasp.joint_positions[row])
         for hand_pose, joints in self._way(grasps, row, stages):

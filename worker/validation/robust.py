@@ -75,7 +75,7 @@ class Robustness:
 
 
 def needed(wanted: float, models: int) -> int:
-    """Return the number of models in which a grasp must hold for the wanted share; 0 (no share): all of them."""
+    """Return in how many models a grasp must hold for the wanted share; 0 (no share): in all of them."""
     return math.ceil(wanted * models - _EXACT) if wanted > 0 else models
 
 

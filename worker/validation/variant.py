@@ -155,7 +155,7 @@ def _vector(rng: np.random.Generator, most: float) -> Vector:
 
 
 def replace_coupling(hand: HandModel, coupling: Coupling) -> HandModel:
-    """Return the hand with another interpretation of its tendons; unchanged without tendons, or for other couplings.
+    """Return the hand with its tendons reinterpreted; unchanged without tendons, or for other couplings.
     separate: each joint of a tendon gets the drive it would have without the tendon. ratio: joints of a tendon turn
     together, by equal angles with their coefficients' signs. Gain and limit are then the sums over their drives."""
     if not hand.tendons or coupling not in ("separate", "ratio"):
@@ -388,7 +388,7 @@ def motion_of(obj: ObjectModel, variant: Variant) -> Floats:
 
 
 def restrict_to_support(variant: Variant, up: Floats) -> Variant:
-    """Restrict a variant to an object on a support: shifts along the support, rotations about the vertical.
+    """Restrict a variant to an object on a support: shifts along the support, turns about the vertical.
     `up` (3,) is the direction against gravity, in the object frame."""
     if not moves_object(variant):
         return variant
@@ -398,7 +398,7 @@ def restrict_to_support(variant: Variant, up: Floats) -> Variant:
 
 
 def _fingers(hand: HandModel) -> NDArray[np.intp]:
-    """Return the index (J,) in `hand.fingertips` of the one fingertip that a joint moves; -1: several or none."""
+    """Return the index (J,) in `hand.fingertips` of the one tip that a joint moves; -1: several or none."""
     moved: list[set[int]] = [set() for _ in range(hand.bodies)]
     for place, tip in enumerate(hand.fingertips):
         body = tip

@@ -365,7 +365,7 @@ def mujoco_warp_version() -> str:
 
 @cache
 def mujoco_warp() -> Any:
-    """Initialise Warp and return the module `mujoco_warp`; raise InputError if mujoco-warp is not installed."""
+    """Initialise Warp and return the module `mujoco_warp`; raise InputError if mujoco-warp is missing."""
     mujoco_warp_version()
     backend.start()
     import mujoco_warp as engine
