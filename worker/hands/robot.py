@@ -176,12 +176,11 @@ def _check_tree(links: dict[str, Link], joints: dict[str, Joint], filename: str)
         found = ", ".join(map(repr, roots[:3])) or "none: the joints form a cycle"
         raise HandError(f"{filename}: a hand needs exactly one root link; found {found}")
     for link in links:
-        seen, at = {link}, link
-        while at in parent_of:
-            at = parent_of[at]
-            if at in seen:
-                raise HandError(f"{filename}: the joints around link {at!r} form a loop without a root")
-            seen.add(at)
+        at = link
+        for _ in links:
+            at = parent_of.get(at, at)
+        if at != roots[0]:
+            raise HandError(f"{filename}: the joints above link {link!r} form a loop without a root")
     return roots[0]
 
 

@@ -144,20 +144,16 @@ def _hand_joints(robot: Robot, root: str, drop: set[str]) -> list[Joint]:
 def _resolve(name: str, mimics: Mapping[str, Mimic | None], fixed: Mapping[str, float]) -> Mimic | float:
     """Return the drive of a joint through a chain of mimics, or its value if a fixed joint ends the chain."""
     multiplier, offset, at = 1.0, 0.0, name
-    seen = {name}
-    while True:
+    for _ in mimics:
         if at in fixed:
             return multiplier * fixed[at] + offset
         mimic = mimics[at]
         if mimic is None:
-            break
+            return Mimic(at, multiplier, offset) if abs(multiplier) > 1e-9 else offset
         offset += multiplier * mimic.offset
         multiplier *= mimic.multiplier
         at = mimic.joint
-        if at in seen:
-            raise HandError(f"joint {name!r} mimics itself through {at!r}; free one of them")
-        seen.add(at)
-    return Mimic(at, multiplier, offset) if abs(multiplier) > 1e-9 else offset
+    raise HandError(f"joint {name!r} mimics itself through {at!r}; free one of them")
 
 
 def _fold_limits(dof: str, moving: dict[str, Mimic], robot: Robot, options: HandOptions) -> tuple[float, float]:

@@ -115,13 +115,11 @@ def from_manifold(solid: Any) -> tuple[Floats, Indices]:
     return np.array(mesh.vert_properties, dtype=np.float64)[:, :3], np.array(mesh.tri_verts, dtype=np.int64)
 
 
-def unite(parts: list[tuple[Floats, Indices]], holes: list[tuple[Floats, Indices]]) -> Any | None:
-    """Unite outward meshes and subtract the holes (outward too); None if a mesh is no solid.
-    A part inside a hole does not belong to the solid around the hole, so it stays."""
-    solids: list[Any] = [to_manifold(*part) for part in parts]
-    cuts: list[Any] = [to_manifold(*hole) for hole in holes]
-    if any(solid is None for solid in solids + cuts):
-        return None
+def unite(parts: list[tuple[Floats, Indices]], holes: list[tuple[Floats, Indices]]) -> Any:
+    """Unite closed outward meshes and subtract the holes (outward too).
+    A part inside a hole does not belong to the solid around the hole, so it stays. A part without thickness adds
+    nothing."""
+    solids, cuts = ([solid for mesh in side if (solid := to_manifold(*mesh)) is not None] for side in (parts, holes))
     loose = [solid for solid in solids if any((solid - cut).is_empty() for cut in cuts)]
     result = union([solid for solid in solids if not any(solid is one for one in loose)])
     for cut in cuts:

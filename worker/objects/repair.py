@@ -88,11 +88,8 @@ def _solid(mesh: RepairedMesh, options: ObjectOptions) -> RepairedMesh:
     if not topology.is_closed(mesh.faces):
         return _accept_open(mesh, options)
     mesh = _resolve_self_intersections(_resolve_components(mesh, options))
-    volume = signed_volume(mesh.vertices, mesh.faces)
-    extent = float(np.ptp(mesh.vertices, axis=0).max())
-    if volume < 1e-9 * extent**3:
-        raise MeshError("the mesh encloses no volume; give the surface a thickness")
-    wall = 2 * volume / float(topology.face_areas(mesh.vertices, mesh.faces).sum())
+    area = float(topology.face_areas(mesh.vertices, mesh.faces).sum())
+    wall = 2 * signed_volume(mesh.vertices, mesh.faces) / area
     if wall < THIN_M:
         note = f"thin: walls of {wall * 1e3:.1f} mm on average; use a fine fidelity"
         mesh = replace(mesh, notes=(*mesh.notes, note))
@@ -253,7 +250,7 @@ def _resolve_components(mesh: RepairedMesh, options: ObjectOptions) -> RepairedM
     volumes = np.array([signed_volume(*part) for part in parts])
     largest = int(np.argmax(np.abs(volumes)))
     solid_parts = np.abs(volumes) > DEBRIS * abs(volumes[largest])
-    if abs(volumes[largest]) <= 0:
+    if abs(volumes[largest]) < 1e-9 * np.ptp(parts[largest][0], axis=0).max() ** 3:
         raise MeshError("the mesh encloses no volume; give the surface a thickness")
     if not solid_parts.all():
         parts = [part for part, keep in zip(parts, solid_parts, strict=True) if keep]
@@ -291,12 +288,6 @@ def _unite(
     positives = [p for p, hole in zip(parts, hollow, strict=True) if not hole]
     holes = [p for p, hole in zip(parts, hollow, strict=True) if hole]
     united = mesh_geometry.unite(positives, holes)
-    if united is None:
-        raise MeshError.with_fixes(
-            "the mesh has components that are no solids",
-            "repair it where it was made, or --keep-largest",
-            {"keep_largest": True},
-        )
     if turned_parts:
         mesh = replace(mesh, repairs=(*mesh.repairs, f"winding of {turned_parts} components turned outward"))
     # A cavity is its own shell, of negative volume.

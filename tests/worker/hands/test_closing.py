@@ -11,7 +11,7 @@ from graspd.service.store.asset_summary import summary
 from graspd.worker.hands.check import check_hand
 from graspd.worker.hands.jaws import fingertip_pad, sign_of
 from graspd.worker.hands.model import HandModel
-from tests.worker.hands.urdfs import joint, link, load, report, robot
+from tests.worker.hands.urdfs import joint, limits, link, load, report, robot
 
 _PALM = '<collision><geometry><box size="0.09 0.02 0.09"/></geometry></collision>'
 _PHALANX = '<collision><origin xyz="0 0 0.02"/><geometry><box size="0.014 0.014 0.04"/></geometry></collision>'
@@ -24,32 +24,24 @@ TURNS |= {f"{angle} degrees": (np.array([1, 2, 3]) / np.sqrt(14), np.deg2rad(ang
 TURNS = {name: quat_from_axis_angle(np.array(axis, float), np.asarray(angle)) for name, (axis, angle) in TURNS.items()}
 
 
-def limit(lower: float, upper: float) -> str:
-    return f'<limit lower="{lower}" upper="{upper}" effort="1" velocity="1"/>'
-
-
-def finger(name: str, x: float, bends: str = limit(-0.2, 1.5)) -> list[str]:
+def finger(name: str, x: float, bends: str = limits(-0.2, 1.5)) -> list[str]:
     """A finger along z that bends to +y, where the palm faces, about -x; it swings sideways about y."""
     return [
-        link(f"{name}0", _PHALANX),
-        link(f"{name}1", _PHALANX),
-        link(f"{name}2", _PHALANX),
-        joint(f"{name}_spread", "palm", f"{name}0", origin=f"{x} 0 0.045", axis="0 1 0", limit=limit(-0.1, 0.5)),
+        *(link(f"{name}{k}", _PHALANX) for k in range(3)),
+        joint(f"{name}_spread", "palm", f"{name}0", origin=f"{x} 0 0.045", axis="0 1 0", limit=limits(-0.1, 0.5)),
         joint(f"{name}_bend", f"{name}0", f"{name}1", origin="0 0 0.04", axis="-1 0 0", limit=bends),
-        joint(f"{name}_tip", f"{name}1", f"{name}2", origin="0 0 0.04", axis="-1 0 0", limit=limit(-0.1, 1.5)),
+        joint(f"{name}_tip", f"{name}1", f"{name}2", origin="0 0 0.04", axis="-1 0 0", limit=limits(-0.1, 1.5)),
     ]
 
 
-def urdf(*thumb: str, bends: str = limit(-0.2, 1.5)) -> bytes:
+def urdf(*thumb: str, bends: str = limits(-0.2, 1.5)) -> bytes:
     return robot(link("palm", _PALM), *finger("index", -0.025, bends), *finger("ring", 0.025), *thumb)
 
 
 def opposing_thumb(bends: str) -> list[str]:
     return [
-        link("thumb0", _PHALANX),
-        link("thumb1", _PHALANX),
-        link("thumb2", _PHALANX),
-        joint("thumb_axial", "palm", "thumb0", origin="0 0.09 0.02", axis="0 0 1", limit=limit(-0.2, 2.0)),
+        *(link(f"thumb{k}", _PHALANX) for k in range(3)),
+        joint("thumb_axial", "palm", "thumb0", origin="0 0.09 0.02", axis="0 0 1", limit=limits(-0.2, 2.0)),
         joint("thumb_bend", "thumb0", "thumb1", origin="0 0 0.04", axis="1 0 0", limit=bends),
         joint("thumb_tip", "thumb1", "thumb2", origin="0 0 0.04", axis="1 0 0", limit=bends),
     ]
@@ -64,21 +56,21 @@ def closing_of(hand: HandModel) -> dict[str, int]:
 
 
 def test_thumbs_close_to_the_fingers_whatever_their_limits() -> None:
-    text = urdf(*opposing_thumb(limit(-1.5, 0.2)))
+    text = urdf(*opposing_thumb(limits(-1.5, 0.2)))
     found = closing_of(hand_of(text))
     assert (found["thumb_bend"], found["thumb_tip"]) == (1, 1)
     stated = closing_of(hand_of(text, closing={"thumb_bend": -1}))
     assert stated == {**found, "thumb_bend": -1}, "what is stated of one joint counts for it alone"
-    assert closing_of(hand_of(urdf(*opposing_thumb(limit(-1.2, 0.8)))))["thumb_bend"] == 1
-    assert closing_of(hand_of(urdf(*opposing_thumb(limit(-1.2, 1.2)))))["thumb_bend"] == 0
-    assert closing_of(hand_of(urdf(*opposing_thumb(limit(-0.2, 1.5)))))["thumb_axial"] == 0
-    found = closing_of(hand_of(urdf(*opposing_thumb(limit(-0.2, 1.5)), bends=limit(-1.0, 1.5))))
+    assert closing_of(hand_of(urdf(*opposing_thumb(limits(-1.2, 0.8)))))["thumb_bend"] == 1
+    assert closing_of(hand_of(urdf(*opposing_thumb(limits(-1.2, 1.2)))))["thumb_bend"] == 0
+    assert closing_of(hand_of(urdf(*opposing_thumb(limits(-0.2, 1.5)))))["thumb_axial"] == 0
+    found = closing_of(hand_of(urdf(*opposing_thumb(limits(-0.2, 1.5)), bends=limits(-1.0, 1.5))))
     assert [found[f"{name}_spread"] for name in ("index", "ring")] == [0, 0]
     assert [found[f"{name}_{part}"] for name in ("index", "ring") for part in ("bend", "tip")] == [1, 1, 1, 1]
 
 
 def test_a_finger_that_no_joint_closes_is_told() -> None:
-    text = urdf(*opposing_thumb(limit(-0.2, 1.5)))
+    text = urdf(*opposing_thumb(limits(-0.2, 1.5)))
     closed = check_hand({"r.urdf": text}, "r", {"approach": [0, 1, 0]})
     assert "no joint closes" not in closed["message"]
     still = {"approach": [0, 1, 0], "closing": dict.fromkeys(("thumb_axial", "thumb_bend", "thumb_tip"), 0)}

@@ -11,13 +11,10 @@ from graspd.worker.hands.load import hand_from_path, load_hand
 from graspd.worker.hands.model import HandModel
 from graspd.worker.stages.models import hand_glb
 from tests.worker.commands_run import graspd
-from tests.worker.hands.urdfs import BOX, gripper, joint, link, robot
+from tests.worker.hands.urdfs import gripper, joint, link, robot
 
 CLAW = robot(
-    link("palm", BOX),
-    link("a", BOX),
-    link("b", BOX),
-    link("c", BOX),
+    *map(link, ("palm", "a", "b", "c")),
     link("mount", ""),
     link("tip", ""),
     joint("ja", "palm", "a", origin="0.02 0 0.02", axis="0 -1 0"),

@@ -226,6 +226,7 @@ def test_a_urdf_is_read_as_programs_write_it(written: str) -> None:
     ("data", "told"),
     [
         (b" \r\n", "h.urdf contains nothing but spaces"),
+        (b'<?xml version="1.0"?>', "h.urdf is empty; export it again"),
         (claw().replace('name="test"', 'name="test" name="b"').encode(), "duplicate attribute"),
         (b"<sdf/>", "the XML root is <sdf>, a URDF begins with <robot>"),
         (b'<!DOCTYPE robot [<!ENTITY a "b">]><robot name="&a;"/>'.decode().encode("utf-16"), "entities are refused"),
@@ -337,10 +338,9 @@ def refusal(body: str, **others: bytes) -> str:
 @pytest.mark.parametrize(
     ("body", "named"),
     [
-        ('<xacro:include filename="/etc/passwd"/>', "outside the hand's folder"),
         ('<xacro:include filename="../../etc/passwd"/>', "outside the hand's folder"),
         ('<xacro:include filename="/etc/*"/>', "outside the hand's folder"),
-        ('<xacro:include filename="missing.xacro"/>', "missing.xacro"),
+        ('<xacro:include filename="missing.xacro"/>', "'missing.xacro', which is missing"),
         ("""<a b="${xacro.load_yaml('/etc/passwd')}"/>""", "outside the hand's folder"),
         ('<a b="$(find nowhere)"/>', "nowhere"),
         ('<a b="$(env HOME)"/>', "environment variable"),
@@ -353,6 +353,8 @@ def refusal(body: str, **others: bytes) -> str:
         ("<xacro:unknown/>", "unknown"),
         ('<xacro:macro name="m" params=""><xacro:m/></xacro:macro><xacro:m/>', "recursion"),
         ('<a b="${nothing}"/>', "nothing"),
+        ("""<a b="${'x' * 5 * 2**20}"/>""", "characters; at most 4194304 are taken"),
+        pytest.param('<a b="${[' + "1," * 100_001 + ']}"/>', "an expression is too long", id="many numbers"),
     ],
 )
 def test_what_reaches_out_or_is_wrong_is_refused_in_one_line(body: str, named: str) -> None:

@@ -26,7 +26,7 @@ from graspd.worker.hands.surface import sample_surface
 from graspd.worker.simulation.device import joint_units
 from graspd.worker.validation.decomposition import decompose
 from graspd.worker.validation.model import MujocoOptions, build
-from tests.worker.hands.urdfs import BOX, OPENING, gripper, joint, link, robot
+from tests.worker.hands.urdfs import BOX, OPENING, gripper, joint, limits, link, robot
 from tests.worker.models import object_from_mesh
 
 HEIGHT_M = 0.012
@@ -114,9 +114,8 @@ def test_spans_begin_where_pads_end() -> None:
 
 def pointer() -> HandModel:
     """A stick of three links that bends a little: none of them ever faces another."""
-    bends = '<limit lower="0" upper="0.3" effort="1" velocity="1"/>'
     thin = BOX.replace("0.02 0.02 0.04", "0.01 0.01 0.04")
-    joints = joint("one", "a", "b", limit=bends), joint("two", "b", "c", limit=bends)
+    joints = joint("one", "a", "b", limit=limits(0, 0.3)), joint("two", "b", "c", limit=limits(0, 0.3))
     files = {"pointer.urdf": robot(*(link(name, thin) for name in "abc"), *joints)}
     return load_hand(files, name="pointer", digest="0" * 32)
 

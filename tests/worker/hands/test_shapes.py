@@ -77,8 +77,12 @@ def test_distance_of_two_boxes(offset: tuple[float, float, float], expected: flo
     box, _ = primitives.tessellate("box", (0.2, 0.2, 0.2))
     # The sums of the weights are held to 1 in 1e6 of the size.
     assert hull_distance(box, box + np.array(offset)) == pytest.approx(expected, abs=1e-5)
-    with pytest.raises(HandError, match="flat"):
-        primitives.hull(np.random.default_rng(0).random((10, 3)) * [1, 1, 0])
+
+
+@pytest.mark.parametrize(("points", "told"), [(np.eye(4, 3) * [1, 1, 0], "flat"), (np.ones((4, 3)), "no volume")])
+def test_points_without_a_volume_have_no_hull(points: np.ndarray, told: str) -> None:
+    with pytest.raises(HandError, match=told):
+        primitives.hull(points)
 
 
 def hand_with_mesh(scale: str) -> HandModel:
@@ -204,6 +208,14 @@ def test_a_point_inside_another_body_at_rest_is_dropped() -> None:
     world = apply(body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0, 1], finger)
     (palm,) = (piece for piece in hand.pieces if piece.body == 0)
     assert len(finger) and piece_distance(palm, world).min() >= -surface.BURIED_M
+
+
+def test_shapes_that_hide_each_other_are_told() -> None:
+    """Each ball outside the one before it by less than the distance at which two faces count as one."""
+    ball = hand_of(shape(BALL))
+    balls = tuple(replace(ball.pieces[0], size=(0.04 + 0.7 * k * surface.COINCIDENT_M,)) for k in range(3))
+    with pytest.raises(HandError, match="lie inside one another"):
+        sample_surface(replace(ball, pieces=balls), 1)
 
 
 @pytest.mark.parametrize("count", [16, 400, 2000])

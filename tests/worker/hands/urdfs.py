@@ -19,6 +19,10 @@ def link(name: str, body: str = BOX) -> str:
     return f'<link name="{name}">{body}</link>'
 
 
+def limits(lower: float, upper: float) -> str:
+    return f'<limit lower="{lower}" upper="{upper}" effort="1" velocity="2"/>'
+
+
 def joint(
     name: str,
     parent: str,
@@ -30,10 +34,9 @@ def joint(
     origin: str = "0 0 0.04",
     axis: str = "0 1 0",
 ) -> str:
-    limit = limit or '<limit lower="0" upper="1.5" effort="1" velocity="2"/>'
     return (
         f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
-        f'<origin xyz="{origin}"/><axis xyz="{axis}"/>{limit}{extra}</joint>'
+        f'<origin xyz="{origin}"/><axis xyz="{axis}"/>{limit or limits(0, 1.5)}{extra}</joint>'
     )
 
 

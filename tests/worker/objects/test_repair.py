@@ -7,7 +7,6 @@ from manifold3d import Manifold
 from numpy.typing import NDArray
 
 from graspd.commands.objects import report_object
-from graspd.service.model.errors import MeshError
 from graspd.worker.objects.check import check_object
 from graspd.worker.objects.intersections import crossings, untangle
 from graspd.worker.objects.mesh_geometry import from_manifold, signed_volume
@@ -26,6 +25,12 @@ SHARED = 16 / 3 * RADIUS**3
 ROUGHLY = 0.04
 
 
+_CORNERS, _FACES = box()
+#: A box whose upper half is inside out, so that its halves cancel; and both sides of a slanted triangle.
+BOW_TIE: Mesh = _CORNERS * np.where(_CORNERS[:, 2:] > 0, [-1, 1, 1], 1), _FACES
+TWO_SIDES: Mesh = 0.1 * np.eye(3), np.array([[0, 1, 2], [0, 2, 1]])
+
+
 def check(mesh: Mesh, **options) -> dict:
     return check_object(stl(mesh), "m", face_error_m=0.0, **options)
 
@@ -35,21 +40,15 @@ def check(mesh: Mesh, **options) -> dict:
     [
         ("banana_in_millimetres.stl", {"units": "mm"}, 171.3e-6),
         ("two_components.stl", {"keep_largest": True}, 4 / 3 * np.pi * 0.04**3),
-        ("open_shell.stl", {"allow_open": True}, None),
+        # Its hull is a cap of the ball, 52.36 mm high.
+        ("open_shell.stl", {"allow_open": True}, np.pi * 0.05236**2 * (0.04 - 0.05236 / 3)),
     ],
 )
-def test_the_mend_that_a_refusal_names_works(shared_data, file: str, options, volume: float | None) -> None:
+def test_the_mend_that_a_refusal_names_works(shared_data, file: str, options, volume: float) -> None:
     report = report_object(str(shared_data / "bad" / file), options)
-    assert report["verdict"] != "refuse"
-    if volume is not None:
-        # A sphere of 1280 faces has 1.2 % less volume than the ball.
-        assert report["facts"]["volume_m3"] == pytest.approx(volume, rel=0.015)
-
-
-def test_an_open_mesh_is_marked_as_such(shared_data) -> None:
-    files = {"m.stl": (shared_data / "bad" / "open_shell.stl").read_bytes()}
-    model = load_object(files, name="m", digest="", face_error_m=0.0, options={"allow_open": True})
-    assert not model.watertight and model.volume > 0
+    assert report["verdict"] != "refuse" and report["facts"]["watertight"] is ("allow_open" not in options)
+    # A sphere of 1280 faces has 1.2 % less volume than the ball.
+    assert report["facts"]["volume_m3"] == pytest.approx(volume, rel=0.015)
 
 
 def test_a_sound_mesh_is_taken_as_it_is_scaled_and_weighed() -> None:
@@ -83,11 +82,8 @@ def test_touching_or_overlapping_solids_become_one() -> None:
     report = check(join(box(), box(at=(0.03, 0.0, 0.0))))
     assert report["verdict"] == "repair" and "intersect" in report["message"]
     assert report["facts"]["volume_m3"] == pytest.approx(0.09 * 0.05 * 0.04, rel=1e-4)
-    cubes = []
-    for corner in np.indices((2, 2, 2)).reshape(3, -1).T:
-        cubes.append(trimesh.creation.box((0.03, 0.03, 0.03)))
-        cubes[-1].apply_translation(0.03 * corner)
-    report = check_parts(trimesh.util.concatenate(cubes))
+    corners = 0.03 * np.indices((2, 2, 2)).reshape(3, -1).T
+    report = check(join(*(box(0.03, 0.03, 0.03, at=tuple(corner)) for corner in corners)))
     assert report["verdict"] == "repair" and report["facts"]["volume_m3"] == pytest.approx(0.06**3)
 
 
@@ -103,6 +99,11 @@ def test_small_holes_are_filled_others_and_inner_walls_refused() -> None:
     kept = ~np.isclose(other[more][:, :, 0], 0.03).all(axis=1)
     report = check(join((one, faces), (other, more[kept])))
     assert report["verdict"] == "refuse" and "not watertight (4 open edges)" in report["message"]
+
+
+@pytest.mark.parametrize(("mesh", "told"), [(BOW_TIE, "; give the surface"), (TWO_SIDES, ": its faces have no area")])
+def test_a_mesh_without_volume_is_told_why(mesh: Mesh, told: str) -> None:
+    assert "encloses no volume" + told in check(mesh)["message"]
 
 
 def test_seams_are_welded_and_debris_without_volume_dropped() -> None:
@@ -128,12 +129,16 @@ def test_published_scans_become_closed_solids(shared_data, chosen: tuple[str, ..
         assert is_closed(model.faces.astype(np.int64)) and model.volume > 0, path.parent.name
 
 
-def test_unknown_keys_and_two_meshes_are_refused() -> None:
-    with pytest.raises(MeshError, match="unit"):
-        wrong = {"asset.json": b'{"file": "m.stl", "unit": "mm"}'}
-        load_object({**stl(box()), **wrong}, name="m", digest="", face_error_m=0)
-    with pytest.raises(MeshError, match="name one"):
-        load_object({**stl(box()), "n.stl": b"x"}, name="m", digest="", face_error_m=0)
+@pytest.mark.parametrize(
+    ("beside", "told"),
+    [
+        ({"asset.json": b'{"file": "m.stl", "unit": "mm"}'}, "unit"),
+        ({"asset.json": b'{"file": "n.stl"}'}, "names the file 'n.stl', which is missing"),
+        ({"n.stl": b"x"}, "name one"),
+    ],
+)
+def test_unknown_keys_and_unclear_files_are_refused(beside: dict[str, bytes], told: str) -> None:
+    assert told in check_object({**stl(box()), **beside}, "m")["message"]
 
 
 def crossing_tube(scale: float = 0.04, inside_out: bool = False) -> Mesh:
@@ -198,9 +203,8 @@ def test_a_tube_through_itself_is_repaired_and_said_so(inside_out: bool) -> None
 
 
 def boxes(gap: float, upper: tuple[float, float, float] = (0.04, 0.05, 0.03)) -> trimesh.Trimesh:
-    lower, other = trimesh.creation.box((0.04, 0.05, 0.06)), trimesh.creation.box(upper)
-    other.apply_translation((0, 0, 0.03 + upper[2] / 2 + gap))
-    return trimesh.util.concatenate([lower, other])
+    other = trimesh.creation.box(upper).apply_translation((0, 0, 0.03 + upper[2] / 2 + gap))
+    return trimesh.util.concatenate([trimesh.creation.box((0.04, 0.05, 0.06)), other])
 
 
 def check_parts(mesh: trimesh.Trimesh, suffix: str = "obj", **options) -> dict:
@@ -230,8 +234,7 @@ def test_parts_within_a_millimetre_are_one_body() -> None:
     assert compound["verdict"] == "accept" and "2 parts that lie apart are one rigid body" in compound["message"]
     assert compound["facts"]["volume_m3"] == pytest.approx(abs(apart.volume))
     assert check_parts(apart, keep_largest=True)["facts"]["volume_m3"] == pytest.approx(0.04 * 0.05 * 0.06)
-    third = trimesh.creation.box((0.04, 0.05, 0.07))
-    third.apply_translation((0, 0, 0.3))
+    third = trimesh.creation.box((0.04, 0.05, 0.07)).apply_translation((0, 0, 0.3))
     report = check_parts(trimesh.util.concatenate([boxes(0.0005), third]), keep_largest=True)
     assert report["facts"]["volume_m3"] == pytest.approx(0.04 * 0.05 * 0.09)
 
