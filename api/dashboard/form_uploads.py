@@ -161,12 +161,12 @@ def fix_options(fields: FormData, kind: AssetKind) -> dict[str, Any]:
     said = json_object(text, "the option") if (text := _text(fields, f"{kind.value}_fix")) else {}
     for key in [key for key, value in said.items() if value is None and key in _ASKED]:
         label, given = _ASKED[key][0], _text(fields, f"{kind.value}_{key}").strip()
+        if not given:
+            raise InputError(f"{label}: a value is missing")
         try:
             said[key] = float(given) / 1e3 if key == "scale_to" else given
         except ValueError:
             raise InputError(f"{label}: {given[:20]!r} is no number") from None
-        if not given:
-            raise InputError(f"{label}: a value is missing")
     return said
 
 

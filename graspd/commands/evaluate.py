@@ -100,13 +100,13 @@ def evaluate_command(
         raise InputError(f"--validation-hand validates by protocol dexgraspbench, not by {protocol}")
     other = None if validation_hand is None else hand_from_path(validation_hand, drag=True)
     twins = _joint_map(joint_map)
+    listed = [one for path in files for one in expand(path)]
+    copies = _copies(files, listed, out, robust=robust, hard=hard)
     rows: list[dict[str, Any]] = []
     name, done = TextColumn("{task.description}", markup=False), TextColumn("{task.completed:.0f}/{task.total:.0f}")
     columns = (name, BarColumn(), done, TimeElapsedColumn(), TimeRemainingColumn())
     with Progress(*columns, console=plain_console(stderr=True), disable=json, transient=True) as bar:
         task = bar.add_task("reading", total=1)
-        listed = [one for path in files for one in expand(path)]
-        copies = _copies(files, listed, out, robust=robust, hard=hard)
         for file in listed:
             case = load_case(file, hand=hand, obj=object)
             if copies and (case.placed is None) == (protocol == "lift"):

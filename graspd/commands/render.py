@@ -222,17 +222,17 @@ def _best_grasps(base: Shard, hand: str | None) -> DrawnHand | None:
 
 def _hand_in_pictures(scene: Shard, base_file: Path | None, hand: str | None) -> DrawnHand | None:
     """Return the best clear grasp of each scene by epsilon, for `--with-hand`."""
-    if base_file is None:
+    source = np.asarray(scene["grasp/base_index"])
+    if base_file is None or not len(source):
         return None
     base = read_shard(base_file, kind="base")
     model = hand_of_shard(scene, hand)
     hand_of_shard(base, hand)
-    rows = best_kept(scene.arrays, base.arrays)
-    source = np.asarray(scene["grasp/base_index"])[rows]
-    if len(source) and source.max() >= len(base["grasp/joint_positions"]):
+    if source.max() >= len(base["grasp/joint_positions"]):
         fix = "give the base shard of these scenes"
         raise InputError(f"{base_file} has fewer grasps than the scenes refer to; {fix}")
-    joints = np.asarray(base["grasp/joint_positions"], float)[source]
+    rows = best_kept(scene.arrays, base.arrays)
+    joints = np.asarray(base["grasp/joint_positions"], float)[source[rows]]
     poses = np.asarray(scene["grasp/hand_pose"], float)[rows]
     return DrawnHand(model, rows, poses, joints, wrists_of(scene, rows))
 

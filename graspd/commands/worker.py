@@ -46,6 +46,8 @@ def worker(
     data_dir: Annotated[Path | None, typer.Option(help="Data folder of graspd; default: GRASPD_DATA_DIR.")] = None,
 ) -> None:
     """Run one or several workers, each on one device, until stopped."""
+    if workers > 1 and (burst or once or max_tasks is not None):
+        raise InputError("--burst, --once and --max-tasks are for a single worker")
     settings = load_settings(device=device, threads=threads, join=join, processes=processes, data_dir=data_dir)
     log_to_stderr(settings, "worker")
     restrict_file_access(settings)
@@ -53,8 +55,6 @@ def worker(
         check_worker(settings)
         return
     if workers > 1:
-        if burst or once or max_tasks is not None:
-            raise InputError("--burst, --once and --max-tasks are for a single worker")
         from graspd.service.run.commands import stop_on_signals
 
         _parse_stages(stages)

@@ -21,6 +21,8 @@ from graspd.worker.stages import ingest
 from graspd.worker.stages.context import TaskContext
 from tests.api.factories import zipped
 
+MIB = 1 << 20
+
 
 def test_the_options_of_a_hand_decide_its_check(http: TestClient, services: Services) -> None:
     urdf = builtin_files(AssetKind.HAND, "allegro")["allegro.urdf"]
@@ -36,9 +38,6 @@ def test_the_options_of_a_hand_decide_its_check(http: TestClient, services: Serv
     assert "thumb_rotation" not in facts["dofs"]
     assert not [name for name in facts["dofs"] if name.startswith("ring_m")]
     assert "palm" not in facts["guessed"] and "closing" in facts["guessed"]
-
-
-MIB = 1 << 20
 
 
 def folder_of(count: int, size: int) -> bytes:

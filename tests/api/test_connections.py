@@ -24,6 +24,7 @@ Connect = Callable[..., socket.socket]
 Closed = tuple[FastAPI, dict[Scope, str]]
 _WHOLE = b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
 _HALF = b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX-Half: "
+_POST = b"POST / HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: %d\r\n\r\n"
 
 
 class _Quick(TimedProtocol):
@@ -203,9 +204,6 @@ def test_uploads_without_a_key_leave_nothing(connect: Connect, closed: Closed, m
 def test_a_redirect_does_not_go_where_the_host_header_says(connect: Connect, closed: Closed) -> None:
     answer = rest(connect(b"GET /v1/jobs/ HTTP/1.1\r\nHost: evil.example\r\nConnection: close\r\n\r\n", app=closed[0]))
     assert b"evil.example" not in answer and answer.split()[1] == b"404"
-
-
-_POST = b"POST / HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: %d\r\n\r\n"
 
 
 async def refuses(scope: Any, receive: Any, send: Any) -> None:

@@ -4,19 +4,15 @@ import json
 import os
 import sys
 from pathlib import Path
-from typing import Any
 
 from PIL import Image
 
 from graspd.service.store.shards import read_shard
 from tests.shell import completed
+from tests.worker.commands_run import refused
 
 #: The least that passes all stages; the first run on a machine compiles kernels as well.
 SMALL = ("--grasps", "4", "--scenes", "1", "--views", "1", "--fidelity", "draft")
-
-
-def demo(*options: str, timeout: int = 60) -> Any:
-    return completed([sys.executable, "-m", "graspd", "demo", *options], timeout=timeout)
 
 
 def processes_of(folder: Path) -> list[str]:
@@ -32,7 +28,7 @@ def processes_of(folder: Path) -> list[str]:
 
 
 def test_a_demo_leaves_its_files_and_nothing_that_runs(tmp_path: Path) -> None:
-    done = demo("--out", str(tmp_path), "--json", *SMALL, timeout=280)
+    done = completed([sys.executable, "-m", "graspd", "demo", "--out", tmp_path, "--json", *SMALL], timeout=280)
     assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout.splitlines()[-1])
     assert (result["state"], result["grasps"], len(result["job"])) == ("succeeded", 4, 32)
@@ -51,5 +47,5 @@ def test_a_demo_leaves_its_files_and_nothing_that_runs(tmp_path: Path) -> None:
 
 
 def test_a_wrong_number_is_refused_before_anything_starts(tmp_path: Path) -> None:
-    assert demo("--out", str(tmp_path / "out"), "--grasps", "0").returncode == 2
+    assert "--grasps: must be at least 1" in refused("demo --grasps 0 --out", tmp_path / "out")
     assert not (tmp_path / "out").exists()

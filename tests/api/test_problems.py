@@ -6,12 +6,17 @@ from unittest.mock import Mock
 
 import pytest
 from fastapi import FastAPI
+from starlette.responses import StreamingResponse
 from starlette.testclient import TestClient
 
 from graspd.service.model.errors import IndexUnavailable, QueueUnavailable, StoreUnavailable
 from graspd.service.pipeline.backends import Services
+from tests.api.conftest import BASE_URL
 
 JOB = {"hand": "allegro", "object": "mug", "grasps": 32}
+PLANE = {"kind": "half_space"}
+FLAT = {"supports": [PLANE, {"kind": "box", "size": [0, 1, 1]}]}
+PLACED = {"supports": [PLANE], "target": [0, 0, 0, 1, 0, 0, 0], "neighbours": [{"object": "a"}]}
 
 
 def problem(answer: Any, status: int, slug: str) -> dict[str, Any]:
@@ -21,11 +26,6 @@ def problem(answer: Any, status: int, slug: str) -> dict[str, Any]:
     assert document["type"] == f"/problems/{slug}" and document["status"] == status
     assert document["request_id"] == answer.headers["x-request-id"] and "\n" not in document["detail"]
     return document
-
-
-PLANE = {"kind": "half_space"}
-FLAT = {"supports": [PLANE, {"kind": "box", "size": [0, 1, 1]}]}
-PLACED = {"supports": [PLANE], "target": [0, 0, 0, 1, 0, 0, 0], "neighbours": [{"object": "a"}]}
 
 
 def test_a_field_in_error_is_pointed_at(http: TestClient) -> None:
@@ -86,6 +86,12 @@ def test_a_part_that_is_away_is_503_and_worth_another_try(
     answer = http.post("/v1/jobs", json=JOB)
     assert problem(answer, 503, slug)["detail"] == str(error)
     assert int(answer.headers["retry-after"]) > 0
+
+
+def test_an_answer_that_breaks_off_gets_no_second_one(app: FastAPI) -> None:
+    app.add_api_route("/v1/half", lambda: StreamingResponse(bytes(1 // left) for left in (1, 0)))
+    with TestClient(app, base_url=BASE_URL) as http, pytest.raises(ZeroDivisionError):
+        http.get("/v1/half")
 
 
 def test_an_unforeseen_error_tells_no_detail(app: FastAPI, http: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 from graspd.cli import build
 from graspd.worker.rendering import portraits
+from tests.worker.commands_run import refused
 
 #: Colours of the arrow on the palm and of the prepared mesh: red exceeds blue by at least this [of 255].
 WARM = 60
@@ -22,13 +23,6 @@ def check(*arguments: str) -> tuple[int, dict[str, Any]]:
     return result.exit_code, json.loads(result.stdout.splitlines()[-1])
 
 
-@pytest.mark.parametrize(("kind", "name"), [("hands", "shadow"), ("objects", "mug")])
-def test_a_built_in_is_accepted_with_exit_code_0(kind: str, name: str) -> None:
-    code, report = check(kind, "check", name)
-    assert code == 0
-    assert report["verdict"] == "accept" and report["repairs"] == [] and report["message"] and report["facts"]
-
-
 def test_a_folder_gets_a_verdict_each_and_code_2_if_refused(shared_data: Path, tmp_path: Path) -> None:
     for source, name in (("quads_and_ngons.obj", "prism"), ("inverted_normals.stl", "mug"), ("garbage.stl", "noise")):
         folder = tmp_path / "set" / name
@@ -38,6 +32,7 @@ def test_a_folder_gets_a_verdict_each_and_code_2_if_refused(shared_data: Path, t
     assert code == 2 and report["refused"] == ["noise"]
     said = {one["name"]: one["verdict"] for one in report["objects"]}
     assert said == {"mug": "repair", "noise": "refuse", "prism": "accept"}
+    assert "--picture draws one object" in refused("objects check --picture p.png", tmp_path / "set")
     told = CliRunner().invoke(build(), ["objects", "check", str(tmp_path / "set")])
     assert [line.split()[0] for line in told.stdout.splitlines()] == ["repair", "refuse", "accept"]
     assert "1 of 3 objects were refused: noise" in told.stderr
@@ -96,12 +91,12 @@ def test_an_option_that_cannot_be_read_is_the_callers_mistake(option: str) -> No
     assert result.exit_code == 2 and option.split()[0] in result.stderr
 
 
-@pytest.mark.parametrize(("kind", "name"), [("hands", "barrett"), ("objects", "mug")])
-def test_the_picture_shows_something(kind: str, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("kind", "name"), [("hands", "shadow"), ("objects", "mug")])
+def test_a_built_in_is_accepted_and_its_picture_shows_it(kind: str, name: str, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(portraits, "_SAMPLES", 2)  # grainy, and shown all the same
     path = tmp_path / "p.png"
-    code, _ = check(kind, "check", name, "--picture", str(path))
-    assert code == 0
+    code, report = check(kind, "check", name, "--picture", str(path))
+    assert (code, report["verdict"], report["repairs"]) == (0, "accept", []) and report["message"] and report["facts"]
     pixels = np.asarray(Image.open(path).convert("RGB")).astype(int)
     thirds = np.array_split(pixels, 3, axis=1)
     assert all((third[..., 0] - third[..., 2] > WARM).sum() > 100 for third in thirds)

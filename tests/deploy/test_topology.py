@@ -32,6 +32,8 @@ from tests.service.conftest import wait_for_redis
 from tests.shell import completed
 from tests.waiting import answers, until
 
+NAME = "grasps.example.org"
+
 
 @dataclass
 class Topology:
@@ -145,9 +147,6 @@ def test_redis_refuses_those_without_the_password(tmp_path: Path) -> None:
             queue.close()
             process.terminate()
     assert (tmp_path / "appendonlydir").is_dir()
-
-
-NAME = "grasps.example.org"
 
 
 def served(folder: Path, api: int, plain: int, secure: int) -> Path:

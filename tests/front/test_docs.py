@@ -26,6 +26,17 @@ from tests.conftest import PACKAGES, REPOSITORY
 from tests.shell import completed
 from tests.waiting import PATIENCE_S, until_a_worker_is_idle
 
+DOCS = REPOSITORY / "docs"
+TUTORIALS = sorted((DOCS / "tutorials").glob("*.md"))
+#: `graspd jobs`, <pre>graspd jobs</pre>, epilog="graspd jobs".
+_NAMED = re.compile(r'(?:`|>|epilog=")(graspd\s+[a-z](?:(?!\.\.\.)[^"`{}<…,;])*)')
+QUESTIONS: list[dict[str, Any]] = yaml.safe_load((REPOSITORY / "tests" / "docs_questions.yaml").read_text())
+#: Results that a reader looks at before another search.
+LOOKED_AT = 5
+#: What a browser fetches by itself: a link that a reader follows may lead anywhere.
+_FETCHED = re.compile(r"<(?:(?:script|img|iframe|source)[^>]* src|link[^>]* href)=\"((?:https?:)?//[^\"]+)")
+_IMPORTED = re.compile(r"(?:@import|url\()\s*[\"']?((?:https?:)?//[^\"')]+)")
+
 
 @pytest.fixture(scope="module")
 def environment(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
@@ -78,9 +89,6 @@ def test_the_notebook_runs(environment: dict[str, str], tmp_path: Path) -> None:
     assert (tmp_path / "grasps.h5").is_file()
 
 
-TUTORIALS = sorted((REPOSITORY / "docs" / "tutorials").glob("*.md"))
-
-
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("page", [*TUTORIALS, REPOSITORY / "docs" / "how-to" / "hands.md"], ids=lambda page: page.stem)
@@ -111,10 +119,6 @@ def test_the_lines_that_read_the_first_grasps_run(tmp_path: Path, monkeypatch: p
     exec(block, said)
     best = said["best"]
     assert (len(best), best.joint_positions.shape) == (3, (3, 16)) and (best.metric("epsilon") > 0).all()
-
-
-#: `graspd jobs`, <pre>graspd jobs</pre>, epilog="graspd jobs".
-_NAMED = re.compile(r'(?:`|>|epilog=")(graspd\s+[a-z](?:(?!\.\.\.)[^"`{}<…,;])*)')
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -201,12 +205,6 @@ def test_pages_that_sources_name_exist(room: str) -> None:
     assert {(file, page) for file, page in named if not (REPOSITORY / page).is_file()} == set()
 
 
-DOCS = REPOSITORY / "docs"
-QUESTIONS: list[dict[str, Any]] = yaml.safe_load((REPOSITORY / "tests" / "docs_questions.yaml").read_text())
-#: Results that a reader looks at before another search.
-LOOKED_AT = 5
-
-
 @cache
 def pages() -> dict[str, Counter[str]]:
     found = {}
@@ -234,11 +232,6 @@ def test_a_question_is_answered_within_one_search_and_one_page(asked: dict[str, 
     text = (DOCS / asked["page"]).read_text()
     assert [words for words in asked["words"] if words not in text] == []
     assert asked["page"] in ranked(asked["search"])[:LOOKED_AT]
-
-
-#: What a browser fetches by itself: a link that a reader follows may lead anywhere.
-_FETCHED = re.compile(r"<(?:(?:script|img|iframe|source)[^>]* src|link[^>]* href)=\"((?:https?:)?//[^\"]+)")
-_IMPORTED = re.compile(r"(?:@import|url\()\s*[\"']?((?:https?:)?//[^\"')]+)")
 
 
 @pytest.fixture(scope="module")

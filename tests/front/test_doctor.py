@@ -7,9 +7,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
-from graspd.doctor import all_checks, app
+from graspd.doctor import all_checks
 from graspd.service.settings import Settings
 from tests.conftest import REPOSITORY
 from tests.servers import free_ports
@@ -44,11 +43,6 @@ def test_what_is_wrong_ends_it_with_1_and_says_the_mend(tmp_path: Path) -> None:
     assert [line[:2] for line in lines if line[0] == "bad"] == [["bad", "redis"], ["bad", "keys"]]
     assert sum(line[0] == "fix:" for line in lines) == 2
     assert "hidden" not in done.stdout + done.stderr
-
-
-def test_a_check_that_does_not_exist_is_the_callers_mistake() -> None:
-    done = CliRunner().invoke(app, ["--only", "disk,weather"])
-    assert done.exit_code == 2 and "there is no check weather; choose from disk" in done.output
 
 
 @pytest.mark.parametrize("check", [check.name for check in all_checks(Settings())])

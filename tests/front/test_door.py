@@ -4,6 +4,7 @@ import errno
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 from unittest.mock import Mock
 
 import pytest
@@ -128,18 +129,15 @@ def refused(command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> st
 
 
 @pytest.mark.parametrize("command", COMMANDS + ABSENT)
-def test_a_file_that_is_not_there_is_named(command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert "FILE" in refused(command, tmp_path, monkeypatch)
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_a_file_of_no_kind_is_named(command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for word in command.split():
+def test_a_file_that_is_absent_or_of_no_kind_is_named(command: str, tmp_path: Path, monkeypatch: Any) -> None:
+    assert "FILE" in refused(command, tmp_path, monkeypatch), "it is not there"
+    for word in command.split() if command in COMMANDS else ():
         path = Path(word.rpartition("=")[2].rstrip("/"))
         if path.stem == "FILE":
             (tmp_path / path.name).write_bytes(b"{no")
     assert "FILE" in refused(command, tmp_path, monkeypatch)
 
 
-def test_a_folder_in_the_place_of_a_file_is_refused_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert "is a folder" in refused("synth --hand allegro --object mug -o .", tmp_path, monkeypatch)
+@pytest.mark.parametrize(("out", "says"), [(".", "is a folder"), ("none/g.h5", "none does not exist; create it")])
+def test_an_output_that_cannot_be_is_refused_first(tmp_path: Path, monkeypatch: Any, out: str, says: str) -> None:
+    assert says in refused(f"synth --hand allegro --object mug -o {out}", tmp_path, monkeypatch)

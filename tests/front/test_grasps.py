@@ -20,6 +20,7 @@ from graspd.service.model.transforms import compose
 from graspd.service.store.shards import write_shard
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
+from tests.api.factories import scene_columns
 from tests.worker.commands_run import graspd as command
 from tests.worker.commands_run import refused
 from tests.worker.models import attributes_of
@@ -27,10 +28,10 @@ from tests.worker.models import attributes_of
 THRESHOLDS = np.array([0.001, 0.005, 0.01])
 
 
-def columns(count: int, *, scenes: int = 0, seed: int = 0) -> dict[str, Any]:
+def columns(count: int, *, scenes: int = 0, seed: int = 0, thresholds: Any = THRESHOLDS) -> dict[str, Any]:
     """A base shard of noise; the first metric at 5 mm counts up, every second grasp is valid."""
     rng = np.random.default_rng(seed)
-    made: dict[str, Any] = {"quality/thresholds_m": THRESHOLDS}
+    made: dict[str, Any] = {"quality/thresholds_m": thresholds}
     for name in ("grasp", "pregrasp", "squeeze"):
         pose = rng.normal(size=(count, 7))
         pose[:, 3:] /= np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
@@ -80,6 +81,8 @@ def test_top_is_the_best_first_of_what_is_known(grasps: graspd.Grasps, tmp_path:
     (tmp_path / "g.h5").write_bytes(write_shard("base", made, {"hand": "claw", "object": "mug"}))
     found = graspd.open(tmp_path / "g.h5").top("penetration_depth_mm", 3)
     assert found.metric("penetration_depth_mm").tolist() == [1, 2]
+    with pytest.raises(graspd.InputError, match="must be at least 0"):
+        grasps.top("epsilon", -1)
 
 
 @pytest.mark.parametrize("rows", [slice(1, 3), [1, 2], np.array([False, True, True, False, False, False])])
@@ -109,6 +112,11 @@ def test_a_folder_may_hold_several_objects_but_one_file_may_not(tmp_path: Path) 
     assert (len(both), sorted(both.objects)) == (12, ["bowl", "mug"])
     with pytest.raises(graspd.InputError, match="bowl, mug"):
         both.save(tmp_path / "c.h5")
+    first, second = both.objects
+    of = {name: both.where(lambda g, name=name: g.column("object") == name) for name in (first, second)}
+    with pytest.raises(graspd.InputError, match=f"open the file of {second} alone"):
+        of[second].save(tmp_path / "c.h5")
+    assert graspd.open(of[first].save(tmp_path / "d.h5")).objects == [first]
 
 
 def test_hands_are_not_mixed(tmp_path: Path) -> None:
@@ -118,6 +126,10 @@ def test_hands_are_not_mixed(tmp_path: Path) -> None:
     assert graspd.open(tmp_path, hand="fist").joint_names == ["a", "b", "d"]
     with pytest.raises(graspd.InputError, match="claw, fist"):
         graspd.open(tmp_path, hand="foot")
+    for of, words in (({"joints": "abd"}, "different joints"), ({"thresholds": THRESHOLDS / 2}, "contact thresholds")):
+        shard(tmp_path / "b.h5", **of)
+        with pytest.raises(graspd.InputError, match=words):
+            graspd.open(tmp_path)
 
 
 def test_a_source_without_grasps_is_refused(tmp_path: Path) -> None:
@@ -125,9 +137,10 @@ def test_a_source_without_grasps_is_refused(tmp_path: Path) -> None:
     for name in ("absent.h5", "empty"):
         with pytest.raises(graspd.NotFoundError, match=name):
             graspd.open(tmp_path / name)
-
-
-KEY = "a-key-that-nobody-sees"
+    scene = scene_columns(np.random.default_rng(0), 3, 1)
+    (tmp_path / "empty" / "s.h5").write_bytes(write_shard("scene", scene, {"hand": "claw", "object": "mug"}))
+    with pytest.raises(graspd.InputError, match="no file of grasps"):
+        graspd.open(tmp_path / "empty")
 
 
 @pytest.fixture(scope="module")
@@ -156,10 +169,11 @@ def test_a_table_has_poses_joints_and_metrics_by_name(grasps: graspd.Grasps) -> 
     assert set(grasps.metrics) <= set(table.columns) and len(grasps[[]].to_pandas()) == 0
 
 
-def test_without_pandas_one_line_tells(grasps: graspd.Grasps, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(graspd.InputError, match=re.escape("pip install 'graspd[pandas]'")):
-        grasps.to_pandas()
+def test_without_an_extra_one_line_tells(grasps: graspd.Grasps, monkeypatch: pytest.MonkeyPatch) -> None:
+    for library, extra, call in (("pandas", "pandas", grasps.to_pandas), ("viser", "view", grasps.view)):
+        monkeypatch.setitem(sys.modules, library, None)
+        with pytest.raises(graspd.InputError, match=re.escape(f"pip install 'graspd[{extra}]'")):
+            call()
 
 
 def test_a_notebook_shows_the_best_as_a_small_picture(known: graspd.Grasps) -> None:
@@ -206,21 +220,11 @@ def test_the_viewer_serves_them(known: graspd.Grasps) -> None:
 
 
 def test_reprs_are_short_and_show_no_key(grasps: graspd.Grasps) -> None:
-    client = graspd.Client(f"http://user:{KEY}@127.0.0.1:1", key=KEY)
-    assert repr(client).startswith("<client of http://") and KEY not in repr(client)
+    client = graspd.Client("http://user:hidden@127.0.0.1:1", key="hidden")
+    assert repr(client).startswith("<client of http://") and "hidden" not in repr(client)
     assert repr(grasps.pregrasp) == "<6 postures of 3 joints>"
     assert re.fullmatch(r"<grasp at \(.*\) m, 3 joints, epsilon 5, valid>", repr(grasps[5]))
     assert all(len(repr(one)) < 120 for one in (client, grasps, grasps.pregrasp, grasps[0]))
-
-
-def test_grasps_of_another_object_are_not_saved_as_the_firsts(tmp_path: Path) -> None:
-    shard(tmp_path / "a.h5"), shard(tmp_path / "b.h5", obj="bowl")
-    both = graspd.open(tmp_path)
-    first, second = both.objects
-    of = {name: both.where(lambda g, name=name: g.column("object") == name) for name in (first, second)}
-    with pytest.raises(graspd.InputError, match=f"open the file of {second} alone"):
-        of[second].save(tmp_path / "c.h5")
-    assert graspd.open(of[first].save(tmp_path / "d.h5")).objects == [first]
 
 
 def test_a_file_of_robust_grasps_says_so_to_every_reader(tmp_path: Path) -> None:

@@ -26,6 +26,7 @@ SCHEMAS = {
     "dependabot": [FORGE / "dependabot.yml"],
     "github-issue-forms": sorted((FORGE / "ISSUE_TEMPLATE").glob("*")),
     "github-workflows": WORKFLOWS,
+    "compose-spec": [REPOSITORY / "docker-compose.yml"],
 }
 PROSE = [
     *(REPOSITORY / name for name in ("CONTRIBUTING.md", "SECURITY.md", "CODE_OF_CONDUCT.md")),

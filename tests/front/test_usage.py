@@ -3,7 +3,6 @@
 import inspect
 import os
 import re
-import subprocess
 import sys
 from collections.abc import Iterator
 from typing import Any
@@ -15,7 +14,10 @@ import graspd.cli
 from graspd.cli import build
 from tests.shell import completed
 
-NOBODY = {"GRASPD_API_URL": "http://127.0.0.1:9"}
+OFFERED = {"": "synth", "admin ker": "kernels", "admin index re": "rebuild", "datasets cr": "create"}
+OFFERED |= {"export --for": "--format", "datasets card --li": "--licence"}
+#: Of a number that is no count: its unit, or the word of one without.
+UNIT = re.compile(r"\[\w+\]|\b(mm|kg|kg/m3|metres|coefficient|share|candidates)\b", re.IGNORECASE)
 
 
 @pytest.mark.parametrize(
@@ -35,10 +37,22 @@ NOBODY = {"GRASPD_API_URL": "http://127.0.0.1:9"}
             "--state: must be one of queued, running, succeeded, failed, cancelled; did you mean running?",
         ),
         ("export x.h5 --format mjcf -o out", "there is no export format 'mjcf'"),
+        ("export x.h5 --depth tiff -o out", "there is no depth format 'tiff'"),
+        ("datasets card ./x --snapshot 0f -o out", "./x is a folder; --snapshot goes with the name of a dataset"),
+        ("doctor --only disk,weather", "there is no check weather; choose from disk"),
+        ("evaluate g.h5 --robust 2 --protocol displacement", "--robust repeats pushes or lifts in perturbed models"),
+        ("evaluate g.h5 --robust 2 -o none/g.h5", "none/g.h5 cannot be written: choose a file in an existing folder"),
+        ("evaluate g.json --robust 2 -o g.h5", "g.json is no shard of graspd"),
+        ("objects add notes.txt --scale-to 0.1,0.2", "several sizes need a mesh file or a folder of meshes"),
+        ("worker --workers 2 --once --stages none", "--burst, --once and --max-tasks are for a single worker"),
+        ("tags add good", "select grasps: SHARD:ROW, or --where, --job, --dataset"),
+        ("tags add good abc:1 --where valid", "give SHARD:ROW, or --where, --job and --dataset, not both"),
+        ("tags add good abc:1 abc", "'abc' does not name a grasp; write SHARD:ROW"),
+        ("tags export good -o good.h5", "good.h5: the name of the file must end in .zip, .csv or .json"),
     ],
 )
 def test_a_mistake_is_one_line(command: str, line: str) -> None:
-    done = CliRunner().invoke(build(), command.split(), prog_name="graspd", env=NOBODY)
+    done = CliRunner().invoke(build(), command.split(), prog_name="graspd", env={"GRASPD_API_URL": "nobody"})
     assert done.exit_code == 2 and done.stderr.startswith(f"graspd: {line}") and done.stderr.count("\n") == 1
 
 
@@ -47,20 +61,13 @@ def test_a_group_without_a_command_shows_its_help() -> None:
     assert done.exit_code == 2 and not done.stderr and "Usage: graspd tags" in done.stdout
 
 
-def python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    start = f"import sys; sys.argv[0] = 'graspd'; from graspd.cli import main\n{code}"
-    return completed([sys.executable, "-c", start], env=os.environ | environment)
-
-
-OFFERED = {"": "synth", "admin ker": "kernels", "admin index re": "rebuild", "datasets cr": "create"}
-OFFERED |= {"export --for": "--format", "datasets card --li": "--licence"}
-
-
 @pytest.mark.parametrize(("typed", "offered"), OFFERED.items())
 def test_completion_knows_commands_without_the_engine(typed: str, offered: str) -> None:
-    code = "try: main()\nfinally: print('warp' in sys.modules, file=sys.stderr)"
-    words = f"graspd {typed}"
-    done = python(code, _GRASPD_COMPLETE="complete_bash", COMP_WORDS=words, COMP_CWORD=str(words.count(" ")))
+    code = "import sys; sys.argv[0] = 'graspd'; from graspd.cli import main\ntry: main()\n"
+    code += "finally: print('warp' in sys.modules, file=sys.stderr)"
+    words = {"COMP_WORDS": f"graspd {typed}", "COMP_CWORD": str(1 + typed.count(" "))}
+    asked = os.environ | {"_GRASPD_COMPLETE": "complete_bash"} | words
+    done = completed([sys.executable, "-c", code], env=asked)
     assert offered in done.stdout.split()
     assert done.stderr.strip() == "False"
 
@@ -96,10 +103,6 @@ def test_help_loses_no_word(every: dict[str, Any], monkeypatch: pytest.MonkeyPat
                 lost.append(f"{path}: {said}")
     assert len(every) > 60
     assert not lost, "\n".join(lost)
-
-
-#: Of a number that is no count: its unit, or the word of one without.
-UNIT = re.compile(r"\[\w+\]|\b(mm|kg|kg/m3|metres|coefficient|share|candidates)\b", re.IGNORECASE)
 
 
 def test_every_option_has_a_help_with_its_unit(every: dict[str, Any]) -> None:

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from graspd.service.model.fidelity import FIDELITIES
-from graspd.service.model.studies import FILTERED, IN_SCENE, pareto
+from graspd.service.model.studies import FILTERED, IN_SCENE
 from graspd.service.pipeline.fidelity_choice import cheapest
 from graspd.service.store.records import latest
 from graspd.service.store.store import open_store
@@ -101,20 +101,17 @@ def test_a_wrong_option_is_the_callers_mistake(words: str, says: str) -> None:
     assert says in refused(f"chart --quick {words}")
 
 
+def test_a_chart_in_scenes_with_neighbours_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "s.json").write_text('{"supports": [{"kind": "half_space"}], "neighbours": [{"object": "block"}]}')
+    assert "neighbours, which a chart does not support" in refused("chart --quick --scene", tmp_path / "s.json")
+
+
 def test_method_can_be_charted_with_options_and_batch_of_its_own() -> None:
     given = {"batches": [32], "baseline_batch": 4, "options": ["graspit:steps=40000"], "quick": False}
     methods, run = ["graspit", "graspit:keep=5@10"], ExecutionContext(threads=1)
     plain, kept = settings_of(methods, ["draft"], **given, run=run)
     assert (plain.fidelity, plain.batch, plain.options) == ("as published", 4, {"steps": "40000"})
     assert (kept.fidelity, kept.batch, kept.options) == ("keep=5", 10, {"steps": "40000", "keep": "5"})
-
-
-def test_the_front_has_no_point_that_another_beats() -> None:
-    assert pareto([(1, 1), (2, 0.5), (0.5, 2), (0.9, 0.9), (2, 0.5)]) == {0, 1, 2, 4}
-    rng = np.random.default_rng(0)
-    points = [tuple(p) for p in rng.random((60, 2))]
-    unbeaten = {i for i, (x, y) in enumerate(points) if not any(a > x and b > y for a, b in points)}
-    assert pareto(points) == unbeaten
 
 
 def test_the_first_valid_grasp_takes_the_calls_of_a_coin() -> None:

@@ -35,6 +35,7 @@ Start = Callable[..., System]
 _WAITING = 500
 #: Of these may be done before it: those that run, every fourth turn, and what one worker does while the other has it.
 _BEFORE_IT = 150
+LEASE_S = 2.0
 
 
 def makers(system: System) -> set[str]:
@@ -210,9 +211,6 @@ def test_a_full_disk_is_waited_for_until_there_is_room(start: Start, small_disk:
     assert not system.services.index.jobs.get(job).state.is_final
     subprocess.run(["mount", "-o", "remount,size=64m", str(small_disk)], check=True)
     finish_and_compare(system, job, 32 * 100)
-
-
-LEASE_S = 2.0
 
 
 class House:

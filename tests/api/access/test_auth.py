@@ -31,6 +31,9 @@ from tests.memory_queue import MemoryQueue
 
 JOB = {"hand": "allegro", "object": "mug"}
 Closed = tuple[TestClient, dict[Scope, str]]
+SECRET = "correct horse battery staple"
+PROXY, STRANGER = ("10.1.2.3", 4000), ("203.0.113.9", 4000)
+GROUPS = {"ops": ":admin", "vision": "red:submit", "hands": "blue:submit", "*": ":read"}
 
 
 @pytest.fixture
@@ -221,11 +224,6 @@ def test_a_file_that_everybody_reads_or_nobody_can_is_bad(tmp_path: Path) -> Non
     settings.resolved_keys_file.write_text("{")
     found = keys_finding(settings)
     assert not found.ok and str(settings.resolved_keys_file) in found.message
-
-
-SECRET = "correct horse battery staple"
-PROXY, STRANGER = ("10.1.2.3", 4000), ("203.0.113.9", 4000)
-GROUPS = {"ops": ":admin", "vision": "red:submit", "hands": "blue:submit", "*": ":read"}
 
 
 def basic(user: str, secret: str = SECRET) -> str:

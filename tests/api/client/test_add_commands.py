@@ -18,6 +18,7 @@ from graspd.service.store.assets import pack, unpack
 from graspd.service.store.object_sets import files_of_set
 
 STL = b"solid box\nendsolid box\n"
+MESH = '<mesh filename="{}"/>'
 
 
 @pytest.fixture
@@ -80,9 +81,6 @@ def test_a_zip_of_several_meshes_is_a_set(tmp_path: Path) -> None:
     assert set(files_of_set(tmp_path / "many.zip") or {}) == {"A0", "B1"}
     assert files_of_set(tmp_path / "one.zip") is None
     assert files_of_set(tmp_path / "described.zip") is None
-
-
-MESH = '<mesh filename="{}"/>'
 
 
 @pytest.fixture

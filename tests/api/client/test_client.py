@@ -13,8 +13,11 @@ from graspd.client import client as client_module
 from graspd.client.client import Client
 from graspd.service.model import errors
 from graspd.service.model.states import AssetKind, State
+from tests.worker.commands_run import refused
 
 Handler = Callable[[httpx.Request], httpx.Response]
+ASSET = dict.fromkeys(("name", "digest", "filename", "created"), "") | {"kind": "hand", "files": [], "size_bytes": 1}
+ASSET |= {"builtin": False, "verdict": None, "message": None, "repairs": [], "facts": {}}
 
 
 def client_of(handler: Handler) -> Client:
@@ -53,13 +56,10 @@ def test_a_problem_document_becomes_its_exception(slug: str, status: int, kind: 
 
 
 def test_lists_are_read_to_their_last_page_with_the_key() -> None:
-    plain = dict.fromkeys(("name", "digest", "filename", "created"), "") | {"kind": "hand", "files": []}
-    plain |= {"size_bytes": 1, "builtin": True, "verdict": "accept", "message": None, "repairs": [], "facts": {}}
-
     def handler(request: httpx.Request) -> httpx.Response:
         assert request.headers["authorization"] == "Bearer gd_secret"
         cursor = request.url.params.get("cursor")
-        asset = plain | {"name": {None: "one", "2": "two"}[cursor]}
+        asset = ASSET | {"name": {None: "one", "2": "two"}[cursor]}
         return httpx.Response(200, json={"items": [asset], "next": "2" if cursor is None else None})
 
     with client_of(handler) as client:
@@ -76,18 +76,32 @@ def test_watching_goes_on_where_the_stream_broke() -> None:
         assert [seen.state for seen in client.watch("a")] == [State.RUNNING, State.SUCCEEDED]
 
 
+def test_watching_a_service_that_stays_away_ends_with_its_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(client_module, "time", Mock(**{"monotonic.side_effect": (0.0, 1.0, 31.0)}))
+    away = Mock(side_effect=(httpx.ConnectError("gone"),) * 2)
+    with client_of(away) as client, pytest.raises(errors.UnavailableError, match="no graspd answers"):
+        next(client.watch("a"))
+
+
+def test_a_check_that_no_worker_makes_is_waited_for_so_long() -> None:
+    answers = iter((ASSET, ASSET | {"verdict": "accept"}))
+    client = client_of(lambda _: httpx.Response(200, json=next(answers)))
+    with pytest.raises(errors.UnavailableError, match="is a worker running"):
+        client.wait_checked(AssetKind.HAND, "a", timeout_s=-1.0)
+
+
+def test_no_job_is_made_of_a_refused_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    refusal = httpx.Response(200, json=ASSET | {"verdict": "refuse", "message": "the mesh is open"})
+    monkeypatch.setattr("graspd.client.commands.open_client", lambda _: client_of(lambda _: refusal))
+    (tmp_path / "open.stl").touch()
+    assert "refused: the mesh is open" in refused("submit --hand allegro --object", tmp_path / "open.stl")
+
+
 def test_a_download_that_breaks_leaves_no_file(tmp_path: Path) -> None:
-    with (
-        client_of(Mock(side_effect=httpx.ReadError("connection lost"))) as client,
-        pytest.raises(errors.UnavailableError, match="connection lost"),
-    ):
+    client = client_of(Mock(side_effect=httpx.ReadError("connection lost")))
+    with pytest.raises(errors.UnavailableError, match="connection lost"):
         client.save("/v1/shards/a/file", tmp_path / "a.h5")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_file_that_cannot_be_opened_is_the_callers_mistake(tmp_path: Path) -> None:
-    with client_of(lambda _: httpx.Response(500)) as client, pytest.raises(errors.InputError, match="nowhere"):
-        client.upload(AssetKind.OBJECT, tmp_path / "nowhere.stl")
 
 
 def test_requests_that_come_too_fast_are_sent_again_but_a_used_up_quota_is_told() -> None:

@@ -15,8 +15,10 @@ from typing import Any, Self
 import pytest
 from typer.testing import CliRunner
 
+from graspd import GraspdError, demo, remote
 from graspd.cli import build
 from graspd.client.client import Client
+from graspd.service.cli import plain_console
 from graspd.service.model.states import AssetKind, State
 from graspd.service.run.supervisor import Supervisor
 from graspd.service.settings import Settings
@@ -31,6 +33,8 @@ from tests.shell import completed
 from tests.waiting import PATIENCE_S
 
 STL = b"solid box\nendsolid box\n"
+CREATE = ("datasets", "create", "kitchen", "--hands", "allegro,barrett", "--objects", "mug,block", "--grasps", "64")
+_PAIR = "submit --hand allegro --object mug"
 
 
 @dataclass(frozen=True)
@@ -86,6 +90,20 @@ def test_a_submitted_job_is_listed_shown_cancelled_and_retried(graspd: Shell) ->
     assert graspd.json("logs", job["job"])["attempts"] == []
 
 
+def test_a_cancelled_job_is_a_failure_to_whoever_waits(graspd: Shell, service: Supervisor, tmp_path: Path) -> None:
+    submit = (*_PAIR.split(), "--seed", "2")
+    job = graspd.json(*submit)["job"]
+    graspd("cancel", job)
+    done = graspd(*submit)
+    assert done.returncode == 1 and f"`graspd retry {job[:12]}` runs it again" in said(done)
+    with Client(service.api_url) as client, remote.Client(service.api_url) as user:
+        one, again = user.job(job), client.job(job).request
+        show = lambda: demo.run(client, again, tmp_path, plain_console())  # noqa: E731
+        for call, words in ((one.wait, "ended cancelled"), (one.grasps, "no grasps yet"), (show, "the job cancelled")):
+            with pytest.raises(GraspdError, match=words):
+                call()
+
+
 def test_a_job_asks_for_pictures_and_neighbours(graspd: Shell, tmp_path: Path) -> None:
     pair = ("--hand", "allegro", "--object", "mug")
     (tmp_path / "s.yaml").write_text("supports: [{kind: half_space}]\nneighbours: [{object: block}]\n")
@@ -97,6 +115,7 @@ def test_a_job_asks_for_pictures_and_neighbours(graspd: Shell, tmp_path: Path) -
         f"--scene {tmp_path / 's.yaml'}",
     )
     assert len({graspd.json("submit", *pair, *words.split())["job"] for words in asked}) == len(asked)
+    assert "give more characters" in said(graspd("status", "")), "their ids have the empty prefix in common"
 
 
 def test_the_built_in_hands_and_objects_are_there(graspd: Shell) -> None:
@@ -165,12 +184,10 @@ def _deletable(graspd: Shell, kind: str) -> tuple[str, str]:
         graspd.json("datasets", "create", thing, *few)
         graspd("datasets", "cancel", thing)
         return thing, f"Delete dataset {thing} with 1 cell,"
-    if kind == "objects delete":
-        path = Path(graspd.environment["GRASPD_DATA_DIR"]) / f"{thing}.stl"
-        path.write_bytes(STL + thing.encode())
-        graspd("objects", "add", str(path), "--no-wait")
-        return thing, thing
-    raise AssertionError(kind)
+    path = Path(graspd.environment["GRASPD_DATA_DIR"]) / f"{thing}.stl"
+    path.write_bytes(STL + thing.encode())
+    graspd("objects", "add", str(path), "--no-wait")
+    return thing, thing
 
 
 def test_an_object_is_added_from_a_file_and_its_licence_kept(graspd: Shell, tmp_path: Path) -> None:
@@ -181,10 +198,6 @@ def test_an_object_is_added_from_a_file_and_its_licence_kept(graspd: Shell, tmp_
     store = open_store((Path(graspd.environment["GRASPD_DATA_DIR"]) / "store").as_uri())
     kept = json.loads(load_asset_files(store, AssetKind.OBJECT, made["digest"])["asset.json"])
     assert (kept["licence"], kept["source"]) == ("CC-BY-4.0", "https://example.org/crate")
-
-
-CREATE = ("datasets", "create", "kitchen", "--hands", "allegro,barrett", "--objects", "mug,block", "--grasps", "64")
-_PAIR = "submit --hand allegro --object mug"
 
 
 @pytest.mark.parametrize(
@@ -200,7 +213,10 @@ _PAIR = "submit --hand allegro --object mug"
         (f"{' '.join(CREATE)} --yes --grasps 0", "--grasps: "),
         (f"{' '.join(CREATE)} --yes --views 2", "views need scenes"),
         (f"{' '.join(CREATE)} --yes --fidelity auto --target gsr>=0.5", "graspd chart --publish"),
-        (f"{' '.join(CREATE)} --yes --option keep", "write it as name=value"),
+        (f"{' '.join(CREATE)} --yes --objects {__file__}", f"run `graspd objects add {__file__}`"),
+        ("keys limit lab", "give at least one limit, such as --jobs-per-day"),
+        ("projects limit vision", "give at least one limit, such as --grasps-per-day"),
+        ("projects limit a/b --grasps-per-day 5", "'a/b' is no name of a project"),
     ],
 )
 def test_a_mistake_is_one_line_and_exit_2(graspd: Shell, arguments: str, words: str) -> None:
@@ -293,6 +309,13 @@ def test_a_set_goes_by_its_name_beside_its_folder(graspd: Shell, tmp_path: Path,
         assert graspd.json("datasets", "estimate", "--hands", "allegro", "--objects", place)["cells"] == cells
 
 
+def test_a_folder_of_unusable_objects_makes_no_dataset(graspd: Shell, tmp_path: Path) -> None:
+    (tmp_path / "box.stl").write_bytes(STL)
+    (tmp_path / "asset.json").write_text("{}")
+    done = graspd("datasets", "create", "none", "--hands", "allegro", "--objects", str(tmp_path), "--yes")
+    assert "none of the 1 objects can be used" in said(done)
+
+
 def test_a_snapshot_of_nothing_is_refused(graspd: Shell, tmp_path: Path) -> None:
     graspd.json("datasets", "create", "empty", *CREATE[3:], "--seed", "9", "--yes")
     for command in (("snapshot", "empty"), ("export", "empty", "-o", str(tmp_path))):
@@ -306,5 +329,3 @@ def test_a_spec_in_a_file_is_what_the_options_would_say(graspd: Shell, tmp_path:
     assert (dry["cells"], dry["asked"]) == (4, 252)  # 63 each: a quarter of 250, rounded up
     found = graspd.json("datasets", "estimate", "--spec", str(spec), "--objects", "mug", "--grasps", "10")
     assert (found["cells"], found["asked"]) == (2, 20)
-    made = graspd.json("datasets", "create", "--spec", str(spec), "--yes")["dataset"]
-    assert (made["name"], made["asked"]) == ("spec", 252)

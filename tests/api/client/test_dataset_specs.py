@@ -67,11 +67,12 @@ def test_a_folder_of_objects_lies_beside_the_spec(tmp_path: Path) -> None:
         ("grasps = 3\ntotal_grasps = 4", "give one of them"),
         ('hands = ["allegro"]', "give the objects"),
         ('objects = ["mug"]', "give the hands"),
+        ("[1]", "must contain the keys of a dataset"),
     ],
 )
 def test_a_spec_that_cannot_be_used_says_what_is_wrong(tmp_path: Path, text: str, words: str) -> None:
     with pytest.raises(InputError, match=words):
-        asked(spec(tmp_path, text))
+        asked(spec(tmp_path, text, "k.json" if text == "[1]" else "k.toml"))
     with pytest.raises(InputError, match=r"none\.toml cannot be read"):
         read_spec(tmp_path / "none.toml")
 

@@ -81,6 +81,7 @@ def test_a_dataset_is_made_watched_retried_and_frozen(http: TestClient, services
     chosen = {"action": "cancel", "cell": [services.index.datasets.cells("kitchen").items[0].job_id]}
     assert "1 job cancelled" in http.post("/datasets/kitchen/cells", data=chosen).text
     assert http.post("/datasets/kitchen/retry").status_code == 200
+    assert "a dataset has no action 'burn'" in http.post("/datasets/kitchen/burn").json()["detail"]
     finish_all(services, add_job(services, fidelity="draft"))
     answer = http.post("/datasets/kitchen/snapshot")
     assert "The snapshot is taken" in answer.text

@@ -101,6 +101,8 @@ def test_forms_tag_chosen_grasps_and_lead_back_to_the_list(http: TestClient, ser
     assert does("tag", grasp=f"{shard}:1", here="//example.org").startswith("/grasps?")
     assert does("tag") == does("tag", all="true", filter="job=none") == does("export", grasp="../../x:1") == "422"
     assert "no grasp is selected" in http.post("/grasps/tag", data={"tag": "good"}).text
+    long = {"tag": "good", "all": "true", "filter": "x" * 40_001}
+    assert "the filter of the list cannot be read" in http.post("/grasps/tag", data=long).text
     assert http.post("/grasps/tag", data=filters, headers={"Origin": "https://example.org"}).status_code == 403
     assert http.post("/grasps/export", data={"grasp": f"{shard}:1", "format": "csv"}).text.count("\r\n") == 2
     assert http.post("/tags/good/delete").status_code == 422, "its name was not typed"

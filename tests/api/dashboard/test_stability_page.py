@@ -1,8 +1,7 @@
-"""The maps of failure on their page: laid out as pictures are, told in words, and what stands there before any."""
+"""The maps of failure on their page: laid out as pictures are, told in words."""
 
 import math
 
-import pytest
 from starlette.testclient import TestClient
 
 from graspd.api.dashboard.figures import PITCH, draw
@@ -62,10 +61,3 @@ def test_the_page_shows_the_latest_maps_and_what_they_mean(http: TestClient, ser
     shown = ("energy", "weak: 1.02", "hands sink in", "direct has none", "tests/test_it.py::test_it", "the soft ones")
     cells = ("mesh inside out (fine)", "time step [s] 0.01: broken; note 4", "graspd stability")
     assert [words for words in shown + cells if words not in page] == []
-
-
-@pytest.mark.parametrize("stored", [None, b"{}", b"no json"])
-def test_without_maps_the_page_names_the_command(http: TestClient, services: Services, stored: bytes | None) -> None:
-    if stored is not None:
-        services.store.put("stability/20260101.json", stored)
-    assert "graspd stability --quick --publish" in http.get("/stability").text

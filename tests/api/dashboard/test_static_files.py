@@ -15,6 +15,13 @@ from graspd.api.dashboard.rendering import STATIC, environment
 GIVEN: Final = {"may_change", "caller"}
 ENVIRONMENT: Final = environment()
 TEMPLATES: Final = sorted(ENVIRONMENT.list_templates())
+FOLDERS = (STATIC / "vendor", Path(__file__).parents[2] / "browser" / "vendor")
+#: What is bundled comes with the list of its parts.
+SOURCES = {"three-entry.mjs"}
+PERMISSIVE = {"MIT", "0BSD", "OFL-1.1", "Apache-2.0"}
+#: What WCAG asks for between a text of that size and what it stands on.
+CONTRAST = 4.5
+_PAIR = r"light-dark\((#\w{6}), (#\w{6})\)"
 
 
 def parsed(name: str) -> nodes.Template:
@@ -47,12 +54,6 @@ def test_a_template_compiles_and_calls_what_there_is(name: str) -> None:
     assert missing == set()
 
 
-FOLDERS = (STATIC / "vendor", Path(__file__).parents[2] / "browser" / "vendor")
-#: What is bundled comes with the list of its parts.
-SOURCES = {"three-entry.mjs"}
-PERMISSIVE = {"MIT", "0BSD", "OFL-1.1", "Apache-2.0"}
-
-
 @pytest.mark.parametrize("folder", FOLDERS, ids=["served", "for tests"])
 def test_vendored_files_are_those_of_the_list(folder: Path) -> None:
     entries = json.loads((folder / "vendor.json").read_text())
@@ -69,11 +70,6 @@ def test_what_users_are_served_is_licensed_permissively() -> None:
     entries = json.loads((FOLDERS[0] / "vendor.json").read_text())
     assert {entry["licence"] for entry in entries} <= PERMISSIVE
     assert all(entry["version"] and entry["made"] for entry in entries)
-
-
-#: What WCAG asks for between a text of that size and what it stands on.
-CONTRAST = 4.5
-_PAIR = r"light-dark\((#\w{6}), (#\w{6})\)"
 
 
 def luminance(colour: str) -> float:

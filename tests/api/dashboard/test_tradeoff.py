@@ -1,9 +1,10 @@
-"""The charts of speed against accuracy: points, front, free ones apart from those in scenes, and what stands there
+"""The charts of speed against accuracy: points, front, free ones apart from those in scenes, and what a page shows
 before anything is measured."""
 
 import itertools
 import json
 import math
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -111,7 +112,8 @@ def test_the_page_shows_the_chart_that_was_published_last(http: TestClient, serv
 
 
 @pytest.mark.parametrize("stored", [None, b"{}", b"no json"])
-def test_without_a_chart_the_page_names_the_command(http: TestClient, services: Services, stored: bytes | None) -> None:
-    if stored is not None:
-        services.store.put("charts/20260101.json", stored)
-    assert "graspd chart" in http.get("/chart").text
+def test_with_nothing_to_show_a_page_names_the_command(http: TestClient, services: Services, stored: Any) -> None:
+    for kind, page in (("charts", "chart"), ("stability", "stability")):
+        if stored is not None:
+            services.store.put(f"{kind}/20260101.json", stored)
+        assert f"graspd {page} --quick --publish" in http.get(f"/{page}").text

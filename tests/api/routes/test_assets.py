@@ -141,6 +141,13 @@ def test_sixty_long_uploads_keep_no_other_request_waiting(app: FastAPI, monkeypa
     assert {(answer.status_code, "retry-after" in answer.headers) for answer in answers} == {(503, True)}
 
 
+def test_more_uploads_at_once_than_fit_are_refused(http: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(assets, "_AT_ONCE", threading.Semaphore(0))
+    monkeypatch.setattr(assets, "_TURN_S", 0.0)
+    answer = http.post("/v1/objects", files={"file": ("box.stl", STL)})
+    assert answer.status_code == 429 and "too many uploads at once; try again" in answer.json()["detail"]
+
+
 def test_a_turn_that_does_not_come_in_time_is_refused() -> None:
     async def use() -> None:
         turns = RequestLimiter(1, patience_s=0.05)

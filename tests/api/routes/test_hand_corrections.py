@@ -16,10 +16,12 @@ from graspd.service.store.assets import builtin_files
 from graspd.service.store.descriptions import MAX_ENTRIES
 from graspd.service.store.library import load_asset, load_asset_files
 from tests.api.conftest import BASE_URL
-from tests.api.factories import people_of
+from tests.api.factories import people_of, zipped
+from tests.damage import overwrite
 
 FILES = builtin_files(AssetKind.HAND, "barrett")
 SAID = {"closing": {"finger_1_spread": 1}, "preshape": {"finger_2_medial": -0.3}}
+WRONG = {"approach_x=far": "no number", "closing.0=7": "-1, 0 or 1", "palm_link=<b>": "&lt;b&gt;", "name=a b": "name"}
 
 
 def corrected(http: TestClient, body: dict[str, Any], hand: str = "barrett") -> Any:
@@ -96,6 +98,16 @@ def test_a_model_of_an_older_version_says_the_mend(http: TestClient, services: S
         assert "older version" in http.get("/hands/old").text
 
 
+def test_damaged_files_or_a_long_description_are_refused(http: TestClient, services: Services, monkeypatch) -> None:
+    monkeypatch.setattr("graspd.api.catalog.assets.MAX_BYTES", 100)
+    answer = corrected(http, SAID)
+    assert answer.status_code == 413 and "give fewer corrections" in answer.json()["detail"]
+    key = names.asset_files(AssetKind.HAND, http.get("/v1/hands/barrett").json()["digest"])
+    overwrite(services.store, key, zipped({"other.urdf": b"<robot/>"}))
+    answer = corrected(http, SAID)
+    assert answer.status_code == 500 and "upload it again" in answer.json()["detail"]
+
+
 def test_a_reader_corrects_nothing_and_a_writer_owns_the_hand(settings: Settings, services: Services) -> None:
     people = people_of(settings, reader=(Scope.READ, ""), writer=(Scope.SUBMIT, ""))
     with TestClient(create_app(settings, services), base_url=BASE_URL) as http:
@@ -119,9 +131,6 @@ def test_the_page_has_a_field_for_each_guess_without_scripts(http: TestClient) -
     assert answer.headers["location"] == f"/hands/{made['digest']}"
     shown = http.get(answer.headers["location"]).text
     assert "A worker checks the hand" in shown and 'data-poll="2"' in shown
-
-
-WRONG = {"approach_x=far": "no number", "closing.0=7": "-1, 0 or 1", "palm_link=<b>": "&lt;b&gt;", "name=a b": "name"}
 
 
 @pytest.mark.parametrize(("typed", "says"), WRONG.items())

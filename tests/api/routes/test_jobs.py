@@ -17,6 +17,7 @@ from tests.service.pipeline.test_fidelity_choice import scene_chart
 from tests.waiting import until
 
 JOB = {"hand": "allegro", "object": "mug", "grasps": 64, "scenes": 1, "views": 1}
+PAIR = {"hand": "allegro", "object": "mug", "grasps": 32}
 
 
 def test_a_submitted_job_has_an_address_and_is_one_job(http: TestClient) -> None:
@@ -121,9 +122,6 @@ def test_time_that_another_job_spent_is_not_counted_twice(http: TestClient, serv
     assert http.get(f"/v1/jobs/{first.id}").json()["stages"][0]["seconds"] == 12.5
     assert "12 s, 1 reused" in http.get(f"/jobs/{second.id}").text
     assert "none, reused" in http.get(f"/jobs/{add_job(services, seed=7, scenes=1).id}").text
-
-
-PAIR = {"hand": "allegro", "object": "mug", "grasps": 32}
 
 
 def test_a_job_in_a_scene_tells_its_stages_and_its_scene(http: TestClient) -> None:

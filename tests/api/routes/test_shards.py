@@ -17,6 +17,8 @@ from graspd.service.store.store import Store
 from tests.api.factories import add_job, finish_all
 from tests.damage import cut, flip, remove
 
+MODEL = "/v1/hands/allegro/model"
+
 
 @pytest.fixture
 def shard(services: Services) -> str:
@@ -26,9 +28,6 @@ def shard(services: Services) -> str:
 @pytest.fixture
 def file(shard: str) -> str:
     return f"/v1/shards/{shard}/file"
-
-
-MODEL = "/v1/hands/allegro/model"
 
 
 def test_what_a_client_has_is_not_sent_again(http: TestClient, file: str) -> None:
@@ -78,12 +77,6 @@ def test_head_is_logged_and_counted_as_head(app: FastAPI, http: TestClient) -> N
     assert 'method="HEAD",route="/healthz"' in app.state.metrics.render(app.state.overview.snapshot()).decode()
 
 
-def test_allow_names_head_beside_get(http: TestClient) -> None:
-    answer = http.put("/v1/jobs")
-    assert (answer.status_code, answer.headers["allow"]) == (405, "GET, HEAD, POST")
-    assert answer.json()["type"] == "/problems/method-not-allowed"
-
-
 def test_an_encoded_body_is_refused_by_its_encoding(http: TestClient) -> None:
     places = (("POST", "/v1/jobs"), ("POST", "/submit"), ("DELETE", "/v1/jobs/x"))
     for encoding, (method, path) in product(("gzip", "zstd", "gzip, br"), places):
@@ -99,12 +92,15 @@ def test_a_day_is_a_full_date_and_nothing_else(http: TestClient) -> None:
         assert http.get(path, params={"since": "2026-01-30", "until": "2026-01-31"}).status_code == 200
         for day, name in product(odd, ("since", "until")):
             assert http.get(path, params={name: day}).status_code == 422, (name, day)
+        assert "at most 366 days" in http.get(path, params={"since": "2025-01-30", "until": "2026-01-31"}).text
 
 
-def test_an_estimate_names_the_one_method_that_works(http: TestClient) -> None:
-    for method in ("GET", "HEAD", "PUT", "OPTIONS", "PROPFIND"):
-        answer = http.request(method, "/v1/datasets/estimate")
-        assert (answer.status_code, answer.headers["allow"]) == (405, "POST")
+def test_a_method_that_an_address_lacks_is_told_the_others(http: TestClient) -> None:
+    asked = [(method, "/v1/datasets/estimate", "POST") for method in ("GET", "HEAD", "PUT", "OPTIONS", "PROPFIND")]
+    for method, path, others in (*asked, ("PUT", "/v1/jobs", "GET, HEAD, POST")):
+        answer = http.request(method, path)
+        assert (answer.status_code, answer.headers["allow"]) == (405, others)
+    assert answer.json()["type"] == "/problems/method-not-allowed"
     matrix = {"name": "estimate", "hands": ["allegro"], "objects": ["mug"]}
     assert http.post("/v1/datasets", json=matrix).status_code == 422, "no dataset takes its name"
 
