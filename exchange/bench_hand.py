@@ -172,7 +172,7 @@ def _text(values: Any) -> str:
     return " ".join(f"{float(value):.12g}" for value in values)
 
 
-#: Folder of the grasps of an experiment; the mapping is in its parent.
+#: Folder of an experiment's grasps; the mapping file is in the parent folder.
 GRASPS: Final = "graspdata"
 #: Folder of grasps that were collected for training.
 COLLECTED: Final = "succ_collect"
@@ -183,7 +183,7 @@ _FOLDERS: Final = (GRASPS, COLLECTED, "evaluation", "succgrasp")
 
 @dataclass(frozen=True)
 class HandMapping:
-    """Map between graspd's joints and `qpos`: root pose (7,) of the model, then joints in its order."""
+    """Map between graspd's postures and `qpos`: the model's root pose (7,), then joints in its order."""
 
     hand: str
     root_link: str
@@ -236,7 +236,7 @@ def _read(path: Path) -> HandMapping | None:
     try:
         found = TypeAdapter(HandMapping).validate_json(path.read_bytes())
     except ValidationError:
-        raise InputError(f"{path} is no mapping of a hand; export the grasps again or remove it") from None
+        raise InputError(f"{path} is no mapping of a hand; export the grasps again or remove this file") from None
     if (numbers := len(found.root_in_model)) != len(IDENTITY_POSE):
         raise InputError(f"{path}: root_in_model has {numbers} numbers instead of {len(IDENTITY_POSE)}")
     return found
@@ -258,7 +258,7 @@ _ALLEGRO_URDFS: Final = (
 )
 #: Pose of the palm of DexGraspBench's Allegro hand in the model's world frame: a rotation alone.
 _ALLEGRO_ROOT: Final = (0.0, 0.0, 0.0, 0.0, 0.5**0.5, 0.0, 0.5**0.5)
-#: Pose of the palm of DexGraspBench's Shadow hand, above the wrist, which is omitted.
+#: Pose of the palm of DexGraspBench's Shadow hand. The wrist below the palm is omitted.
 _SHADOW_ROOT: Final = (0.0, 0.0, 0.034, 1.0, 0.0, 0.0, 0.0)
 
 

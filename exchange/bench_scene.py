@@ -3,7 +3,7 @@
 Files of an object are its mesh, convex pieces, measurements, and scenes. In a scene the object floats at scale 1 or is
 on a table. Poses on a table are in the table's frame: z up, top at z = 0, where the evaluator has a floor. Grasps on a
 table have two more fields, for arms. `approach_qpos` (W, 7 + J) leads the open hand from the standoff to the pregrasp.
-`lift_qpos` (7 + J,) is the raised squeeze. The evaluator raises a hand without arm itself."""
+`lift_qpos` (7 + J,) is the raised squeeze. The evaluator itself raises a hand without an arm."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ SCALE: Final = "scale100"
 
 
 def write_object(obj: ObjectModel, name: str, root: Path) -> tuple[Path, Path]:
-    """Write an object and its scene below `root` as in a checkout; return folder and scene, both relative."""
+    """Write an object and its scene below `root`; return its folder and scene file, relative to `root`."""
     folder, scene = SET / "processed_data" / name, SET / "scene_cfg" / name / "floating" / f"{SCALE}.npy"
     for part in (folder / "mesh", folder / "info", folder / "urdf" / "meshes", SET / "valid_split"):
         (root / part).mkdir(parents=True, exist_ok=True)
@@ -159,7 +159,7 @@ def object_of_scene(file: Path, scene_path: str) -> Row:
 def with_trajectory(
     hand: HandModel, grasps: GraspSet, rows: Sequence[Row], obj_pose: Floats, mapping: HandMapping | None
 ) -> GraspSet:
-    """Add approach and lift in the object frame if waypoint numbers are equal and the hand stays open."""
+    """Add approach and lift (object frame) if approaches have equally many waypoints and constant joints."""
     if not all({"approach_qpos", "lift_qpos"} <= set(row) for row in rows):
         return grasps
     ways = [np.asarray(row["approach_qpos"], float) for row in rows]

@@ -77,9 +77,9 @@ def write(
     placed: PlacedGrasps | None = None,
 ) -> list[Path]:
     """Write grasps and all files that DexGraspBench's evaluator needs, to be copied over its checkout.
-    The object has scale 1. It is at the origin or, for `placed` grasps, on its table, as in the tabletop test; both are
-    separate experiments. Grasps are written for a model of the hand that is made here, and for the benchmark's own
-    model of the same hand, if any. Return the files of grasps for the first model."""
+    The object has scale 1. It is at the origin or, for `placed` grasps, on its table, as in the tabletop test; the two
+    cases are separate experiments. Grasps are written for a model of the hand that is made here, and for the
+    benchmark's own model of the same hand, if any. Return the files of grasps for the first model."""
     if placed is not None:
         check_table(placed)
     name = plain_name(obj.name)

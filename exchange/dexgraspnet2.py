@@ -12,9 +12,9 @@ Zhang et al., DexGraspNet 2.0, CoRL 2024. Below `data/`, NNNN is a scene and VVV
         `translation` (N, 3), `rotation` (N, 3, 3): root link in the camera frame of view 0; `point` (N, 3):
             surface point of the object that the grasp aims at, in the same frame; each joint (N,) by its name
     dex_graspness_new/scene_NNNN/realsense/VVVV.npy
-        (P, 1) f4 graspness of the P points that its loader makes of the view, in pixel order
+        (P, 1) f4 graspness of the P points that DexGraspNet's loader makes of the view, in pixel order
 
-Its loader puts the centre of pixel (u, v) at u, v, but graspd at u + 0.5, v + 0.5. The intrinsics account for this.
+That loader puts the centre of pixel (u, v) at u, v, but graspd at u + 0.5, v + 0.5. The intrinsics account for this.
 
 Graspness is a distance-weighted number of grasps that aim at a point. Values follow src/preprocess/dex_graspness.py,
 and clouds follow src/utils/pc.py, both of zcyqyq/DexTouch-sim2real at 7824d859a8da1d942bc38709a9d217dfb548db5d. 1,000
@@ -208,7 +208,7 @@ CAMERA: Final = "realsense"
 VIEWS: Final = 256
 #: Steps per metre in a depth picture: 16 bits reach 6.5 m.
 FACTOR: Final = 10000
-#: Scene numbers: for training those of `train_1` and `part`, for held-out objects those of `val` and `test`.
+#: Numbers of scenes: `train_1` and `part` are for training, `val` and `test` for held-out objects.
 TRAIN: Final = (range(90), range(1000, 8500))
 HELD_OUT: Final = (range(90, 100), range(100, 190))
 #: Keys of a file of grasps that do not name joints.
@@ -218,9 +218,9 @@ _OURS: Final = ("pregrasp_qpos", "squeeze_qpos", "success", "row")
 _NUMPYS: Final = ("file", "args", "kwds", "allow_pickle")
 #: Largest size of a `meta` file [bytes]; real ones have 2 kB. Unpacked, a file is at most 1,000 times as large.
 _LARGEST_META: Final = 64 * 2**10
-#: Largest unpacked size of a file's members [bytes]; files of grasps of one object are far smaller.
+#: Largest unpacked size of an `.npz` file [bytes]; the grasps of one object are far smaller.
 LARGEST: Final = 2**30
-#: Largest number of members.
+#: Largest number of arrays in an `.npz` file.
 _MEMBERS: Final = 1024
 
 

@@ -34,7 +34,7 @@ from graspd.worker.grasps import GraspSet
 #: Folder of each `quality/grasp_type`; the number before the underscore is a network's input.
 TYPES: Final = ("0_any", "1_power", "2_precision", "3_lateral")
 VISION: Final = SET / "vision_data" / "azure_kinect_dk"
-#: Number of points in a network's input, which are sampled from a cloud with repetition.
+#: Number of points in a network's input; they are sampled from a cloud with repetition.
 POINTS: Final = 1024
 _FREE: Final = -1
 
@@ -108,13 +108,13 @@ def _clouds(
         written[scene] += 1
     bare = set(scenes.values()) - set(written)
     for scene in bare if written else ():
-        # DexLearn's test samples a cloud of every scene in the folder.
+        # DexLearn's test needs a cloud of every scene in the folder.
         (folder / scene).unlink()
     return written.total(), len(bare)
 
 
 def points_of(pictures: Pictures, look: PictureReference, noise: DepthNoise | None, *, on_table: bool) -> Floats:
-    """Return the object's points (P, 3) in a picture [m]; without a table, in the object's frame."""
+    """Return the object's points (P, 3) in a picture [m]; frame of the table, if any, or of the object."""
     view = CloudView(pictures[look.index], noise, np.random.default_rng(look.index))
     points = view.points(*view.pixels(whole=False))
     return points if on_table else apply(invert(look.object_pose), points)

@@ -48,7 +48,7 @@ POSTURES: Final = ("pregrasp", "grasp", "squeeze")
 PER_SHARD: Final = 64
 #: Largest size of a record that is read [bytes]; 2,000 grasps have half a megabyte.
 LARGEST: Final = 256 * 2**20
-#: GraspGen's generator skips objects with fewer good grasps.
+#: GraspGen's generator skips objects with fewer good grasps than this.
 FEWEST: Final = 5
 #: Tolerance of a published rotation matrix, since matrices are printed with six digits or more.
 _ROTATION: Final = 1e-3
@@ -128,7 +128,7 @@ def _record(hand: HandModel, lots: list[ExportPart]) -> dict[str, Any]:
 
 def convention(hand: HandModel) -> dict[str, Any]:
     """Return values of a gripper's YAML file: opening [m], reach along the approach [m], and frame.
-    The frame is that of GraspGen's convention in the base link's frame, as [[x, y, z], [x, y, z, w]]. For a hand
+    GraspGen's frame is given by its pose [[x, y, z], [x, y, z, w]] in the base link's frame. For a hand
     without jaws, x is the direction across the approach with the largest distance of open fingertips."""
     z, jaws = hand.palm.approach, jaws_of(hand)
     if jaws is not None:
@@ -167,7 +167,7 @@ def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[Impo
         raise InputError(f"{file} has transforms of shape {matrices.shape} for {len(held)} grasps")
     turns = matrices[:, :3, :3]
     if not np.abs(turns @ np.swapaxes(turns, 1, 2) - np.eye(3)).max() < _ROTATION or np.linalg.det(turns).min() < 0:
-        raise InputError(f"{file} has transforms that are no poses")
+        raise InputError(f"{file} has transforms that are not poses")
     if not 0 < scale < np.inf:
         raise InputError(f"{file} has an object of scale {scale:g}")
     model, thing = hand_from_path(hand), scaled_object(obj, scale)
@@ -203,7 +203,7 @@ def _found(path: Path, uuid: str) -> tuple[str, dict[str, Any]]:
     found: tuple[str, dict[str, Any]] | None = None
     for file in files:
         try:
-            # Only uncompressed files, in which a member is as large as its space in the file.
+            # Only an uncompressed file is opened: none of its members is larger than the file.
             with tarfile.open(file, "r:") as tar:
                 for member in tar:
                     key, _, what = Path(member.name).name.partition(".")

@@ -36,7 +36,7 @@ POSTURES: Final = ("pregrasp", "grasp", "squeeze")
 #: Values of column `scene_kind` that `read` supports.
 FREE: Final = "free"
 TABLE: Final = "table"
-#: Columns of grasps, with types as names for `parquet.type_of`.
+#: Columns of grasps, with the names of their types in `parquet.type_of`.
 GRASPS: Final = {
     "hand": "text",
     "object": "text",
@@ -109,7 +109,7 @@ def write(
         }
         for table in (["grasps", "pictures"] if len(pictures) else ["grasps"])
     ]
-    # The head of a data set's card: JSON is YAML.
+    # The head of a data set's card, as JSON, which is valid YAML.
     (folder / "README.md").write_text(
         f"---\nconfigs: {json.dumps(tables)}\n---\n\n# Grasps made with graspd\n\n"
         "Columns, units and frames: docs/how-to/exchange/huggingface.md of graspd.\n"

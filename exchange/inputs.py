@@ -1,4 +1,4 @@
-"""Grasps to evaluate from files: our base shards, published reference grasps, DexGraspBench folders."""
+"""Grasps from files, for evaluation: base shards, published reference grasps, DexGraspBench folders."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.environment import PlacedGrasps
 
-#: JSON files without grasps in folders of shards.
+#: JSON files in folders of shards that contain no grasps.
 BESIDE_SHARDS: Final = ("snapshot.json", "subset.json", "card.json", "clouds.json")
 
 
@@ -87,7 +87,7 @@ def _shard(path: Path, hand: str | None, obj: str | None) -> Case:
     model, thing = hand_of_shard(shard, hand), object_of_shard(shard, obj)
     grasps = GraspSet.from_columns(shard.arrays)
     if (joints := grasps.grasp.joint_positions.shape[1]) != len(model.joint_names):
-        raise InputError(f"{path} has {joints} joints, {model.name} {len(model.joint_names)}; give --hand")
+        raise InputError(f"{path} has {joints} joints, but {model.name} has {len(model.joint_names)}; give --hand")
     said = shard.attributes
     return Case(
         path.name,

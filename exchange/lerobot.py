@@ -66,7 +66,7 @@ _INDEXED: Final = {
 
 
 def write(lots: Sequence[ExportPart], pictures: Pictures, folder: Path, out: frozenset[str]) -> ExportSummary:
-    """Write an episode per grasp in a pictured scene (pictures round-robin); held-out objects come last."""
+    """Write an episode per grasp, with a picture of its scene (round-robin); held-out objects come last."""
     parquet.arrow()
     if (folder / "meta").exists():
         raise InputError(f"{folder} holds a data set already; give another folder as --output")
@@ -221,7 +221,7 @@ def task_of(name: str) -> str:
 
 
 def _statistics(values: NDArray[Any], *, picture: bool) -> dict[str, Any]:
-    """Compute statistics of frames (F, n), each (n,), or of pixels (P, 3), each (3, 1, 1)."""
+    """Return statistics: of shape (n,) for frames (F, n), of shape (3, 1, 1) for pixels (P, 3)."""
     values = np.asarray(values, float)
     found = {
         "min": values.min(axis=0),

@@ -46,7 +46,7 @@ class ExportPart:
 
 
 def held_out(kinds: Mapping[str, str], share: float) -> frozenset[str]:
-    """Return the objects of a share of the families, which are chosen by hash.
+    """Return the objects of a share of the families; a hash selects these families.
     At least one family is chosen and one is not; a single family is not chosen."""
     order = sorted(set(kinds.values()), key=lambda kind: hashlib.sha256(kind.encode()).digest())
     chosen = order[: min(max(1, round(share * len(order))), len(order) - 1)]

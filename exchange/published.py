@@ -7,7 +7,7 @@ and distal angles of finger 1, the same of finger 2, then the medial and distal 
 DexGraspNet's layout: a `.npy` file per object with a list of dictionaries: `scale`, and `qpos` by joint name.
 
 Wang et al., DexGraspNet, ICRA 2023. `qpos` has the root's translation WRJTx, y, z [m] and its rotation WRJRx, y, z:
-Euler angles about the fixed axes x, y, z in turn [rad]. Joints are `robot0:FFJ3` ... of the MuJoCo Shadow hand, whose
+Euler angles about the fixed axes x, y, z in turn [rad]. Joints are `robot0:FFJ3` ... of the MuJoCo Shadow hand; their
 numbers are one less than in the URDF (FFJ4 ...). The object's mesh is multiplied by `scale`.
 
 MultiDex, the dataset of GenDexGrasp: a torch file with a list `metadata` of (..., q, object, robot) tuples.
@@ -143,7 +143,7 @@ def read_multidex(path: Path, *, hand: str, obj: str, robot: str, object_name: s
     q = np.stack([np.asarray(row[-3], float).ravel() for row in rows])
     joints = len(model.joint_names)
     if q.shape[1] not in (9 + joints, 6 + joints):
-        raise InputError(f"{path}: q has {q.shape[1]} numbers, {model.name} needs 9 + {joints} or 6 + {joints}")
+        raise InputError(f"{path}: q has {q.shape[1]} numbers, but {model.name} needs 9 + {joints} or 6 + {joints}")
     turn = rotation_of_columns(q[:, 3:9]) if q.shape[1] == 9 + joints else rotation_of_angles(q[:, 3:6])
     grasp = Posture(np.concatenate([q[:, :3], turn], axis=1), q[:, -joints:])
     return [ImportedGrasps(model, thing, add_postures(model, thing, grasp), object_name.rpartition("+")[2])]

@@ -44,7 +44,7 @@ class RobotExportOptions:
     unvalidated: bool = False
     every: bool = False
     best: int = 0
-    """Largest number of grasps, best epsilon first; 0: all, in the order of the shard."""
+    """Largest number of grasps, best epsilon first; 0 for all, in the order of the shard."""
     tool: str | None = None
     speed: float = 0.5
     """Share of the velocity limits that trajectories use."""

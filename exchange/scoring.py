@@ -67,7 +67,7 @@ def write_scored(
     if found.published is not None and (found.published >= 0).any():
         arrays["quality/published"] = found.published
     if scenes is not None:
-        # Other formats support no scene but a table.
+        # Imported grasps have no scene but a table.
         attributes["scene"] = json_attribute(SceneSpec(kind="table").model_dump(mode="json"))
         arrays["scene/object_pose"] = scenes.object_pose
         arrays["scene/rest_probability"] = np.full(len(scenes.object_pose), np.nan)

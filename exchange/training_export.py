@@ -36,7 +36,7 @@ class TrainingExportOptions:
     every: bool = False
     held_out: float = 0.2
     noise: str = ""
-    """Name of a depth camera; empty: perfect depth."""
+    """Name of a depth camera; empty for perfect depth."""
 
 
 def export_training(source: Path, format_: str, wishes: TrainingExportOptions, folder: Path) -> ExportSummary:

@@ -45,8 +45,8 @@ def validated_batches(
 ) -> list[ValidatedBatch]:
     """Plan consecutive batches of a job from number `first`, each with the result of `validated_grasps`.
     `join` batches are planned in one launch. `scenes` are common to all batches, or one per batch. With `partial`, a
-    cancellation returns the batches validated so far. `checked` receives each finished batch and may raise. An error in
-    `empty_on` gives a batch without grasps, except the job's first batch. Other errors cancel all other batches."""
+    cancellation returns the batches validated so far. `checked` receives each finished batch and may raise. An error
+    whose type is in `empty_on` gives an empty batch, but not for the job's first. Other errors cancel all batches."""
     known: list[ConvexPieces] = []
 
     def pieces_once(prepared: ObjectModel) -> ConvexPieces:
@@ -112,7 +112,7 @@ class _Job:
                 own.progress(1.0, 1.0, "done")
 
     def in_waves(self, join: int) -> Generator[Made]:
-        """Plan candidates of `join` batches in one launch, while the wave before is validated and measured."""
+        """Plan candidates of `join` batches in one launch, while the previous wave is validated and measured."""
         require_graspable(self.hand, self.obj)
         stop, shares = threading.Event(), ProgressShares(self.sizes, self.run.progress)
         run = replace(self.run, cancelled=lambda: stop.is_set() or self.run.cancelled())

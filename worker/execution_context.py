@@ -42,15 +42,15 @@ class ExecutionContext:
 
     device: str = "cpu"
     threads: int = 0
-    """CPU threads; 0: one per core that this process may use."""
+    """CPU threads; 0 for one per core that this process may use."""
     progress: Progress = lambda done, total, message: None
     cancelled: Cancelled = lambda: False
     prefilter: PrefilterMode = "auto"
     """Whether MuJoCo Warp decides clear verdicts; auto: on a GPU, if it is installed."""
     pool: Pool | None = None
-    """Processes for validation and measurement; None: threads of this process."""
+    """Processes for validation and measurement; None for threads of this process."""
     sharing: CoreSharing | None = None
-    """Parallel parts, including this one, that share the cores; None: all cores are available."""
+    """Parallel parts, including this one, that share the cores; None if all cores are available."""
 
     @property
     def cores(self) -> int:
@@ -145,7 +145,7 @@ def parallel_map(
 def evaluate_rows(
     rows: Sequence[int], make: Callable[[], T], ask: Callable[[T, int], R], *, threads: int, name: str
 ) -> list[R]:
-    """Run `ask` on grasps `rows` in parallel, with one test per thread; return results in this order."""
+    """Run `ask` on grasps `rows` in parallel, with a test per thread; return results in order of `rows`."""
     if not len(rows):
         return []
     if (workers := min(threads, len(rows))) <= 1:
@@ -175,7 +175,7 @@ def measure_rows(
     run: ExecutionContext,
     name: str,
 ) -> NDArray[np.float64]:
-    """Return measurements (count,) of the grasps that are `held` (count,), else nan; None: of all grasps."""
+    """Return measurements (count,), nan for grasps not `held` (count,); if `held` is None, of all grasps."""
 
     def asked(test: T, row: int) -> float:
         run.check("the validator")

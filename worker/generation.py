@@ -2,7 +2,7 @@
 
 A grasp is feasible if it passes the geometric gate, and valid if it is feasible and held by the validator. Without
 validation, feasible grasps are counted instead and none is valid. If a job wants robust grasps, a valid grasp counts
-only if it holds in the wanted share of perturbed models. Expensive steps come last: measurement follows validation, and
+only if it holds in the wanted share of perturbed models. Expensive steps come late: measurement follows validation, and
 perturbed models come last."""
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ from graspd.worker.validation.validator import prefiltered, validate
 #: dropped: the validator did not hold it. gate: it fails the geometric gate. not_robust: it holds in too few models.
 #: weak: its payload is too small. alike: it is a near-duplicate of a selected grasp.
 REJECTIONS: Final = ("diverged", "blocked", "dropped", "gate", "not_robust", "weak", "alike")
-#: Rejection of each outcome with another name; failed pushes and lifts of the validator are `dropped`.
+#: Rejections whose names differ from the outcome's; failed pushes and lifts of the validator are `dropped`.
 _REJECTION_OF: Final = {"no_place": "blocked", **{f"gate_{name}": "gate" for name in GATES}}
 #: Names of the outcomes of failed pushes and of failed lifts.
 _PUSHED: Final = {
@@ -80,7 +80,7 @@ class ValidatedBatch:
     outcomes: dict[str, int]
     """Number of rejected candidates, by outcome or failed gate (`service.model.planning.OUTCOMES`)."""
     verdict_key: str | None
-    """Digest of all settings that affect verdicts; None: not validated."""
+    """Digest of all settings that affect verdicts; None without validation."""
     planned: int
     seconds: dict[str, float] = field(default_factory=dict)
     shares: dict[str, float] = field(default_factory=dict)
@@ -176,7 +176,7 @@ class Scoring(AbstractContextManager["Scoring"]):
         self.run = replace(self.run, cancelled=DEFAULT_CONTEXT.cancelled)
 
     def rollout(self, known: Known) -> Rollout | None:
-        """Return the rollout of candidates; None: grasps are not validated, or the planner's loss decides.
+        """Return the rollout of candidates; None without validation, or if the planner's loss decides.
         Verdicts of rollouts at the job's level are added to `known`."""
         if self.pieces is None:
             return None
@@ -197,7 +197,7 @@ class Scoring(AbstractContextManager["Scoring"]):
         return self.request.validation
 
     def prefiltered(self, planned: GraspSet) -> PrefilterVerdicts | None:
-        """Return the GPU prefilter's verdicts on the finite grasps; None: the prefilter is not used."""
+        """Return the GPU prefilter's verdicts on the finite grasps; None if the prefilter is not used."""
         if self.pieces is None or self.scenes is not None or not prefilter_key_terms(self.hand, self._level, self.run):
             return None
         finite = planned.take(np.flatnonzero(planned.finite))
@@ -316,7 +316,7 @@ class Scoring(AbstractContextManager["Scoring"]):
         return columns
 
     def placed(self, grasps: GraspSet) -> PlacedGrasps | None:
-        """Return the grasps with their scenes; None: free object."""
+        """Return the grasps with their scenes; None for a free object."""
         if self.scenes is None:
             return None
         assert grasps.scene is not None
@@ -337,7 +337,7 @@ class RoundRequest:
     begun: int
     """Number of the batch's candidates that were planned before this round."""
     progress: tuple[float, float]
-    """Progress of the batch before these rows, and the expected progress after them at the rate so far."""
+    """Progress of the batch before these rows, and the expected progress after them."""
 
 
 class Batch:
@@ -346,7 +346,7 @@ class Batch:
     def __init__(
         self, scoring: Scoring, number: int, count: int, run: ExecutionContext, scenes: range | None = None
     ) -> None:
-        """Begin a batch. `run` reports its progress; `scenes` is its part of the job's scenes, None: all."""
+        """Begin a batch. `run` reports its progress; `scenes` is its part of the job's scenes, None for all."""
         self.scoring, self.number, self.count, self.run = scoring, number, count, run
         self.request = scoring.request
         self.rounds: list[Round] = []
@@ -359,7 +359,7 @@ class Batch:
         self._kept = np.zeros((0, POINTS, 3))
         self._needs = self._round_requests()
         self.needed = next(self._needs, None)
-        """Candidates to make and add next; None: the batch is ready for `finish`."""
+        """Candidates to make and add next; None once the batch is ready for `finish`."""
 
     def _round_requests(self) -> Iterator[RoundRequest]:
         """Yield requests until `count` grasps are found or the budget is used up; call `add` after each."""
@@ -397,7 +397,7 @@ class Batch:
         self.needed = next(self._needs, None)
 
     def _is_unreachable(self) -> bool:
-        """Check whether the latest grasps, none selected, show that the hand lifts far less than wanted."""
+        """Check whether the latest grasps show that the hand lifts far less than the wanted payload."""
         scoring = self.scoring
         if scoring.pieces is None or (self.limit is not None and self.limit.grasps >= ENOUGH):
             return False
@@ -478,7 +478,7 @@ class Batch:
         return NoStartFound(f"{error}: {why}") if why else error
 
     def finish(self) -> ValidatedBatch:
-        """Join the rounds to one batch of `count` grasps, with rechecks."""
+        """Join the rounds to one batch of at most `count` grasps, with rechecks."""
         scoring, rounds, count = self.scoring, self.rounds, self.count
         grasps = joined([part.grasps for part in rounds])
         columns = joined_columns([part.columns for part in rounds])

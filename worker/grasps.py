@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from graspd.service.model.transforms import Floats
 
 Columns = Mapping[str, NDArray[Any]]
-#: The only column of a base shard that does not have one row per grasp.
+#: The only quality column of a base shard that does not have one row per grasp.
 THRESHOLDS: Final = "quality/thresholds_m"
 #: Columns of grasps in scenes; either all of them are present or none.
 _IN_SCENES: Final = ("scene_index", "approach", "approach_joint_positions", "lift")
@@ -85,7 +85,7 @@ class GraspSet:
     """(N, K) wrist angles above the hand's root, in the order of `HandModel.mounting.joint_names` [rad].
     Only in scenes, for hands with a wrist."""
     attempts: int = 0
-    """Number of starts for the whole set, retries included; 0: not reported."""
+    """Number of starts for the whole set, retries included; 0 if not reported."""
 
     def __len__(self) -> int:
         return len(self.grasp)

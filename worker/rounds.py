@@ -70,8 +70,8 @@ class Round:
 
 def next_round(wanted: int, valid: int, candidates: int, budget: int) -> int:
     """Return the number of grasps to plan next: the missing ones at the rate so far, plus 10 %.
-    `wanted` is the number of valid grasps, `budget` the largest number of planned ones. 0: enough are found, or the
-    budget is used up."""
+    `wanted` is the number of valid grasps, `budget` the largest number of planned ones. The result is 0 if
+    enough are found, or if the budget is used up."""
     if valid >= wanted or candidates >= budget:
         return 0
     if candidates == 0:

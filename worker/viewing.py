@@ -126,7 +126,7 @@ _STEP: Final = np.pi / 8
 
 
 def missing() -> str:
-    """Return instructions to install the viewer; empty: nothing is missing."""
+    """Return instructions to install the viewer; empty if nothing is missing."""
     try:
         import viser  # noqa: F401
     except ImportError:
@@ -148,7 +148,7 @@ class Viewer:
     """Server of one file until it is closed. `url` is its address; `row` is the grasp shown."""
 
     def __init__(self, shown: ViewerContent, *, host: str = "127.0.0.1", port: int = 8080) -> None:
-        """Start the server on a port; 0: any free port; otherwise the first free port from this number on.
+        """Start the server on the first free port from number `port` on; 0 takes any free port.
         Raises InputError: viser is not installed, the file holds no grasps, or the address cannot be used."""
         if said := missing():
             raise InputError(said)

@@ -51,9 +51,9 @@ class Executions:
     rows: NDArray[np.intp]
     """(N,) row of each grasp in its shard."""
     object_pose: Floats
-    """(N, 7) the object at rest."""
+    """(N, 7) poses of the object at rest."""
     postures: dict[str, Posture]
-    """The N postures of each of `POSTURES`; hand poses are of the root link."""
+    """N postures for each name in `POSTURES`; hand poses are those of the root link."""
     placed: PlacedGrasps | None
     """Scene of each grasp, if there are scenes."""
     quality: dict[str, NDArray[Any]]
@@ -183,7 +183,7 @@ ASSUMED_M_S: Final = 0.05
 #: Velocity limit of the hand as a whole [m/s, rad/s].
 HAND_M_S: Final = 0.25
 HAND_RAD_S: Final = 1.0
-#: Shortest motion, and time between points [s].
+#: Shortest duration of a motion, and largest time between points [s].
 SHORTEST_S: Final = 0.4
 STEP_S: Final = 0.05
 _STEEPEST: Final = 15 / 8
@@ -218,9 +218,9 @@ class RobotTrajectory:
     phase: tuple[str, ...]
     """(K,) motion to which each point belongs."""
     time: Floats
-    """(K,) since the start [s]."""
+    """(K,) times since the start [s]."""
     hand_pose: Floats
-    """(K, 7) root link."""
+    """(K, 7) poses of the root link."""
     joints: Floats
     """(K, J)"""
     velocity: Floats
@@ -249,8 +249,8 @@ def straight_paths(found: Executions, row: int, points: int = 2) -> list[Path]:
 
 def time_motions(paths: Sequence[Path], names: Sequence[str], velocity: Floats, *, speed: float) -> RobotTrajectory:
     """Time the motions in sequence, each at rest at both ends; each starts at the end of the previous one.
-    `speed` is a factor above 0 and at most 1 on the velocity limits of the joints, `velocity` (J,) [rad/s or m/s], and
-    of the hand."""
+    `velocity` (J,) has the limits of the joints [rad/s or m/s]. `speed`, above 0 and at most 1, is a factor on these
+    limits and on those of the hand."""
     phase, time, pose, joints = [paths[0].phase], [0.0], [paths[0].hand_pose[:1]], [paths[0].joints[:1]]
     for path in paths:
         seconds = max(SHORTEST_S, _STEEPEST * _slowness(path, velocity) / speed)

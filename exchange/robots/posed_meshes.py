@@ -79,7 +79,7 @@ class Solid:
     colour: Colour
     """Linear RGB, 0 .. 1."""
     body: int | None = None
-    """Body of the hand to which the mesh belongs; None: it belongs to the object or a support."""
+    """Body of the hand to which the mesh belongs; None for the object and supports."""
 
 
 def hand_meshes(found: Executions) -> list[Solid]:

@@ -209,7 +209,7 @@ class ReachSearch:
         return np.array(rows)
 
     def _solve(self, q: Floats, root_pose: Floats, steps: int) -> Floats | None:
-        """Return dofs (A,) within limits that reach a pose (7,) of the hand's root link; None: none found."""
+        """Return dofs (A,) within limits that reach a pose (7,) of the hand's root link; None if none do."""
         mink, configuration, task = self._mink, self._configuration, self._task
         full = np.zeros(self._model.nq)
         full[self._order] = self.arm.model.expand(q)

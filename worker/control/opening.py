@@ -22,7 +22,7 @@ from graspd.worker.simulation.launches import Launches, launch
 #: Distance from the object at which fingers stop opening [m]. It covers the errors of a calibrated arm. From a larger
 #: distance, fingers arrive faster on closing and push the object away more often.
 CLEARANCE_M: Final = 0.003
-#: A finger with less distance from the object after opening is opened again, against `HandModel.closing` alone [m].
+#: A finger closer than this to the object after opening [m] is opened again, against `HandModel.closing` alone.
 STUCK_M: Final = 0.003
 #: The root retreats only if the open hand is closer than this to the object [m]. A palm in contact pushes the object
 #: away. So does a palm that returns from a large distance while the fingers close.
@@ -35,7 +35,7 @@ OPENING_STEP: Final = 0.05
 SLIDING_STEP_M: Final = 0.002
 OPENING_STEPS: Final = 24
 #: Allowed penetration of an opening finger into the rest of the hand, in addition to that in the grasp [m]; checked
-#: shares of its path; number of checks. A jammed finger opens half as far, after the last failed check not at all.
+#: shares of its path; number of checks. A jammed finger opens half as far. If the last check fails, it does not open.
 JAM_M: Final = 5e-4
 WAY: Final = (1 / 3, 2 / 3, 1.0)
 JAM_LOOKS: Final = 4
@@ -46,7 +46,7 @@ Blocked = Callable[[NDArray[np.intp], Floats], NDArray[np.bool_]]
 
 
 def fingers_of_dofs(hand: HandModel) -> NDArray[np.int32]:
-    """Return the first finger (D,) that each dof drives; -1: none, so it does not open."""
+    """Return the first finger (D,) that each dof drives; -1 if none, so that the dof does not open."""
     finger = fingers_of_bodies(hand)
     driven = [finger[np.flatnonzero((hand.dof == d) & (finger >= 0))] for d in range(hand.dofs)]
     return np.array([f[0] if len(f) else -1 for f in driven], np.int32)
@@ -72,7 +72,7 @@ def count_fingers(hand: HandModel) -> int:
 
 
 class Openings:
-    """N hands opened together from grasps with dofs `q` (N, D); `wide`: open dofs (N, D), by default `q`."""
+    """N hands opened together from grasps with dofs `q` (N, D); open dofs `wide` (N, D), by default `q`."""
 
     def __init__(self, posing: PostureData, hand_pose: Floats, q: Floats, wide: Floats | None = None) -> None:
         self.posing, self.hand_pose, self.q = posing, hand_pose, q

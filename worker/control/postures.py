@@ -98,7 +98,7 @@ def wide_open(hand: HandModel, obj: ObjectModel, pregrasp: Posture, placed: Plac
 def squeeze(
     hand: HandModel, obj: ObjectModel, grasp: Posture, *, total_normal_force: float | None = None, device: str = "cpu"
 ) -> Posture:
-    """Compute N commanded postures that press, q + Kp^-1 J^T f; root fixed; see `worker.control.squeeze`."""
+    """Compute N commanded postures q + Kp^-1 J^T f that press (`worker.control.squeeze`); root unchanged."""
     force = normal_force(obj) if total_normal_force is None else total_normal_force
     if (jaws := jaws_of(hand)) is not None:
         probe = posing_of(hand, obj, points=_POINTS, device=device).probe
@@ -171,7 +171,7 @@ def _fingers_off(posing: PostureData, grasp: Posture) -> NDArray[np.bool_]:
 
 
 def _closed_until_contact(posing: PostureData, hand_pose: Floats, q: Floats, moved: NDArray[np.bool_]) -> Floats:
-    """Return dofs (n, D), those `moved` (n, D) closed until their finger's distance is `CLOSED_M`."""
+    """Return dofs (n, D); those `moved` (n, D) are closed until their finger's distance is `CLOSED_M`."""
     hand, count, looks = posing.hand, len(q), CLOSING_STEPS + 1
     step = moved * hand.closing * dof_steps(hand)
     path = np.clip(q[:, None] + np.arange(looks)[None, :, None] * step[:, None], hand.lower, hand.upper)

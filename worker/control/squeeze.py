@@ -30,8 +30,8 @@ SUM: Final = 10.0
 @dataclass(frozen=True)
 class HoldForces:
     residual: Floats
-    """(N,) net wrench divided by the sum of normal forces, with torques divided by the object's radius. 0: balanced; 1:
-    nothing presses. The residual predicts whether a grasp holds."""
+    """(N,) net wrench over the sum of normal forces, with torques divided by the object's radius.
+    It is 0 if balanced, 1 if nothing presses. The residual predicts whether a grasp holds."""
     torque: Floats
     """(N, D) torques of the dofs that exert the forces [N m or N]."""
 

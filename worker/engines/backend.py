@@ -93,7 +93,7 @@ def kernel_cache() -> Path | None:
 
 #: Environment variable with the folder of precompiled kernels.
 VARIABLE: Final = "GRASPD_KERNELS"
-#: A100, H100 and H200, B200.
+#: Compute capabilities, times ten, of A100, H100 and H200, and B200.
 ARCHITECTURES: Final = (80, 90, 100)
 
 

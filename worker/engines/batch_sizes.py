@@ -41,7 +41,7 @@ def batches_that_fit(multiprocessors: int, free_bytes: int) -> int:
 
 
 def processes_at_once(device: str, wanted: int, *, threads: int = 0, workers: int = 1, root: Path = ROOT) -> int:
-    """Return how many processes validate and measure: `wanted` if not 0; 1: only the worker's threads.
+    """Return how many processes validate and measure: `wanted` if not 0; 1 for the worker's threads alone.
     By default a worker on a GPU has one process fewer than its share of the cores. All `workers` together use at most a
     quarter of the memory. On a CPU the planner needs all cores, so the default is 1."""
     if wanted or not device.startswith("cuda"):

@@ -52,7 +52,7 @@ class Device:
         threading.Thread(target=work, name="device", daemon=True).start()
 
     def resolve(self) -> str:
-        """Return cpu, cuda:0, ...; waits until it is resolved."""
+        """Wait until the device is resolved; return its name: cpu, cuda:0, ..."""
         with self._lock:
             if not self._resolved:
                 self._resolved, self.name = _find_device(self.wanted, self._number)
@@ -100,8 +100,8 @@ class Gpu:
 
 
 def select_gpu(gpus: Sequence[Gpu], folder: Path, *, number: int | None = None) -> Gpu:
-    """Select one of the GPUs (at least one): that of worker `number`, else one with the fewest processes.
-    The GPU counts as taken until this process ends. Without a writable folder: the GPU of `number`, else the first."""
+    """Select one of the GPUs: that of worker `number`; if it is None, one with the fewest processes.
+    The GPU counts as taken until this process ends. Without a writable folder, None selects the first GPU."""
     eligible = [gpus[number % len(gpus)]] if number is not None else list(gpus)
     try:
         folder.mkdir(parents=True, exist_ok=True)

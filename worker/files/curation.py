@@ -29,8 +29,8 @@ class Balance:
     """Balanced selection; a `Chooser` of `worker.files.subsets` for the shards of one hand and object."""
 
     by: Sequence[str]
-    at_most: int = 0  # largest number per category; 0: median number over the categories
-    min_distance: float = 0.0  # least distance of two selected grasps [m], see `worker.quality.diversity`; 0: any
+    at_most: int = 0  # largest number per category; 0 for the median number over the categories
+    min_distance: float = 0.0  # least distance of two selected grasps [m], see `worker.quality.diversity`; 0 for any
     seed: int = 0
     hand: str | None = None  # the hand's file if the shards do not lead to it; only distances need it
 

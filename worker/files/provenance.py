@@ -76,8 +76,8 @@ def path_attributes(hand: str, obj: str, options: Mapping[str, Any]) -> dict[str
 
 
 def find_files(sought: AssetReference) -> AssetFiles:
-    """Find the files of a hand or object: built in, at the shard's path, in the store or shard's folder.
-    Raises NotFoundError: in none of these; the message lists the places."""
+    """Find the files of a hand or object: built in, at the recorded path, in the store, near the shard.
+    Raises NotFoundError: they are in none of these places; the message lists the places."""
     if sought.name in builtin_names(sought.kind):
         files = builtin_files(sought.kind, sought.name)
         if digest_files(sought.kind, files) == sought.digest:
@@ -141,14 +141,14 @@ def options_of(attribute: object) -> dict[str, Any]:
     return said if isinstance(said, dict) else {}
 
 
-#: Bound of the simplification of neighbours [m]; neighbours are obstacles and are not grasped.
+#: `face_error_m` of neighbours [m]; neighbours are obstacles and are not grasped.
 NEIGHBOUR_FACE_ERROR_M: Final = 3e-4
 _MATTER: Final = {"object_mass_kg": MASS_KG, "object_friction": FRICTION}
 
 
 def hand_of_shard(shard: Shard, given: str | None) -> HandModel:
     """Load the hand `given` (a file or a built-in); by default the shard's own, see `find_files`.
-    Raises NotFoundError: there is no such file, built-in or hand. ConflictError: it is not that of the shard."""
+    Raises NotFoundError: there is no such file, built-in or hand. ConflictError: it is not the shard's hand."""
     if given:
         hand = hand_from_path(given)
         _check_digest(shard, "hand", hand.digest, given)
@@ -266,7 +266,7 @@ def _check_digest(shard: Shard, kind: str, digest: str, given: str) -> None:
 
 
 def id_of_columns(columns: Columns) -> str:
-    """Return the id of a shard that no job made: a digest of its columns, which names it in later shards."""
+    """Return the id by which other shards name a shard that no job made: a digest of its columns."""
     found = hashlib.sha256()
     for name in sorted(columns):
         array = np.ascontiguousarray(columns[name])
@@ -307,7 +307,7 @@ def base_attributes(
 ) -> dict[str, Attribute]:
     """Return the attributes of a base shard: joints, request, scene, candidates, settings of validation.
     `candidates` is the number of candidates up to the last selected one. `verdict_key` is the digest of all settings
-    that affect verdicts; None: not validated. `outcomes` are the numbers of rejected candidates by reason."""
+    that affect verdicts; None without validation. `outcomes` are the numbers of rejected candidates by reason."""
     said: dict[str, Attribute] = {
         "joint_names": list(hand.joint_names),
         "mu": request.friction,

@@ -19,7 +19,7 @@ from graspd.service.store import validity
 from graspd.service.store.shards import Shard, part_of_shard, place_of, read_shard
 from graspd.service.store.store import open_store
 
-#: Function from the base shards of one hand on one object to the mask (N,) of each.
+#: Function from the base shards of one hand on one object to a mask (N,) for each shard.
 Chooser = Callable[[list[Shard]], list[NDArray[np.bool_]]]
 
 

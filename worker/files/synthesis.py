@@ -92,7 +92,7 @@ class SynthesisResult:
 
     @property
     def limit(self) -> Limit | None:
-        """Return the payload if it explains why no grasp was found."""
+        """Return the payload limit if it explains why no grasp was found."""
         return None if len(self.arrays["quality/valid"]) else self.batches[0].limit
 
     def summary(self) -> dict[str, Any]:
@@ -169,7 +169,7 @@ class SynthesisResult:
 
 
 def synthesize_with(hand: str, obj: str, options: LocalOptions, **run: Any) -> SynthesisResult:
-    """Run `synthesize_grasps` with a local user's options; `run`: further arguments."""
+    """Run `synthesize_grasps` with a local user's options; `run` are its further arguments."""
     return synthesize_grasps(
         hand,
         obj,
@@ -201,11 +201,11 @@ def synthesize_grasps(
     cancelled: Callable[[], bool] | None = None,
     partial: bool = False,
 ) -> SynthesisResult:
-    """Make the grasps of a job; `hand` and `obj` are files or built-in names, `place` is their scene.
-    `mesh` has options for the object's file. `join` is the number of batches of 32 in one launch of the planner; None:
-    as many as fill a GPU. `processes` validate and measure; 1: this one only; 0: on a GPU the cores less one, else 1.
+    """Make the grasps of a job in scene `place`; `hand` and `obj` are files or built-in names.
+    `mesh` has options for the object's file. `join` is the number of batches of 32 in one launch of the planner; None
+    for as many as fill a GPU. `processes` validate and measure; 1 for this process alone, 0 for `processes_at_once`.
     Raises InputError: an invalid argument, or a scene without space. TaskCancelled: `cancelled` returned True; with
-    `partial`, before any validation."""
+    `partial`, only before any validation."""
     planner(request.method, request.options, in_scenes=place.kind != "free")  # before the files are read
     if request.shake and place.kind == "free":
         raise InputError(SHAKE_NEEDS_A_SCENE)

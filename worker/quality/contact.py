@@ -23,7 +23,7 @@ def contact_area_cm2(distance: Floats, area: Floats, thresholds_m: Floats) -> Fl
     """Compute the hand area (B, T) within thresholds (T,) of the object's surface, on either side [cm^2].
     The distances (B, N) are signed [m]; each point represents an `area` (N,) [m^2]."""
     near = np.abs(distance)
-    # Sums of rows: the rounding of a matrix product would depend on its number of rows.
+    # Rows are summed, because the rounding of a matrix product would depend on its number of rows.
     return np.stack([np.where(near < t, area, 0.0).sum(axis=-1) for t in thresholds_m], axis=-1) * 1e4
 
 
@@ -74,7 +74,7 @@ def contact_links(body_distance: Floats) -> NDArray[np.int32]:
 
 
 def finger_of_body(hand: HandModel) -> NDArray[np.int32]:
-    """Return each body's finger (L,), an index into `HandModel.fingertips`; -1: palm and shared bodies."""
+    """Return each body's finger (L,), an index into `HandModel.fingertips`; -1 for palm and shared bodies."""
     finger = np.full(hand.bodies, -1, np.int32)
     members = np.zeros(hand.bodies, np.int32)
     for number, body in enumerate(hand.fingertips):

@@ -46,7 +46,7 @@ def hand_points(hand: HandModel, posture: Posture) -> Floats:
 
 
 def distances(points: Floats, one: NDArray[np.intp], other: NDArray[np.intp]) -> Floats:
-    """Compute distances (K,) of grasps `one` from `other` (K,), rows of the result of `hand_points` [m]."""
+    """Compute distances (K,) [m] between grasps `one` and `other`, (K,) indices into `points` (N, P, 3)."""
     parts = [slice(i, i + _PAIRS) for i in range(0, len(one), _PAIRS)]
     found = [np.linalg.norm(points[one[part]] - points[other[part]], axis=2).mean(axis=1) for part in parts]
     return np.concatenate([np.zeros(0), *found])
@@ -61,7 +61,7 @@ def least_distance(points: Floats) -> float | None:
     middles = cKDTree(points.mean(axis=1))
     near = np.asarray(middles.query(middles.data, k=2)[1])
     rows = np.arange(len(points))
-    # If mean points coincide, the first neighbour may be another point than the point itself.
+    # If mean points coincide, the first neighbour may be a point other than the point itself.
     bound = float(distances(points, rows, np.where(near[:, 0] == rows, near[:, 1], near[:, 0])).min())
     # The mean distance of points is at least the distance of their means.
     pairs = middles.query_pairs(bound, output_type="ndarray")
@@ -69,7 +69,7 @@ def least_distance(points: Floats) -> float | None:
 
 
 def distinct(points: Floats, least: float, *, given: int = 0) -> NDArray[np.bool_]:
-    """Return a mask (N,) of grasps of which no two, by `points` (N, P, 3), are closer than `least` [m].
+    """Return a mask (N,) of grasps at least `least` [m] apart, by their `points` (N, P, 3).
     Earlier grasps take precedence; the first `given` are always selected. `least` 0 selects all."""
     kept = np.ones(len(points), bool)
     if least <= 0 or len(points) < 2:

@@ -41,7 +41,7 @@ class PostureData:
                 wp.load_module(module=module, device=self.device)
             self.chain, self.points = chain_of(probe.hand, self.device), _points(probe)
             self.effort = wp.array(probe.hand.effort, dtype=wp.float64)
-            #: (L,) finger of each body, -1: none.
+            #: (L,) finger of each body; -1 without finger.
             self.finger = wp.array(finger, dtype=wp.int32)
 
     def parts(self, count: int) -> list[slice]:
@@ -52,7 +52,7 @@ class PostureData:
             return allocate_bodies(self.hand, count)
 
     def roots(self, hand_pose: Floats) -> tuple[Any, Any]:
-        """Return positions relative to the object's centre of mass and rotations, from root poses (n, 7)."""
+        """Return positions (about the object's centre of mass) and rotations of root poses (n, 7)."""
         with wp.ScopedDevice(self.device):
             position = wp.array(hand_pose[:, :3] - self.probe.obj.centre_of_mass, dtype=wp.vec3d)
             return position, wp.array(to_xyzw(hand_pose[:, 3:]), dtype=wp.quatd)
@@ -82,7 +82,7 @@ class PostureData:
 
     def _gaps(self, posture: Posture, reach: float, part: NDArray[np.int32]) -> Floats:
         """Return the least distance (N, P) of each part of the hand, at most `reach` [m].
-        `part` (points,) is the part of each hand point; -1: ignored."""
+        `part` (points,) is the part of each hand point; points with -1 are ignored."""
         parts = sorted(set(part[part >= 0].tolist()))
         found = np.full((len(posture), len(parts)), reach)
         for rows in self.parts(len(posture)):

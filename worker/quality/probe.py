@@ -34,7 +34,7 @@ OBJECT_POINTS: Final = 3000
 SEED: Final = 7919
 #: Distances are capped at this [m].
 REACH_M: Final = 0.012
-#: Cells along the longest side of the grid by which points beyond reach are found.
+#: Number of cells along the longest side of a coarse grid; the grid finds points beyond reach.
 COARSE_CELLS: Final = 32
 #: Hand and object normals of a contact are opposite to within 60 degrees.
 FACING_COS: Final = -0.5
@@ -61,9 +61,9 @@ class Distances(NearestPoints):
     """Nearest points, the distances of P pieces from the object, and the depth of the hand in itself."""
 
     piece_distance: Floats
-    """(B, P) least distance of an object point to each piece, at most `REACH_M`; negative: inside."""
+    """(B, P) least distance of an object point to each piece, at most `REACH_M`; negative inside."""
     self_depth: Floats
-    """(B,) deepest hand point inside another, non-neighbouring body."""
+    """(B,) depth of the deepest hand point inside another, non-neighbouring body."""
 
 
 class Probe:
@@ -212,7 +212,7 @@ class Probe:
         return least
 
     def self_depth(self, bodies: Floats, points: Floats) -> Floats:
-        """Return the depth (B, L) of each body in other bodies, or of others in it, where contact counts [m]."""
+        """Return the depth (B, L) of each body in non-neighbouring bodies, or of these bodies in it [m]."""
         with wp.ScopedDevice(self.device):
             own = wp.array(points - self.obj.centre_of_mass, dtype=wp.vec3)
             depth = wp.zeros((len(bodies), self.hand.bodies), dtype=wp.float32)

@@ -204,9 +204,9 @@ MEASURES: Final[dict[str, Callable[[_Chunk], NDArray[np.generic]]]] = {
     "approach_cell": lambda chunk: approach_cells(chunk.pair.probe.hand, chunk.found.bodies[:, 0, 3:]),
 }
 
-#: Cosine between a digit's surface and its axis of flexion above which the surface is a side: 45 degrees.
+#: Cosine between a digit's surface normal and its axis of flexion above which the surface is a side: 45 degrees.
 SIDE_COS: Final = float(np.sqrt(0.5))
-#: Number of digits that must touch with more than their last links if the palm does not touch.
+#: Least number of wrapping digits of a power grasp if the palm does not touch.
 ENVELOPING: Final = 2
 
 

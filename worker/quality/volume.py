@@ -171,7 +171,7 @@ def _planes(piece: ConvexPiece) -> Floats:
 
 
 def penetration_depth(found: Distances) -> Floats:
-    """Return the deepest penetration (B,), of hand points in the object and object points in the hand [m].
+    """Return the deepest penetration (B,) of hand points in the object or object points in the hand [m].
     One direction alone is not enough: a thin wall passes between hand points, a small fingertip between object
     points."""
     hand_in_object = np.maximum(0.0, -found.distance).max(axis=1)

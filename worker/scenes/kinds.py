@@ -34,7 +34,7 @@ def supports_of(spec: SceneSpec) -> tuple[Obstacle, ...]:
 
 
 def walled_area(spec: SceneSpec) -> tuple[float, float] | None:
-    """Return the sides x and y of the area inside a bin's walls or on a shelf's board [m]; None: no limit."""
+    """Return sides x and y of the area in a bin's walls or on a shelf's board [m]; None without limits."""
     return {"bin": BIN_SIZE, "shelf": (SHELF_SIZE[1], SHELF_SIZE[0])}.get(spec.kind)
 
 
@@ -110,7 +110,7 @@ def move_inside(obj: ObjectModel, pose: Floats, size: tuple[float, float], rng: 
 
 
 def check_free(obj: ObjectModel, poses: Floats, supports: tuple[Obstacle, ...]) -> None:
-    """Raise SceneError if the object at a pose (S, 7) penetrates a support by more than rounding errors."""
+    """Raise SceneError if the object at a pose (S, 7) penetrates a support by more than `SUNK`."""
     for pose in poses:
         corners = quat_rotate(pose[3:], obj.hull_vertices) + pose[:3]
         for number, support in enumerate(supports):

@@ -174,7 +174,7 @@ class _Heap:
 
 def neighbour_clearance(hand: HandModel, path: Posture, object_pose: Floats, neighbours: Neighbours) -> Floats:
     """Compute the hand's least signed distance (S, P) from neighbours' hulls [m], at most `FARTHEST_M`.
-    `path` has P postures in the object frame, `object_pose` (S, 7) is in the table frame."""
+    `path` has P postures in the object frame. `object_pose` (S, 7) is in the table frame."""
     spec = mujoco.MjSpec()
     for k, piece in enumerate(hand.pieces):
         _add_piece(spec, spec.worldbody.add_body(mocap=True), f"p{k}", piece)

@@ -123,7 +123,7 @@ def _scenes_of(
         try:
             poses = drop_together(obj, others, count=count, seed=seed)
         except MeshError:
-            # Too many objects never come to rest without touching.
+            # With too many objects, no drop ends with all of them apart.
             poses = _place_objects(SceneSpec(kind="table"), obj, others, supports, count=count, seed=seed)
         check_free(obj, poses["scene/object_pose"], supports)
     else:
@@ -191,7 +191,7 @@ def gaps_between(things: Sequence[Neighbour], poses: Floats, farthest: float = 0
     return gaps
 
 
-#: Largest number of faces of a simplified hull; excess over its piece from which on no faces are added [m].
+#: Largest number of faces of a simplified hull, and excess over its piece [m] that needs no further faces.
 MOST_PLANES: Final = 48
 ENOUGH_M: Final = 1e-3
 #: Corners closer than this are merged [m].

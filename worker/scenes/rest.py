@@ -25,7 +25,7 @@ STABILITY_MARGIN = 1e-4
 SAME_FACE_ANGLE = np.radians(2.0)
 #: Uncertainty of the surface of convex pieces and of real objects [m].
 CHANGE_M = 1e-3
-#: The object rolls if such a change of its surface may turn it by more than this [rad].
+#: The object rolls if a change of its surface by `CHANGE_M` may turn it by more than this [rad].
 ROLLS = np.radians(20.0)
 
 
@@ -44,9 +44,9 @@ class RestingFaces:
     sides: Ints
     """(E, 2) pairs of adjacent faces; a row is one edge of its first face."""
     margin: Floats
-    """(E,) distance from this edge to the projected centre of mass, positive inside the face [m]."""
+    """(E,) distance from each edge to the projected centre of mass, positive inside the face [m]."""
     width: Floats
-    """(E,) width of the face across this edge [m]."""
+    """(E,) width of the face across each edge [m]."""
 
     @property
     def stable(self) -> Ints:
@@ -84,7 +84,7 @@ def rolling_poses(obj: ObjectModel, poses: Floats) -> int:
 
 
 def rolling_note(rolling: int, scenes: int) -> str | None:
-    """Return a note on scenes in which the object may roll; None: there are none."""
+    """Return a note on scenes in which the object may roll; None without such scenes."""
     if not rolling:
         return None
     return (

@@ -32,7 +32,7 @@ BLOCKED: Final = 8.0
 #: Added if only the validator detects contact on the approach: the object's convex pieces protrude from its surface.
 #: Level `dexgraspbench` does not test the approach.
 TOUCHES: Final = 2.0
-#: Factor on the short test's score, at most 1, of a candidate that fails the whole test; added to `SLIPS` + 1.
+#: A candidate that fails the whole test scores `SLIPS` + 1 plus this share of its short test's score (at most 1).
 FALLS: Final = 0.4
 #: Highest score of a candidate that lifts at half friction.
 BEST: Final = 0.99
@@ -48,7 +48,7 @@ def rollout_on(
     known: dict[str, Any] | None = None,
     level: Level = "standard",
 ) -> Callable[[GraspSet, PlacedGrasps | None, Floats], Floats] | None:
-    """Return the rollout for `run`; None: the planner's merit decides. `known` caches verdicts of `level`.
+    """Return `run`'s rollout; None if the planner's merit decides. `known` caches verdicts of `level`.
     Around free objects a GPU has no rollouts, because it plans faster than the CPU simulates. In scenes it waits for
     the rollouts, which use all threads.
     """
@@ -165,7 +165,7 @@ def scene_verdicts(
 
     Returns:
         The grasps with `approach`, `coming`, `lift` and `wrist`; and columns of the base shard, with the lift's
-        verdict in `quality/success` (-1: not clear)."""
+        verdict in `quality/success` (-1 if not clear)."""
     assert grasps.scene is not None
     placed = scenes.placed(grasps.scene)
     way = plan_trajectory(hand, obj, grasps, placed)
@@ -196,7 +196,7 @@ def scene_verdicts(
 
 
 def outcomes_in_scenes(columns: Arrays) -> dict[str, NDArray[np.bool_]]:
-    """Return masks (N,) of grasps that are clear, lift, lift at half friction; see `scene_verdicts`."""
+    """Return masks (N,) of grasps that are clear, lifted, and lifted at half friction (`scene_verdicts`)."""
     clear = np.asarray(columns["quality/success"] >= 0)
     if "quality/lift_outcome" not in columns:
         return {"clear": clear, "lift": np.zeros_like(clear), "lift_hard": np.zeros_like(clear)}

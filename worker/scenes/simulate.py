@@ -91,7 +91,7 @@ def settle_on_face(
     obj: ObjectModel, faces: RestingFaces, face: int, pose: Floats, rng: np.random.Generator
 ) -> tuple[int, Floats]:
     """Return the face on which a centred object stays after coming to rest on `face`, and its pose (7,).
-    If it may roll there, one of the steady faces of the reference drops is drawn, with their frequency. If the object
+    If it may roll there, a steady face (on which it does not roll) is drawn from the reference drops. If the object
     is round on all of these faces, its pose is unchanged."""
     if not faces.rolls(face) or not (steady := _steady_faces(obj)):
         return face, pose

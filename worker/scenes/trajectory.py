@@ -30,7 +30,7 @@ from graspd.worker.simulation.mounting import choose_wrist, wrist_clearance
 from graspd.worker.simulation.obstacles import obstacle_clearance
 
 _POINTS: Final = 600
-#: Around a free object: tilts of the retreat from the palm's own direction [rad], and number of sides of each tilt.
+#: Around a free object: tilts of the retreat from the palm's own direction [rad], and number of directions per tilt.
 TILTS: Final = (0.4, 0.8, 1.2)
 SIDES: Final = 8
 #: Points of hand and object in the check of a trajectory around a free object.
@@ -77,7 +77,7 @@ class Trajectory:
 
 def plan_trajectory(hand: HandModel, obj: ObjectModel, grasps: GraspSet, placed: PlacedGrasps) -> Trajectory:
     """Plan each grasp's trajectory in its scene.
-    The approach has the first free direction of retreat, else the direction with most clearance."""
+    The approach has the first free direction of retreat or, without one, that with most clearance."""
     probe = probe_of(hand, obj, hand_points=_POINTS, object_points=64)
     count, scenes, which = len(grasps), placed.scenes, np.asarray(placed.index, np.intp)
     rise = RISE_M * np.array([scene.up for scene in scenes])[which]

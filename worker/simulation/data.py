@@ -121,7 +121,7 @@ class Data:
         self.active.assign(active)
 
     def set_scenes(self, index: NDArray[np.integer[Any]]) -> None:
-        """Set each hand's scene number `index` (n,), -1: none; `set_state` does not change it."""
+        """Set each hand's scene number `index` (n,), -1 without scene; `set_state` does not change it."""
         padded = np.full(self.capacity, -1, dtype=np.int32)
         padded[: len(index)] = index
         self.scene.assign(padded)

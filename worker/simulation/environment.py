@@ -36,7 +36,7 @@ class Obstacle:
     edges: NDArray[np.intp] = field(default_factory=lambda: np.zeros((0, 2), np.intp))
     """(E, 2) indices of corners that an edge connects."""
     tips_m: float | None = None
-    """Clearance of fingertips [m], negative if they may press into the body; None: that of the hand."""
+    """Clearance of fingertips [m], negative if they may press into the body; None for that of the hand."""
 
     def __post_init__(self) -> None:
         if self.planes.ndim != 2 or self.planes.shape[1] != 4 or not len(self.planes):
@@ -99,7 +99,7 @@ class Neighbour:
     pieces: tuple[Floats, ...]  # corners (V, 3) of each piece, for the validator
     solids: tuple[Obstacle, ...]  # slightly enlarged pieces with few faces, for the clearance of hands
     error_m: float  # largest excess of a solid over its piece [m]
-    about_centre: Neighbour | None = None  # the same with its frame at the centre; None: the frame is there already
+    about_centre: Neighbour | None = None  # the same with its frame at the centre; None if the frame is there already
 
 
 @dataclass(frozen=True)

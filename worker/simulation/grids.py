@@ -126,7 +126,7 @@ def feature_normals(vertices: Floats, faces: NDArray[np.integer[Any]]) -> Floats
 
 
 def _summed(group: NDArray[np.integer[Any]], rows: Floats) -> Floats:
-    """Return for each row (R, 3) the sum of all rows of its group."""
+    """Return the sum of each row's group, for all rows (R, 3)."""
     total = np.zeros((int(group.max(initial=0)) + 1, 3))
     np.add.at(total, group, rows)
     return total[group]

@@ -35,7 +35,7 @@ class Launches:
         return list(self._commands)
 
     def run(self, times: int = 1) -> None:
-        """Run all launches, `times` times, without waiting for the device."""
+        """Run all launches `times` times without waiting for the device."""
         if not wp.get_device(self.device).is_cuda:
             with _counted():
                 for _ in range(times):

@@ -48,7 +48,7 @@ class LossOptions:
     """Depth at which penetration has the same force as the attraction of points without contact [m].
     The attraction fades with their distance."""
     pull_length: float = 0.013  # distance over which the attraction falls to 1/e [m]
-    simulate: bool = True  # False: no simulation; every point near the object is attracted. A control for benchmarks
+    simulate: bool = True  # if False, every point near the object is attracted instead: a control for benchmarks
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Model:
     hand: DeviceHand
     obj: DeviceObject
     options: LossOptions
-    obstacles: DeviceObstacles | None  # obstacles that the hands must avoid; None: there are none
+    obstacles: DeviceObstacles | None  # obstacles that the hands must avoid; None without obstacles
     count: int  # number of hand points
     point_body: Any
     point_position: Any

@@ -31,7 +31,7 @@ def choose_wrist(
     """Choose wrist angles that stay constant while the hand moves; return the mounting's clearance.
     `poses` (N, P, 7) are root poses of N hands, object frame; `which` (N,) is the scene of each hand, by default the
     first. Return wrist angles (N, K): the first of `wrist_positions` with a clearance of `CLEAR_M`, else the clearest
-    one tried. At most `TRIES` whose points are clear are tried; if no points are clear, one. Also return the least
+    one tried. At most `TRIES` angles with clear points are tried; one if no points are clear. Also return the least
     clearance (N,) of the mounting from obstacles at all poses [m]. Without a mounting K is 0 and the clearance inf."""
     mounting, count = hand.mounting, len(poses)
     if mounting is None:
@@ -50,7 +50,7 @@ def missing_mounting_clearance(
     exact: bool = True,
 ) -> Floats:
     """Return by how much (N,) mountings miss a clearance of `MARGIN_M` + `room` [m], at least 0.
-    `poses` (N, 7) are root poses; wrists have their best angles. `exact`: check the mounting, not only its points."""
+    `poses` (N, 7) are root poses; wrists have their best angles. Unless `exact`, only points are checked."""
     mounting, wanted = hand.mounting, MARGIN_M + room
     if mounting is None or not len(poses):
         return np.zeros(len(poses))
@@ -98,7 +98,7 @@ def point_clearance(
         rows = np.flatnonzero(which == scene)
         place, flat = poses[rows][:, :, None], points.reshape(-1, 3).T
         for obstacle in scenes[scene].obstacles:
-            # Planes in the root frame: points are many, planes few.
+            # Planes are transformed to the root frame, because points are many and planes few.
             normals = quat_rotate(quat_conjugate(place[..., 3:]), obstacle.planes[:, :3])
             shift = place[..., :3] @ obstacle.planes[:, :3].T - obstacle.planes[:, 3]
             distance = (normals @ flat + shift[:, :, 0, :, None]).max(axis=2).min(axis=1)

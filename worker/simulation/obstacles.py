@@ -33,7 +33,7 @@ class PosedFeatures:
     """The F features of a hand in P postures."""
 
     centre: Floats  # (P, F, 3)
-    axis: Floats  # (P, F, 3); zero: a ball
+    axis: Floats  # (P, F, 3); zero for a ball
     radius: Floats  # (F,)
     rim: NDArray[np.bool_]  # (F,)
 
@@ -77,7 +77,7 @@ def _device_hand(hand: HandModel) -> DeviceHand:
 def body_clearance(
     hand: HandModel, postures: Posture, scenes: Sequence[Environment], which: NDArray[np.integer[Any]] | None = None
 ) -> Floats:
-    """Return signed distances (P, L) of the hand's bodies from the nearest obstacle [m]; inf: no obstacle.
+    """Return signed distances (P, L) of the hand's bodies from the nearest obstacle [m]; inf if none.
     Posture i is in the scene `which[i]`, by default in the first one. Fingertips may be closer to some supports than
     `CLEAR_M`. Their distance from such a support is increased by the difference, so a hand is clear if no distance is
     below `CLEAR_M`. Distances are exact from half-spaces, and from solids that the hand does not penetrate. Near edges

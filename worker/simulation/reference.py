@@ -49,7 +49,7 @@ def loss(s: Floats, world: World) -> Floats:
 
 
 def direct(contacts: Contacts, s0: Floats, world: World, passes: int = 60) -> Floats:
-    """Return motions (..., 6) in compliant contact for free ones (..., 6), by reweighted least squares."""
+    """Return motions (..., 6) in compliant contact for free motions (..., 6), by reweighted least squares."""
     n, offset = contacts.normals, world.dilation - contacts.distances
     k = world.stiffness * contacts.weights
     j = row(n, contacts.points)

@@ -39,7 +39,7 @@ def simulated_displacement_cm(
     pieces: ConvexPieces | None = None,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Floats:
-    """Return displacements (N,) of the centre of mass for N postures [cm]; nan: simulation diverged."""
+    """Return displacements (N,) of the centre of mass for N postures [cm]; nan if the simulation diverged."""
     model = _model(hand, obj, pieces or decompose(obj))
     bodies = body_poses(hand, grasp.hand_pose, grasp.joint_positions)
     centre = obj.centre_of_mass

@@ -1,4 +1,4 @@
-"""Verdicts in another model of the same hand than the one with which the grasps were planned.
+"""Verdicts in a model of the hand other than the one used to plan the grasps.
 
 The other model provides the mechanism: shapes, masses, joint frames, limits, couplings, armature and dry friction. The
 grasp's own model provides the controller: commanded postures, gains, damping and torque limits."""
@@ -52,7 +52,7 @@ class ForeignVerdicts:
 
 
 def share_counts(held: Mapping[str, int]) -> dict[str, Any]:
-    """Return shares from numbers of grasps held in both models, in one, or in neither; None: no grasps.
+    """Return shares from numbers of grasps held in both models, one, or neither; None without grasps.
     foreign_held: the counts. agreement: share of grasps with equal verdicts in both models. foreign_share: share of
     nominally held grasps that hold in the other model. foreign_gsr: share of all grasps that hold in it."""
     n, nominal = sum(held.values()), held["both"] + held["nominal"]

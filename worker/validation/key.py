@@ -1,4 +1,4 @@
-"""Key of a verdict: digest of all that affects it; success rates compare only between equal keys."""
+"""Key of a verdict: digest of all that affects it. Only success rates with equal keys are comparable."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Level = Literal["dexgraspbench", "standard", "fast"]
 REVISION: Final = 6
 
 _EARLY: Final = ("FIRST_LOOK_S", "INTERVAL_S", "SURE", "AHEAD", "LOST_ROTATION")
-#: Constants that affect verdicts, by module; `LEVEL_MOVES` has constants that only one level uses. Other constants of
+#: Constants that affect verdicts, by module; `LEVEL_MOVES` has constants that not all levels use. Other constants of
 #: these modules affect no verdict.
 MOVES: Final[dict[ModuleType, tuple[str, ...]]] = {
     protocol: ("DIRECTIONS", "MAX_DISPLACEMENT_M", "MAX_ROTATION", "MAX_PENETRATION_M", "STAGES", "STAGE_S", "HOLD_S"),

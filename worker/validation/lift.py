@@ -59,7 +59,7 @@ class LiftOutcome(IntEnum):
 class LiftTest:
     outcome: LiftOutcome = LiftOutcome.NOT_TRIED
     margin: float = 0.0
-    """Larger ratio of final deviation in position or rotation to its limit; 0: the hand did not rise."""
+    """Larger ratio of final deviation in position or rotation to its limit; 0 if the hand did not rise."""
     steps: int = 0
 
     @property
@@ -194,7 +194,7 @@ class Lift(Test):
 
     def _root_yield(self) -> tuple[Floats, Floats] | None:
         """Return the root's position (3,) and its rotation (4,) relative to the command.
-        None: the root is fixed, or motion is measured in the world. Unlike an arm, the protocol's weld yields by 10
+        None if the root is fixed, or motion is measured in the world. Unlike an arm, the protocol's weld yields by 10
         degrees under the weight of a hammer. An object that only follows this deviation has not moved in the hand."""
         at = self.scene.root_qpos
         if at < 0 or not self._in_hand:

@@ -128,7 +128,7 @@ def require_approaches(grasps: GraspSet, placed: PlacedGrasps, level: LiftLevel)
 def lift_key(
     hand: HandModel, obj: ObjectModel, placed: PlacedGrasps, level: LiftLevel, hard: bool, *, pieces: ConvexPieces
 ) -> str:
-    """Return the digest of a lift's terms: those of pushes, supports, neighbours, the lift's constants."""
+    """Return the digest of a lift's terms: those of pushes, supports and neighbours, and its constants."""
     pushes = verdict_key(hand, obj, "dexgraspbench" if level == "dexgraspbench" else "standard", hard, pieces=pieces)
     supports = b"".join(np.round(s.planes, 9).tobytes() for s in placed.supports)
     constants = {name: getattr(module, name) for module, names in _MOVES.items() for name in names}

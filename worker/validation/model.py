@@ -35,10 +35,10 @@ HAND_SOLREF: Final = (0.005, 1.0)
 #: stretch them. MuJoCo's minimum is 2 steps.
 COUPLING_SOLREF: Final = (0.008, 1.0)
 COUPLING_SOLIMP: Final = (0.98, 0.999, 1e-4, 0.5, 2.0)
-#: Features of today's MuJoCo that version 3.3.2, pinned by DexGraspBench, lacks. They are off here: several contacts
-#: per pair of convex pieces, and a solver for each island of contacts.
+#: Features of today's MuJoCo that version 3.3.2, pinned by DexGraspBench, lacks: several contacts per pair of convex
+#: pieces, and a solver for each island of contacts. They are off here, except for the first with grippers.
 NOT_IN_3_3_2: Final = int(mujoco.mjtDisableBit.mjDSBL_MULTICCD) | int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
-#: Number of dofs from which on Jacobians are sparse; MuJoCo's own rule is 60. Lift time, sparse over dense Jacobians:
+#: Least number of dofs for sparse Jacobians; MuJoCo's own rule is 60. Lift time, sparse over dense Jacobians:
 #: .77 for 28 dofs (Allegro), .73 for 34 (Shadow), 1.09 for 20 (Barrett). Verdicts differ only by rounding.
 SPARSE: Final = 24
 #: A body without geometry has the inertia of a ball of this radius [m].
@@ -91,14 +91,14 @@ class Scene:
     object_body: int
     object_qpos: int
     root_qpos: int
-    """-1: the root is fixed."""
+    """-1 if the root is fixed."""
     joint_qpos: NDArray[np.intp]
     """(J,) in `HandModel.joint_names` order."""
     dof_gain: Floats
     """(D,) `dof_gain * q + dof_shift` is the position of each dof's leading joint."""
     dof_shift: Floats
     pulls: Floats | None
-    """(A, D) matrix from these values to the actuators' controls; None: both are equal."""
+    """(A, D) matrix from positions of leading joints to the actuators' controls; None if both are equal."""
     centre: Floats
     """(3,) the object's centre of mass in the object frame."""
     mass: float

@@ -84,7 +84,7 @@ class _WeightTest(Test):
 
     def _heaviest(self, bears: Callable[[float], bool], first: float) -> float:
         """Return the heaviest mass [kg] for which `bears` is true; the search begins at `first`.
-        It is at least the object's mass; nan: `bears` is false even for the object's own mass."""
+        It is at least the object's mass; nan if `bears` is false even for the object's own mass."""
         low, high, step, borne = self._own, math.inf, STEP, False
         mass = min(max(first, low), MOST_KG)
         while True:
@@ -107,7 +107,7 @@ class LiftPayload(_WeightTest, FixedRootScene):
     """Payloads of grasps in one scene."""
 
     def payload(self, grasps: GraspSet, row: int) -> float:
-        """Return the payload [kg]; nan: the grasp does not lift the object."""
+        """Return the payload [kg]; nan if the grasp does not lift the object."""
         self._weigh(self._own)
         if not self._closed(grasps, row):
             return math.nan
@@ -134,7 +134,7 @@ class PushPayload(_WeightTest):
     __test__ = False
 
     def payload(self, grasps: GraspSet, row: int) -> float:
-        """Return the payload [kg]; nan: the grasp does not hold the object under the pushes."""
+        """Return the payload [kg]; nan if the grasp does not hold the object under the pushes."""
         self._weigh(self._own)
         if self._start(grasps, row).outcomes[0] is Outcome.PENETRATION:
             return math.nan
@@ -169,8 +169,8 @@ def payloads(
     held: NDArray[np.bool_] | None = None,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Floats:
-    """Compute payloads (N,) [kg], at least the object's mass; nan: not `held` (N,), or not lifted.
-    Grasps lift in the scenes `placed`; None: a free object is pushed in six directions."""
+    """Compute payloads (N,) [kg], at least the object's mass; nan if not `held` (N,), or not lifted.
+    Grasps lift in the scenes `placed`; if None, a free object is pushed in six directions."""
 
     def make() -> LiftPayload | PushPayload:
         around = (placed.supports, placed.neighbours) if placed is not None else ()
@@ -230,7 +230,7 @@ def limit_of(
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Limit | None:
     """Return the payload limit of N grasps.
-    None: a grasp lifts the `wanted` mass [kg], or fewer than `least` grasps lift a light object."""
+    None if a grasp lifts the `wanted` mass [kg], or if fewer than `least` grasps lift a light object."""
     if len(grasps) < least:
         return None
     light = obj.with_mass(mass=MASS_KG if wanted is None else min(MASS_KG, LIGHT * wanted))
@@ -289,7 +289,7 @@ def shake_margins(
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Floats:
     """Return shake margins (N,): largest ratio of displacement or rotation to its limit.
-    Below 1 the grasp holds; nan: grasps that are not `held` (N,)."""
+    Below 1 the grasp holds; nan for grasps that are not `held` (N,)."""
 
     def make() -> Shake:
         return Shake(scene_of(hand, obj, pieces, LIFTING, placed.supports, placed.neighbours), placed)
@@ -308,7 +308,7 @@ _UNBOUNDED: Final = 3
 
 
 def capacities(hand: HandModel, obj: ObjectModel, grasp: Posture, against: Floats) -> Floats:
-    """Compute load capacities (N,) [kg]; 0: no contact; inf: no drive and no friction limits it.
+    """Compute load capacities (N,) [kg]; 0 without contact, inf if neither drives nor friction limit it.
     `against` (N, K, 3) are unit vectors against the weight; the least of the K capacities is returned."""
     probe = posing_of(hand, obj, points=_POINTS, device="cpu").probe
     found = probe.touch(grasp)

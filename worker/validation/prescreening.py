@@ -43,7 +43,7 @@ PUSHED: Final = 2
 #: Pulls in object weights: hanging at half friction, hanging at full friction, and push. Rejecting a good candidate
 #: costs more than accepting one that fails the full test. Of 32 Allegro candidates that lift at half friction, 1.3
 #: weights reject 19, the present value 9. Of 63 that hold a free object at half friction, 2 weights and two stages of
-#: closing rejected 14, the present values 9. A push must be strong enough to move an object that is not held. At full
+#: closing reject 14, the present values 9. A push must be strong enough to move an object that is not held. At full
 #: friction the pull exceeds the weight: of 25 candidates that lift .8 weights, 10 fail another lift test; of 21 that
 #: lift 1.3 weights, 3 fail it.
 HANGS: Final = 0.8
@@ -73,7 +73,7 @@ class LiftRollout(Lift):
         self._half, self._whole = scenes
 
     def score(self, grasps: GraspSet, row: int, beat: float = np.inf) -> float:
-        """Return the ratio of motion to its limit after hanging at half friction; below 1: lifted.
+        """Return the ratio of motion to its limit after hanging at half friction; below 1 if lifted.
         Otherwise return the ratio at full friction plus `SLIPS`, or `beat` if `beat` is below 1 + `SLIPS`."""
         self.scene = self._half
         if self._begin(grasps, row).outcome is not LiftOutcome.NOT_TRIED:
@@ -106,7 +106,7 @@ class PushRollout(Test):
         self._half, self._whole = scenes
 
     def score(self, grasps: GraspSet, row: int, beat: float = np.inf) -> float:
-        """Return the largest ratio of motion to its limit in pushes at half friction; below 1: held.
+        """Return the largest ratio of motion to its limit in pushes at half friction; below 1 if held.
         Otherwise return the ratio at full friction plus `SLIPS`.
         Return inf as soon as the score cannot be below `beat`; if `beat` is below 1 + `SLIPS`, skip full friction."""
         self.scene = self._half
@@ -148,7 +148,7 @@ class ShortTests:
         self._lock = threading.Lock()
 
     def scores(self, grasps: GraspSet, placed: PlacedGrasps | None, beat: Floats | None = None) -> Floats:
-        """Return scores (N,) of grasps (`worker.planners.Rollout`): from lifts in `placed`, else from pushes.
+        """Return scores (N,) (`worker.planners.Rollout`), by lifts if `placed` is given, else by pushes.
         Scores are below 1 for grasps that hold at half friction, and below 2 for grasps that hold at full friction.
         Each call uses `threads`; planners on the CPU already call from all their threads."""
         with self._lock:

@@ -173,7 +173,7 @@ class Test:
 
     def _close(self, grasps: GraspSet, row: int, *, give_up: bool = False, stages: int = STAGES) -> bool:
         """Move from pregrasp through grasp to squeeze, each in `stages` stages.
-        With `give_up`, return False as soon as the object is lost; without, always return True."""
+        With `give_up`, return False as soon as the object is lost; without it, always return True."""
         self._put(grasps.pregrasp.hand_pose[row], grasps.pregrasp.joint_positions[row])
         for hand_pose, joints in self._way(grasps, row, stages):
             self.scene.command(self.data, hand_pose, joints)

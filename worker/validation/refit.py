@@ -19,7 +19,7 @@ from graspd.worker.hands.primitives import hull, sample, signed_distance, tessel
 
 Fit = Literal["own", "hull", "primitive", "capsule"]
 
-#: A piece with a larger ratio of width to thickness is not replaced by a capsule.
+#: A piece with a larger ratio of width to thickness than this is not replaced by a capsule.
 WIDE: Final = 1.5
 #: A shrunk piece keeps at least this share of its half thickness.
 _LEFT: Final = 0.5

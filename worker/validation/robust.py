@@ -45,7 +45,7 @@ class Robustness:
 
     @property
     def share(self) -> Floats:
-        """(N,) share of the models in which a grasp holds; nan: not tested.
+        """(N,) share of the models in which a grasp holds; nan if it was not tested.
         After an early end the share is a lower bound if the wanted share was reached, else an upper bound."""
         models = self.held.shape[1]
         held, failed = (self.held == 1).sum(axis=1), (self.held == 0).sum(axis=1)
@@ -55,7 +55,7 @@ class Robustness:
 
     @property
     def weakest(self) -> NDArray[np.uint8]:
-        """(N,) `Axis` of the first model in which a grasp does not hold; 0: it holds in all."""
+        """(N,) `Axis` of the first model in which a grasp does not hold; 0 if it holds in all."""
         failed = self.held == 0
         first = failed.argmax(axis=1)
         return np.where(failed.any(axis=1), self.axis[np.arange(len(first)), first], np.uint8(Axis.NONE))
@@ -65,7 +65,7 @@ class Robustness:
         return {"quality/robust_share": self.share, "quality/robust_weakest": self.weakest}
 
     def by_axis(self) -> dict[Axis, tuple[int, int]]:
-        """Return for each validated axis the number of models in which a grasp held, and the number of models."""
+        """Return the number of models in which a grasp held, and of all models, for each validated axis."""
         counts = {}
         for axis in Axis:
             found = self.held[(self.axis == axis) & (self.held != NOT_VALIDATED)]
@@ -75,7 +75,7 @@ class Robustness:
 
 
 def needed(wanted: float, models: int) -> int:
-    """Return in how many models a grasp must hold for the wanted share; 0 (no share): in all of them."""
+    """Return the number of models in which a grasp must hold for a wanted share; all of them for share 0."""
     return math.ceil(wanted * models - _EXACT) if wanted > 0 else models
 
 
@@ -104,8 +104,8 @@ def robust(
 
     Args:
         held: (N,) verdicts of the nominal model; only grasps with 1 are tested. By default all.
-        placed: the grasps' scenes, for the lift test; None: six pushes.
-        wanted: share of models in which a grasp must hold; a grasp's tests end once this is decided. 0: test in all.
+        placed: the grasps' scenes, for the lift test; None for six pushes.
+        wanted: share of models in which a grasp must hold; a grasp's tests end once this is decided. 0 tests in all.
         seed: seed of the models, together with the grasp's own numbers.
         hard: sliding friction halved, torsional friction a tenth.
         pieces: convex pieces of the object; by default its CoACD pieces.

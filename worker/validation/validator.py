@@ -102,7 +102,7 @@ def validate(
         hard: sliding friction halved, torsional friction a tenth.
         pieces: convex pieces of the object; by default its CoACD pieces.
         known: finished CPU rollouts with the same terms; they are reused, and new rollouts are added.
-        prefilter: result of `prefiltered` on these grasps with the same terms; None: it is computed.
+        prefilter: result of `prefiltered` on these grasps with the same terms; computed if None.
         run: receives the number of finished grasps; polled for cancellation between grasps."""
     if level not in LEVELS:
         raise InputError(f"unknown level {level!r}; choose one of {', '.join(LEVELS)}")

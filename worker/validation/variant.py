@@ -55,9 +55,9 @@ class Variant:
     """Replacement of the hand's collision shapes, see `refit`."""
     grown_m: float = 0.0
     armature: float | None = None
-    """Armature of every joint [kg m^2 or kg]; None: the model's own."""
+    """Armature of every joint [kg m^2 or kg]; None for the model's own."""
     dry_friction: float | None = None
-    """Dry friction of every joint [N m or N]; None: the model's own."""
+    """Dry friction of every joint [N m or N]; None for the model's own."""
     damping: float = 1.0
     gain: float = 1.0
     """Factor on the position gain; torque limits are unchanged."""
@@ -276,7 +276,7 @@ class Models:
         return _perturbed_scene(scene, variant)
 
     def _lags(self, variant: Variant) -> Floats | None:
-        """Return delays (J,) of joints, as shares of the closing time; None: all start at once."""
+        """Return delays (J,) of joints, as shares of the closing time; None if all start at once."""
         if not any(variant.lags):
             return None
         lags = np.array([0.0, *variant.lags])
@@ -398,7 +398,7 @@ def restrict_to_support(variant: Variant, up: Floats) -> Variant:
 
 
 def _fingers(hand: HandModel) -> NDArray[np.intp]:
-    """Return the index (J,) in `hand.fingertips` of the one tip that a joint moves; -1: several or none."""
+    """Return the index (J,) in `hand.fingertips` of the one tip that a joint moves; -1 if several or none."""
     moved: list[set[int]] = [set() for _ in range(hand.bodies)]
     for place, tip in enumerate(hand.fingertips):
         body = tip

@@ -77,7 +77,7 @@ def objective(
     b: int,
     r: wp.array2d(dtype=wp.float64),
 ):
-    """Return phi, see the module."""
+    """Return phi, as defined in the docstring of the module."""
     total = wp.float64(0.0)
     for i in range(target.shape[0]):
         total = total + square * r[b, i] * (wp.float64(0.5) * r[b, i] - target[i])

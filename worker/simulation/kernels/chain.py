@@ -10,7 +10,7 @@ class Chain:
     """A hand's joint tree (L bodies), and its features sorted by body."""
 
     parent: wp.array(dtype=wp.int32)
-    turns: wp.array(dtype=wp.int32)  # 1: revolute
+    turns: wp.array(dtype=wp.int32)  # 1 for revolute joints
     joint: wp.array(dtype=wp.int32)  # column of the joint positions
     origin_p: wp.array(dtype=wp.vec3d)
     origin_q: wp.array(dtype=wp.quatd)
@@ -18,10 +18,10 @@ class Chain:
     dof: wp.array(dtype=wp.int32)
     multiplier: wp.array(dtype=wp.float64)  # factor from the dof's value to the joint's value
     offset: wp.array(dtype=wp.float64)  # added to this product
-    tip: wp.array(dtype=wp.int32)  # 1: a fingertip
+    tip: wp.array(dtype=wp.int32)  # 1 for fingertips
     first: wp.array(dtype=wp.int32)  # (L + 1,) first feature of each body
     centre: wp.array(dtype=wp.vec3d)  # (F,) body frame
-    about: wp.array(dtype=wp.vec3d)  # (F,) axis of a rim; zero: a ball
+    about: wp.array(dtype=wp.vec3d)  # (F,) axis of a rim; zero for a ball
     radius: wp.array(dtype=wp.float64)
 
 
@@ -54,7 +54,7 @@ def joint_value(chain: Chain, body: wp.int32, q: wp.float64):
 
 @wp.func
 def joint_axis(chain: Chain, bodies: Bodies, p: wp.int32, body: wp.int32):
-    """Return the axis of a body's joint in the frame of the poses; the joint's own motion keeps it."""
+    """Return the axis of a body's joint in the frame of the poses; the joint's motion does not change it."""
     return wp.quat_rotate(bodies.rotation[p, body], chain.axis[body])
 
 

@@ -36,7 +36,7 @@ class Physics:
     leak_length: wp.float32  # [m]
     one_sided: wp.int32
     step: wp.float32  # |s0| of a moving simulation [m]
-    radius: wp.float32  # no used point is farther from the centre of mass [m]
+    radius: wp.float32  # bound on the distance of used points from the centre of mass [m]
     near_gap: wp.float32  # direct solver: largest gap of contacts in the near list [m]
 
 
@@ -252,7 +252,7 @@ def gauss_seidel(
     loss_out: wp.array2d(dtype=wp.float32),
     end_out: wp.array2d(dtype=vec6),
 ):
-    """Take the paper's step: one sweep of position-based dynamics over the contacts (Deul 2016), in order.
+    """Take the paper's step: one sweep of position-based dynamics (Deul 2016), contact by contact.
     Contact i moves the object by -M^-1 j C / w along the normal. Friction then opposes the slip of the contact's point,
     with an impulse of at most mu C / w. `states` (B, M, N) stores the object's motion before each contact
     for the reverse sweep. `passes_in` is ignored, since `states` has room for one sweep. Launch over (B, M)."""
@@ -331,7 +331,7 @@ def jacobi(
     end_out: wp.array2d(dtype=vec6),
 ):
     """Take averaged Jacobi passes, each with the mean correction of all active contacts, in any order.
-    `states` (B, M, >= passes) stores the motion before each pass. Summed instead of averaged corrections diverge if
+    `states` (B, M, >= passes) stores the motion before each pass. Without averaging, corrections diverge if
     contacts are many. The adjoint takes the count of active contacts as constant. Launch over (B, M)."""
     b, m = wp.tid()
     if hands_in.active[b] == 0:

@@ -1,4 +1,4 @@
-"""Distances for metrics: exact in sign and value, no smoothing, no gradient.
+"""Distances for metrics, exact in sign and value, without smoothing.
 
 `worker.simulation.kernels.surface` serves the optimiser (smoothed, cheap). This module serves validation: the distance
 of a point from the mesh itself, and its depth in the hand's convex pieces."""
@@ -21,11 +21,11 @@ class Skin:
     """An object's surface, about its centre of mass."""
 
     mesh: wp.uint64
-    winding: wp.int32  # 1: open, the sign is that of the winding number
+    winding: wp.int32  # 1 for an open mesh: the sign is that of the winding number
     corner_normal: wp.array(dtype=wp.vec3)  # (3 F,)
     low: wp.vec3  # box around the object
     high: wp.vec3
-    coarse: wp.array3d(dtype=wp.float32)  # distances at grid nodes, the first one at `low`; empty: no grid
+    coarse: wp.array3d(dtype=wp.float32)  # distances at grid nodes, the first one at `low`; empty without grid
     spacing: wp.float32
     coarse_reach: wp.float32  # larger distances in `coarse` are not exact [m]
 
@@ -36,7 +36,7 @@ class NearestPoint:
 
     distance: wp.float32
     closest: wp.vec3
-    normal: wp.vec3  # gradient of the distance, unit; 0: beyond reach
+    normal: wp.vec3  # unit gradient of the distance; 0 beyond reach
 
 
 @wp.func
@@ -156,7 +156,7 @@ def self_distance(
     point_in: wp.array2d(dtype=wp.vec3),
     depth_inout: wp.array2d(dtype=wp.float32),
 ):
-    """Compute the greatest depth (B, L) of each body in others, or of others in it, where contact counts.
+    """Compute the greatest depth (B, L) of each body in non-neighbouring bodies, or of these bodies in it.
     Launch over points (B, N)."""
     b, i = wp.tid()
     x = point_in[b, i]

@@ -20,7 +20,7 @@ class FingerJams:
     share: wp.array2d(dtype=wp.float64)  # (B, F) share of its path that each finger moves
     limit: wp.array2d(dtype=wp.float32)  # (B, F) allowed depth
     depth: wp.array2d(dtype=wp.float32)  # (B, F) greatest depth on the path
-    blocked: wp.array2d(dtype=wp.int32)  # (B, F) 1: blocked by something else
+    blocked: wp.array2d(dtype=wp.int32)  # (B, F) 1 if blocked by something else
 
 
 @wp.func
@@ -108,7 +108,7 @@ def limit_depth(more_in: wp.float32, jams_inout: FingerJams):
 
 @wp.kernel
 def shorten_paths(less_in: wp.float64, jams_inout: FingerJams):
-    """Multiply the paths of jammed fingers by `less`; finish hands without jams. Reset depths. Over B."""
+    """Multiply paths of jammed fingers by `less`, finish hands without jams, reset depths. Launch over B."""
     b = wp.tid()
     if jams_inout.going[b] == 0:
         return
@@ -149,7 +149,7 @@ def hand_clearance(
     bodies_in: Bodies,
     retreat_inout: Retreat,
 ):
-    """Compute the least distance of hands moved `back` against their palm's approach. Over (B, N / lane)."""
+    """Compute least distances of hands moved `back` against the approach. Launch over (B, N / lane)."""
     b, part = wp.tid()
     if retreat_inout.going[b] == 0:
         return

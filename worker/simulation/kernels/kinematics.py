@@ -29,7 +29,7 @@ class Hands:
     active: wp.array(dtype=wp.int32)
     iteration: wp.array(dtype=wp.int32)  # (1,)
     dilation_scale: wp.array(dtype=wp.float32)  # factor on the schedule's dilation
-    scene: wp.array(dtype=wp.int32)  # -1: none
+    scene: wp.array(dtype=wp.int32)  # -1 without scene
     pivot: wp.array(dtype=wp.vec3)  # palm centre
     rotation: wp.array(dtype=wp.quat)
     q: wp.array2d(dtype=wp.float32)
@@ -57,7 +57,7 @@ def forward(
     near_count_out: wp.array(dtype=wp.int32),
     depths_out: Depths,
 ):
-    """Compute poses of all bodies (B, L) and world axes of their joints; reset accumulators. Over B."""
+    """Compute poses (B, L) of all bodies and world axes of joints; reset accumulators. Launch over B."""
     b = wp.tid()
     hands = hands_inout
     if hands.active[b] == 0:

@@ -33,7 +33,7 @@ class Faces:
 
 @wp.struct
 class Cells:
-    """Faces listed by cells; `first` has one entry more than cells, all arrays are empty without lists."""
+    """Faces listed by cells; without lists all arrays are empty."""
 
     faces: Faces
     first: wp.array(dtype=wp.int32)  # (cells + 1,)
@@ -45,7 +45,7 @@ class Cells:
 class ClosestPoint:
     """A closest point of the mesh: a + v ab + w ac."""
 
-    face: wp.int32  # -1: none
+    face: wp.int32  # -1 without face
     v: wp.float32
     w: wp.float32
     point: wp.vec3
@@ -88,7 +88,7 @@ def on_face(face: Face, p: wp.vec3):
 
 @wp.func
 def closest_in_cell(cells: Cells, cell: wp.int32, centre: wp.vec3, p: wp.vec3):
-    """Return the closest point of the mesh to p, in the cell with this centre; face -1: nothing is listed."""
+    """Return the closest point of the mesh to p, in the cell with this centre; face -1 if none is listed."""
     out = ClosestPoint()
     out.face = -1
     off = wp.length(p - centre)

@@ -11,7 +11,7 @@ from graspd.worker.simulation.kernels.wrenches import add_wrench
 
 wp.set_module_options({"enable_backward": False})
 
-#: Share of `room` that fingertips keep from obstacles with a clearance of their own for fingertips (`tips`).
+#: Share of `room` that fingertips keep from obstacles that have another clearance for fingertips (`tips`).
 TIP_ROOM = wp.constant(wp.float32(0.25))
 
 
@@ -21,10 +21,10 @@ class Features:
 
     body: wp.array(dtype=wp.int32)
     centre: wp.array(dtype=wp.vec3)  # body frame
-    axis: wp.array(dtype=wp.vec3)  # body frame; zero: a ball
+    axis: wp.array(dtype=wp.vec3)  # body frame; zero for a ball
     radius: wp.array(dtype=wp.float32)
-    margin: wp.array(dtype=wp.float32)  # clearance [m]; negative: it may penetrate
-    tip: wp.array(dtype=wp.int32)  # 1: of a fingertip
+    margin: wp.array(dtype=wp.float32)  # clearance [m]; negative if it may penetrate
+    tip: wp.array(dtype=wp.int32)  # 1 for fingertips
     first: wp.array(dtype=wp.int32)  # (P + 1,) first feature of each piece
     middle: wp.array(dtype=wp.vec3)  # (P,) centre of a ball around the features of a piece, body frame
     extent: wp.array(dtype=wp.float32)  # (P,) radius of this ball [m]
@@ -46,7 +46,7 @@ class Feature:
 
 @wp.struct
 class Obstacles:
-    """Convex obstacles, scene by scene, in each scene half-spaces first. Scene number -1: no obstacles."""
+    """Convex obstacles, scene by scene, half-spaces first. Scene number -1 has no obstacles."""
 
     first: wp.array(dtype=wp.int32)  # (S + 1,) first obstacle of each scene
     first_solid: wp.array(dtype=wp.int32)  # (S,) first obstacle with corners
@@ -187,7 +187,7 @@ def residuals(
     target_in: wp.float32,
     residuals_out: Residuals,
 ):
-    """Emit residuals: features within margin + near of a half-space move to margin + target. Over (B, P)."""
+    """Emit residuals that move features near half-spaces to margin + target. Launch over (B, P)."""
     b, piece = wp.tid()
     hands = hands_in
     if hands.active[b] == 0 or hands.scene[b] < 0:

@@ -15,8 +15,8 @@ wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 class Fingers:
     """F fingers of a hand with L bodies and D dofs; each finger opens as a unit."""
 
-    of_body: wp.array(dtype=wp.int32)  # (L,) -1: none
-    of_dof: wp.array(dtype=wp.int32)  # (D,) -1: does not open
+    of_body: wp.array(dtype=wp.int32)  # (L,) -1 without finger
+    of_dof: wp.array(dtype=wp.int32)  # (D,) -1 if it does not open
     closing: wp.array(dtype=wp.float64)  # (D,)
     step: wp.array(dtype=wp.float64)  # (D,) [rad or m]
     lower: wp.array(dtype=wp.float64)
@@ -89,7 +89,7 @@ def opening_directions(
     sweep_out: Sweep,
 ):
     """Compute opening directions (B, D): a share `plain` of -`closing`, the rest along the forces.
-    The motion along the forces has speed 1 at each finger's fastest dof. Start all hands. Launch over B."""
+    The motion along the forces has speed 1 at each finger's fastest dof. Reset the sweep. Launch over B."""
     b = wp.tid()
     dofs = away_out.shape[1]
     for d in range(dofs):

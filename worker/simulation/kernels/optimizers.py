@@ -30,7 +30,7 @@ def descend(
     second_inout: wp.array2d(dtype=wp.float32),
     hands_inout: Hands,
 ):
-    """Take a step of Adam (Kingma & Ba 2015), or if `adam` is 0 of gradient descent, as in the paper.
+    """Take a step of Adam (Kingma & Ba 2015), or of the paper's gradient descent if `adam` is 0.
     Rates: translation, rotation, every dof. With `clamp` 1, dofs stay inside their limits. Launch over B."""
     b = wp.tid()
     if hands_inout.active[b] == 0:
@@ -66,7 +66,7 @@ def descend(
 
 @wp.kernel
 def advance(iteration_inout: wp.array(dtype=wp.int32)):
-    """Increase the iteration counter on the device, so that a captured graph can be replayed. Over 1."""
+    """Increase the iteration counter on the device, for replays of a captured graph. Launch over 1."""
     iteration_inout[0] = iteration_inout[0] + 1
 
 

@@ -139,7 +139,7 @@ class Samples:
 
 @wp.func
 def cell_range(low: wp.float32, high: wp.float32, origin: wp.float32, size: wp.float32, count: wp.int32):
-    """Return first and last of `count` cells along an axis that an interval meets; first > last: none."""
+    """Return first and last of `count` cells along an axis that an interval meets; first > last if none."""
     a = int(wp.floor((low - origin) / size))
     b = int(wp.floor((high - origin) / size))
     return wp.vec2i(wp.max(a, 0), wp.min(b, count - 1))
@@ -148,7 +148,7 @@ def cell_range(low: wp.float32, high: wp.float32, origin: wp.float32, size: wp.f
 @wp.func
 def cells_around(samples: Samples, p: wp.vec3, extent: wp.vec3):
     """Return the cells that a box of these half extents about p meets.
-    First and last along x, y, z; first > last: none."""
+    The result is first and last along x, y, z; first > last if there are none."""
     low = samples.low
     size = samples.size
     shape = samples.shape
@@ -195,7 +195,7 @@ def object_in_pieces(
     hands_inout: Hands,
     depth_inout: wp.array(dtype=wp.float32),
 ):
-    """Add the gradient of w sum depth^2 over object samples in a piece; record the deepest. Over (B, P).
+    """Add the gradient of w sum depth^2 over object samples in a piece, and the depth. Launch over (B, P).
     A motion of the body along n deepens samples below the face with outward normal n: the gradient is 2 w depth n."""
     b, piece = wp.tid()
     if hands_inout.active[b] == 0:
@@ -293,7 +293,7 @@ def pieces_in_pieces(
     reach = wp.length(pieces_in.half[piece]) + margin_in
     for own in range(hands_inout.body_p.shape[1]):
         if may_touch(pieces_in, points_in, other, p, reach, own, b, hands_inout.body_p, hands_inout.body_q):
-            # From the body's frame straight into the piece's.
+            # Transform from the body's frame straight into the piece's.
             turn = wp.quat_to_matrix(wp.quat_inverse(q) * hands_inout.body_q[b, own])
             shift = wp.quat_rotate_inv(q, hands_inout.body_p[b, own] - p)
             force = wp.vec3(0.0)
@@ -313,7 +313,7 @@ def pieces_in_pieces(
                         touched = 1
             if touched == 1:
                 f = wp.quat_rotate(q, force)
-                # About the object's origin: the sum was about the piece's.
+                # The sum was about the piece's origin; the wrench is about the object's.
                 t = wp.quat_rotate(q, torque) + wp.cross(p, f)
                 add_wrench(hands_inout.wrench, b, other, f, t)
                 add_wrench(hands_inout.wrench, b, own, -f, -t)

@@ -34,7 +34,7 @@ class Residuals:
 
     count: wp.array(dtype=wp.int32)
     body: wp.array2d(dtype=wp.int32)
-    other: wp.array2d(dtype=wp.int32)  # body that the motion is relative to, or -1: the object
+    other: wp.array2d(dtype=wp.int32)  # body that the motion is relative to, or -1 for the object
     point: wp.array2d(dtype=wp.vec3)
     direction: wp.array2d(dtype=wp.vec3)  # direction of the body's motion that increases d
     value: wp.array2d(dtype=wp.float32)  # d - target [m]
@@ -74,7 +74,7 @@ def point_residuals(
     hold_weight_in: wp.float32,
     residuals_out: Residuals,
 ):
-    """Emit residuals: points closer than `near` move to `target`, points within `hold` are weakly held.
+    """Emit residuals that move points closer than `near` to `target`; weakly hold points within `hold`.
     Launch over (B, N / lane)."""
     b, part = wp.tid()
     if hands_in.active[b] == 0:
@@ -143,7 +143,7 @@ def self_residuals(
     reach = wp.length(pieces_in.half[piece]) + near_in
     for own in range(hands_in.body_p.shape[1]):
         if may_touch(pieces_in, points_in, other, p, reach, own, b, hands_in.body_p, hands_in.body_q):
-            # From the body's frame straight into the piece's.
+            # Transform from the body's frame straight into the piece's.
             turn = wp.quat_to_matrix(wp.quat_inverse(q) * hands_in.body_q[b, own])
             shift = wp.quat_rotate_inv(q, hands_in.body_p[b, own] - p)
             for i in range(points_in.first[own], points_in.first[own + 1]):

@@ -19,7 +19,7 @@ class Grips:
     middle: wp.array(dtype=wp.vec3)  # (P,)
     axis: wp.array(dtype=wp.vec3)  # (P,) unit
     width: wp.array(dtype=wp.float32)  # (P,)
-    sums: wp.array(dtype=wp.float32)  # (P,) cumulative probability, the last is 1
+    sums: wp.array(dtype=wp.float32)  # (P,) cumulative probability; the last is 1
     posture: wp.array2d(dtype=wp.float32)  # (K, D)
     between: wp.array(dtype=wp.vec3)  # (K,) centre between the pads
     frame: wp.array(dtype=wp.quat)  # (K,) x: line of the pads, y: as near as possible to the palm's approach
@@ -128,7 +128,7 @@ def reach(
     rotation_out: wp.array(dtype=wp.quat),
     q_out: wp.array2d(dtype=wp.float32),
 ):
-    """Find each start's first clear draw with a number from `first` to below `draws`; number -1: none.
+    """Find each start's first clear draw with a number from `first` to below `draws`; -1 if none is clear.
     Launch over B."""
     b = wp.tid()
     number_out[b] = -1

@@ -51,7 +51,7 @@ class NearestObstacle:
 def tangent_intersection(
     t0: wp.float32, f0: wp.float32, g0: wp.float32, t1: wp.float32, f1: wp.float32, g1: wp.float32
 ):
-    """Return where between t0 and t1 the tangents of a convex function with slopes g0 < 0 < g1 intersect."""
+    """Return the place, t0 to t1, where tangents of a convex function with slopes g0 < 0 < g1 intersect."""
     return wp.clamp((f1 - f0 + g0 * t0 - g1 * t1) / (g0 - g1), t0, t1)
 
 
@@ -213,7 +213,7 @@ def penalty(
     hands_inout: Hands,
     depth_inout: wp.array(dtype=wp.float32),
 ):
-    """Add the gradient of w sum min(d - margin - room, 0)^2 over features and nearest edges. Over (B, P)."""
+    """Add the gradient of w sum min(d - margin - room, 0)^2 of features and edges. Launch over (B, P)."""
     b, piece = wp.tid()
     hands = hands_inout
     if hands.active[b] == 0 or hands.scene[b] < 0 or features_in.first[piece] == features_in.first[piece + 1]:
@@ -252,7 +252,7 @@ def residuals(
     target_in: wp.float32,
     residuals_out: Residuals,
 ):
-    """Emit residuals: features and edges within margin + near move to margin + target. Over (B, P)."""
+    """Emit residuals that move features and edges near solids to margin + target. Launch over (B, P)."""
     b, piece = wp.tid()
     hands = hands_in
     if hands.active[b] == 0 or hands.scene[b] < 0 or features_in.first[piece] == features_in.first[piece + 1]:
@@ -287,7 +287,7 @@ def distances(
     distance_inout: wp.array2d(dtype=wp.float32),
 ):
     """Compute the least distance (B, L) of each body from the solids of scene 0, at most `reach`.
-    A feature that is not above a face is skipped: an edge of the obstacle is nearer to the link. Over (B, P)."""
+    A feature that is not above a face is skipped: an edge of the obstacle is nearer to the link. Launch over (B, P)."""
     b, piece = wp.tid()
     body = pieces_in.body[piece]
     least = reach_in

@@ -22,7 +22,7 @@ class Surface:
     mesh: wp.uint64
     corner_normals: wp.array(dtype=wp.vec3)  # (3 F,)
     alpha: wp.float32
-    field: wp.array3d(dtype=wp.float32)  # coarse grid of distances; empty: not used
+    field: wp.array3d(dtype=wp.float32)  # coarse grid of distances; empty if not used
     field_origin: wp.vec3
     field_cell: wp.float32
     field_error: wp.float32  # grid distances above `exact_below` + this are used without the mesh

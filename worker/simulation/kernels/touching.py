@@ -63,7 +63,7 @@ def touch(
 
 @wp.func
 def apart(touching: NearbySurface, radius: wp.float64, b: wp.int32, i: wp.int32, j: wp.int32):
-    """Return the squared separation of two contacts: of places divided by `radius`, plus of normals."""
+    """Return the squared separation of two contacts: that of places / `radius`, plus that of normals."""
     place = (wp.vec3d(touching.closest[b, i]) - wp.vec3d(touching.closest[b, j])) / radius
     turn = wp.vec3d(touching.normal[b, i]) - wp.vec3d(touching.normal[b, j])
     return wp.dot(place, place) + wp.dot(turn, turn)
@@ -86,7 +86,7 @@ def choose(
 ):
     """Choose at most C pressing points (B, C) of each hand that are far apart. Launch over B.
     Points press if they face the object with a cosine below `facing` and are closer than `near`. On a finger without
-    such points, `far` replaces `near`; `finger` has the finger of each body, -1: none. Each chosen point is the
+    such points, `far` replaces `near`; `finger` has the finger of each body, or -1. Each chosen point is the
     farthest from earlier points (Gonzalez 1985). `count` (B,) is the number of chosen points. `touches` (B, F), `list`
     and `least` (B, N) are scratch."""
     b = wp.tid()

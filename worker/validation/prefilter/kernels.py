@@ -18,8 +18,8 @@ wp.set_module_options({"enable_backward": False})
 BAND: Final = (0.8, 1.2)
 #: Ticks of a push after its motion exceeds a limit. If the motion is then still in the band, the verdict is not clear.
 PATIENCE: Final = 5
-#: Number of ticks (of `protocol.INTERVAL_S`) after which a grasp stays undecided. Grasps that hold take at least 32, 1
-#: in 100 of them more than 47. A few slow grasps would delay the whole launch.
+#: Number of ticks (of `protocol.INTERVAL_S`) after which a grasp stays undecided. Grasps that hold take at least 32; 1
+#: in 100 takes more than 47. A few slow grasps would delay the whole launch.
 MOST_TICKS: Final = 48
 #: Ticks of one stage of closing; stages of each motion; ticks until the first check of a push, and of a whole push.
 STAGE = wp.constant(round(protocol.STAGE_S / protocol.INTERVAL_S))
@@ -80,7 +80,7 @@ class Worlds:
     """State of the schedule in each of W worlds."""
 
     grasp: wp.array(dtype=wp.int32)
-    """-1: no grasp is left for the world."""
+    """-1 if no grasp is left for the world."""
     ticks: wp.array(dtype=wp.int32)
     """Ticks since the hand began to close."""
     push: wp.array(dtype=wp.int32)
@@ -88,7 +88,7 @@ class Worlds:
     looks: wp.array(dtype=wp.int32)
     """Ticks of the present push."""
     broken: wp.array(dtype=wp.int32)
-    """Outcome for the limit that the present push exceeded; 0: none."""
+    """Outcome for the limit that the present push exceeded; 0 if it exceeded none."""
     before: wp.array(dtype=wp.vec3)
     turned_before: wp.array(dtype=wp.float32)
     qpos: wp.array2d(dtype=wp.float32)

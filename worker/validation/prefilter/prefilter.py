@@ -206,7 +206,7 @@ class WorldPool:
             array.assign(whole)
 
     def _depths(self, states: NDArray[np.float32]) -> tuple[Floats, NDArray[np.bool_]]:
-        """Return the deepest penetration (N, 2) of hand and object, and in the hand [m], and overflows (N,)."""
+        """Return the deepest penetrations (N, 2), hand-object and hand-hand [m], and a mask (N,) of overflows."""
         n, data = len(states), self._data
         out, rows, short = wp.zeros((n, 2), dtype=wp.float32), wp.array(states, dtype=wp.float32), np.zeros(n, bool)
         for first in range(0, n, self.worlds):
@@ -261,7 +261,7 @@ class PrefilterVerdicts:
     stands: dict[int, Rollout]
     """Final verdicts, by row. The CPU validates all other rows."""
     rechecked: dict[int, bool]
-    """Clear verdicts that the CPU rechecks, by row; True: the prefilter held the grasp."""
+    """Clear verdicts that the CPU rechecks, by row; True if the prefilter held the grasp."""
 
     def contradicted(self, rollouts: dict[int, Rollout]) -> int:
         return sum(rollouts[row].success != held for row, held in self.rechecked.items())
