@@ -36,7 +36,7 @@ JsonFlag = Annotated[bool, typer.Option("--json", help="Print one JSON object on
 
 
 def reporting_errors(command: Callable[P, R]) -> Callable[P, R]:
-    """Convert errors to one line on stderr and an exit code: 2 for invalid input, 1 for all others."""
+    """Convert errors to one line on stderr and an exit code: 2 for invalid input, 130 for Ctrl-C, else 1."""
 
     @functools.wraps(command)
     def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from graspd.service.model.errors import InputError
 
-#: Limit of the unpacked size that a foreign file states [bytes].
+#: Limit [bytes] of the unpacked size that a file of unknown origin states.
 LARGEST: Final = 2**31
 #: Type of pictures for Hugging Face's readers: bytes and path of a file.
 IMAGE: Final = "image"
@@ -25,7 +25,7 @@ def arrow() -> Any:
 
 
 def type_of(name: str) -> Any:
-    """Return the Arrow type of `image`, `text` or such as `int64`; suffix [n]: list of n, []: any length."""
+    """Return an Arrow type by name, such as `image`, `text`, `int64`; lists have a suffix [length] or []."""
     pa = arrow()
     if name.endswith("]"):
         inner, _, size = name[:-1].rpartition("[")
@@ -56,7 +56,7 @@ def write(file: Path, schema: Any, groups: Iterable[Sequence[Mapping[str, Any]]]
 
 
 def read(file: Path, wanted: Iterable[str]) -> dict[str, list[Any]]:
-    """Read the wanted columns that a file has; InputError: no Parquet file, or larger than `LARGEST`."""
+    """Read the wanted columns that a file has; InputError if it is not Parquet or exceeds `LARGEST`."""
     pa = arrow()
     try:
         with pa.parquet.ParquetFile(file) as found:

@@ -106,7 +106,7 @@ class Database:
 
     @contextmanager
     def writing(self, within: Connection | None = None) -> Iterator[Connection]:
-        """Yield a new transaction, which is committed as a whole or not at all; or the given one.
+        """Yield the given transaction, or a new one that is committed as a whole or not at all.
 
         Writers run one at a time, because a transaction derives states from rows that a concurrent one might
         change.
@@ -216,7 +216,7 @@ def rows_in(
 
 
 def _file_of(url: str | URL) -> SqliteFile | None:
-    """Return the file of an SQLite index; None if in memory or another database; InputError: invalid URL."""
+    """Return the file of an SQLite index, None if it has no file; InputError for an invalid URL."""
     try:
         parsed = make_url(url)
         is_file = parsed.get_backend_name() == "sqlite" and parsed.database and parsed.database != ":memory:"
@@ -242,7 +242,7 @@ def url_error(error: Exception) -> InputError:
 
 
 def connect_postgres(url: str | URL) -> Engine:
-    """Return an engine, make no tables; its connections raise InputError unless the encoding is UTF-8."""
+    """Return an engine without making tables; connections raise InputError unless the encoding is UTF-8."""
     engine = create_engine(url, pool_pre_ping=True, pool_size=5, max_overflow=10)
 
     # Runs before SQLAlchemy inspects the connection: the inspection fails on SQL_ASCII databases, which return bytes.
@@ -271,7 +271,7 @@ def _sqlite_engine(url: str | URL) -> Engine:
 
 
 def _make_tables(engine: Engine, *, anew: bool) -> str:
-    """Make missing tables; return the revision of dropped ones, else ""."""
+    """Make missing tables; return the revision of dropped tables, "" if none were dropped."""
     dropped = ""
     with _schema_transaction(engine) as connection:
         found = revision_of(connection)
@@ -300,7 +300,7 @@ def revision_of(connection: Connection) -> str:
 
 def _revision_mismatch(found: str) -> str:
     if found > REVISION:
-        return f"the index was made by a newer graspd (revision {found}, here {REVISION}); use it, or delete the index"
+        return f"a newer graspd made the index (revision {found}, here {REVISION}); use that one, or delete the index"
     return f"the index is of an older graspd (revision {found}, here {REVISION}); run `graspd admin index rebuild`"
 
 
@@ -331,7 +331,7 @@ def convert_errors() -> Iterator[None]:
         # The value is invalid, not the database: retries would never end.
         raise InputError(f"the index cannot store this value: {_error_line(error)}") from error
     except (OverflowError, UnicodeEncodeError):
-        raise InputError("the index stores only whole numbers below 2^63 and Unicode text; give such values") from None
+        raise InputError("the index needs whole numbers below 2^63 and valid Unicode text; give such values") from None
     except SQLAlchemyError as error:
         if getattr(getattr(error, "orig", None), "sqlite_errorcode", 0) & 0xFF in _DAMAGED:
             raise IndexDamaged(
@@ -366,7 +366,7 @@ Identity = tuple[int, int] | None
 
 
 class SqliteFile:
-    """File of an SQLite index; a lock prevents an open while another process moves the file away."""
+    """File of an SQLite index; a lock prevents opening it while another process moves it away."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -381,7 +381,7 @@ class SqliteFile:
 
     @contextmanager
     def opening(self) -> Iterator[None]:
-        """Hold the lock among processes, and remove files that belonged to a missing database."""
+        """Hold the inter-process lock, and remove files that belonged to a missing database."""
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             lock = self._sidecar(".lock").open("w")
@@ -413,7 +413,7 @@ Row = Mapping[str, Any]
 
 
 def upsert(connection: Connection, table: Table, rows: Sequence[Row], *, keep: Sequence[str] = ()) -> None:
-    """Insert or update rows with equal columns; of equal keys the last counts. `keep` is never updated."""
+    """Insert or update rows of the same columns; the last row of a key wins. `keep` is never updated."""
     if not rows:
         return
     keys = [column.name for column in table.primary_key]

@@ -22,8 +22,8 @@ from graspd.service.index.tags import Tags
 class Index:
     """SQL rows derived from the store; `url` is an SQLAlchemy URL.
 
-    Only API and controller write. Every method raises IndexUnavailable if the database does not answer. Cursors are
-    opaque, `limit` is at most 200, and an unknown id raises NotFoundError.
+    Only the API and the controller write to it. Every method raises IndexUnavailable if the database does not answer.
+    Cursors are opaque, `limit` is at most 200, and an unknown id raises NotFoundError.
     """
 
     def __init__(self, url: str | URL, *, anew: bool = False) -> None:

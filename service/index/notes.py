@@ -1,4 +1,4 @@
-"""Notes on the state of index and store: completeness, progress of the scan, damaged objects."""
+"""Notes on the state of index and store: completeness, progress of the scan, damaged stored objects."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class IndexCompleteness:
 
     at: str
     left_out: int = 0
-    """Damaged records of the store that are not in the index."""
+    """Number of damaged records of the store that are not in the index."""
     names: tuple[str, ...] = ()
 
 
@@ -119,7 +119,7 @@ class Notes(IndexPart):
 
 @dataclass(frozen=True)
 class Damage:
-    """Object of the store with damaged or missing content."""
+    """Stored object with damaged or missing content."""
 
     key: str
     what: str
@@ -128,10 +128,10 @@ class Damage:
 
 
 class KnownDamage(IndexPart):
-    """List of damaged and missing objects of the store."""
+    """List of damaged and missing stored objects."""
 
     def known(self, *, limit: int = 100) -> tuple[int, list[Damage]]:
-        """Return the number of damaged objects, and the first of them."""
+        """Return the number of damaged stored objects, and the first of them."""
         query = select(damage).order_by(damage.c.found, damage.c.key).limit(limit)
         with self.database.reading() as connection:
             count = int(connection.scalar(select(func.count()).select_from(damage)) or 0)

@@ -16,7 +16,7 @@ from graspd.service.model.clock import timestamp
 from graspd.service.model.projects import EVERYTHING, ProjectScope
 from graspd.service.model.webhooks import MOST_WAITING, WAITS_S, Webhook
 
-#: Ends and deliveries older than this are deleted [s].
+#: Age [s] above which ends and deliveries are deleted.
 KEPT_S: Final = 30 * 86400.0
 _AT_ONCE: Final = 500
 
@@ -29,7 +29,7 @@ class DueDelivery:
 
 
 def append_ends(connection: Connection, rows: Sequence[dict[str, Any]]) -> None:
-    """Append ends to the feed within a transaction.
+    """Append ends of jobs and datasets to the feed within a transaction.
 
     The number of an end is the time in milliseconds, or the last number plus 1 if that is greater. A new index thus
     continues after the numbers of a lost one. Writers run one at a time, so numbers appear in ascending order.
@@ -94,7 +94,7 @@ class Outbox(IndexPart):
         return [DeliveryView(**row) for row in self.database.rows(query)]
 
     def plan(self) -> None:
-        """Create deliveries of new ends; they fail at once if too many deliveries of the webhook are waiting."""
+        """Create deliveries of newly ended jobs and datasets; they fail at once if too many already wait."""
         for hook in self.hooks():
             mine = (ends.c.project == hook.project, ends.c.seq > hook.seen)
             query = select(ends.c.seq, ends.c.state).where(*mine).order_by(ends.c.seq).limit(_AT_ONCE)
@@ -138,7 +138,7 @@ class Outbox(IndexPart):
         ]
 
     def settle(self, due: DueDelivery, *, status: int | None, detail: str, done: bool, final: bool = False) -> None:
-        """Record an attempt: a failure delays all deliveries of the address, or ends them if `final`."""
+        """Record an attempt: a failure delays all deliveries of the webhook, or fails them if `final`."""
         last = final or due.attempts >= len(WAITS_S)
         rest_until = 0.0 if done else time.time() + WAITS_S[min(due.attempts, len(WAITS_S) - 1)]
         values = {

@@ -52,9 +52,9 @@ Progress = Callable[[str, int], object]
 
 
 def rebuild(index: Index, store: Store, *, progress: Progress = lambda what, number: None) -> dict[str, int]:
-    """Derive all rows anew from the store; return the numbers of records read, by kind, and omitted.
+    """Derive all rows anew from the store; return the numbers of records by kind, and of omitted ones.
 
-    The old rows stay until all new ones exist. The log and `index.notes.completeness()` name each damaged record.
+    The old rows stay until all new ones exist. The log names all damaged records; `index.notes` stores the first 50.
     """
     with index.database.writing() as connection:
         connection.execution_options(**{QUIET: True})
@@ -192,7 +192,7 @@ def complete_if_new(index: Index, store: Store) -> None:
 
 
 def differences(index: Index, store: Store) -> list[str]:
-    """Return damaged records, then the rows that `rebuild` would change, one line each; empty if equal."""
+    """Return at most 50 lines: damaged records, then rows that `rebuild` would change; empty if equal."""
     with (
         tempfile.TemporaryDirectory(prefix="graspd-index-") as folder,
         closing(Index(sqlite_url(Path(folder) / "index.sqlite"))) as fresh,
@@ -206,7 +206,7 @@ def differences(index: Index, store: Store) -> list[str]:
 
 
 def missing_names(index: Index, store: Store) -> list[str]:
-    """List shards and jobs that only index or only store has, one line each, without reading records."""
+    """List shards and jobs missing in the index or in the store, one line each, without reading records."""
     gone = {f"jobs {name}" for what, name in pending(store) if what == "job"}
     stored = {
         f"shards {entry.key.rpartition('/')[2].removesuffix('.json')}"

@@ -234,7 +234,7 @@ datasets: Final = Table(
     Column("events", Integer, nullable=False),
     Column("applied", Integer, nullable=False, default=0),
     Column("planned", Boolean, nullable=False, default=False),
-    # Number of events at the last reported end; -1: not reported.
+    # Number of events at the last reported end; -1 before the first report.
     Column("told", Integer, nullable=False, server_default="-1"),
     Column("neighbours", String(300), nullable=False, server_default=""),
     Column("network_digest", String(32), nullable=False, server_default=""),
@@ -288,7 +288,7 @@ tagged: Final = Table(
     Column("row", Integer, primary_key=True),
     Index("tagged_grasps", "shard_id", "row"),
 )
-#: Current state: the store does not contain it.
+#: Ended jobs and datasets: current state, which the store does not contain.
 ends: Final = Table(
     "ends",
     metadata,

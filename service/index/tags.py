@@ -31,7 +31,7 @@ class Tags(IndexPart):
         return str(found)
 
     def of(self, wanted: Collection[Grasp], *, scope: ProjectScope = EVERYTHING) -> dict[Grasp, list[str]]:
-        """Return the names of the tags of each given grasp that has any."""
+        """Return the tag names of each given grasp that has any."""
         found: dict[Grasp, list[str]] = {}
         query = select(tagged.c.shard_id, tagged.c.row, tags.c.name).order_by(tags.c.name)
         query = query.where(tags.c.id == tagged.c.tag, *in_scope(scope, tags))

@@ -330,7 +330,7 @@ class DatasetView(Validated):
 
     @property
     def counted(self) -> int:
-        """Grasps that count under the dataset's options: valid ones, else all."""
+        """Number of grasps that count: valid ones, or all stored ones if validation is off."""
         return self.valid if self.options.standing == "valid" else self.grasps
 
 
@@ -355,7 +355,7 @@ class CellView(Validated):
     reason: str | None = Field(description="why it failed, or found fewer grasps than requested")
 
     def counted(self, options: JobOptions) -> int:
-        """Grasps that count under the dataset's options: valid ones, else all."""
+        """Number of grasps that count: valid ones, or all stored ones if validation is off."""
         return self.valid if options.standing == "valid" else self.grasps
 
 
@@ -372,7 +372,7 @@ class SnapshotView(View):
     size_bytes: int
 
     def counted(self, options: JobOptions) -> int:
-        """Grasps that count under the dataset's options: valid ones, else all."""
+        """Number of grasps that count: valid ones, or all stored ones if validation is off."""
         return self.valid if options.standing == "valid" else self.grasps
 
 

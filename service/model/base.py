@@ -47,7 +47,7 @@ _WORDS: Final = {
 #: Pydantic's error types for bounds, with the name of each bound.
 _BOUNDS: Final = {"greater_than_equal": "ge", "greater_than": "gt", "less_than_equal": "le", "less_than": "lt"}
 _NAMES: Final = "must begin with a letter or digit and have at most 64 letters, digits, dots, dashes and underscores"
-#: Prefix of pydantic's messages, which the field's name replaces.
+#: Prefixes of pydantic's messages that `problem_text` removes or replaces by `must`.
 _SUBJECT: Final = re.compile(r"^(Value error, )|^\w+ should ")
 _CLASS: Final = re.compile(r"_[A-Z]\w*$|constrained-\w+$")
 #: Typer's message about choices; pydantic's key for choices is `expected`.

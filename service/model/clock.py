@@ -6,7 +6,7 @@ from datetime import UTC, datetime, timedelta
 
 
 def timestamp(ago_s: float = 0.0) -> str:
-    """Return the time now, or `ago_s` before: RFC 3339 in UTC with milliseconds, sortable as text."""
+    """Return the time `ago_s` before now: RFC 3339 in UTC with milliseconds, sortable as text."""
     when = datetime.now(UTC) - timedelta(seconds=ago_s)
     return when.isoformat(timespec="milliseconds").replace("+00:00", "Z")
 

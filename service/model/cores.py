@@ -38,14 +38,14 @@ def _quotas(root: Path) -> Iterator[float]:
 
 
 def available_memory(root: Path = ROOT) -> int:
-    """Return the memory of this process [bytes]: the machine's, or its control group's limit if less."""
+    """Return the memory [bytes] of this process: the machine's, or its control group's limit if lower."""
     limits = (text.strip() for text in _limits(root, "memory.max"))
     given = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     return min([given, *(int(text) for text in limits if text.isdigit() and int(text) > 0)])
 
 
 def _limits(root: Path, name: str) -> Iterator[str]:
-    """Yield the texts of a limit's file in the process's control group (version 2) and its ancestors."""
+    """Yield the content of file `name` in the process's control group (version 2) and each ancestor."""
     for line in _text(root / "proc/self/cgroup").splitlines():
         path = PurePosixPath(line.partition("::")[2])
         for group in (path, *path.parents):

@@ -1,4 +1,4 @@
-"""Content addresses: digests of a result's inputs, so that repeated runs of a task give one object."""
+"""Content addresses: digests of a result's inputs, so that repeated runs of a task write one shard."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def _verdict_text(request: JobRequest, batches: range) -> dict[str, object]:
 
 
 def job_id(request: JobRequest, hand_digest: str, object_digest: str, project: str = "") -> str:
-    """Return the id of a job: equal requests on equal hand and object in one project are one job."""
+    """Return the id of a job: equal requests for the same hand, object and project are one job."""
     wanted = original_request(request.model_dump(mode="json"))
     said = {"request": wanted, "hand": hand_digest, "object": object_digest, "revisions": STAGE_REVISIONS}
     return digest_json(said | ({"project": project} if project else {}))

@@ -327,7 +327,7 @@ class JobOptions(Model):
 
     @property
     def matter(self) -> dict[str, float]:
-        """Mass, density and friction of the object as far as given; empty: none."""
+        """Mass, density and friction of the object, without those that are not given."""
         said = {"mass": self.mass, "density": self.density, "object_friction": self.object_friction}
         return {name: value for name, value in said.items() if value is not None}
 
@@ -342,7 +342,7 @@ class JobOptions(Model):
 
     @property
     def _named_neighbours(self) -> tuple[NamedNeighbour, ...]:
-        # Plain names became `NamedNeighbour` when the field was parsed.
+        # The field's validation has converted names to `NamedNeighbour`.
         return tuple(one for one in self.neighbours if isinstance(one, NamedNeighbour))
 
     @property
@@ -380,7 +380,7 @@ class JobOptions(Model):
 
     @property
     def standing(self) -> Literal["valid", "feasible", "kept"]:
-        """Grasps that tables count: valid, or without validation all stored ones."""
+        """Grasps that tables count: `counted`, or all stored ones if candidates are wanted without validation."""
         return "kept" if self.counted == "feasible" and self.want == "candidates" else self.counted
 
     def rechecks_of(self, batch: int) -> int:

@@ -1,7 +1,7 @@
 """Installed libraries: cached versions, and imports without garbage collection.
 
-The modules of one process contain half a million objects. Garbage collections during imports and at exit would scan
-all of them; this takes half of the time of start and exit.
+The modules of one process contain half a million Python objects. Garbage collections during imports and at exit would
+scan all of them; this takes half of the time of start and exit.
 """
 
 from __future__ import annotations

@@ -97,7 +97,7 @@ class LocalOptions(MeshOptions, JobOptions):
         return {name: value for name in sorted(given) if (value := getattr(self, name))}
 
     def request(self, options: dict[str, Any]) -> JobOptions:
-        """Return the job without scene and rechecks; `options` has digests, not files; InputError if invalid."""
+        """Return the job without scene and rechecks; `options` has digests of files. InputError if invalid."""
         shared = {name: getattr(self, name) for name in JobOptions.model_fields.keys() - _OF_PLACE}
         # Rechecks are a sample over many jobs; a single file can be validated completely at level `dexgraspbench`.
         return validate(JobOptions, shared | {"fidelity": self.knobs, "options": options, "rechecks": 0})

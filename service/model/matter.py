@@ -6,10 +6,10 @@ from typing import Annotated, Final
 
 from pydantic import Field
 
-#: Default mass [kg] and coefficient of sliding friction: DexGraspBench's.
+#: Default mass [kg] and coefficient of sliding friction, as in DexGraspBench.
 MASS_KG: Final = 0.1
 FRICTION: Final = 0.6
-#: Gravity, and the acceleration of pushes, in the protocol [m/s^2].
+#: Gravity and acceleration of pushes in DexGraspBench's protocol [m/s^2].
 ACCELERATION: Final = 10.0
 MOST_KG: Final = 100.0
 

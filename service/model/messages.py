@@ -103,7 +103,7 @@ class WorkerBeat:
     seen: Annotated[str, Field(max_length=32)]
     reason: Annotated[str, Field(max_length=300)] = ""
     schemas: tuple[Count, Count] = (0, 0)
-    """Oldest and newest readable task message; workers of graspd 0.1 report none and get no tasks."""
+    """Oldest and newest readable schema of task messages; workers of graspd 0.1 report none and get no tasks."""
     revisions: Annotated[dict[HostWord, Count], Field(max_length=16)] = field(default_factory=dict)
     done: Amount = 0.0
     total: Amount = 0.0

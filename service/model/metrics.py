@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final, Literal
 
-#: Shorter names are symbols with unchanged case.
+#: Column titles shorter than this are symbols, whose case is kept.
 _SYMBOL: Final = 4
 
 
@@ -49,7 +49,7 @@ class GraspMetric:
     bounds: tuple[float, float] = (0, math.inf)
     less_is_better: bool = False
     digits: int | None = None
-    """Decimal places in a card's table; None: not in this table."""
+    """Decimal places in a card's table; None omits the metric from the table."""
     plot: Literal["no", "whole", "cut"] = "no"
     """Whether a card plots its distribution, and whether the plot ends at the 99th percentile."""
 
@@ -310,20 +310,20 @@ SECTORS: Final = 12
 
 DIRECTION_CELLS: Final = BANDS * SECTORS
 
-#: Distance below which two grasps of a job are near-duplicates [m]: mean over corresponding points of the hand's
+#: Distance [m] below which two grasps are near-duplicates: mean over corresponding points of the hand's
 #: surface. Twice this distance is hardly visible in a picture; near-duplicates occur in fewer than 1 in 100 pairs of
 #: batches.
 MIN_DISTANCE_M: Final = 0.005
 
 
 def entropy_bits(counts: Iterable[int]) -> float:
-    """Return the Shannon entropy [bit] of the distribution over categories; 0: one category or no grasps."""
+    """Return the Shannon entropy [bit] of a distribution over categories; 0 for one category or no grasps."""
     known = [count for count in counts if count > 0]
     total = sum(known)
     return -sum(count / total * math.log2(count / total) for count in known) + 0.0
 
 
 def evenness(counts: Iterable[int], kinds: int) -> float:
-    """Return 2^entropy / kinds; 1: uniform, 1 / kinds: a single category, 0: no grasps."""
+    """Return 2^entropy / kinds: 1 if uniform, 1 / kinds for a single category, 0 without grasps."""
     counts = list(counts)
     return float(2 ** entropy_bits(counts) / kinds) if any(counts) else 0.0

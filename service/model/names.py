@@ -133,7 +133,7 @@ log = logging.getLogger(__name__)
 
 
 def check_length(name: str) -> str:
-    """Return the name; InputError if a name that users choose is too long."""
+    """Return a name that a user chose; InputError if it is too long."""
     if len(name) > MOST:
         raise InputError(
             f"the name {name} has {len(name)} characters, and at most {MOST} are allowed; give a shorter one"

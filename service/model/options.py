@@ -133,7 +133,7 @@ def keywords_of(model: type[BaseModel], place: Place) -> list[tuple[Row, str]]:
 
 
 def type_text(annotation: Any) -> str:
-    """Format an annotation for callers: without bounds, and models as mappings."""
+    """Format an annotation for callers, without bounds; models become mappings."""
     origin, inner = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
         return type_text(inner[0])

@@ -30,7 +30,7 @@ MAX_BACKOFF_S: Final = 300.0
 
 @dataclass(frozen=True)
 class PlannedTask:
-    """Task of a job: batches from `batch` on, `count` grasps in all; `inputs` and `output` are shard ids."""
+    """Task of a job: `count` grasps, starting at batch `batch`; `inputs` and `output` are shard ids."""
 
     id: str
     stage: Stage
@@ -274,7 +274,7 @@ def format_outcomes(outcomes: Mapping[str, int]) -> str:
 def shortfall(
     found: int, wanted: int, counted: str, candidates: int, budget: float, outcomes: Mapping[str, int], limit: str = ""
 ) -> str | None:
-    """Explain why fewer grasps were found than wanted, None if all were; `limit` replaces the budget."""
+    """Explain why fewer grasps were found than wanted, None if enough were; `limit` replaces the budget."""
     if found >= wanted:
         return None
     lost, tries = format_outcomes(outcomes), candidates + outcomes.get("repeated", 0)
@@ -285,7 +285,7 @@ def shortfall(
 
 
 def limit_text(hand: str, friction: float, grasps: int, lifts: float, bound: float, wanted: float | None = None) -> str:
-    """Describe a hand's payload limit; `bound` [kg] follows from actuators and friction, inf: none."""
+    """Describe a hand's payload limit; `bound` [kg] follows from actuators and friction (inf: no bound)."""
     most = f", and at most {bound:.2g} kg by actuator effort" if math.isfinite(bound) else ""
     less = "" if wanted is None else f"; {wanted:.3g} kg are wanted"
     return f"{hand} lifts {lifts:.2g} kg at friction {friction:g} in the best of {grasps} grasps{most}{less}"

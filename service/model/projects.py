@@ -21,7 +21,7 @@ class ProjectScope:
     """Visible resources: all, or those of one project and shared hands and objects."""
 
     project: str = ""
-    """Project whose resource is used if two projects have the same name."""
+    """Project whose resource is preferred if other projects have one of the same name."""
     everything: bool = True
 
     def sees(self, project: str) -> bool:
@@ -33,5 +33,5 @@ EVERYTHING: Final = ProjectScope()
 
 
 def project_mark(files: Mapping[str, bytes], project: str) -> dict[str, bytes]:
-    """Return a private upload's mark; for a shared upload, an empty file replacing an existing mark."""
+    """Return a private upload's mark; for a shared upload, an empty file that replaces an existing mark."""
     return {MARK: project.encode()} if project or MARK in files else {}

@@ -282,7 +282,7 @@ Row = Annotated[int, Field(ge=0, lt=2**31)]
 
 
 class Tag(Record):
-    """`tags/{id}/{number:06}.json`: version of a tag after a change; the last one counts; `gone`: deleted."""
+    """`tags/{id}/{number:06}.json`: version of a tag; the last one counts, and `gone` marks a deleted tag."""
 
     version: Literal[1] = 1
     id: Digest

@@ -74,7 +74,7 @@ def _chart_name(name: str) -> str:
 
 
 def original_request(request: dict[str, Any]) -> dict[str, Any]:
-    """Return a job's request with the names of graspd 0.2, whose digests are the ids of jobs and shards."""
+    """Return a request with the names of graspd 0.2: ids of jobs and shards are digests with these names."""
     found = {
         _OLD_KEYS.get(key, key): _OLD_VALUES[key].get(value, value) if key in _OLD_VALUES else value
         for key, value in request.items()

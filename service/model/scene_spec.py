@@ -53,7 +53,7 @@ class HalfSpace(Model):
     normal: Vector = (0.0, 0.0, 1.0)
     """Outward normal of the support, of any length."""
     offset: _Metres = 0.0
-    """n.x on the plane [m]."""
+    """Value of n.x on the plane [m], with n = `normal` as given."""
 
     @model_validator(mode="after")
     def _check_normal(self) -> Self:
@@ -133,7 +133,7 @@ class SceneSpec(Model):
 def parse_scene(
     text: str, *, faces: str = "drawn", touch: float | None = None, beside: Sequence[str] = ()
 ) -> SceneSpec:
-    """Parse a scene, one of `KINDS` or a file; `touch` None: the file's value; InputError if invalid."""
+    """Parse a scene: one of `KINDS` or a file. `touch` replaces the file's value. InputError if invalid."""
     if faces not in ("drawn", "all"):
         raise InputError(f"unknown faces {faces!r}; choose drawn or all")
     path = Path(text)
@@ -302,7 +302,7 @@ def scene_of(
 def known_name(text: str) -> str:
     """Return the name of an object; InputError for a file, because jobs need names known to the service."""
     if "/" in text or Path(text).is_file():
-        raise InputError(f"the neighbour {text} is a file: `graspd objects add {text}` first, then give its name")
+        raise InputError(f"the neighbour {text} is a file: run `graspd objects add {text}` first, then give its name")
     return text
 
 

@@ -60,7 +60,7 @@ _ALL: Final = (
         "graspd_grasps_total",
         "counter",
         ("verdict",),
-        "grasps stored: all, valid; candidates tested: validated",
+        "grasps stored (all, valid), candidates tested (validated)",
         "controller",
     ),
     Series("graspd_shards_total", "counter", ("stage",), "shards written", "controller"),

@@ -166,7 +166,7 @@ def _exponent(text: str) -> str:
 
 _RECORD: Final = TypeAdapter(Stability)
 
-#: Modes of a row of a chart in scenes: planned in the scene, or planned around a free object and filtered.
+#: Modes of the rows in charts of scenes: planned in the scene, or planned around a free object and filtered.
 IN_SCENE: Final = "in the scene"
 FILTERED: Final = "free, filtered"
 

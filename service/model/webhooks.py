@@ -24,7 +24,7 @@ WAITS_S: Final = (5.0, 30.0, 120.0, 600.0, 3600.0, 6 * 3600.0)
 
 
 class Webhook(Record):
-    """`webhooks/{id}.json`: a URL and its events. The secret is derived from the id."""
+    """`webhooks/{id}.json`: a URL and the final states to report to it; `secret_of` derives the secret."""
 
     version: Literal[1] = 1
     id: Digest

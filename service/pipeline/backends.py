@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Services:
-    """Store, index and queue; only API and controller open the index; workers use `open_store` and queue."""
+    """Store, index and queue of the API and the controller; workers use only store and queue."""
 
     settings: Settings
     store: Store
@@ -54,7 +54,7 @@ class Services:
 
 @contextmanager
 def recording(services: Services, made: Sequence[str] = ()) -> Iterator[tuple[Connection, Put]]:
-    """Yield an index transaction and a function that puts records; a failure deletes these and `made`.
+    """Yield an index transaction and a function to store records; a failure deletes them and keys `made`.
 
     No other process writes to the index meanwhile, so checks before a record still hold when its rows are written.
     """

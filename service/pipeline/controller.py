@@ -54,7 +54,7 @@ _LONGEST_PAUSE_S: Final = 5.0
 _COLLECT_EVERY_S: Final = 5.0
 #: Interval of the check that store and index still belong to this service.
 _IDENTIFY_EVERY_S: Final = 30.0
-#: Longest wait for a running read of the store after a stop [s].
+#: Longest wait [s] for a running read of the store after a stop.
 _LAST_READ_S: Final = 3.0
 #: Least wait between two parts of large jobs [s]: longer than the sleep of a writer that waits for SQLite.
 _ENTERING_GAP_S: Final = 0.15
@@ -70,7 +70,7 @@ class Controller:
         self._planner = DatasetRounds(services, clock=clock)
         self._garbage = GarbageCollector(services, clock=clock)
         self._known: str | None = None
-        """Mark of the index at its last comparison with the store's."""
+        """Mark of the index when it last matched the store's mark."""
         self._has_plans = False
         self._turns = RoundRobin()
         self._backlog: list[tuple[str, Event]] = []
@@ -128,7 +128,7 @@ class Controller:
     def _run(self, stop: threading.Event) -> None:
         pause = 0.0
         while not stop.is_set():
-            # Touched even while a backend is unavailable: a restarted controller would wait just as long.
+            # The heartbeat goes on while a backend is unavailable: a restarted controller would wait just as long.
             self._alive.touch()
             try:
                 self.round(wait_s=self._services.settings.controller_interval_s)
@@ -172,7 +172,7 @@ class Controller:
             self._known, self._made = fresh, False
 
     def _publish_progress(self) -> None:
-        """Publish changed progress of tasks from the reports of workers."""
+        """Write changed progress of tasks, from the reports of workers, to the index."""
         busy = (beat for beat in self._services.queue.workers() if beat.task_id)
         found = {beat.task_id: (beat.done, beat.total, beat.message) for beat in busy}
         if changed := {task: one for task, one in found.items() if self._progress.get(task) != one}:
@@ -356,7 +356,7 @@ def _log_failures(away: list[UnavailableError]) -> Iterator[None]:
 class PeriodicDuty:
     """Duty called in each round: runs at most once per `every_s`, and for at most `share` of the time.
 
-    After an error, or a result True because work is left, the duty also runs in the next round.
+    The duty also runs in the next round after an error, or after a result True, which means that work is left.
     """
 
     def __init__(
@@ -368,7 +368,7 @@ class PeriodicDuty:
         share: float = 0.2,
         longest_s: float = math.inf,
     ) -> None:
-        """`longest_s` is the longest pause, regardless of the share [s]."""
+        """`longest_s` [s] is the longest pause, regardless of `share`."""
         self._clock, self._work = clock, work
         self._every_s, self._share, self._longest_s = every_s, share, longest_s
         self._again = -math.inf

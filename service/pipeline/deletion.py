@@ -1,9 +1,9 @@
 """Deletion of assets, jobs and datasets by users, and the garbage collector of the store.
 
 One step under the index's write lock writes `deletions/{what}/{id}.json` and removes the rows. From then on the
-resource does not exist: rebuilds omit it, and nothing of its id is accepted. In the following rounds of the controller,
-the garbage collector moves its objects aside, then removes that record; it can resume after a kill. After the grace
-time, it permanently removes these objects and the shards that no job needs.
+resource does not exist: rebuilds omit it, and requests with its id are refused. In later rounds of the controller, the
+garbage collector moves its stored objects aside, then removes that record; it can resume after a kill. After the grace
+time, it permanently removes these stored objects and the shards that no job needs.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def delete_asset(
 
 
 def delete_job(services: Services, job_id: str, *, owner: str = "") -> None:
-    """Delete a job, and later the shards that only it needs; ConflictError: unfinished, or in a dataset."""
+    """Delete a job, and later the shards that only it needs; ConflictError if unfinished or in a dataset."""
     job = services.index.jobs.get(job_id)
     try:
         record = read_record(JobRecord, services.store, names.job_record(job_id))
@@ -89,7 +89,7 @@ def delete_job(services: Services, job_id: str, *, owner: str = "") -> None:
 
 
 def delete_dataset(services: Services, name: str, *, owner: str = "", with_snapshots: bool = False) -> None:
-    """Delete a dataset and jobs for it alone; ConflictError: unfinished, or with unconfirmed snapshots."""
+    """Delete a dataset and jobs for it alone; ConflictError if unfinished, or for unconfirmed snapshots."""
     dataset = services.index.datasets.get(name)
     if not dataset.state.is_final:
         raise ConflictError(f"dataset {name!r} is {dataset.state}; cancel it first: graspd datasets cancel {name}")
@@ -106,7 +106,7 @@ def delete_dataset(services: Services, name: str, *, owner: str = "", with_snaps
 
 
 def move_to_removed(services: Services, deletion: Deletion) -> None:
-    """Move deleted objects below `removed/`, resource record last, unless the resource was restored."""
+    """Move a deleted resource below `removed/`, its record last, unless it was restored."""
     record = _record_of(deletion)
     with services.index.database.writing():
         if not services.store.exists(names.deletion(deletion.what, deletion.id)):
@@ -129,10 +129,10 @@ def restore(
     permit: Callable[[Deletion], None],
     among: Callable[[Deletion], bool] = lambda _: True,
 ) -> Deletion:
-    """Restore a deleted resource by name or id, unchanged; a dataset with its deleted jobs.
+    """Restore a deleted resource unchanged, by name or id; a dataset is restored with its deleted jobs.
 
-    `permit` raises for a forbidden deletion; `among` tests the scope. NotFoundError: nothing of this name was deleted
-    within the grace time. ConflictError: the name is in use again, or a dependency is deleted.
+    `permit` raises if the user may not restore it; `among` tests the scope. NotFoundError: nothing of this name was
+    deleted within the grace time. ConflictError: the name is in use again, or a dependency is deleted.
     """
     known = [one for one in deletions(services.store, what) if name in (one.id, one.name) and among(one)]
     if not known:
@@ -149,7 +149,7 @@ def restore(
 
 
 def _restore(services: Services, deletion: Deletion, connection: Connection) -> None:
-    """Restore objects, then rows, then remove the deletion; requires the index's write lock."""
+    """Restore stored objects, then rows, then remove the deletion; requires the index's write lock."""
     store, record, folder = services.store, _record_of(deletion), removed_folder(deletion)
     waiting = names.deletion(deletion.what, deletion.id)
     if not store.exists(waiting) and store.exists(record):
@@ -223,7 +223,7 @@ def _restore_tag(services: Services, deletion: Deletion) -> None:
 def _require(services: Services, wanted: Collection[tuple[AssetKind, str]], connection: Connection) -> None:
     if missing := services.index.assets.missing(wanted, within=connection):
         kind = missing[0].partition(" ")[0]
-        raise ConflictError(f"it needs the {missing[0]}, which was deleted too; first: graspd {kind}s restore")
+        raise ConflictError(f"it needs the {missing[0]}, which was deleted too; first run `graspd {kind}s restore`")
 
 
 def _record_of(deletion: Deletion) -> str:
@@ -258,11 +258,11 @@ class GarbageCollector:
         for _, deletion in self._records(Deletion, names.DELETIONS):
             if self._clock() > deadline or not self._execute(deletion, deadline):
                 return True
-            log.info("the objects of %s %s are removed", deletion.what, deletion.id)
+            log.info("the stored objects of %s %s are removed", deletion.what, deletion.id)
         return False
 
     def collect(self, budget_s: float = BUDGET_S) -> bool:
-        """Remove objects whose grace time is over, and unused shards; return whether work is left."""
+        """Remove stored objects whose grace time is over, and unused shards; return whether work is left."""
         deadline = self._clock() + budget_s
         before = timestamp(self._services.settings.shard_grace_s)
         # The record of a deletion is removed last.
@@ -294,7 +294,7 @@ class GarbageCollector:
                 log.warning("%s", error)
 
     def _execute(self, deletion: Deletion, deadline: float) -> bool:
-        """Remove rows that a killed process left, then objects; return whether all is done."""
+        """Remove rows that a killed process left, then stored objects; return whether all is done."""
         with self._services.index.database.writing() as connection:
             if not self._services.store.exists(names.deletion(deletion.what, deletion.id)):
                 return True  # The resource was restored after the listing.

@@ -23,7 +23,7 @@ Near = Literal["hand and object", "hand", "all"]
 
 _TARGET: Final = re.compile(r"\s*([a-z_]+)\s*(>=|<=)\s*([0-9]*\.?[0-9]+)\s*")
 _EXAMPLES: Final = {False: "gsr>=0.6, epsilon>=0.2 or pd_mm<=1", True: "lift>=0.9, lift_hard>=0.7 or robust>=0.95"}
-#: Properties that runs of a chart share with a request, the nearest first.
+#: Properties that runs of a chart share with a request, the most specific first.
 _NEAR: Final[tuple[tuple[Near, tuple[str, ...]], ...]] = (
     ("hand and object", ("hand", "object")),
     ("hand", ("hand",)),
@@ -70,7 +70,7 @@ class Resolver:
         return self.choose(request)[0]
 
     def choose(self, request: JobRequest) -> tuple[JobRequest, Choice | None]:
-        """Return the request with `auto` replaced, and why (None without `auto`); InputError without a match."""
+        """Return the request without `auto`, and the reason (None if unchanged); InputError without a match."""
         if request.fidelity != AUTO:
             return request, None
         chart = self._chart(request)
@@ -122,10 +122,10 @@ def parse_target(text: str, *, in_scene: bool = False) -> tuple[str, float]:
 
 
 def cheapest(chart: Row, target: str, *, method: str, hand: str, object_: str) -> ChosenFidelity:
-    """Return a method's fastest fidelity (by valid grasps) that meets a target; InputError if none does.
+    """Return a method's fastest fidelity (valid grasps per second) that meets a target; else InputError.
 
-    Runs of the same hand and object count; else runs of the hand; else all. In a chart of scenes only grasps planned
-    in the scene count, by lifted grasps per second.
+    Runs of the same hand and object count, else runs of the hand, else all runs. In a chart of scenes only grasps
+    planned in the scene count, by lifted grasps per second.
     """
     in_scene = "scene" in chart
     metric, bound = parse_target(target, in_scene=in_scene)

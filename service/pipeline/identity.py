@@ -1,8 +1,8 @@
 """Identity of the service that owns a store, an index and a Redis.
 
 Two services with a common store, index or Redis would undo each other's work. The store contains a chain of create-only
-records; the last record identifies its service. Index and Redis repeat the id. If one is lost, the other identifies the
-service. If both are empty, they count as a second service; `graspd admin index rebuild` makes it the present one.
+records; the last record identifies its service. Index and Redis repeat the id. If either is lost, the other identifies
+the service. If both are empty, they count as a second service; `graspd admin index rebuild` gives it the store.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _FILE: Final = "service.id"
 _BYTES: Final = 16
 _REDIS: Final = (
     "this Redis belongs to another graspd service; give this one a Redis of its own, or another database number, in "
-    "GRASPD_REDIS_URL; if the other is gone for good, empty it: redis-cli FLUSHDB"
+    "GRASPD_REDIS_URL; if the other is gone for good, empty this Redis: redis-cli FLUSHDB"
 )
 
 
@@ -49,7 +49,7 @@ class Identity:
 
     @property
     def is_same(self) -> bool:
-        """Whether the store's last service owns the index (if that has no id: Redis or the data folder)."""
+        """Whether the store's last service owns the index or, if that has no id, Redis or the data folder."""
         if self.index is not None:
             return self.index == self.chain[-1]
         others = {self.redis, self.folder} - {None}
@@ -89,13 +89,13 @@ def identify(
 
     Raises BusyError if one of them belongs to another service.
     """
-    # Redis is read first and the store last, so that concurrent new processes see each other's writes.
+    # Redis is read before store and index, so that concurrent new processes see each other's writes.
     redis = services.queue.service() if ask_redis else None
     left = recorded(folder)
     chain = service_ids(services.store)
     index = services.index.notes.service()
     if not chain:
-        # An empty index remains from a start that was killed here.
+        # Only an incomplete index can remain from a start that was killed here.
         if index is not None and not take_over and services.index.notes.completeness() is not None:
             raise BusyError(_foreign_index_error(services.store.url))
         index = services.index.notes.name_service(index or secrets.token_hex(_BYTES))
@@ -150,7 +150,7 @@ def recorded(folder: Path | None) -> str | None:
 def _foreign_index_error(store: str) -> str:
     return (
         f"the index belongs to another graspd service than the store {store}; name the index of that store, or run "
-        "`graspd admin index rebuild` to make this one from it"
+        "`graspd admin index rebuild` to fill this one from the store"
     )
 
 

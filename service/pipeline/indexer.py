@@ -80,7 +80,7 @@ class Indexer:
             started.clear()
 
     def _finish(self, events: Sequence[Event], places: Sequence[int]) -> list[int]:
-        """Index finished shards; return the positions of events whose manifests cannot be read."""
+        """Index finished shards; return the positions of events that must wait for the store."""
         made, waiting = list[ShardManifest](), []
         for place, found in self._load_manifests(events, places):
             if isinstance(found, ShardManifest):
@@ -105,7 +105,7 @@ class Indexer:
             yield from zip(some, self._readers.map(self._load, [events[place] for place in some]), strict=True)
 
     def _load(self, event: Event) -> ShardManifest | Exception:
-        """Read the manifest of a shard; reads run in parallel, because most of the time is latency."""
+        """Return the manifest of a shard, or the error; reads run in parallel, because latency dominates."""
         try:
             assert event.stage is not None
             return load_manifest(self._services.store, event.stage, event.output)
@@ -217,7 +217,7 @@ def _skip_invalid(what: str) -> Iterator[None]:
         log.exception("%s is ignored", what)
 
 
-#: Maximum number of error names with their own series, a bound against forged names; an engine raises fewer.
+#: Maximum number of pairs of stage and error name with a series of their own, because names can be forged.
 MOST_KINDS: Final = 60
 OTHER_KIND: Final = "other"
 
@@ -229,7 +229,7 @@ class Tally:
     """
 
     def __init__(self, count: Callable[[Mapping[str, float]], None]) -> None:
-        """`count` adds to the sums."""
+        """`count` adds amounts to the sums in Redis."""
         self._count = count
         self._amounts: defaultdict[str, float] = defaultdict(float)
         self._kinds: set[tuple[str, str]] = set()

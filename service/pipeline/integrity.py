@@ -58,16 +58,16 @@ from graspd.service.store.store import Store
 log = logging.getLogger(__name__)
 #: Least interval of rounds over a small store [s].
 ROUND_S: Final = 3600.0
-#: Interval of checks of known damage, so that repaired objects soon leave the list [s].
+#: Interval [s] of checks of known damage, so that repaired entries soon leave the list.
 _AGAIN_S: Final = 60.0
 _KNOWN: Final = 1000
 #: Keys in memory at once; further keys need another listing of the folder.
 _KEYS: Final = 10_000
-#: Each object counts as at least this size [bytes], so that a million small objects are not read at once.
+#: Each stored object counts as at least this size [bytes], so that a million small ones are not read at once.
 _LEAST: Final = 16 * 2**10
-#: Time lost in a pause that reads may make up at once, at most [s].
+#: Longest pause [s] that faster reads may make up afterwards.
 _BURST_S: Final = 0.25
-#: Interval of queries whether `graspd admin store verify` pauses the scan [s].
+#: Interval [s] of queries whether `graspd admin store verify` pauses the scan.
 _PAUSE_S: Final = 5.0
 _OF_ASSET: Final = re.compile(r"assets/(hand|object|network)/([0-9a-f]{32})/(.+)")
 
@@ -114,17 +114,17 @@ MISSING: Final = "its file is missing"
 NO_MANIFEST: Final = "it has no manifest"
 BAD_MANIFEST: Final = "its manifest is damaged"
 FOREIGN: Final = "graspd did not write it"
-#: Time for which a file may lack its manifest [s].
+#: Time [s] for which a file may lack its manifest.
 _ON_ITS_WAY_S: Final = 60.0
 Read = Callable[[int], object]
-#: Called with the key of each object that was written without a checksum.
+#: Called with the key of each stored object that has no checksum.
 Unsealed = Callable[[str], None]
 
 
 def scan(
     store: Store, *folders: str, read: Read = lambda size: None, unsealed: Unsealed = lambda key: None
 ) -> Iterator[tuple[str, Damage | None]]:
-    """Yield every checkable object of all or some folders, with its damage or None."""
+    """Yield each checkable key in all or some folders, with the damage of its stored object or None."""
     for folder in folders or FOLDERS:
         for entry in store.list(folder):
             if is_checked(entry.key):
@@ -146,7 +146,7 @@ def is_checked(key: str) -> bool:
 def examine(
     store: Store, key: str, *, read: Read = lambda size: None, unsealed: Unsealed = lambda key: None
 ) -> Damage | None:
-    """Return the damage of one object or None; the file of a shard is checked with its manifest."""
+    """Return the damage of one stored object or None; the file of a shard is checked with its manifest."""
     try:
         if not key.startswith(f"{names.SHARDS}/"):
             return _check_sealed(store, key, read, unsealed)
@@ -164,7 +164,7 @@ def examine(
 
 
 def _check_sealed(store: Store, key: str, read: Read, unsealed: Unsealed) -> Damage | None:
-    """Check an object by its own checksum; without a checksum, check its content as far as possible."""
+    """Check a stored object by its own checksum, or without checksum by its content as far as possible."""
     match = _UPLOAD.fullmatch(key)
     model = next((model for pattern, model in _RECORDS if re.fullmatch(pattern, key)), None)
     try:
@@ -255,7 +255,7 @@ class IntegrityScan:
             self._stop.wait(_PAUSE_S)
 
     def _may_read(self) -> bool:
-        """Check that `store verify` does not pause the scan; queries the index every few seconds."""
+        """Check that `store verify` does not pause the scan; query the index every few seconds."""
         now = self._clock()
         if now - self._asked >= _PAUSE_S:
             if self._services.index.notes.is_scan_paused():
@@ -264,7 +264,7 @@ class IntegrityScan:
         return True
 
     def advance(self) -> bool:
-        """Read further objects; False while no round is due; Interrupted while `store verify` reads the store."""
+        """Check further keys; return False if no round is due. Interrupted: stop, or `store verify` runs."""
         self._recheck_if_due(None)
         note = self._services.index.notes.scan_note()
         if note.folder >= len(FOLDERS):
@@ -291,7 +291,7 @@ class IntegrityScan:
             self.look_again()
 
     def look_again(self) -> None:
-        """Check known damage again; remove repaired and deleted objects from the list."""
+        """Check known damage again; remove repaired and deleted entries from the list."""
         self._looked = self._clock()
         _, known = self._services.index.damage.known(limit=_KNOWN)
         if well := [one.key for one in known if self._is_repaired(one)]:
@@ -322,7 +322,7 @@ class IntegrityScan:
 
 
 def repair(services: Services, found: Sequence[Damage]) -> tuple[list[Damage], list[Damage]]:
-    """Move damaged objects below `damaged/` and queue what can be made again; return repaired and others.
+    """Move damaged files to `damaged/` and queue tasks that remake them; return repaired and other damage.
 
     A worker stores a repaired shard only if its checksum equals the manifest's.
     """
@@ -337,7 +337,7 @@ def repair(services: Services, found: Sequence[Damage]) -> tuple[list[Damage], l
 
 
 def _fix(services: Services, one: Damage, harmed: set[str]) -> str:
-    """Repair one object; return the reason if this is impossible, else ""."""
+    """Repair one stored object; return why this is impossible, or ""."""
     if one.what == FOREIGN:
         services.store.set_aside(one.key)
         return ""

@@ -48,14 +48,14 @@ from graspd.service.telemetry import bound
 
 log = logging.getLogger(__name__)
 Options = TypeVar("Options", bound=JobOptions)
-#: Interval at which held-back tasks are checked for a capable worker [s].
+#: Interval [s] at which held-back tasks are checked for a capable worker.
 HELD_S: Final = 10.0
 #: Allowed depth of a centre of mass in a support [m]: the centre was measured on another mesh.
 _SUNK_M: Final = 1e-3
 
-#: Finished tasks that are used to measure the time of a batch.
+#: Number of finished tasks that are used to measure the time of a batch.
 _LOOKED_AT: Final = 64
-#: Workers assumed if none is present: a service may start them once a task waits.
+#: Number of workers assumed if none is present: a service may start them once a task waits.
 _EXPECTED: Final = 8
 #: Cache lifetime of measured workers and rates [s].
 _KNOWN_S: Final = 10.0
@@ -74,7 +74,7 @@ class TaskRanges:
     def sized(self, job: JobRecord, *, among: int = 1) -> JobRecord:
         """Return a job with its number of batches per task; `among`: number of jobs that share the workers."""
         batches, wanted_s = batches_of(job.request.grasps), self._services.settings.task_s
-        # Pictures of a batch are already a file of megabytes.
+        # The pictures of one batch already fill a file of megabytes.
         if batches == 1 or job.request.views or not wanted_s:
             return job
         if self._clock() >= self._read_again:
@@ -159,7 +159,7 @@ def with_network(
 
 
 def submit(services: Services, request: JobRequest, *, priority: Priority | None = None) -> tuple[JobView, bool]:
-    """Call `prepare`, then `enter`; equal requests give one job; if failed or cancelled, see `retry`."""
+    """Prepare and enter a job. Equal requests give one job; `retry` restarts a failed or cancelled one."""
     return enter(services, prepare(services, request, priority=priority))
 
 
@@ -206,8 +206,8 @@ def enter(services: Services, record: JobRecord, *, keeps_assets: bool = False) 
     """Record a planned job and queue its first tasks; return the job, and whether it is new.
 
     The controller enters the rest. With `keeps_assets` a dataset protects hand, object, neighbours and network from
-    deletion meanwhile. NotFoundError: one of them was deleted. ConflictError: the same job was deleted, and its objects
-    are still being removed.
+    deletion meanwhile. NotFoundError: one of them was deleted. ConflictError: the same job was deleted, and its
+    stored objects are still being removed.
     """
     key = names.job_record(record.id)
     # A dataset needs its jobs even after an interruption, and must not hold the lock while it accesses the store.
@@ -315,7 +315,7 @@ def _start(services: Services, job_id: str) -> None:
 
 @contextmanager
 def _transaction(services: Services, job_id: str, refuse: Callable[[JobView], None]) -> Iterator[Callable[..., None]]:
-    """Lock a job to append an event unless `refuse` raises; a later change sees the earlier one.
+    """Lock a job and yield a function that appends an event, unless `refuse` raises.
 
     Earlier events are read before the lock, because the store may be slow.
     """
@@ -356,7 +356,7 @@ def _publish_state(services: Services, job_id: str) -> JobView:
 
 
 def check_scene(options: JobOptions, obj: AssetView, beside: Sequence[AssetView] = ()) -> None:
-    """Raise SceneError if an object's centre of mass lies in a support, which its hull then penetrates.
+    """Raise SceneError if an object's centre of mass lies in a support: its hull then penetrates it.
 
     Without a measured centre, and for checks that need meshes, the first task reports the error.
     """

@@ -52,7 +52,7 @@ class Leadership:
 
     @contextmanager
     def held(self, stop: threading.Event) -> Iterator[threading.Event]:
-        """Hold the lease, then release it; yield an event set when another process leads or `stop` is set.
+        """Hold the lease, then release it; yield an event that is set once another process leads or on `stop`.
 
         Only another holder in Redis ends the lease: while Redis is unavailable, no process can take it.
         """

@@ -23,7 +23,7 @@ from graspd.service.store.packs import unpack_all
 from graspd.service.store.records import put_record, read_record, task_attempts
 
 log = logging.getLogger(__name__)
-#: Time for which a task may be in transit between queue, worker and stream [s].
+#: Time [s] for which a task may be in transit between queue, worker and stream.
 LOST_AFTER_S: Final = 3.0
 
 
@@ -58,7 +58,7 @@ class LeaseReaper:
         return lost
 
     def find_missing(self, present: Collection[str]) -> list[str]:
-        """Return ids of tasks that the index counts as queued but that neither queue nor workers have."""
+        """Recover tasks that the index counts as queued but neither queue nor workers have; return their ids."""
         tasks, checks = self._services.index.feed.believed_queued()
         believed = tasks | {ingest_id(kind, digest) for kind, digest in checks}
         now = self._clock()

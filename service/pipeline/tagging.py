@@ -67,7 +67,7 @@ def restore_tag(services: Services, tag: Tag) -> None:
 def _change(
     services: Services, tag: str, change: Callable[[Tag], Tag], permit: Permit, *, fresh: Tag | None = None
 ) -> tuple[Tag, Tag]:
-    """Return the tag before and after; the index's lock makes changes sequential."""
+    """Change a tag; return it before and after the change. The index's lock makes changes sequential."""
     with recording(services) as (connection, put):
         found = newest_version(services.store, tag)
         known = None if found is None or found.gone else found

@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 AT_ONCE: Final = 32
 SLOW_AT_ONCE: Final = AT_ONCE // 2
 _PAUSE_S: Final = 1.0
-#: Interval of rounds [s]: the summary of a large dataset takes a while.
+#: Interval [s] of checks for ended datasets: the summary of a large dataset takes a while.
 _DATASETS_EVERY_S: Final = 5.0
 _FORGET_EVERY_S: Final = 3600.0
 
@@ -129,7 +129,7 @@ def _resolve_host(host: str, port: int) -> list[Any]:
 def post(
     url: str, body: bytes, headers: Mapping[str, str], *, allowed: Networks = (), patience_s: float = PATIENCE_S
 ) -> Response:
-    """Send a body and return the status of the answer; never raises."""
+    """Send a body and return the response; errors become responses without status."""
     parts = urlsplit(url)
     host = parts.hostname or ""
     port = parts.port or (443 if parts.scheme == "https" else 80)
@@ -173,7 +173,7 @@ class _Connection(http.client.HTTPConnection):
         self.sock = self._context.wrap_socket(dialled, server_hostname=self.host) if self._context else dialled
 
     def cut(self) -> None:
-        """Close the connection from another thread, in any state."""
+        """Shut the open connection down, from another thread."""
         with contextlib.suppress(OSError):
             if self.sock is not None:
                 self.sock.shutdown(socket.SHUT_RDWR)
@@ -229,7 +229,7 @@ class WebhookDispatcher:
         self._pool.shutdown(wait=False, cancel_futures=True)
 
     def start_deliveries(self, *, now: float | None = None) -> list[Future[None]]:
-        """Create deliveries of new ends, and start due ones while slots are free."""
+        """Create deliveries of newly ended jobs and datasets, and start due ones while slots are free."""
         out = self._services.index.outbox
         if time.monotonic() > self._forget_again:
             out.forget_old()
@@ -249,7 +249,7 @@ class WebhookDispatcher:
         return started
 
     def _fair_order(self, found: list[DueDelivery]) -> list[DueDelivery]:
-        """Sort by turns of projects, or of keys without a project; within each, the least recently used first."""
+        """Let projects (or keys without a project) take turns; within each, least recently used come first."""
         of_project: dict[str, list[DueDelivery]] = {}
         for due in sorted(found, key=lambda one: self._last.get(one.hook.id, (0.0, False))):
             of_project.setdefault(due.hook.project or f"key {due.hook.owner}", []).append(due)

@@ -39,7 +39,7 @@ def connect(url: str, *, patience: int = 3, timeout_s: float = _SOCKET_TIMEOUT_S
         ) from None
 
 
-#: Longest path of a unix socket on both Linux (108 bytes with the final zero) and macOS (104).
+#: Limit of a unix socket's path [bytes], below those of Linux (108 with the final zero) and macOS (104).
 _MAX_SOCKET_PATH: Final = 100
 
 
@@ -64,7 +64,7 @@ def password_file(data_dir: Path) -> Path:
 
 
 def socket_path(data_dir: Path) -> Path:
-    """Return the socket of a data folder's Redis: in the folder, or for a long path in a private folder."""
+    """Return the socket's path of a data folder's Redis: in that folder, or if too long in a private one."""
     path = data_dir.resolve() / "redis" / "redis.sock"
     if len(os.fsencode(path)) <= _MAX_SOCKET_PATH:
         return path

@@ -39,14 +39,14 @@ from graspd.service.queue.port import Event, Message, priority_order
 Entry = TypeVar("Entry", WorkerBeat, Event)
 _ADAPTERS: Final[dict[type, TypeAdapter[Any]]] = {kind: TypeAdapter(kind) for kind in (WorkerBeat, Event)}
 _ATTEMPT: Final = re.compile(r"(.+)-([0-9]{1,9})")
-#: Limit of the unpacked message; a real one has a few kilobytes.
+#: Limit of an unpacked message [bytes]; real messages have a few kilobytes.
 _MESSAGE_BYTES: Final = 1 << 20
-#: A stream whose newest id is further in the future [ms] is removed: it would reject all current entries.
+#: A stream is removed if its newest id is later than now by more than this [ms]: it would reject new entries.
 _FUTURE_MS: Final = 24 * 3600 * 1000
 
 
 def text(raw: bytes | None) -> str:
-    """Decode text that every database accepts; invalid UTF-8 becomes text that matches no name."""
+    """Decode bytes from Redis; invalid UTF-8 becomes text that matches no name."""
     return (raw or b"").decode(errors="replace")
 
 
@@ -71,7 +71,7 @@ def message(data: bytes | None) -> Message | None:
 
 
 def read(kind: type[Entry], data: bytes | None) -> Entry | None:
-    """Parse a worker's report or an event; None if forged, or of a much newer or older version."""
+    """Parse a worker's report or an event; None if it is malformed or of an incompatible version."""
     try:
         found: Entry = _ADAPTERS[kind].validate_json(data or b"")
         return found
@@ -80,7 +80,7 @@ def read(kind: type[Entry], data: bytes | None) -> Entry | None:
 
 
 def events(reply: Any) -> list[tuple[str, Event | None]]:
-    """Return id and event of each entry of a reply; trimmed entries have no fields."""
+    """Return id and event of each entry of a reply; the event is None if trimmed or malformed."""
     streams = reply.items() if isinstance(reply, dict) else reply or []
     return [
         (event_id.decode(), read(Event, fields.get(b"e")) if fields else None)
@@ -120,7 +120,7 @@ def allowed_job(job: Job, queue: Queue) -> Job:
     try:
         name, message = str(job.func_name), job.args[0]
     except (DeserializationError, LookupError, TypeError):
-        name, message = "what cannot be read", None
+        name, message = "an unreadable job", None
     if name != TASK_FUNCTION or job.instance is not None or not isinstance(message, dict):
         raise TaskRefused(f"the queue contains {name[:80]!r}, which is no task of graspd")
     return new_job(message, id=job.id, origin=queue.name, connection=job.connection, description=job.description)
@@ -152,7 +152,7 @@ def queue_name(priority: Priority, stage: Stage, need: Requirements | None = Non
 
 
 def queue_names(stages: Collection[Stage], taken: int = 0, *, ability: Capabilities | None = None) -> list[str]:
-    """Return the queues of a worker for these stages, in the order of its next task after `taken` tasks.
+    """Return a worker's queues for these stages, in the order in which it reads them after `taken` tasks.
 
     Separate lists come first, because other workers cannot serve them.
     """

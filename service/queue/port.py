@@ -1,4 +1,4 @@
-"""Queue interface: tasks, leases, events. `rq_queue` implements it."""
+"""Types of the queue: events, leases, status. `rq_queue` implements the queue."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from graspd.service.model.states import Priority, Stage
 Message = TaskMessage | IngestMessage
 
 
-#: A worker looks for every n-th task in bulk first, so that steady interactive work does not block bulk work.
+#: For every n-th task, a worker looks in bulk first, so that steady interactive work does not block bulk work.
 BULK_EVERY: Final = 4
 
 
@@ -27,7 +27,7 @@ def priority_order(taken: int) -> tuple[Priority, ...]:
 
 
 class EventKind(StrEnum):
-    """Type of an event. Workers send events of tasks, controller and API send `job` events."""
+    """Type of an event. Workers send events of tasks; controller and API send `job` events."""
 
     STARTED = "started"
     FINISHED = "finished"
@@ -61,7 +61,7 @@ class Event(Model):
     output: Annotated[str, Field(pattern=r"^([a-z]{1,10}/)?[A-Za-z0-9_-]{0,64}$")] = ""
     """Shard id of a finished stage; kind and digest (`hand/...`) of a finished check."""
 
-    # A newer worker may send more fields than an older controller has.
+    # A newer worker may send more fields than an older controller knows.
     model_config = ConfigDict(frozen=True, extra="ignore")
 
 

@@ -75,7 +75,7 @@ class RqQueue:
         self.connection: Any = connection
         self._queues: dict[str, Queue] = {}
         self._unread = "0"
-        """Position up to which an earlier controller's pending events were read; ">": all of them."""
+        """Position up to which an earlier controller's pending events were read; ">" once all were read."""
         self._leases: dict[str, Any] = {}
 
     def ping(self) -> float:
@@ -88,7 +88,7 @@ class RqQueue:
     def enqueue(
         self, messages: Sequence[Message], priority: Priority, *, again: bool = False, apart: bool = False
     ) -> int:
-        """Append tasks to a priority's lists; return how many. Waiting and running ones are not added again.
+        """Append tasks that neither wait nor run to a priority's lists; return the number of appended tasks.
 
         `again` replaces remaining data of tasks that the caller found missing. `apart` appends to the separate lists.
         """
@@ -213,7 +213,7 @@ class RqQueue:
                 self.connection.xack(EVENTS, _GROUP, *event_ids)
 
     def tail(self, after: str, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
-        """Return events after an id, for any number of readers; `"$"`: only future ones, `"0"`: all stored."""
+        """Return events after an id, for any number of readers; `"$"` means future ones only, `"0"` all."""
         with _convert_errors():
             found = self.connection.xread({EVENTS: after}, count=limit, block=int(wait_s * 1000) or None)
         return [(event_id, event) for event_id, event in entries.events(found) if event is not None]

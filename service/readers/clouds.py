@@ -73,7 +73,7 @@ class Clouds(Sequence[dict[str, Any]]):
             scene: include table and neighbours; by default only the object.
             voxel_m: keep one point per cube of this edge [m]; 0: all.
             postures: postures to return for each grasp, among pregrasp, grasp and squeeze.
-            hand_surface: enables graspness; `graspd.readers.hand_surface` is one.
+            hand_surface: function that enables graspness, such as `graspd.readers.hand_surface`.
             touch_m: largest distance of a contact [m].
             seed: seed of the sampled points and the noise; equal seeds and epochs give equal clouds.
 
@@ -196,7 +196,7 @@ def _voxels(points: Floats, edge: float, draw: np.random.Generator) -> Ints:
 
 
 def _seed_words(place: PictureAddress) -> tuple[int, int]:
-    """Return seed words that depend on the content of a picture, not on its file name."""
+    """Return seed words from hand, object, batch and row of a picture, not from its file name."""
     name = f"{place.file.hand}/{place.file.object}/{place.file.batch}"
     return int.from_bytes(hashlib.sha256(name.encode()).digest()[:8]), place.row
 

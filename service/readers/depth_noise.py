@@ -81,7 +81,7 @@ class DepthNoise:
         return np.sqrt(total)
 
     def axial(self, depth: Floats, angle: Floats) -> Floats:
-        """Return the axial noise without disparity noise and quantisation [m]."""
+        """Return the axial noise [m], without disparity noise and quantisation."""
         beyond = np.maximum(depth - self.axial_from_m, 0.0)
         found = self.axial_m + self.axial_slope * beyond + self.axial_square * beyond**2
         if self.axial_angle:

@@ -30,7 +30,7 @@ _STAGES: Final = {kind: stage for stage, kind in names.SHARD_KINDS.items()}
 
 @dataclass(frozen=True)
 class ShardFile:
-    """Local file under `path`, or object of a store under `key`."""
+    """Local file under `path`, or file of a store under `key`."""
 
     id: str
     kind: ShardKind

@@ -57,7 +57,7 @@ class Grasps(Sequence[dict[str, Any]]):
             columns: columns of a sample.
             valid: select only valid grasps: feasible and held by a validator.
             unvalidated: select instead only feasible grasps without validation.
-            where: further selection: a function of the columns that returns a mask.
+            where: function of the columns that returns a mask, for further selection.
 
         Raises InputError for an unknown column, or a mask of wrong length.
         """

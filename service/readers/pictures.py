@@ -147,7 +147,7 @@ class Pictures(Sequence[dict[str, Any]]):
 
     def scenes_of(self, shard: str) -> Scenes:
         found = self._scenes.get(shard)
-        if found is None:  # Concurrent threads may both build the table, with equal results.
+        if found is None:  # Concurrent threads may both build the scenes, with equal results.
             found = self._scenes[shard] = Scenes(self.shards, shard, self._quality, **self._which)
             if len(self._scenes) > _KEPT:
                 self._scenes.popitem(last=False)

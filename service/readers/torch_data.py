@@ -82,7 +82,7 @@ class ShuffledShards(IterableDataset[Sample]):
         columns: columns of a sample.
         valid: select only valid grasps.
         unvalidated: select instead only feasible grasps without validation.
-        where: further selection: a function of the columns that returns a mask.
+        where: function of the columns that returns a mask, for further selection.
         buffer: number of grasps from which the next one is drawn.
         seed: seed of the order; `epoch` changes it.
         rank, ranks: rank of this process, and number of processes of a distributed run.

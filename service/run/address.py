@@ -33,13 +33,13 @@ def record_address(folder: Path, url: str) -> None:
 
 
 def local_url(host: str, port: int) -> str:
-    """Return the local URL of an API that binds to a host; for all addresses, the loopback URL."""
+    """Return the local URL of an API that binds to a host; for 0.0.0.0 or ::, the loopback URL."""
     shown = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(host, f"[{host}]" if ":" in host else host)
     return f"http://{shown}:{port}"
 
 
 def bind(host: str, port: int) -> socket.socket:
-    """Bind a socket to the port (0: a free one); BusyError if it is taken, InputError: unusable address.
+    """Bind a socket to the port (0: a free one). BusyError: port in use. InputError: unusable address.
 
     While it is open, the API of a child process can listen there, and no other process gets the port.
     """
@@ -102,7 +102,7 @@ class ListenAddress:
         return f"redis://:{self.password}@{self.host}:{self.port}/0"
 
     def write(self, settings: Settings, api_url: str) -> None:
-        """Write the settings for workers, as lines for a shell and `--env-file`; UnavailableError if refused."""
+        """Write the settings for workers, as lines for a shell and `--env-file`; UnavailableError on failure."""
         said = {
             "GRASPD_REDIS_URL": self.redis_url,
             "GRASPD_STORE_URL": settings.resolved_store_url,

@@ -24,7 +24,7 @@ _TOKEN: Final = "GRASPD_CHILD_TOKEN"
 _WATCH_S: Final = 0.1
 _FIRST_PAUSE_S: Final = 0.2
 _LONGEST_PAUSE_S: Final = 10.0
-#: After this uptime a child counts as healthy, and its next restart is immediate again [s].
+#: Uptime [s] after which a child counts as healthy; its next restart follows the shortest pause.
 _WELL_AFTER_S: Final = 20.0
 
 
@@ -38,7 +38,7 @@ class Child:
     folder: Path | None
     """Data folder: pid files go to `run/`, output to `logs/`. None: no such files; the parent's output is used."""
     fix: Callable[[Path], None] | None = None
-    """Called with its log after a failure, before the restart."""
+    """Called with the log after a failure, before the restart."""
     process: subprocess.Popen[bytes] | None = None
     starts: int = 0
     _started: float = 0.0
@@ -132,7 +132,7 @@ def stop_children(children: Sequence[Child], grace_s: float) -> None:
 
 
 def kill_leftovers(folder: Path) -> list[int]:
-    """Kill children of an earlier `graspd up` that its pid files name, unless reused; return the pids."""
+    """Kill children named in pid files of an earlier `graspd up`, except reused pids; return the pids."""
     ended = []
     for file in (folder / "run").glob("*.pid"):
         try:

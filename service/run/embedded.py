@@ -85,7 +85,7 @@ def own_redis(settings: Settings) -> IO[str]:
 def move_broken_log(settings: Settings, output: Path) -> None:
     """Move the append-only log aside after a failed start, if Redis reports in `output` that it is broken.
 
-    All content of Redis is queued again from the index, so an empty Redis is better than none.
+    All lost tasks are queued again from the index, so an empty Redis is better than none.
     """
     with contextlib.suppress(OSError), output.open("rb") as file:
         file.seek(max(0, output.stat().st_size - _TAIL_BYTES))
@@ -96,7 +96,7 @@ def move_broken_log(settings: Settings, output: Path) -> None:
 
 
 def move_log(settings: Settings, why: str) -> None:
-    """Make Redis start empty: move its append-only log to a folder `redis/aside-TIME`, and log it."""
+    """Make Redis start empty: move its append-only log to a folder `redis/aside-TIME`, with a warning."""
     folder = settings.data_dir.resolve() / "redis"
     aside = folder / f"aside-{datetime.now(UTC):%Y%m%dT%H%M%S%f}"
     if found := [one for name in _LOGS if (one := folder / name).exists()]:
@@ -109,7 +109,7 @@ def move_log(settings: Settings, why: str) -> None:
 
 
 def lock_file(path: Path, what: str) -> IO[str]:
-    """Hold an exclusive lock on a file with the holder's pid; BusyError names the pid of another holder."""
+    """Lock a file exclusively and write this pid into it; BusyError names the pid of another holder."""
     file = path.open("a+")
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -15,7 +15,7 @@ app = CommandGroup(no_args_is_help=True)
 store_app = CommandGroup(no_args_is_help=True, help="Verify and repair the store.")
 app.add_typer(store_app, name="store")
 
-#: Time for which the integrity scan of the controller pauses after each renewal [s].
+#: Time [s] for which the controller's integrity scan pauses after each renewal.
 _PAUSE_S: Final = 15.0
 
 

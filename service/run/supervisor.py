@@ -31,10 +31,10 @@ from graspd.service.store.store import open_store
 
 log = logging.getLogger(__name__)
 _PROBE_S: Final = 0.1
-#: Timeout for readiness: kernels compile at first use, perhaps on a busy machine [s].
+#: Timeout [s] for readiness: kernels compile at first use, perhaps on a busy machine.
 READY_S: Final = 1800.0
 _TOLD_EVERY_S: Final = 15.0
-#: Restarts after which a process counts as failed.
+#: Number of restarts after which a process counts as failed.
 _ENDS: Final = 5
 _REDIS_S: Final = 60.0
 _PROGRAM: Final = (sys.executable, "-m", "graspd")
@@ -65,7 +65,7 @@ class Supervisor:
         self._thread: threading.Thread | None = None
         self._stopping = threading.Event()
         self.settings = settings
-        """Settings of the children: absolute data folder, resolved Redis and port."""
+        """Settings with absolute data folder and resolved port."""
 
     def __enter__(self) -> Self:
         self.start()
@@ -115,7 +115,7 @@ class Supervisor:
         say: Callable[[str], object] | None = None,
         stop: threading.Event | None = None,
     ) -> bool:
-        """Wait until Redis, controller, a worker and the API answer; False: `stop` was set before.
+        """Wait until Redis, controller, workers and the API answer; return False if `stop` is set first.
 
         Raises UnavailableError, with the absent parts and the logs, after `timeout` [s], and earlier if a process ends
         repeatedly or an external Redis is silent. `say` receives the missing parts every 15 s.

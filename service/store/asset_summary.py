@@ -10,7 +10,7 @@ import typer
 
 from graspd.service.model.states import AssetKind
 
-#: Smaller displacements of the surface are rounding and are not reported [m].
+#: Displacements of the surface below this [m] are rounding errors, and are not reported.
 _NOTHING_M = 1e-7
 _OVERRIDES = {"palm": "--palm LINK --approach x,y,z", "preshape": "--pre-shape JOINT=VALUE,..."}
 

@@ -25,7 +25,7 @@ _BUILTIN_CREATED: Final = "2026-11-21T00:00:00Z"
 MAX_FILES: Final = 2000
 #: zlib's message for lack of memory, to distinguish it from damage.
 _NO_MEMORY: Final = "Error -4 "
-#: Limits on one name and on all names together: every list of hands or objects contains them.
+#: Limits on one file name and on all together [characters]: every list of hands or objects contains them.
 MAX_NAME: Final = 255
 MAX_NAMES: Final = 128 << 10
 #: Limit on the ratio of unpacked to packed size: robot meshes have about 4, so only ZIP bombs exceed it.
@@ -75,7 +75,7 @@ def without_common_folder(files: dict[str, _T]) -> dict[str, _T]:
 
 
 class ZipFiles(MutableMapping[str, bytes]):
-    """Files of a ZIP on disk, unpacked in pieces on demand, and added ones; digests are of the contents."""
+    """Files of a ZIP on disk, unpacked in pieces on demand, and added files. Digests are of contents."""
 
     def __init__(self, file: IO[bytes], *, limit_bytes: int) -> None:
         self._archive = _open_zip(file)
@@ -206,7 +206,7 @@ def builtin_names(kind: AssetKind) -> tuple[str, ...]:
 
 
 def describe(kind: AssetKind, name: str, files: Mapping[str, bytes], *, created: str, builtin: bool = False) -> Asset:
-    """Create the asset record of files; the key `file` of their `asset.json` is the main file."""
+    """Create the asset record of files; the key `file` of their `asset.json` names the main file."""
     described = parse_description(asset_json(files), f"{kind.value} {name!r}")
     main = described.file
     if main not in files:

@@ -14,7 +14,7 @@ from pydantic_core import from_json, to_json
 from graspd.service.model.base import Model, first_error
 from graspd.service.model.errors import ConflictError, InputError
 
-#: Size limits of `asset.json` and its facts: lists of hands or objects contain the facts; built-in hands need 2 KB.
+#: Size limits [bytes] of `asset.json` and of its facts, which lists of assets contain; built-in hands need 2 KB.
 MAX_BYTES: Final = 64 << 10
 MAX_FACTS_BYTES: Final = 8 << 10
 _MAX_DEPTH: Final = 6

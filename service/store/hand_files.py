@@ -19,22 +19,22 @@ from graspd.service.store.mesh_files import HEAD_BYTES, MESHES, file_references,
 #: Descriptions that supplement a hand's URDF; the first takes precedence.
 DESCRIPTIONS: Final = ("asset.json", "hand.json")
 
-#: Suffixes of descriptions; the root element decides the format.
+#: Suffixes of a hand's main file; the root element decides the format.
 SUFFIXES: Final = (".urdf", ".xacro", ".xml", ".mjcf")
 #: Suffixes of the files taken from a folder besides its descriptions.
 _TAKEN: Final = (*SUFFIXES, ".yaml", ".yml", ".stl", ".obj", ".ply", ".off", ".glb", ".dae", ".msh")
 _REFERENCE: Final = re.compile(r"""file(?:name)?\s*=\s*["']([^"']+)["']""")
 _FOLDER: Final = re.compile(r"""(?:mesh|asset)dir\s*=\s*["']([^"']*)["']""")
 _MAX_INCLUDED: Final = 32
-#: Folders of descriptions in a ROS package: meshes are in sibling folders.
+#: Folders of main files in a ROS package: meshes are in sibling folders.
 _OF_PACKAGES: Final = ("urdf", "robots", "xacro", "mjcf")
 _ABOVE: Final = 4
 
 
 def files_of_hand(path: Path) -> tuple[dict[str, Path], str]:
-    """Find a hand's files with relative names, and the name of its description (empty for a folder).
+    """Find a hand's files by relative name, and the name of its main file (empty for a folder).
 
-    Files of a description are named relative to its ROS package, else to its folder. Links to targets outside the
+    Names are relative to the main file's ROS package, else to its folder. Links to targets outside the
     hand's folder are ignored.
     """
     files, main = (_files_of_folder(path), "") if path.is_dir() else _files_of_description(path)
@@ -82,7 +82,7 @@ def _files_of_description(path: Path) -> tuple[dict[str, Path], str]:
     root = _package(path)
     main = path.relative_to(root).as_posix()
     if path.is_file() and format_of(path.name, path.read_bytes()) == "xacro":
-        # The expansion of xacro reveals included files.
+        # Only the expansion reveals which files a xacro includes.
         files = _files_below(root if (root / "package.xml").is_file() else path.parent, root)
     else:
         files = {name: root / name for name in sorted(_referenced_files(path, root))}
@@ -155,7 +155,7 @@ def _inside(file: Path, root: Path) -> bool:
 
 
 Format = Literal["urdf", "xacro", "mjcf"]
-#: Size of the file's head that is searched for a root element [bytes]; no tool writes it later.
+#: Size [bytes] of the head that is searched for the root element; no tool writes it later.
 _HEAD_BYTES: Final = 1 << 16
 _PROLOG: Final = re.compile(r"\s*(?:<\?.*?\?>|<!--.*?-->|<!DOCTYPE(?:[^\[>]|\[.*?\])*>)", re.DOTALL)
 _ROOT: Final = re.compile(r"\s*<([A-Za-z_][\w:.-]*)")
@@ -164,7 +164,7 @@ _MACROS: Final = ("<xacro:", "${", "$(")
 _FORMATS_OF: Final[dict[str, Format]] = {"robot": "urdf", "mujoco": "mjcf"}
 _DECLARED: Final = re.compile(rb"""\s*<\?xml[^>]{0,100}encoding\s*=\s*["']([\w.:-]{1,40})""")
 _DECLARATION: Final = re.compile(r"<\?xml\s[^>]{0,200}\?>")
-#: Encodings accepted from a declaration; all other files are read as UTF-8.
+#: Encodings accepted from a declaration; other declarations are ignored.
 _NAMED: Final = re.compile(r"iso-?8859|latin|windows-12|cp12|gb|big5|shift|euc|koi8", re.IGNORECASE)
 
 
@@ -181,7 +181,7 @@ def format_of(name: str, data: bytes) -> Format | None:
 
 
 def text_of(data: bytes) -> str:
-    """Decode XML or YAML by byte order mark or declaration, and strip both; invalid UTF-8 is Latin 1."""
+    """Decode XML or YAML by byte order mark or declaration; strip both. Invalid UTF-8 is read as Latin 1."""
     coding: str = json.detect_encoding(data)  # The byte order mark, or zeros among the first characters, decides.
     if (declared := _DECLARED.match(data)) and _NAMED.match(said := declared[1].decode()):
         coding = said
@@ -194,7 +194,7 @@ def text_of(data: bytes) -> str:
 
 
 def main_of(files: Mapping[str, bytes], wanted: str = "", *, where: str = "the hand") -> str:
-    """Return the hand's description file; InputError unless exactly one matches `wanted`, part of a name."""
+    """Return the hand's main file; InputError unless exactly one matches `wanted`, a path or its end."""
     known = {name: kind for name in sorted(files) if (kind := format_of(name, _description_head(files, name)))}
     if wanted:
         return _match_name(wanted, [name for name in sorted(files) if name in known or name == wanted], where)

@@ -1,8 +1,8 @@
-"""Checksums of stored objects and of shards in folders; seals inside objects.
+"""Checksums of stored objects and of shards in folders; seals inside stored objects.
 
-A seal is the digest of an object, computed with zeros in place of the seal's 64 digits. JSON records have it as first
-field `checksum`, a ZIP (also `.npz`) as comment, and a binary glTF in the `extras` of its document. Objects of graspd
-0.2 have no seal and are read without this check.
+A seal is the digest of a stored object, computed with zeros in place of the seal's 64 digits. JSON records have it as
+first field `checksum`, a ZIP (also `.npz`) as comment, and a binary glTF in the `extras` of its document. Objects of
+graspd 0.2 have no seal and are read without this check.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _REMEMBERED: Final = 100_000
 
 
 def read_checked(store: Store, key: str, sha256: str) -> bytes:
-    """Read an object and verify its checksum; DamagedShard if it is missing or does not match."""
+    """Read a stored object and verify its checksum; DamagedShard if it is missing or does not match."""
     try:
         data = store.get(key)
     except NotFoundError:
@@ -63,7 +63,7 @@ class _Intact:
 
 
 class CheckedObjects:
-    """Cache of verified objects, valid while size, tag and modification time do not change. Thread-safe."""
+    """Cache of checks of stored objects, valid while size, tag and modification time stay. Thread-safe."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
@@ -71,13 +71,13 @@ class CheckedObjects:
         self._lock = threading.Lock()
 
     def check(self, key: str, sha256: str) -> None:
-        """Verify an object by reading it, unless a recent check exists; DamagedShard if missing or damaged."""
+        """Verify a stored object, unless a recent check exists; DamagedShard if missing or damaged."""
         self._intact(key, sha256)
 
     def stream(self, key: str, sha256: str, start: int, length: int) -> Iterator[bytes]:
-        """Yield bytes of an object; each block is read again and verified before any of it is returned.
+        """Yield bytes of a stored object; each block is verified again before any of it is returned.
 
-        Bit rot leaves the modification time unchanged. DamagedShard at the call or from the iterator, which ends early.
+        Bit rot leaves the modification time unchanged. The call or the iterator raises DamagedShard.
         """
         known = self._intact(key, sha256)
         end = min(known.size, start + length)
@@ -182,7 +182,7 @@ _GLB: Final = b'{"extras":{"checksum":"'
 _ZIP: Final = b"sha256:"
 #: Size of a binary glTF's header and of the header of its first chunk [bytes].
 _GLB_AT: Final = 20
-#: Largest displacement, by bytes added before them, at which the seal's digits are still found [bytes].
+#: The seal's digits are still found if at most this many bytes were inserted before them.
 _SLACK: Final = 4
 _END: Final = struct.Struct("<4s4H2LH")
 _END_MARK: Final = b"PK\x05\x06"
@@ -193,7 +193,7 @@ def put_sealed(store: Store, key: str, data: bytes) -> bool:
 
 
 def get_sealed(store: Store, key: str) -> bytes:
-    """Read an object and verify its seal, if it has one; DamagedError if it does not match."""
+    """Read a stored object and verify its seal, if it has one; DamagedError if that does not match."""
     data = store.get(key)
     is_sealed(key, [data], len(data))
     return data
@@ -204,7 +204,7 @@ def put_document(store: Store, key: str, document: Mapping[str, Any]) -> bool:
 
 
 def get_document(store: Store, key: str) -> dict[str, Any]:
-    """Read the JSON object of `put_document`; errors as in `get_sealed`; other content: DamagedError."""
+    """Read the JSON object of `put_document`; errors as in `get_sealed`, DamagedError for other content."""
     try:
         found = json.loads(get_sealed(store, key))
     except ValueError:
@@ -216,7 +216,7 @@ def get_document(store: Store, key: str) -> dict[str, Any]:
 
 
 def sealed(key: str, data: bytes) -> bytes:
-    """Return the object with its seal; formats other than JSON object, ZIP and glTF are unchanged."""
+    """Return the bytes with a seal; formats other than JSON object, ZIP and glTF are unchanged."""
     if key.endswith(".json") and data[:1] == b"{":
         data, at = _JSON + _ZEROS + b'",' + data[1:], len(_JSON)
     elif key.endswith(".glb") and data[:4] == b"glTF" and data[_GLB_AT : _GLB_AT + 1] == b"{":
@@ -241,7 +241,7 @@ def seal_archive(file: BufferedRandom) -> None:
 
 
 def is_sealed(key: str, chunks: Iterable[bytes], size: int) -> bool:
-    """Check the seal; False if graspd 0.2 wrote the object without one; DamagedError if it does not match."""
+    """Check a seal; return False if there is none (graspd 0.2). DamagedError if it does not match."""
     is_zip = key.endswith((".zip", ".npz"))
     before, start = (_GLB, _GLB_AT) if key.endswith(".glb") else (_JSON, 0)
     at = size - len(_ZEROS) if is_zip else start + len(before)

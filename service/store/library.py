@@ -20,7 +20,7 @@ from graspd.service.store.records import Put, put_record, read_record
 from graspd.service.store.store import Store
 
 log = logging.getLogger(__name__)
-#: Size limit against a manipulated store; archives packed by the service have the upload limit.
+#: Size limit [bytes] of an unpacked archive, against a manipulated store; uploads have their own limit.
 UNPACKED_LIMIT_BYTES: Final = 2 * 2**30
 
 
@@ -58,7 +58,7 @@ def _is_damaged(store: Store, key: str) -> bool:
 
 
 def record_asset(store: Store, asset: Asset, put: Put | None = None) -> Asset:
-    """Write the record, by `put` if any; ConflictError: content has another name, or is being removed."""
+    """Write the record, by `put` if given. ConflictError: content has another name, or is being removed."""
     record = names.asset_record(asset.kind, asset.digest)
     new = put(record, asset) if put is not None else put_record(store, record, asset)
     if store.exists(names.deletion(asset.kind.value, asset.digest)):

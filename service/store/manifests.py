@@ -184,7 +184,7 @@ def _summaries(
 def publish_shard(store: Store, manifest: ShardManifest, data: bytes) -> bool:
     """Store a shard, manifest last; return False if it exists already, which is also success."""
     if not store.put(manifest.key, data):
-        # After concurrent writes, or an end between both writes, the manifest describes the bytes in the store.
+        # After concurrent writes, or a kill between the two writes, the manifest describes the bytes in the store.
         manifest = rebuild_manifest(manifest.model_dump(mode="json"), store.get(manifest.key))
     return put_record(store, names.shard_manifest(manifest.stage, manifest.shard_id), manifest)
 
@@ -203,7 +203,7 @@ def shard_exists(store: Store, stage: Stage, shard: str) -> bool:
 
 
 def rebuild_manifest(said: Mapping[str, Any], data: bytes) -> ShardManifest:
-    """Rebuild a file's manifest; `said`, the shard's existing manifest as JSON, gives the other fields."""
+    """Rebuild the manifest of the file `data`; other fields come from its existing manifest `said`."""
     pictures = tuple(path for path in SCHEMAS["views"] if path.startswith("image/"))
     shard = read_shard(data, without=pictures, name=said["key"])
     told = {"sha256": hashlib.sha256(data).hexdigest(), "size_bytes": len(data)}

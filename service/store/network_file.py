@@ -27,7 +27,7 @@ from graspd.service.store.assets import asset_json
 from graspd.service.store.descriptions import json_object, parse_description
 
 SCHEMA: Final = "graspd/proposals@1"
-#: Size limit of a file, packed or unpacked; a network of 22 joints takes 5.4 MB [bytes].
+#: Size limit [bytes] of a file, packed or unpacked; a network of 22 joints takes 5.4 MB.
 MAX_BYTES: Final = 64 << 20
 #: Number of point features, and widths of the encoder's layers before the maximum over points.
 ENCODER: Final = (7, 64, 128, 256)

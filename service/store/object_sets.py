@@ -1,4 +1,4 @@
-"""Sets of objects from a folder or archive of meshes; detects the layouts of YCB and EGAD."""
+"""Sets of objects from a folder or archive of meshes; the layouts of YCB and EGAD are detected."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Conversion of packs of graspd 0.2 (many shards in one object) to files; no other module uses packs.
+"""Conversion of packs of graspd 0.2 (many shards in one file) to a file per shard.
 
 A pack has a head (magic bytes and the length of the directory), the directory, the manifests and the files. Its name is
 the digest of its directory, which has the SHA-256 of each manifest and file. Records beside it list its deleted shards.
@@ -95,7 +95,7 @@ def _unpack(store: Store, key: str, dead: list[str]) -> Iterator[ShardManifest]:
     if whole:
         store.delete(key)
     else:
-        log.error("the pack %s is partly damaged, and moved aside: `graspd admin store verify --repair`", key)
+        log.error("the pack %s is partly damaged, and moved aside; run `graspd admin store verify --repair`", key)
         store.set_aside(key)
 
 

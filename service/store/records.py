@@ -244,12 +244,12 @@ def refuse_pending(store: Store, what: str, name: str) -> None:
 
 
 def removed_folder(deletion: Deletion) -> str:
-    """Return the folder of a deleted resource's objects for the grace time; equal for repeated deletions."""
+    """Return the folder that holds a deleted resource's stored objects for the grace time."""
     return f"{names.REMOVED}/{_DIGITS.sub('', deletion.at)}-{deletion.what}-{deletion.id}"
 
 
 def removed_before(key: str, at: str) -> bool:
-    """Check whether an object below `removed/` belongs to a deletion before the time `at`."""
+    """Check whether a key below `removed/` belongs to a deletion before the time `at`."""
     return key.split("/")[1].partition("-")[0] < _DIGITS.sub("", at)
 
 

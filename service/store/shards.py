@@ -40,7 +40,7 @@ _UNREADABLE: Final = (OSError, KeyError, ValueError, TypeError, RuntimeError, Ov
 
 
 def write_shard(kind: ShardKind, arrays: Arrays, attributes: Mapping[str, Attribute]) -> bytes:
-    """Write a shard; return its HDF5 bytes; InputError if a column or attribute does not fit the schema.
+    """Return the HDF5 bytes of a shard; InputError if a column or attribute does not fit the schema.
 
     `created` and `code_version` replace the current values; `joint_names` is also an attribute of the joint datasets.
     """
@@ -215,7 +215,7 @@ def carried_attributes(shard: Shard) -> dict[str, Attribute]:
 
 
 def part_of_shard(shard: Shard, mask: NDArray[np.bool_]) -> bytes:
-    """Write a base shard of the rows in a mask (N,); their values and scenes are unchanged."""
+    """Return the bytes of a base shard with the rows in a mask (N,); values and scenes are unchanged."""
     schema = SCHEMAS["base"]
     arrays = {
         path: array[mask] if schema[path].shape.split()[0] == "N" else array for path, array in shard.arrays.items()

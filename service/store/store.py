@@ -31,7 +31,7 @@ from graspd.service.model.errors import InputError, NotFoundError, StoreUnavaila
 _KEY: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._=-]*(/[A-Za-z0-9][A-Za-z0-9._=-]*)*")
 _PROBE: Final = "health/probe"
 STREAM_BYTES: Final = 1 << 20
-#: Number of retries of a failed request; after them the task's own back-off applies.
+#: Time-outs and retries of requests; after them the task's own back-off applies.
 _REMOTE: Final[dict[str, Any]] = {
     "client_options": {"timeout": timedelta(seconds=120), "connect_timeout": timedelta(seconds=5)},
     "retry_config": {"max_retries": 3, "retry_timeout": timedelta(seconds=30)},
@@ -44,7 +44,7 @@ class Entry:
     size: int
 
 
-#: Size, modification time and tag (if any) of an object; constant while the object does not change.
+#: Size, modification time and tag (if any) of a stored object; constant while it does not change.
 Stamp = tuple[int, str, str]
 
 
@@ -52,7 +52,7 @@ class Store:
     """Objects by key. Every method raises StoreUnavailable if the store does not answer."""
 
     def __init__(self, backend: Any, url: str, *, signer: Any = None) -> None:
-        """`signer` is the same store at the address for clients; None if clients have no access."""
+        """`signer` is the same store at its address for clients; None if clients have no access."""
         self._backend = backend
         self._signer = signer
         self.url = url
@@ -177,7 +177,7 @@ def open_store(url: str, *, public_endpoint: str | None = None, make: bool = Tru
 
 
 def local_folder(url: str) -> Path | None:
-    """Return a local store's folder, None for others; InputError unless the path is absolute and plain."""
+    """Return a local store's folder, None for others; InputError for a relative path or bad characters."""
     parts = urlsplit(url)
     if parts.scheme != "file":
         return None

@@ -43,7 +43,7 @@ from graspd.service.model.states import State
 from graspd.service.store.manifests import ShardManifest
 
 Row = dict[str, Any]
-#: Limits for facts [bytes], repairs and texts of a hand or object: lists contain them, and uploads are untrusted.
+#: Limits of facts [bytes], repairs and texts of a hand or object, because uploads are untrusted.
 _MOST_FACTS: Final = 64 << 10
 _MOST_REPAIRS: Final = 100
 _LONGEST_TEXT: Final = 2000
@@ -162,11 +162,11 @@ def _limited_facts(facts: dict[str, Any]) -> dict[str, Any]:
     return {name[:100]: value for name, value in list(facts.items())[:100] if isinstance(value, int | float)}
 
 
-#: Jobs whose states are derived together.
+#: Maximum number of jobs whose states are derived together.
 _JOBS_AT_ONCE: Final = 200
 _FACTS: Final = ("stage", "done", "last_attempt", "exhausted", "retried_upto")
 
-#: Option of a connection that suppresses reports of ended jobs and datasets.
+#: Option of a connection that suppresses reports of ended jobs.
 QUIET: Final = "graspd_quiet"
 #: Prefix of the note about a job with tasks still to enter; the job's id follows.
 ENTERING: Final = "entering "
@@ -274,7 +274,7 @@ def _derive_job_states(connection: Connection, ids: Sequence[str]) -> dict[str, 
     return states
 
 
-#: Ranges entered in one transaction; it takes some tenths of a second, and other writers wait for it.
+#: Maximum number of ranges per transaction, which takes some tenths of a second while other writers wait.
 RANGES_AT_ONCE: Final = 500
 
 
@@ -330,7 +330,7 @@ class Changes(IndexPart):
     def add_attempt(
         self, attempt: AttemptRecord, *, not_before: float = 0.0, within: Connection | None = None
     ) -> State | None:
-        """Add a failed attempt, the next due at `not_before` [s]; return the job's state, None if unchanged."""
+        """Add a failed attempt; the next is due at `not_before` [s]. Return the job's state, if it changed."""
         with self.database.writing(within) as connection:
             if connection.scalar(select(tasks.c.id).where(tasks.c.id == attempt.task_id)) is None:
                 return None  # The job is deleted, or the attempt is forged.
@@ -350,7 +350,7 @@ class Changes(IndexPart):
             return None if touched is None else derive_states(connection, touched.job_id, [touched.batch])
 
     def set_job_events(self, job_id: str, events: Sequence[JobEvent], *, within: Connection | None = None) -> State:
-        """Update a job and its tasks for all its events so far, the oldest first."""
+        """Apply all events of a job so far, the oldest first, to the job and its tasks."""
         cancelled = bool(events) and events[-1].what == "cancelled"
         with self.database.writing(within) as connection:
             connection.execute(update(jobs).where(jobs.c.id == job_id).values(cancelled=cancelled))
@@ -363,7 +363,7 @@ class Changes(IndexPart):
             return derive_states(connection, job_id)
 
     def add_asset(self, asset: Asset, check: Mapping[str, Any] | None, *, within: Connection | None = None) -> None:
-        """Add an asset with the result of its check; None: the check is pending."""
+        """Add an asset with the result of its check, None while the check is pending."""
         with self.database.writing(within) as connection:
             upsert(connection, assets, [asset_row(asset, check)], keep=("last_attempt", "queued", "not_before"))
 
@@ -378,7 +378,7 @@ class Changes(IndexPart):
         upsert(connection, tasks, rows, keep=[name for name in rows[0] if name != "priority"])
 
     def _enter(self, connection: Connection, record: JobRecord, first: int, *, goes_on: bool) -> None:
-        """Add up to `RANGES_AT_ONCE` ranges from `first` on; `notes` has the next range until all are added."""
+        """Add up to `RANGES_AT_ONCE` ranges, starting at `first`; a note stores the next range, if any."""
         number = ranges_of(record.request.grasps, record.span)
         some = range(first, min(number, first + RANGES_AT_ONCE))
         self._upsert_tasks(connection, list(task_rows(record, some)))
@@ -443,7 +443,7 @@ class DatasetChanges(IndexPart):
             upsert(connection, dataset_cells, cells)
 
     def set_events(self, name: str, events: Sequence[DatasetEvent], *, within: Connection | None = None) -> None:
-        """Update a dataset for all its events so far, the oldest first."""
+        """Apply all events of a dataset so far, the oldest first."""
         cancelled = bool(events) and events[-1].what == "cancelled"
         number = max((event.number for event in events), default=0)
         values = {"cancelled": cancelled, "events": number, "planned": False}

@@ -29,7 +29,7 @@ class Removals(IndexPart):
     """`within` makes a read or write part of a larger transaction, so that checks still hold at the write."""
 
     def user_of_asset(self, asset: AssetView, *, within: Connection) -> str:
-        """Return in a few words what needs a hand, object or network; empty if nothing does."""
+        """Return what needs a hand, object or network, in a few words; empty if nothing needs it."""
         kind, digest = asset.kind, asset.digest
         column = f"{kind.value}_digest"
         if job := within.scalar(select(jobs.c.id).where(jobs.c[column] == digest).limit(1)):
@@ -68,7 +68,7 @@ class Removals(IndexPart):
         return int(within.scalar(query) or 0)
 
     def planned_only(self, ids: Sequence[str]) -> list[str]:
-        """Return those of the given jobs that a dataset made, not a user, and that no dataset contains."""
+        """Return the given jobs that were made for a dataset and are in no dataset now."""
         planned = (jobs.c.priority == Priority.BULK.value, jobs.c.origin.is_(None))
         needed = exists().where(dataset_cells.c.job_id == jobs.c.id)
         query = select(jobs.c.id).where(jobs.c.id.in_(ids), *planned, ~needed)

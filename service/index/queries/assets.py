@@ -34,7 +34,7 @@ class Assets(IndexPart):
         return Page(items=[AssetView(**row) for row in rows], next=following)
 
     def get(self, kind: AssetKind, name_or_digest: str, *, scope: ProjectScope = EVERYTHING) -> AssetView:
-        """Return an asset by digest or name, preferably not refused, then own, then new; or NotFoundError."""
+        """Return an asset by digest or name: usable before refused, then own, then newest; else NotFoundError."""
         named = and_(assets.c.kind == kind.value, assets.c.name == name_or_digest)
         by_digest = and_(assets.c.kind == kind.value, assets.c.digest == name_or_digest)
         refused_last = case((assets.c.verdict == "refuse", 1), else_=0)
@@ -71,7 +71,7 @@ class ObjectSets(IndexPart):
         return list({row["name"]: ObjectSetView(**row) for row in self.database.rows(query)}.values())
 
     def named(self, name: str) -> ObjectSetView | None:
-        """Return the newest version of a set of any project; None if there is none."""
+        """Return the newest set of this name in any project; None if there is none."""
         query = select(object_sets).where(object_sets.c.name == name)
         rows = self.database.rows(query.order_by(object_sets.c.created.desc(), object_sets.c.digest.desc()).limit(1))
         return ObjectSetView(**rows[0]) if rows else None

@@ -148,7 +148,7 @@ def _state(row: Any, states: dict[State, int]) -> State:
     if row["cancelled"]:
         # A cancelled dataset has no pending work: its jobs stop, or continue for another dataset.
         return state if state.is_final else State.CANCELLED
-    # The jobs have not received the dataset's last event, a retry.
+    # An ended dataset is queued again until its jobs have received its last event, a retry.
     return State.QUEUED if state.is_final and row["applied"] < row["events"] else state
 
 
@@ -166,7 +166,7 @@ def _states(connection: Connection, row: Any) -> dict[State, int]:
 
 
 def _tasks_of_cell(options: JobOptions, span: int | None) -> int:
-    """Return the number of tasks of a cell; `span`: batches per task, None: the cell has no job, use 1."""
+    """Return the number of tasks of a cell; `span` is batches per task, None (used as 1) without a job."""
     return ranges_of(options.grasps, span or 1) * len(stages_of(options))
 
 

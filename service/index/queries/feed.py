@@ -107,7 +107,7 @@ class Feed(IndexPart):
         return {row["id"]: row["last_attempt"] for row in self.database.rows(query)}
 
     def unfinished_tasks(self, job_id: str) -> list[str]:
-        """Return tasks of a job that are queued or running."""
+        """Return tasks of a job that are in the queue or running."""
         return self.database.column(select(tasks.c.id).where(tasks.c.job_id == job_id, tasks.c.queued.is_(True)))
 
 
@@ -182,7 +182,7 @@ class DatasetFeed(IndexPart):
     def cells_in_states(
         self, name: str, states: Collection[State], *, after: int, limit: int, unshared: bool
     ) -> list[tuple[int, str]]:
-        """Return positions and jobs of the next cells in some states, after a position.
+        """Return positions and jobs of the next cells in these states, after position `after`.
 
         `unshared` omits jobs that another key submitted, and jobs that another uncancelled dataset needs.
         """

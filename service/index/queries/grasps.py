@@ -3,9 +3,9 @@
 This module chooses the database index: SQLite has no statistics of the values, and scans a whole index for a rare
 match. There are three plans:
 
-1. A condition leaves few rows: fetch them by its index, and sort them.
+1. If a condition leaves few rows, they are fetched by its index and sorted.
 2. Otherwise a bounded number of rows is read in the wanted order until the page is full.
-3. Each condition matches many rows, but their conjunction hardly any: all rows are read once.
+3. If these rows do not fill the page, all rows are read once.
 
 `sql_condition` translates grasp expressions (`service.model.where`) to SQL.
 """
@@ -129,7 +129,7 @@ class Condition:
     value: Any
 
     def sql(self, groups: Sequence[str] | None) -> ColumnElement[bool]:
-        """Return the test; if its group is not in `groups` (None: all), in a form that cannot use an index."""
+        """Return the test, without use of an index if its group is not in `groups` (None means all groups)."""
         return self._of(self.column if groups is None or self.group in groups else _without_index(self.column))
 
     def on(self, rows: Subquery) -> ColumnElement[bool]:
@@ -221,7 +221,7 @@ def sql_conditions(where: GraspFilter | None) -> list[ColumnElement[bool]]:
 def search(
     connection: Connection, where: GraspFilter | None, sort: GraspSort, size: int, start: tuple[Any, ...] | None
 ) -> list[Any]:
-    """Return the first `size` rows after `start`, given by metric, shard id and row of the previous grasp."""
+    """Return the first `size` rows after `start`: metric, shard id and row of the previous grasp."""
     wanted = conditions(where)
     few = _selective_group(connection, where, wanted)
     rows: list[Any] = []
@@ -344,7 +344,7 @@ def _without_index(column: ColumnElement[Any]) -> ColumnElement[Any]:
 
 
 def sql_condition(node: Node, grasps: Columns) -> ColumnElement[bool]:
-    """Translate an expression to SQL that is never NULL, so `not` inverts it; InputError: missing column."""
+    """Translate an expression to never-NULL SQL, so `not` inverts it; InputError for a missing column."""
     if isinstance(node, Connective):
         return (or_ if node.word == "or" else and_)(*(sql_condition(part, grasps) for part in node.parts))
     if isinstance(node, Negation):
@@ -381,13 +381,13 @@ class GraspFilter(Model):
     where: str | None = None
     """An expression of `service.model.where`."""
     project: str | None = None
-    """Project of the jobs; None: all."""
+    """Project of the jobs; None for all projects."""
     validated: bool | None = None
     valid: bool | None = None
-    """False: validated, and not valid."""
+    """False selects validated grasps that are not valid."""
     success: bool | None = None
     scene: str | None = None
-    """Kind of the scene in which the grasp was planned; any: all except free."""
+    """Kind of the scene in which the grasp was planned; `any` means all kinds except free."""
     neighbours: bool | None = None
     lift_hard: bool | None = None
     robust_weakest: str | None = None

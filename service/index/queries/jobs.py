@@ -150,7 +150,7 @@ MOST_SHARDS: Final = 1000
 
 
 def outcomes_of(connection: Connection, of_jobs: ColumnElement[bool]) -> dict[str, int]:
-    """Count rejected candidates by outcome, in the first `MOST_SHARDS` shards of the selected jobs."""
+    """Count rejected candidates by outcome in at most `MOST_SHARDS` shards of the selected jobs."""
     query = (
         select(shards.c.manifest["info"]["outcomes"])
         .join(tasks, tasks.c.shard_id == shards.c.id)

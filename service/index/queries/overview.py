@@ -48,7 +48,7 @@ class Overview(IndexPart):
         )
 
     def valid_per_minute(self, *, since: str, scope: ProjectScope = EVERYTHING) -> dict[str, int]:
-        """Return the valid grasps of each minute (2026-11-22T08:30) since a time, without empty minutes."""
+        """Return the number of valid grasps per minute (2026-11-22T08:30) since a time, without empty minutes."""
         minute = func.substr(shards.c.created, 1, 16)
         query = select(minute, func.sum(shards.c.valid)).group_by(minute)
         query = query.where(shards.c.kind == "base", shards.c.created >= since, *shards_in_scope(scope, shards.c.id))
@@ -134,7 +134,7 @@ class IndexStatus:
     grasps_per_s: float
     valid_per_s: float
     damaged: int
-    """Objects of the store with known damage, counted up to `MOST_JOBS`."""
+    """Stored objects with known damage, counted up to `MOST_JOBS`."""
 
 
 def read_index(database: Database) -> IndexStatus:
@@ -195,7 +195,7 @@ class Usage(IndexPart):
         return views
 
     def gpu_seconds(self, project: str, day: str) -> float:
-        """Return the time of GPU workers for a project's requests on one day [s]."""
+        """Return the time [s] of GPU workers for a project's requests on one day."""
         return sum(one.gpu_seconds for one in self.days(day, day, scope=ProjectScope(project, everything=False)))
 
 
@@ -227,7 +227,7 @@ class BatchCost:
 
     @property
     def kept(self) -> int:
-        """Grasps that count towards the request: valid ones, or without validation all stored ones."""
+        """Grasps that count towards the request: valid ones, or all stored ones if validation is off."""
         return self.valid if self.request.counted == "valid" else self.count
 
 

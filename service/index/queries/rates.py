@@ -29,9 +29,9 @@ class Rate:
     bytes_per_grasp: float
     origin: str
     batches: int
-    """Finished batches of the measurement; 0: stored values."""
+    """Finished batches of the measurement; 0 for stored values."""
     spread: tuple[float, float]
-    """Interval of the seconds, as factors."""
+    """Lower and upper factor on the seconds."""
 
 
 @dataclass(frozen=True)
@@ -43,11 +43,11 @@ class Machine:
     spread: tuple[float, float] = (1.0, 1.0)
     """Interval of single batches, as factors of the median."""
     batches: int = 0
-    """Finished batches of the comparison; 0: unknown."""
+    """Finished batches of the comparison; 0 if the factor is unknown."""
 
     @property
     def stored_spread(self) -> tuple[float, float]:
-        """Interval of a stored number on this machine, as factors."""
+        """Lower and upper factor on a stored number on this machine."""
         low, high = SCALED_SPREAD if self.batches else STORED_SPREAD
         return low * self.spread[0], high * self.spread[1]
 
@@ -66,7 +66,7 @@ class StageRate:
     origin: str
     batches: int
     spread: tuple[float, float] = (1.0, 1.0)
-    """Interval of the seconds, as factors."""
+    """Lower and upper factor on the seconds."""
 
 
 #: Narrowest interval of a measured rate: the observed difference between two runs of the same batches.
@@ -104,7 +104,7 @@ STORED_PICTURE: Final = StageRate(2.1, 1.34e6, ORIGIN, 0)
 
 class Rates:
     def __init__(self, batches: Iterable[BatchCost], options: JobOptions, devices: Collection[str]) -> None:
-        """Group the `synthesize` batches with these options on these devices (empty: all) by hand and object."""
+        """Select `synthesize` batches of these options and devices (empty: all). Group by hand and object."""
         self._options = options
         self._groups: dict[Hashable, list[BatchCost]] = defaultdict(list)
         recipe = recipe_of(options)
@@ -178,7 +178,7 @@ def _stored_of(options: JobOptions) -> tuple[float, float, str]:
 
 
 def machine_of(batches: Iterable[BatchCost]) -> Machine:
-    """Compare the machine of these batches of `synthesize` with the stored numbers of the same recipes."""
+    """Compare the times of these `synthesize` batches with the stored numbers of the same options."""
     comparable = [batch for batch in batches if batch.candidates and _is_stored(batch.request)]
     ratios = [
         batch.seconds / batch.candidates / _stored_of(batch.request)[0]
@@ -205,7 +205,7 @@ def _spread(values: list[float], least: tuple[float, float]) -> tuple[float, flo
 
 
 def _large_batches(batches: list[BatchCost]) -> list[BatchCost]:
-    """Return costs of batches at least half full, else of all batches: loading dominates small ones."""
+    """Return batches that are at least half full, or all if none are: loading dominates small ones."""
     return [batch for batch in batches if 2 * batch.candidates >= BATCH_SIZE] or batches
 
 
@@ -229,7 +229,7 @@ def _rate_on_machine(machine: Machine, stored: StageRate) -> StageRate:
 
 
 def scene_rate(batches: Iterable[BatchCost], options: JobOptions, machine: Machine) -> StageRate:
-    """Return seconds per batch and scene; bytes: per grasp and scene, or per scene if planned in scenes."""
+    """Return seconds per batch and scene, and bytes per grasp and scene (per scene if planned in scenes)."""
     found = [batch for batch in batches if batch.request.scenes and batch.request.in_scene == options.in_scene]
     rows = sum(batch.count for batch in found)
     if not rows:

@@ -99,7 +99,7 @@ class Statistics(IndexPart):
         return np.array(rows, float).reshape(-1, len(metrics))
 
     def kinds(self, where: GraspFilter, *, at_most: int = 20_000) -> GraspKinds:
-        """Return types and directions of about `at_most` grasps, sampled as in `side_by_side`."""
+        """Count types and approach cells of about `at_most` grasps, sampled as in `side_by_side`."""
         columns = grasps.c.grasp_type, grasps.c.approach_cell
         with self.database.reading() as connection:
             query = select(*columns, func.count()).where(*_sample(connection, where, at_most)).group_by(*columns)
@@ -113,7 +113,7 @@ class Statistics(IndexPart):
 
 
 def _sample(connection: Connection, where: GraspFilter, at_most: int) -> list[ColumnElement[bool]]:
-    """Return the filter restricted to a share of shards with about `at_most` grasps."""
+    """Return the conditions of a filter, restricted to a share of shards with about `at_most` grasps."""
     group = "job" if where.job is not None else "dataset" if where.dataset is not None else "pair"
     share = min(1.0, at_most / max(1, number_of(connection, where, group)))
     tests = [c.sql(["job", "dataset"]) for c in conditions(where)]

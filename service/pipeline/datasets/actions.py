@@ -1,4 +1,4 @@
-"""Actions of users on datasets: create, cancel, retry, snapshot; the controller does a part per round.
+"""Actions of users on datasets: create, cancel, retry, snapshot; the controller does them in parts.
 
 The index records which cells have a job, and a job's event names the causing event of the dataset. Another controller
 can therefore continue without applying an event twice.
@@ -79,7 +79,7 @@ def create(
         if record.project != scope.project:
             # The message reveals nothing else: names are unique in the whole service.
             raise ConflictError(f"the name {record.name!r} is taken; take another name")
-        # Options are compared, not digests: a newer graspd has more options, whose defaults an older one implied.
+        # Options are compared, not digests: a newer graspd adds options, and older records imply their defaults.
         if not new and (other := _difference(record, hands, objects, shared)):
             raise ConflictError(f"there is another dataset named {record.name!r} ({other}); take another name")
         refuse_pending(services.store, "dataset", record.name)
@@ -149,10 +149,10 @@ def add_object_set(
     scope: ProjectScope = EVERYTHING,
     may_follow: Callable[[str, str], None] = lambda owner, project: None,
 ) -> ObjectSetView:
-    """Give objects a common name. A change of its objects makes a new version with the same owner.
+    """Name a set of objects. A change of its objects makes a new version with the same owner.
 
-    `may_follow` receives owner and project of the set before a new version, and may raise. Errors as in `usable_asset`;
-    InputError without objects.
+    `may_follow` receives owner and project of the set before a new version, and may raise.
+    NotFoundError: unknown object. ConflictError: another project has the name. InputError: no objects.
     """
     assets = [services.index.assets.get(AssetKind.OBJECT, one, scope=scope) for one in objects]
     wanted = tuple(asset.name for asset in assets)

@@ -1,6 +1,6 @@
 """Estimate the cost of a dataset before it starts: time for 1, 8 and 64 workers, storage, network.
 
-    candidates of a cell = grasps / yield, at most grasps x budget   (candidates: grasps)
+    candidates of a cell = grasps / yield, at most grasps x budget   (want candidates: grasps)
     seconds of a cell  = candidates x seconds per candidate + batches x scenes x seconds per scene
                          + pictures x seconds per picture
     time of W workers  = the larger of seconds / W and rounds of batches x seconds of a batch
@@ -30,9 +30,9 @@ from graspd.service.model.states import AssetKind, Stage
 from graspd.service.pipeline.datasets.spec import MAX_CELLS, Estimate, Matrix, RateUsed, WorkersPlan
 
 WORKERS: Final = (1, 8, 64)
-#: Traffic of a task in the queue and its events, in both directions (docs/explanation/scaling.md) [bytes].
+#: Traffic [bytes] of a task in queue and events, in both directions (docs/explanation/scaling.md).
 _MESSAGE_BYTES: Final = 19_500
-#: Size of an unknown object: a scan of 5000 faces as STL [bytes].
+#: Size [bytes] of an unknown object: a scan of 5000 faces as STL.
 _ASSET_BYTES: Final = 250_000
 _SHOWN_RATES: Final = 20
 Batches = Callable[[Stage], list[BatchCost]]
@@ -179,7 +179,7 @@ def _plan(
 
 
 def _assets(index: Index, hands: Sequence[str], objects: Sequence[str], scope: ProjectScope) -> tuple[float, list[str]]:
-    """Return the bytes of hand and object over all cells, and the unknown names."""
+    """Return the total bytes of hand and object over all cells, and the unknown names."""
     of_hands = index.assets.sizes(AssetKind.HAND, hands, scope=scope)
     of_objects = index.assets.sizes(AssetKind.OBJECT, objects, scope=scope)
     unknown = [name for name in hands if name not in of_hands] + [name for name in objects if name not in of_objects]

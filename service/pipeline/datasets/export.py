@@ -58,7 +58,7 @@ def _is_exported(path: Path, shard: SnapshotShard) -> bool:
 
 
 def _fetch(shard: SnapshotShard, path: Path, fetch: Fetch) -> None:
-    """Fetch a shard; the file gets its name after a check of its checksum."""
+    """Fetch a shard; the file gets its final name once its checksum matches."""
     draft = path.with_name(f".{path.name}.part")
     digest = hashlib.sha256()
     try:

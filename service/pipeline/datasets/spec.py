@@ -30,7 +30,7 @@ Names = Annotated[tuple[Name, ...], AfterValidator(lambda given: tuple(dict.from
 
 
 class Matrix(JobOptions):
-    """Hands x objects, and the options of each cell; `grasps` is a number for each cell."""
+    """Hands x objects, and the options of each cell; `grasps` is the number per cell."""
 
     SUBMITTED = True
 

@@ -102,7 +102,7 @@ def _check_redis(settings: Settings, client: Redis, info: Mapping[str, Any]) -> 
 
 
 def _write(client: Redis) -> float:
-    """Return the duration of a write and a read [s]; RedisError if writes are refused."""
+    """Return the mean duration of a write and a read [s]; RedisError if writes are refused."""
     key, value = f"graspd:doctor:{secrets.token_hex(8)}", secrets.token_bytes(8)
     start = time.perf_counter()
     client.set(key, value, ex=60)

@@ -54,7 +54,7 @@ def controller(settings: Settings) -> Finding:
 
 
 def workers(settings: Settings) -> Finding:
-    """Check whether every stage has a healthy worker of this version."""
+    """Check that workers are healthy, have this version and serve every stage with waiting tasks."""
     return _query_queue(settings, lambda queue: _check_workers(queue.workers(), _waiting_tasks(queue)))
 
 

@@ -72,7 +72,7 @@ def data_folder(settings: Settings, *, mounts: Path = Path("/proc/self/mounts"))
     folder = settings.data_dir.resolve()
     there = existing_ancestor(folder)
     if not os.access(there, os.W_OK | os.X_OK):
-        return bad(f"{there} cannot be written by user {os.getuid()}", f"chown it, or set GRASPD_DATA_DIR: {folder}")
+        return bad(f"{there} cannot be written by user {os.getuid()}", f"chown it, or set GRASPD_DATA_DIR ({folder})")
     kept_here = [
         what for what, url in (("the index (SQLite)", settings.index_url), ("Redis", settings.redis_url)) if url is None
     ]
