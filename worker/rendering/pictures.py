@@ -56,7 +56,7 @@ def grasp_pictures(
     run: ExecutionContext = DEFAULT_CONTEXT,
     samples: int = SAMPLES,
 ) -> NDArray[np.uint8]:
-    """Render root poses (N, 7) in the object frame and joints (N, J) from A sides: (N, A, H, W, 3) sRGB.
+    """Render hands at root poses (N, 7) in the object frame from A sides; return sRGB (N, A, H, W, 3).
     Azimuths [rad] are about the object's z axis; 0 looks across the direction in which the palm approaches. Object and
     hand fill the picture of `size` [px]. Raises TaskCancelled: `run.cancelled()` returned True."""
     hand_pose = moved(np.atleast_2d(np.asarray(hand_pose, float)), np.negative(obj.centre))
