@@ -26,7 +26,7 @@ THREE_SIDES: Final = tuple(np.radians([-35.0, 85.0, 205.0]).tolist())
 ELEVATION: Final = np.radians(20.0)
 FIELD_OF_VIEW: Final = np.radians(24.0)
 SAMPLES: Final = 12
-#: Hand parts farther than this from the object's hull are not framed [m]: a forearm may leave the picture.
+#: Hand parts farther than this from the object's bounding ball are not framed [m]: a forearm may leave the picture.
 NEAR_M: Final = 0.14
 _TOGETHER: Final = 16  # grasps traced together: bounds the memory
 
