@@ -32,7 +32,7 @@ def check_hand(
     options: Mapping[str, Any] | None = None,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> dict[str, Any]:
-    """Check whether the files describe a usable hand; `run` receives the links in progress.
+    """Check whether the files describe a usable hand; `run` receives progress by link.
     Return verdict (accept or refuse), message (one line), repairs (always empty), and facts: measured or guessed
     values in SI units. If options can fix a refusal, facts have `problem` and `options_suggested` (`HandOptions`)."""
     try:
@@ -109,14 +109,14 @@ def _limits(robot: Robot, settings: HandOptions) -> list[str]:
 
 
 def _omitted_links(robot: Robot, hand: HandModel, settings: HandOptions) -> list[str]:
-    """Return notes on joints above the root: left out without an option, or taken as fixed with one."""
+    """Return notes on joints above the root: faulty ones if option `root` is set, else all moving ones."""
     chain = chain_to(robot, hand.root_link)
     above = [joint.name for joint in chain if joint.type != "fixed"]
     if settings.root:
         return [f"{joint.name} ({joint.type}) above the palm taken as fixed" for joint in chain if joint.fault]
     if not above:
         return []
-    return [f"{', '.join(above)} above the palm left out, poses are those of {hand.root_link!r} (--root {robot.root})"]
+    return [f"{', '.join(above)} above the palm left out; poses are those of {hand.root_link!r} (--root {robot.root})"]
 
 
 def _mounting(hand: HandModel, fault: str) -> list[str]:

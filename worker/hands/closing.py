@@ -17,7 +17,7 @@ _SHARES: Final = (0.25, 0.5, 0.75)
 #: Least cosine at which two joint axes count as parallel (45 degrees), and at which an axis and the approach do (37).
 _PARALLEL: Final = 0.707
 _ABOUT: Final = 0.8
-#: A joint moves the tip if its tip motion exceeds this share of the largest one by a joint of the finger.
+#: A joint moves the tip if its tip motion exceeds this share of the largest tip motion by a joint of the finger.
 _MOVING: Final = 0.05
 #: Limits are symmetric if their middle is within this share of the range from 0. Such a joint stays straight: Shadow
 #: (with its thumb) and D'Claw lifted less when such joints closed.
@@ -40,7 +40,7 @@ def closing_by_limits(hand: HandModel) -> Floats:
 
 def closing_by_tips(hand: HandModel) -> Floats:
     """Return closing (D,) in -1, 0, +1 for a hand with fingertips, palm and a first guess of its closing.
-    Joints that are parallel to a finger's last joint flex the finger, unless their limits are symmetric. All flex in
+    Joints that are parallel to a finger's last joint flex the finger, unless their limits are symmetric. They flex in
     the direction that brings the tip to the other tips and to the palm. Another joint closes if it brings the tip to
     the other tips and away from the palm. It spreads if it turns about the approach or has symmetric limits. A joint in
     line with its finger does neither."""

@@ -28,7 +28,7 @@ CROWD: Final = 20
 FEW: Final = 8
 #: Range of widths [m].
 WIDTHS_M: Final = (0.004, 0.12)
-#: Numbers of points on each fingertip, on each other body, and on the whole hand, from which the former are drawn.
+#: Numbers of points on each fingertip and on each other body, drawn from `_DENSE` points on the whole hand.
 _TIP_POINTS: Final = 120
 _OTHER_POINTS: Final = 20
 _DENSE: Final = 8000
@@ -76,7 +76,7 @@ def _pinches(hand: HandModel, height: float) -> Oppositions:
 
 @dataclass(frozen=True)
 class _Evaluation:
-    """Poses of the fingertips' ends in N postures."""
+    """Pinches between the fingertips' ends in N postures, and their quality; root frame."""
 
     axis: Floats
     middle: Floats
@@ -112,9 +112,9 @@ class _PinchSearch:
     normals: Floats
     """(F, V, 3)"""
     others: Floats
-    """(V, 3)"""
+    """(W, 3) body frame [m]."""
     body: NDArray[np.intp]
-    """(V,) bodies of the other points."""
+    """(W,) bodies of the other points."""
 
     @classmethod
     def of(cls, hand: HandModel, height: float) -> _PinchSearch:

@@ -23,21 +23,21 @@ from graspd.worker.objects.memory_cache import cached_by_content
 Ints = NDArray[np.intp]
 Size = Literal["small", "wide"]
 
-#: Gaps for small objects [m], and the factor by which gaps for wide objects exceed the widest gap of opposed pads.
+#: Least and largest gap for small objects [m]. Largest ratio of a gap for wide objects to the widest gap of pads.
 SMALL_M: Final = (0.006, 0.042)
 WIDER: Final = 1.06
 #: Number of surface points.
 POINTS: Final = {"small": 256, "wide": 640}
-#: Number of postures, candidates per posture, and random steps that improve them.
+#: Numbers of postures, of candidates per posture, and of random steps that improve the postures.
 POSTURES: Final = 120
 CROWD: Final = 8
 CLIMBS: Final = 80
-#: Least cosine of both surface normals with the line between the points. Cost of a cosine lower by 1 [m], and cost per
-#: metre of penetration of the hand into the cube between the points.
+#: Least cosine of both surface normals with the line between the points. Cost of a cosine that is lower by 1 [m], and
+#: cost per metre of penetration of the hand into the cube between the points.
 FACING: Final = {"small": 0.9, "wide": 0.8}
 TURNED_M: Final = 0.2
 DEEP: Final = 2.0
-#: Least motion by which the two points can approach each other, and least lever of a joint that counts [m].
+#: Motion of the two points towards each other below which a pair costs more, and least lever of a joint [m].
 CLOSES_M: Final = 0.04
 LEVER_M: Final = 0.02
 #: Radius of the disc that a flat part covers on its tangent plane [m], and cost of a part that covers none of it [m].
@@ -48,7 +48,7 @@ _DENSE: Final = 4000
 GOOD_M: Final = 0.006
 #: Largest distance by which the cube extends beyond its contacts towards the palm [m].
 BEYOND_M: Final = 0.012
-#: Pairs per posture that are evaluated in detail, and postures that are compared at once.
+#: Number of pairs per posture that are evaluated in detail, and number of postures evaluated at once.
 CLOSELY: Final = 8
 AT_ONCE: Final = 16
 #: Points nearer than this coincide [m].
@@ -89,7 +89,7 @@ def _search_postures(hand: HandModel, size: Size) -> Oppositions:
 
 @dataclass
 class _BestPairs:
-    """Best pairs of N postures in the form of `Oppositions`, with their costs [m]."""
+    """Best pair of points in each of N postures: fields as in `Oppositions`, and costs (N,) [m]."""
 
     axis: Floats
     middle: Floats
@@ -150,7 +150,7 @@ class _PairSearch:
 
     def _costs(self, held: Floats, normal: Floats, wanted: Floats) -> Floats:
         """Compute the cost (n, pairs) of each pair by matrix products, without penetration and closing motion.
-        The square of a width is rounded to 1e-17 m²."""
+        The square of a width has a rounding error of 1e-17 m²."""
         square = np.einsum("npi,npi->np", held, held)
         own = np.einsum("npi,npi->np", held, normal)
         parts = []
@@ -190,7 +190,7 @@ class _PairSearch:
         half = 0.5 * width
         start = np.minimum(np.einsum("nki,nki->nk", one, up), np.einsum("nki,nki->nk", other, up))
         start = start - np.minimum(half, BEYOND_M)
-        # (n, K, points): along the line between both ends, perpendicular to it, and upwards.
+        # Coordinates (n, K, points): along the line between both ends, perpendicular to it, and upwards.
         middle, points, across = 0.5 * (one + other), place.swapaxes(1, 2), np.cross(axis, up)
         along, aside, above = axis @ points, across @ points, up @ points
         along -= np.einsum("nki,nki->nk", axis, middle)[..., None]

@@ -26,7 +26,7 @@ from graspd.worker.objects.disk_cache import cached_step
 
 #: Share of the range from open to closed in the approach posture.
 PRESHAPE_SHARE = 0.25
-#: Iterations over closing and palm, which depend on each other.
+#: Number of iterations over closing and palm, which depend on each other.
 LOOKS = 2
 #: Fingers are opposed if the sum of tip motions across the hand is below this share of their total length. The share is
 #: 0 for equal fingers around an axis, .3 to .55 for two fingers against one, and .75 or more for hands with a thumb.
@@ -62,7 +62,7 @@ def complete_hand(hand: HandModel, tree: Tree, options: HandOptions) -> HandMode
     for _ in range(LOOKS):
         hand = _with_palm(hand, tree, options)
         hand = replace(hand, closing=np.where(slide, hand.closing, closing_by_tips(hand)))
-    # A stated joint does not change the guess of another.
+    # A joint's stated closing does not change the guess for another joint.
     return _with_palm(replace(hand, closing=_override(hand.closing, stated)), tree, options)
 
 
@@ -181,7 +181,7 @@ def _residual_motion(ways: Floats, ahead: Floats) -> float:
 
 def _between_fingers(hand: HandModel) -> tuple[Floats, bool]:
     """Return the direction out of the palm between opposed fingers, and whether its sign is a tie.
-    It runs from finger bases to half-closed tips, perpendicular to a common closing line. Coplanar points are a tie."""
+    It runs from finger bases to half-closed tips, normal to a common closing line. Coplanar points give a tie."""
     body = shared_bodies(hand)[-1]
     q = closing_posture(hand, 0.5)
     poses = body_poses(hand, IDENTITY_POSE, hand.expand(q))[0]
@@ -296,7 +296,7 @@ def _palm(hand: HandModel, tree: Tree, options: HandOptions, approach: Floats) -
 
 def _exit_distance(parts: Sequence[Floats], point: Floats, direction: Floats) -> float | None:
     """Return the coordinate along `direction` at which a line through `point` leaves the last convex part.
-    Parts are (V, 3); None if the line meets no part."""
+    Parts are corners (V, 3); None if the line meets no part."""
     ends = []
     for corners in parts:
         planes = cached_step("planes", [corners], partial(_planes, corners))["0"]

@@ -44,15 +44,15 @@ class HandMatch:
     ours: HandModel
     theirs: HandModel
     joints: NDArray[np.intp]
-    """(J',) for each joint of `theirs`, the number of the joint of `ours`."""
+    """(J',) index of the matching joint of `ours` for each joint of `theirs`."""
     base: Floats
     """(7,) pose of the root of `theirs` in the root frame of `ours`."""
     fingertips_m: float
-    """Largest distance of corresponding fingertips over random postures."""
+    """Largest distance of corresponding fingertips over random postures [m]."""
 
     @cached_property
     def bodies(self) -> NDArray[np.intp]:
-        """(L',) for each body of `theirs`, the body of `ours` with the same joint; the root for the root."""
+        """(L',) body of `ours` with the matching joint for each body of `theirs`; the root for the root."""
         out = np.zeros(self.theirs.bodies, np.intp)
         out[self.theirs.joint_body] = self.ours.joint_body[self.joints]
         return out
@@ -95,7 +95,7 @@ def match_hands(
         worst = tips[int(error.max(axis=0).argmax())]
         raise InputError(
             f"{theirs.name} is no model of {ours.name}: fingertip {ours.body_names[worst]!r} is up to "
-            f"{1e3 * error.max():.2f} mm from where {ours.name} has it, {1e3 * tolerance_m:g} mm are allowed; "
+            f"{1e3 * error.max():.2f} mm from where {ours.name} has it, but {1e3 * tolerance_m:g} mm are allowed; "
             "compare axes and zeros of the joints, or name the pairs: --joint-map OURS=THEIRS"
         )
     return HandMatch(ours, theirs, joints, base, float(error.max()))
@@ -130,7 +130,7 @@ def _matching_bodies(ours: HandModel, theirs: HandModel, joint_map: Mapping[str,
 
 
 def _strip_prefix(name: str, names: Sequence[str]) -> str:
-    """Strip the common prefix of all names, up to its last non-alphanumeric character."""
+    """Strip the names' common prefix up to its last non-alphanumeric character; return lower case."""
     alike = 0
     while len(names) > 1 and alike < len(name) and all(other[: alike + 1] == name[: alike + 1] for other in names):
         alike += 1
@@ -144,8 +144,8 @@ def _body_centre(hand: HandModel, body: int) -> Floats:
 
 def _fit(where: Floats, poses: Floats, guess: Floats) -> tuple[Floats, Floats]:
     """Fit the other model's base pose (7,), and its fingertip positions (T, 3) in its body frames.
-    `where` are fingertips (N, T, 3) in the own base frame, `poses` bodies (N, T, 7) in the other base frame, `guess`
-    approximate positions (T, 3)."""
+    `where` are fingertips (N, T, 3) in the base frame of `ours`. `poses` (N, T, 7) are bodies in the base frame of
+    `theirs`. `guess` (T, 3) are approximate positions in these bodies."""
     from scipy.optimize import least_squares  # slow to load
 
     start = _align_points(apply(poses, guess), where)
@@ -169,7 +169,7 @@ def _fit(where: Floats, poses: Floats, guess: Floats) -> tuple[Floats, Floats]:
 
 
 def _align_points(points: Floats, where: Floats) -> Floats:
-    """Return the pose that best aligns points (..., 3) with others (Kabsch)."""
+    """Return the pose that best aligns `points` (..., 3) with the points `where` (Kabsch)."""
     a, b = points.reshape(-1, 3), where.reshape(-1, 3)
     left, _, right = np.linalg.svd((a - a.mean(axis=0)).T @ (b - b.mean(axis=0)))
     sign = np.diag([1.0, 1.0, float(np.sign(np.linalg.det(right.T @ left.T)))])

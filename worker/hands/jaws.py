@@ -1,6 +1,6 @@
 """Jaws of a gripper and pads of a hand: surfaces that meet on closing, their opening and closing line.
 
-A gripper is a hand with at most two degrees of freedom, whose closing motion brings opposing surfaces (pads) together.
+A gripper is a hand with at most two degrees of freedom. Its closing motion brings opposing surfaces (pads) together.
 Everything follows from geometry, so a joint at 0 may be open or closed."""
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _STEPS: Final = 17
 _TOWARDS: Final = 1.0
 #: Pads nearer than this touch [m].
 _TOUCH_M: Final = 2e-4
-#: Ratio of smallest to largest singular value of the ends' motions above which these are not planar.
+#: Motions of the ends are not planar if the ratio of their smallest to largest singular value exceeds this.
 _IN_SPACE: Final = 0.2
 
 
@@ -70,7 +70,7 @@ class Jaws:
     first: NDArray[np.bool_]
     """(P,) mask of the points on the first pad."""
     length: float
-    """Extent of the pads along the given approach [m]."""
+    """Extent of the pads along the approach [m]; 0 if no approach is known."""
 
     @cached_property
     def opening(self) -> float:
@@ -92,7 +92,7 @@ class Jaws:
 
 
 def closing_by_geometry(hand: HandModel) -> Floats:
-    """Return each dof's direction (D,) that brings opposing surfaces together: +1 or -1; 0: no direction.
+    """Return each dof's direction (D,) that brings opposing surfaces together: +1, -1, or 0 for none.
     The sign is opposite to that of a sum over postures, from all dofs at their lower limits to all at their upper
     limits. Each summand is the area of facing surfaces times the speed at which they separate."""
     points = _points(hand)
@@ -165,7 +165,7 @@ def _normal_speed(motion: Floats, normal: Floats) -> Floats:
 
 
 def _facing(place: Floats, normal: Floats, points: SurfacePoints, among: Ints) -> tuple[Ints, Ints, Floats]:
-    """Return the points of `among` that face another body, the nearest point each faces, and the gap [m]."""
+    """Return points of `among` that face another body, the nearest facing point of each, and gaps [m]."""
     aside = _ASIDE * np.sqrt(points.area.sum() / len(points))
     first, second, gaps = [], [], []
     for i in among:
@@ -196,7 +196,7 @@ def _is_centric(hand: HandModel, points: SurfacePoints, path: Floats) -> bool:
 
 
 def _closed_posture(hand: HandModel, points: SurfacePoints, path: Floats) -> tuple[Floats, Ints, Ints, Floats] | None:
-    """Return the posture in which the pads meet, or the last of the path, and the first pairs in contact.
+    """Return the posture at which pads meet, else the last with approaching ones, and the first pairs.
     Also return the area (L,) of each body that faced another body before contact, summed over postures."""
     best: tuple[Floats, Ints, Ints, Floats] | None = None
     step, faced = path[-1] - path[0], np.zeros(hand.bodies)
@@ -239,7 +239,7 @@ def _pad_points(
 
 
 def sign_of(line: Floats) -> float:
-    """Return -1 if a line's largest component is negative, else 1; of equally large ones the first counts.
+    """Return -1 if a line's largest component (the first of equal ones) is negative, else 1.
     The sign of a vector from a decomposition is rounding noise."""
     size = np.abs(line)
     return float(np.sign(line[int(np.argmax(size > (1 - 1e-6) * size.max()))]))
@@ -308,7 +308,7 @@ _PAD_POINTS: Final = 1000
 
 @dataclass(frozen=True)
 class Pad:
-    """Part of a body's surface that presses, in the body's frame."""
+    """Part of a body's surface that presses on objects, in the body's frame."""
 
     body: int
     centre: Floats
@@ -342,7 +342,7 @@ def fingertip_pad(hand: HandModel, tip: int) -> Pad:
     driven = [b for b in chain if hand.closing[hand.dof[b]] != 0] or chain
     if not len(place) or not driven:
         return Pad(tip, np.zeros(3), np.array([0.0, 0, 1]), np.zeros((0, 3)))
-    # A joint that turns the tip about itself moves no side forward; a joint nearer to the palm then decides.
+    # A joint that turns the tip about its own axis moves no side forward; a joint nearer to the palm then decides.
     chosen = next((part for body in driven if (part := _leading_points(hand, tip, body, place, normal)).any()), None)
     if chosen is None:
         # No joint decides, and the normals of a whole tip cancel: use the side that faces as the palm does.

@@ -41,7 +41,7 @@ def _levels(parents: bytes) -> tuple[NDArray[np.intp], ...]:
 
 
 def ancestors(hand: HandModel) -> NDArray[np.bool_]:
-    """Return (L, L), True at [a, b] if the joint of body b moves body a: also b itself, but not the root."""
+    """Return a mask (L, L): [a, b] is True if body b has a joint that moves body a, also for a = b."""
     moves = np.zeros((hand.bodies, hand.bodies), dtype=bool)
     for body in range(1, hand.bodies):
         moves[body] = moves[hand.parent[body]]
@@ -52,7 +52,7 @@ def ancestors(hand: HandModel) -> NDArray[np.bool_]:
 def generalized_forces(
     hand: HandModel, bodies: Floats, body: NDArray[np.integer], points: Floats, forces: Floats
 ) -> Floats:
-    """Compute generalized forces (..., C, E, D) on dofs from forces on bodies [N m; N for prismatic dofs].
+    """Compute generalized forces (..., C, E, D) on dofs [N m or N] from forces on bodies.
     By virtual work the torque on a dof is the sum over its joints of multiplier times joint torque. `bodies` (..., L,
     7) are poses; `body` (..., C) is the body of each point. `points` (..., C, 3) [m] are in the frame of the poses; E
     `forces` (..., C, E, 3) act at each point [N]."""

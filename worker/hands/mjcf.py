@@ -212,7 +212,7 @@ def _pose(position: Any, quaternion: Any) -> Floats:
 
 
 def _ellipsoid(half: Floats) -> tuple[Floats, Any]:
-    """Return a hull of 162 points on the surface."""
+    """Return the hull of 162 points on an ellipsoid with half axes `half` (3,)."""
     count = 162
     z = 1 - (2 * np.arange(count) + 1) / count
     turn = np.arange(count) * np.pi * (3 - np.sqrt(5))

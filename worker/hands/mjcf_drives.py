@@ -314,8 +314,8 @@ def _anchors(model: Any, data: Any, loop: int) -> tuple[Floats, Floats]:
 
 
 def servos(model: Any, mimics: Mapping[int, Mimic | float], shared: Collection[int]) -> dict[int, tuple[float, float]]:
-    """Return effort [N m or N] and stiffness [N m/rad or N/m] of each driven joint; 0: not stated.
-    An actuator of gear g on a length l pulls with g F dl/dq at joint q. A position servo of gain k gives the joint the
+    """Return effort [N m or N] and stiffness [N m/rad or N/m] of each driven joint; 0 if not stated.
+    An actuator of gear g on a length l pulls joint q with g F dl/dq. A position servo of gain k gives the joint the
     stiffness k (g dl/dq)^2. If the actuator drives the joint itself, dl/dq is 1. On a fixed tendon, it is the joint's
     coefficient plus coefficient times rate of each follower. If n joints share a tendon (`shared`), each gets n times
     the tendon's gain, so that their series has the tendon's gain."""
@@ -373,7 +373,7 @@ def joints_on_tendon(model: Any, tendon: int) -> list[tuple[int, float]]:
 
 
 def _driver(joint: int, mimics: Mapping[int, Mimic | float], joint_of: Mapping[str, int]) -> tuple[int | None, float]:
-    """Return the joint at the end of a chain of mimics, and the total rate."""
+    """Return the joint that drives `joint` through mimics, and the total rate; None and 0 if it is fixed."""
     rate = 1.0
     for _ in range(len(mimics) + 1):
         follows = mimics.get(joint)

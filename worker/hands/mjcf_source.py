@@ -38,7 +38,7 @@ _MESHES: Final = (".stl", ".obj", ".msh")
 
 def inline_model(files: Mapping[str, bytes], main: str) -> tuple[str, dict[str, bytes], list[str]]:
     """Return the model as one text, the mesh files it names, and notes for the user.
-    Raises HandError: no XML, no MJCF, an include or mesh that is missing or outside the upload, or an element that
+    Raises HandError: not XML, not MJCF, an include or mesh that is missing or outside the upload, or an element that
     loads another model. LimitError: larger than the limits of this module."""
     root = parse_xml(files[main], main, "an MJCF model", "mujoco", limit_bytes=MAX_BYTES)
     _expand_includes(root, files, main, main, [0, 0])
@@ -105,7 +105,7 @@ def _is_supported(actuator: Element) -> bool:
 
 
 def _uses_radians(root: Element) -> bool:
-    """Check whether angles of a model without an angle unit (MuJoCo: degrees) are meant as radians.
+    """Check whether angles are radians in a model that states no unit; MuJoCo would read degrees.
     This is assumed if no joint limit and no other angle exceeds 2 pi."""
     if any("angle" in compiler.attrib for compiler in root.findall("compiler")):
         return False
@@ -145,7 +145,7 @@ def _expand_includes(root: Element, files: Mapping[str, bytes], main: str, here:
 
 
 def _find(wanted: str, files: Mapping[str, bytes], folders: list[str], main: str, does: str) -> str:
-    """Return the name of a file that a model names, searched from several folders."""
+    """Return the name in `files` of a file that a model names; search relative to each folder."""
     path = wanted.replace("\\", "/")
     inside, like = False, []
     for folder in dict.fromkeys(folders):

@@ -44,7 +44,7 @@ class ConvexPiece:
     faces: Ints
     """(F, 3) outward triangles."""
     link: str
-    """URDF link the piece comes from."""
+    """Link to which the piece belongs."""
 
 
 @dataclass(frozen=True)
@@ -76,12 +76,12 @@ class SurfacePoints:
 
 @dataclass(frozen=True)
 class Drag:
-    """Inertia and friction of joint mechanisms, for each body (L,); 0 if not stated."""
+    """Inertia and dry friction of each joint's mechanism, by the joint's body; 0 if not stated."""
 
     armature: Floats
-    """Inertia of the drive [kg m^2 or kg]."""
+    """(L,) inertia of the drive [kg m^2 or kg]."""
     dry_friction: Floats
-    """[N m or N]"""
+    """(L,) [N m or N]"""
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ class HandModel:
     preshape: Floats
     """(D,) posture of the approach."""
     closing: Floats
-    """(D,) -1, 0 or +1: the direction in which the dof closes the hand; 0: it does not close."""
+    """(D,) direction in which the dof closes the hand: -1 or +1; 0 if it does not close."""
     joint_names: tuple[str, ...]
     """(J,) all moving joints, including followers, in the description's order."""
     joint_body: Ints
@@ -140,9 +140,9 @@ class HandModel:
     tendons: tuple[Tendon, ...] = field(default=(), metadata=TOLD_IF_SET)
     """Drives of several dofs; no dof is on two tendons. The other dofs have their own drives."""
     drag: Drag | None = field(default=None, metadata=TOLD_IF_SET)
-    """None: no drag in the validator, as in DexGraspBench's protocol."""
+    """If None, the validator simulates no drag, as in DexGraspBench's protocol."""
     mounting: HandModel | None = field(default=None, metadata=TOLD_IF_SET)
-    """Links above the root that stay clear in scenes, see `worker.hands.mounting`.
+    """Links above the root that must not collide in scenes; see `worker.hands.mounting`.
     A tree of bodies and wrist joints that starts at the root."""
 
     @cached_property

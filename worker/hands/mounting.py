@@ -57,7 +57,7 @@ def mounting_tree(robot: Robot, root: str, options: HandOptions) -> Tree | None:
 
 
 def _value(joint: Joint, options: HandOptions) -> float | None:
-    """Return the value of a joint that does not move [rad or m]; None if it moves."""
+    """Return the value [rad or m] of a joint that does not move; None if it moves."""
     if joint.type == "fixed":
         return 0.0
     if joint.name in options.fix:
@@ -71,8 +71,7 @@ def _of_wrist(joint: Joint) -> bool:
 
 
 def _rigid(robot: Robot, joint: Joint, pose: Floats, options: HandOptions) -> dict[str, Floats]:
-    """Return the poses of a joint's parent (`pose`) and of all links fixed to it, without the joint's
-    child."""
+    """Return the poses of a joint's parent (`pose`) and of links fixed to it, except the joint's child."""
     found, stack = {joint.parent: pose}, [joint.parent]
     while stack:
         at = stack.pop()
@@ -84,7 +83,7 @@ def _rigid(robot: Robot, joint: Joint, pose: Floats, options: HandOptions) -> di
 
 
 def wrist_positions(mounting: HandModel) -> Floats:
-    """Return sampled angles (W, K) of the wrist's K joints, the rest position first, then by distance."""
+    """Return sampled angles (W, K) of the wrist's K joints, sorted by distance from the rest position."""
     angles = [
         [rest, *(rest + share * (end - rest) for share in WRIST_SHARES for end in (low, high) if end != rest)]
         for rest, low, high in zip(mounting.preshape, mounting.lower, mounting.upper, strict=True)

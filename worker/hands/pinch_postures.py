@@ -1,4 +1,4 @@
-"""Pinch postures: test whether a hand's surfaces can oppose one another; opposed postures by width.
+"""Pinch postures of a hand, sorted by width, and a test whether its surfaces can oppose one another.
 
 A hand holds an object between one finger, usually the thumb, and other fingers whose pads face it. Sampling and random
 steps find such postures for all feasible widths."""
@@ -26,7 +26,7 @@ from graspd.worker.hands.surface import sample_surface
 from graspd.worker.objects.disk_cache import cached_arrays
 from graspd.worker.objects.memory_cache import cached_by_content
 
-#: Number of postures, candidates per posture, and random steps that improve them.
+#: Numbers of postures, of candidates per posture, and of random steps that improve the postures.
 POSTURES: Final = 160
 CROWD: Final = 25
 CLIMBS: Final = 100
@@ -55,7 +55,7 @@ _CLOSING_M: Final = 0.003
 
 @dataclass(frozen=True)
 class Oppositions:
-    """K postures of a hand whose pads face one another, sorted by width; root frame."""
+    """K postures in which pads of a hand face one another, sorted by width; root frame."""
 
     q: Floats
     """(K, D)"""
@@ -86,7 +86,7 @@ class Oppositions:
 
     @classmethod
     def cached(cls, kind: str, key: tuple[str, ...], make: Callable[[], Oppositions], *more: ModuleType) -> Oppositions:
-        """Load postures from the disk cache, else make and cache them; the key has the code of `more`."""
+        """Load postures from the disk cache, or make and cache them; modules `more` are part of the key."""
         return cls(**cached_arrays(kind, key, (*_code(), *more), lambda: vars(make())))
 
 
@@ -131,7 +131,7 @@ def opposed_finger(hand: HandModel) -> int:
 
 @dataclass(frozen=True)
 class _PadGaps:
-    """Poses of the pads in N postures."""
+    """Line from one finger's pad to the mean of the other pads in N postures; root frame."""
 
     axis: Floats
     middle: Floats
@@ -139,9 +139,9 @@ class _PadGaps:
     facing: Floats
     """(N,) cosine of the pads' normals with the line between the pads; the lower value of both sides."""
     square: Floats
-    """(N,) cosine of the palm's approach with the line between the pads; 0: perpendicular."""
+    """(N,) absolute cosine of the palm's approach with the line between the pads."""
     ahead: Floats
-    """(N,) distance of the middle in front of the palm [m]."""
+    """(N,) distance of the line's middle in front of the palm [m]."""
 
     @classmethod
     def of(cls, hand: HandModel, pads: list[Pad], one: int, q: Floats) -> _PadGaps:
@@ -187,7 +187,7 @@ def improve_postures(hand: HandModel, one: int, q: Floats, cost: Callable[[Float
 
 
 def random_postures(hand: HandModel, one: int, count: int) -> Floats:
-    """Return postures (count, D): one finger is random; dofs of equal rank in others close together."""
+    """Return postures (count, D): finger `one` is random; dofs of equal rank in others close alike."""
     rng = np.random.default_rng(one)
     finger, rank = _ranks(hand)
     opened = np.where(hand.closing >= 0, hand.lower, hand.upper)

@@ -62,7 +62,7 @@ def tessellate(kind: str, size: tuple[float, ...]) -> tuple[Floats, Ints]:
 
 
 def area(kind: str, size: tuple[float, ...], vertices: Floats, faces: Ints) -> float:
-    """Compute the surface area [m^2]; closed form for primitives, sum of triangles for hulls."""
+    """Compute the surface area [m^2]: in closed form for primitives, as a sum of triangles for hulls."""
     match kind:
         case "box":
             x, y, z = size
@@ -78,7 +78,7 @@ def area(kind: str, size: tuple[float, ...], vertices: Floats, faces: Ints) -> f
 
 
 def volume(kind: str, size: tuple[float, ...], vertices: Floats, faces: Ints) -> float:
-    """Compute the volume [m^3]; closed form for primitives."""
+    """Compute the volume [m^3]: in closed form for primitives, as a sum of tetrahedra for hulls."""
     match kind:
         case "box":
             return float(np.prod(size))
@@ -163,7 +163,7 @@ COPLANAR: Final = 1 - 1.5e-6
 
 @dataclass(frozen=True)
 class HandFeatures:
-    """F balls and rims and E edges of P convex pieces, fixed to the bodies of a hand.
+    """F balls and rims, and E edges, of P convex pieces; fixed to the bodies of a hand.
     A plane meets balls and rims first; a convex solid that penetrates a piece meets one of them or an edge."""
 
     body: NDArray[np.int32]
@@ -171,9 +171,9 @@ class HandFeatures:
     centre: Floats
     """(F, 3) body frame."""
     axis: Floats
-    """(F, 3) body frame; zero: a ball."""
+    """(F, 3) axis of a rim, body frame; zero for a ball."""
     radius: Floats
-    """(F,)"""
+    """(F,) [m]"""
     first: NDArray[np.int32]
     """(P + 1,) the first feature of each piece."""
     edges: Floats
@@ -181,14 +181,14 @@ class HandFeatures:
     thickness: Floats
     """(E,) radius about an edge: 0 except for capsules and spheres."""
     first_edge: NDArray[np.int32]
-    """(P + 1,)"""
+    """(P + 1,) the first edge of each piece."""
 
     def __len__(self) -> int:
         return len(self.body)
 
     @classmethod
     def of(cls, pieces: tuple[ConvexPiece, ...]) -> HandFeatures:
-        """Collect corners and edges of boxes and hulls; spheres; ends and axes of capsules, rims of cylinders."""
+        """Collect spheres, corners and edges of boxes and hulls, ends and axes of capsules, and rims."""
         rows: list[tuple[int, Floats, Floats, float]] = []
         edges: list[Floats] = [np.zeros((0, 2, 3))]
         thickness: list[float] = []

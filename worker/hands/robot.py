@@ -38,7 +38,7 @@ class Shape:
     mesh: tuple[Floats, Ints] | None = None
     """Vertices (V, 3) and triangles (F, 3) of a mesh that the robot's reader has loaded."""
     colour: tuple[float, float, float] | None = None
-    """sRGB, 0 .. 1, of a visual element; None: not stated, or in the mesh file."""
+    """sRGB, 0 .. 1, of a visual element; None if not stated or in the mesh file."""
 
 
 @dataclass(frozen=True)
@@ -74,18 +74,18 @@ class Joint:
     lower: float = 0.0
     upper: float = 0.0
     effort: float = 0.0
-    """[N m or N]; 0: not stated."""
+    """Limit [N m or N]; 0 if not stated."""
     mimic: Mimic | None = None
     """Mimic relation. A URDF follower's own limits are ignored, as in ROS: most published limits of followers are
     wrong."""
     velocity: float = 0.0
-    """Limit [rad/s or m/s]; 0: not stated."""
+    """Limit [rad/s or m/s]; 0 if not stated."""
     stiffness: float = 0.0
-    """Position gain of the joint's servo [N m/rad or N/m]; 0: not stated."""
+    """Position gain of the joint's servo [N m/rad or N/m]; 0 if not stated."""
     armature: float = field(default=0.0, metadata=TOLD_IF_SET)
-    """Inertia that the drive adds [kg m^2 or kg]; 0: not stated."""
+    """Inertia that the drive adds [kg m^2 or kg]; 0 if not stated."""
     dry_friction: float = field(default=0.0, metadata=TOLD_IF_SET)
-    """[N m or N]; 0: not stated."""
+    """[N m or N]; 0 if not stated."""
     fault: str = field(default="", metadata=TOLD_IF_SET)
     """Error for a hand that moves by this joint. Above a hand the joint is fixed and the fault is ignored."""
 
@@ -185,7 +185,7 @@ def _check_tree(links: dict[str, Link], joints: dict[str, Joint], filename: str)
 
 
 def _check_limits(joints: Iterable[Joint], filename: str) -> None:
-    """Check joint limits, since CAD exporters write zero for unstated limits."""
+    """Refuse a robot whose limits are all zero: CAD exporters write zero for unstated limits."""
     limited = [joint for joint in joints if joint.moves and joint.type != "continuous" and joint.mimic is None]
     if limited and all(joint.lower == joint.upper == 0 for joint in limited):
         many = f"all {len(limited)} joints have" if len(limited) > 1 else f"joint {limited[0].name!r} has"
@@ -193,7 +193,7 @@ def _check_limits(joints: Iterable[Joint], filename: str) -> None:
 
 
 def _checked_mimic(joint: Joint, joints: dict[str, Joint], filename: str) -> Joint:
-    """Return the joint, with a fault if it follows itself or no moving joint."""
+    """Return the joint; it gets a fault if it follows itself or a joint that does not move."""
     seen, at = {joint.name}, joint
     while at.mimic is not None:
         target = joints.get(at.mimic.joint)

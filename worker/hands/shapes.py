@@ -110,7 +110,7 @@ def _reduce(points: Floats, limit: int) -> tuple[Floats, Ints]:
 
 
 def _excess_distance(points: Floats, corners: Floats) -> Floats:
-    """Return the distance (N,) of points (N, 3) outside a small hull; from its nearest corner if flat."""
+    """Return the distance (N,) of points (N, 3) from a small hull; from its nearest corner if it is flat."""
     spread = np.linalg.svd(corners - corners.mean(axis=0), compute_uv=False)
     if len(corners) < 4 or spread[2] < 1e-6 * spread[0]:
         return np.linalg.norm(points[:, None] - corners[None], axis=2).min(axis=1)
@@ -210,7 +210,7 @@ class _OpenSurface:
 
     def __init__(self, vertices: Floats, faces: Ints) -> None:
         corners, self._points = vertices[faces], _sample(vertices, faces)
-        # (D, P) whether a direction from a point is free of the mesh.
+        # (D, P) whether a ray in a direction from a point misses the mesh.
         self._sees = np.array([~_hits(self._points, direction, corners) for direction in _DIRECTIONS])
 
     def error(self, parts: tuple[Floats, ...]) -> float:

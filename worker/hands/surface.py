@@ -35,7 +35,7 @@ def sample_surface(hand: HandModel, count: int, *, seed: int = 0) -> SurfacePoin
     gets the area of its Voronoi cell among the candidates, so the areas sum to the exterior area. Parts inside another
     piece have no points. Equal arguments give the same points, bit for bit. Raises HandError: the hand has no outer
     surface."""
-    # The key has no closing and no palm: these are found from such points.
+    # The cache key excludes closing and palm, since these are derived from such points.
     return _cached_samples(
         _Shapes(hand.pieces, body_poses(hand, IDENTITY_POSE, hand.expand(hand.preshape))[0]), count, seed
     )
@@ -45,7 +45,7 @@ def sample_surface(hand: HandModel, count: int, *, seed: int = 0) -> SurfacePoin
 class _Shapes:
     pieces: tuple[ConvexPiece, ...]
     rest: Floats
-    """(L, 7) poses of its bodies."""
+    """(L, 7) poses of the hand's bodies."""
 
     @cached_property
     def content(self) -> str:

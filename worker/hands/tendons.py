@@ -36,7 +36,7 @@ class Tendon:
         return 1.0 / sum(c * c / float(stiffness[d]) for d, c in parts)
 
     def limit(self, effort: Floats) -> float:
-        """Return the largest pull within every dof's limit (D,)."""
+        """Return the largest pull that exceeds no dof's limit (D,)."""
         return min(float(effort[d]) / abs(c) for d, c in zip(self.dofs, self.coefficients, strict=True))
 
 
@@ -56,7 +56,7 @@ def actuators(tendons: tuple[Tendon, ...], dofs: int) -> Floats:
 def tendons_of(
     robot: Robot, stated: Mapping[str, Mapping[str, float]] | None, dof_names: tuple[str, ...]
 ) -> tuple[Tendon, ...]:
-    """Return a hand's tendons: the stated ones, else the description's, else those known of a Shadow hand.
+    """Return a hand's tendons: stated ones, else those of the description, else those of a Shadow hand.
     Only joints that are degrees of freedom of the hand count; fewer than two make no tendon."""
     said = stated if stated is not None else robot.tendons or shadow_tendons(robot)
     found = []
@@ -85,7 +85,7 @@ def shadow_tendons(robot: Robot) -> dict[str, dict[str, float]]:
 
 def check_tendons(robot: Robot, stated: Mapping[str, Mapping[str, float]]) -> None:
     """Check stated tendons.
-    Raises HandError: a tendon names an unknown joint, pulls fewer than two joints, or shares one with another."""
+    Raises HandError: a tendon names an unknown joint or pulls fewer than two joints, or two tendons pull one joint."""
     seen: set[str] = set()
     for name, pulls in stated.items():
         for joint in pulls:

@@ -43,7 +43,7 @@ class Tree:
     links: dict[str, tuple[int, Floats]]
     """Body of each retained link, and its pose in the body's frame."""
     drives: dict[str, Mimic]
-    """Degree of freedom that each moving joint follows."""
+    """Degree of freedom that each moving joint follows, by name of the joint."""
     joint_names: tuple[str, ...]
     """Moving joints in the robot's order."""
     dof_names: tuple[str, ...]
@@ -225,7 +225,7 @@ def reduced_ranges(robot: Robot, tree: Tree) -> list[str]:
 
 
 def _fold_velocity(dof: str, moving: dict[str, Mimic], robot: Robot) -> float:
-    """Return the speed of a dof at which no follower exceeds its own limit; 0 if not stated."""
+    """Return the largest speed of a dof at which no joint exceeds its limit; 0 if none is stated."""
     stated = [
         robot.joints[name].velocity / abs(drive.multiplier)
         for name, drive in moving.items()

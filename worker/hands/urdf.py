@@ -269,7 +269,7 @@ def parse_xml(data: bytes, name: str, what: str = "", root: str = "", *, limit_b
         raise HandError(f"{name}: not well-formed XML ({error}); export it again") from None
     space, _, local = tree.tag.rpartition("}")
     if root and local != root:
-        raise HandError(f"{name}: the XML root is <{local[:40]}>, {what} begins with <{root}>")
+        raise HandError(f"{name}: the XML root is <{local[:40]}>, but {what} begins with <{root}>")
     if space:
         for element in tree.iter():
             element.tag = element.tag.removeprefix(space + "}")

@@ -20,7 +20,7 @@ from graspd.worker.hands.robot import Ints, Shape
 from graspd.worker.objects.formats import Nearby, Soup, read_mesh
 from graspd.worker.objects.topology import compact
 
-#: Largest total of a hand's visual meshes [faces]: more would not change a picture.
+#: Largest total number of faces of a hand's visual meshes: more would not change a picture.
 MAX_FACES: Final = 400_000
 
 
@@ -34,7 +34,7 @@ class VisualMesh:
     faces: Ints
     """(F, 3)"""
     colour: tuple[float, float, float] | None
-    """sRGB, 0 .. 1; None: not stated."""
+    """sRGB, 0 .. 1; None if not stated."""
 
 
 @dataclass(frozen=True)
@@ -160,9 +160,9 @@ def _file_of(item: PlacedShape, files: Mapping[str, bytes], base: str) -> str:
 
 
 def find_mesh(filename: str, files: Mapping[str, bytes], base: str, link: str) -> str:
-    """Return the name in `files` of a URDF's mesh, see `read_reference`.
-    Without an exact match: the only file with the same end of its path, else a path that differs in case.
-    Raises HandError: it is missing, or lies outside the upload."""
+    """Return the name in `files` of a mesh that a URDF references; see `read_reference`.
+    Without an exact match, return the only file whose path has the same end, else one whose path differs in case.
+    Raises HandError: the mesh is missing, or lies outside the upload."""
     try:
         reference = read_reference(filename, base)
     except InputError as error:

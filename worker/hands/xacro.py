@@ -25,7 +25,7 @@ CPU_LIMIT_S: Final = 10
 MEMORY_LIMIT_BYTES: Final = 2**30
 #: Wall time limit [s], which ends a child that waits without computing.
 _WALL_LIMIT_S: Final = 1800.0
-#: Files that an expansion may read; meshes are only named.
+#: Suffixes of files that an expansion may read; of other files it gets only the names.
 _READ: Final = (".xacro", ".urdf", ".xml", ".yaml", ".yml")
 
 

@@ -97,7 +97,7 @@ def _expand(given: dict[str, Any]) -> str:
         raise Refused(f"asks for the environment variable {name!r}; write its value out")
 
     def evaluate(expression: str, symbols: dict[str, Any], scope: Any = None) -> Any:
-        # The table itself is changed: it has the enclosing scopes, a copy would not.
+        # The table itself is changed: a copy would lack the enclosing scopes.
         symbols.update(__builtins__={})
         return eval(_checked(expression), symbols, scope)
 
@@ -155,7 +155,7 @@ def _checked(expression: str) -> Any:
 
 
 def _package(package: str, names: list[str], texts: dict[str, str]) -> str | None:
-    """Return the folder of a ROS package, relative to the top: by its manifest, else by its name."""
+    """Find the folder of a ROS package by manifest, else by name; return its path relative to the top."""
     for name, text in texts.items():
         if posixpath.basename(name) == "package.xml" and f"<name>{package}</name>" in "".join(text.split()):
             return posixpath.dirname(name)
@@ -185,7 +185,7 @@ def _refuse(event: str, _arguments: tuple[Any, ...]) -> None:
 
 
 def _error_text(error: BaseException) -> str:
-    """Return a one-line message; for wrapped errors that of the inner refusal."""
+    """Return a one-line message: that of a wrapped refusal if there is one, else of the error."""
     at: BaseException | None = error
     while at is not None:
         if isinstance(at, Refused):

@@ -67,7 +67,7 @@ def caching_steps(kind: str, terms: tuple[str | int, ...], code: tuple[ModuleTyp
 
 
 def cached_step(what: str, given: Sequence[NDArray[Any]], make: Callable[[], Sequence[NDArray[Any]]]) -> Arrays:
-    """Return arrays that depend on `given` only, as "0", "1", ...: cached by `caching_steps`, or computed."""
+    """Return arrays "0", "1", ... that depend only on `given`; inside `caching_steps` they are cached."""
     known = _recalled.get()
     if known is None:
         return {str(number): array for number, array in enumerate(make())}
@@ -120,7 +120,7 @@ TOLD_IF_SET: Final = MappingProxyType({"told_if_set": True})
 
 
 def content_of(model: Any) -> str:
-    """Compute a digest of a dataclass without its name and its files' digest: arrays bit for bit.
+    """Compute a digest of a dataclass without its name and its files' digest; arrays count bit for bit.
     Raises TypeError: a field is no number, string, array, tuple or set of these, nor a dataclass."""
     whole = hashlib.sha256()
     for part in _parts({name: value for name, value in _digest_fields(model).items() if name not in _NAMES}):

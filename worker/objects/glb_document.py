@@ -35,7 +35,7 @@ class Document:
     ) -> dict[str, Any]:
         """Add a primitive of vertices (V, 3), faces (F, 3) and unit normals per face corner (F, 3, 3).
         Colours are linear RGB: one for all faces, or one for each face (F, 3)."""
-        # A vertex on a crease is repeated for each of its normals. 127 steps per half axis are below half a degree.
+        # A vertex on a crease is repeated for each of its normals. Normals of 8 bits err by less than half a degree.
         small = np.round(127 * normals.reshape(-1, 3)).astype(np.int8)
         corners = np.concatenate([faces.reshape(-1, 1), small], axis=1)
         if face_colours is not None:

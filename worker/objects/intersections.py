@@ -16,7 +16,7 @@ from graspd.worker.objects.topology import Indices
 
 Mesh = tuple[Floats, Indices]
 
-#: Largest searched mesh [faces]: the search of a larger mesh would cost more than all other steps.
+#: Largest number of faces of a searched mesh: a larger search would cost more than all other steps.
 MAX_FACES: Final = 120_000
 #: Largest number of pairs of near pieces; bounds memory and time.
 MAX_PAIRS: Final = 6_000_000
@@ -33,7 +33,7 @@ _CHUNK: Final = 200_000
 
 
 def crossings(vertices: Floats, faces: Indices) -> Indices | None:
-    """Find pairs (P, 2) of intersecting faces without a common vertex; None: too many faces or near pairs.
+    """Find pairs (P, 2) of intersecting faces without common vertex; None if the mesh is too large.
     The broad phase cuts faces into small pieces, and keeps faces whose pieces' balls and whose boxes overlap. The
     narrow phase keeps pairs in which an edge of one face passes through the interior of the other."""
     from scipy.spatial import cKDTree

@@ -28,7 +28,7 @@ class MassProperties:
 
 
 def mass_properties(vertices: Floats, faces: FaceIndices) -> MassProperties:
-    """Integrate over the tetrahedra between the faces and one point (Tonon 2004).
+    """Compute mass properties as sums over tetrahedra between the faces and one point (Tonon 2004).
     The point is the mean vertex, so that a mesh far from its origin loses no digits."""
     origin = vertices.mean(axis=0)
     a, b, c = np.moveaxis(vertices[faces] - origin, 1, 0)
@@ -57,7 +57,7 @@ CREASE_DEG = 40.0
 
 
 def corner_normals(vertices: Floats, faces: Ints, crease_deg: float = CREASE_DEG) -> Floats:
-    """Compute unit normals (F, 3, 3).
+    """Compute a unit normal for each corner of each face (F, 3, 3).
     The normal of a corner is the mean normal of the faces at its vertex, weighted by their angle there. Only faces
     inclined to the corner's own face by less than the crease angle count."""
     from scipy.sparse import csr_matrix
@@ -80,7 +80,7 @@ def corner_normals(vertices: Floats, faces: Ints, crease_deg: float = CREASE_DEG
 
 
 def points_in(corners: Floats, u: Floats, v: Floats) -> Floats:
-    """Return points of triangles (n, 3, 3), uniform for uniform numbers (n, 1) in [0, 1)."""
+    """Return points (n, 3) of triangles (n, 3, 3), uniform for uniform numbers u, v (n, 1) in [0, 1)."""
     u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
     return corners[:, 0] + u * (corners[:, 1] - corners[:, 0]) + v * (corners[:, 2] - corners[:, 0])
 
@@ -157,7 +157,7 @@ def _apart(low: Floats, high: Floats, i: int) -> Floats:
 
 
 #: Number of digits of the longest extent to which coordinates are rounded, so that no sliver collapses. Least number
-#: for a mesh of decimal coordinates.
+#: of digits for a mesh of decimal coordinates.
 DIGITS: Final = 9
 LEAST_DIGITS: Final = 5
 
@@ -205,7 +205,7 @@ def shift_frame(pose: ArrayLike, by: ArrayLike) -> Floats:
 
 
 def to_centre(pose: ArrayLike, centre: ArrayLike) -> Floats:
-    """Convert poses (..., 7) of the file's frame to the centred frame; `centre` (3,) is its origin there.
+    """Convert poses (..., 7) of the file's frame to the centred frame, whose origin is `centre` (3,).
     The result is on a grid, so that the round trip gives the same bits."""
     return moved(shift_frame(pose, centre), np.zeros(3))
 

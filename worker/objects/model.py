@@ -1,7 +1,7 @@
 """Model of an object for the engine: a closed, outward, simplified triangle mesh with mass properties.
 
-All data are in the frame of the uploaded mesh, in metres; `ObjectModel.centred` is relative to its middle, for the
-engine: see `worker.objects.mesh_geometry`."""
+All data are in metres and in the frame of the uploaded mesh. `ObjectModel.centred` has its origin at the mesh's middle,
+for the engine: see `worker.objects.mesh_geometry`."""
 
 from __future__ import annotations
 
@@ -52,16 +52,16 @@ class ObjectModel:
     friction: float = field(default=FRICTION, metadata=TOLD_IF_SET)
     """Coulomb coefficient of its contacts in simulation."""
     about_centre: Floats | None = field(default=None, repr=False)
-    """(V + H + 1, 3) vertices, hull, centre of mass relative to the middle [m]; None: already centred."""
+    """(V + H + 1, 3) vertices, hull and centre of mass relative to the middle [m]; None if centred."""
 
     @cached_property
     def content(self) -> str:
-        """Digest of the prepared model; `digest` is the file's, the same for every fidelity."""
+        """Digest of the prepared model; `digest` is that of the file, equal for every fidelity."""
         return content_of(self)
 
     @property
     def centred(self) -> ObjectModel:
-        """The object in the frame of its middle: the same bits for any origin of the file."""
+        """The object in a frame at its middle: the same bits for any origin of the file."""
         if self.about_centre is None:
             return self
         count = len(self.vertices)
@@ -69,7 +69,7 @@ class ObjectModel:
         return self._in_frame(vertices, hull, mass, (0.0, 0.0, 0.0), None)
 
     def at(self, centre: tuple[float, float, float]) -> ObjectModel:
-        """Place a centred object in a frame with its middle at `centre` [m]."""
+        """Return a centred object in a frame in which the object's middle is at `centre` [m]."""
         if not any(centre):
             return self
         held = np.concatenate([self.vertices, self.hull_vertices, self.centre_of_mass[None]])
@@ -87,7 +87,7 @@ class ObjectModel:
     def with_mass(
         self, *, mass: float | None = None, density: float | None = None, friction: float | None = None
     ) -> ObjectModel:
-        """Return the object with another mass [kg], or density [kg/m^3], and friction; None: unchanged.
+        """Return the object with another mass [kg], or density [kg/m^3], and friction; None changes nothing.
         Raises MeshError: the mass would exceed `MOST_KG`."""
         if mass is None:
             mass = self.mass if density is None else density * self.volume

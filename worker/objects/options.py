@@ -35,7 +35,7 @@ def parse_options(files: Mapping[str, bytes], extra: Mapping[str, Any] | None = 
 
 
 def stated_options(files: Mapping[str, bytes], error: type[AssetError]) -> dict[str, Any]:
-    """Return the keys of `asset.json` among the files; `error` if it is no JSON object."""
+    """Return the keys of `asset.json` among the files; raise `error` if it is no JSON object."""
     try:
         stated = json.loads(files["asset.json"]) if "asset.json" in files else {}
     except (ValueError, RecursionError):
@@ -46,7 +46,7 @@ def stated_options(files: Mapping[str, bytes], error: type[AssetError]) -> dict[
 
 
 def for_request(obj: ObjectModel, request: JobOptions) -> ObjectModel:
-    """Return the object with the job's mass and friction, else its own; dexgraspbench: the published ones.
+    """Return the object with the job's mass and friction; at level dexgraspbench, with the protocol's.
     Raises MeshError: the mass would exceed 100 kg."""
     if request.validation == "dexgraspbench":
         return obj.for_dexgraspbench

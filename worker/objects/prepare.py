@@ -46,7 +46,7 @@ def load_object(
     """Load the object in `files`: a mesh (STL, OBJ, PLY, OFF, GLB or DAE) and optionally `asset.json` (see
     `ObjectOptions`).
     `digest` is that of the files; `options` are keys that override those of `asset.json`. The prepared surface lies
-    within `face_error_m` of the uploaded one [m]; 0: no simplification. Raises MeshError: the mesh cannot be used; the
+    within `face_error_m` of the uploaded one [m]; 0 keeps all faces. Raises MeshError: the mesh cannot be used; the
     message names the fault and the fix."""
     settings = parse_options(files, options)
     main = main_file(files, settings)
@@ -75,7 +75,7 @@ def main_file(files: Mapping[str, bytes], options: ObjectOptions) -> str:
 
 @lru_cache(maxsize=8)
 def _prepared(main: str, data: bytes, options_json: str, face_error_m: float) -> ObjectModel:
-    """Prepare, cached in memory and on disk: batches of a job and repeated commands share an object."""
+    """Prepare an object; cached in memory and on disk for batches of a job and repeated commands."""
     terms = [Path(main).suffix.lower(), options_json, repr(face_error_m), hashlib.sha256(data).hexdigest(), revision()]
     file = user_cache.folder("objects") / f"{digest_json(terms)}.npz"
     if (held := user_cache.load(file)) is not None:
@@ -190,24 +190,24 @@ Mesh = tuple[Floats, Indices]
 FEW_FACES: Final = 64
 #: Meshes with more faces are first reduced to about this number.
 MANY_FACES: Final = 40_000
-#: The search ends when two targets differ by less than this factor.
+#: The search ends when its bounds on the number of faces differ by less than this factor.
 STEP: Final = 1.12
-#: Number of surface samples besides the vertices at which each trial is compared, and the share of the bound within
-#: which it must stay there.
+#: Number of surface samples, besides the vertices, at which a simplified mesh is compared with the original, and its
+#: largest deviation there as a share of the bound.
 SAMPLES: Final = 4000
 MARGIN: Final = 0.9
 #: Number of samples at which the deviation of the returned mesh is measured.
 DENSE_SAMPLES: Final = 30_000
-#: Aggressiveness of the edge collapse: the lowest that reaches its target. Its error is least, and few meshes break.
+#: Aggressiveness of the edge collapse. The lowest value that reaches the target has the least error.
 PATIENCE: Final = 3
 
 
 def simplify(vertices: Floats, faces: Indices, error_m: float, *, closed: bool = True) -> tuple[Floats, Indices, float]:
     """Find the coarsest mesh whose surface lies within `error_m` of the given one, both ways.
     Quadric edge collapse (Garland & Heckbert 1997) reduces the mesh; bisection finds the number of faces. Each trial is
-    measured. For closed meshes it must be an oriented 2-manifold with as many shells as the original. If no trial of a
-    closed mesh passes, manifold3d's edge collapse is used. If that gains nothing, the mesh stays unchanged. Return
-    vertices, faces and the measured deviation [m]."""
+    measured. A trial of a closed mesh must be an oriented 2-manifold with as many shells as the original. If none
+    passes for a closed mesh, manifold3d's edge collapse is used. If that gains nothing, the mesh stays unchanged.
+    Return vertices, faces and the measured deviation [m]."""
     if error_m <= 0 or len(faces) <= FEW_FACES:
         return vertices, faces, 0.0
     limit = MARGIN * error_m
@@ -258,7 +258,7 @@ class ReferenceMesh:
         )
 
     def within(self, mesh: Mesh, limit: float) -> bool:
-        """Check whether two surfaces lie within `limit` [m], both ways, over vertices and even samples."""
+        """Check whether a mesh and the original lie within `limit` [m] at vertices and even samples."""
         back, own = MeshDistance(*mesh), surface_points(*mesh, SAMPLES)
         # A few points reject most meshes that are too coarse. All points are checked only if these pass.
         return all(
@@ -326,7 +326,7 @@ def to_bytes(obj: ObjectModel) -> bytes:
 
 
 def from_bytes(data: bytes, *, name: str, digest: str) -> ObjectModel:
-    """Load what `to_bytes` wrote; raise ValueError, KeyError, OSError, EOFError or BadZipFile."""
+    """Load an object from `to_bytes`; bad data raise ValueError, KeyError, OSError, EOFError, BadZipFile."""
     with np.load(io.BytesIO(data), allow_pickle=False) as stored:
         plain = json.loads(stored["plain"].tobytes())
         arrays = {field: stored[field] for field in _ARRAYS}

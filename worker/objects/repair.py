@@ -24,7 +24,7 @@ from graspd.worker.objects.topology import Indices
 
 MAX_EXTENT_M: Final = 3.0
 MIN_EXTENT_M: Final = 1e-3
-#: Range of extents of graspable objects, and the median extent of YCB's [m], for hints on units.
+#: Range of extents of graspable objects, and the median extent of YCB objects [m], for hints on units.
 HAND_SIZES_M: Final = (0.02, 0.6)
 TYPICAL_SIZE_M: Final = 0.12
 #: Largest gap between parts of one rigid body [m]; assemblies have such gaps between joined parts.
@@ -56,7 +56,7 @@ class RepairedMesh:
     repairs: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     self_intersections: int | None = None
-    """Pairs of faces that still intersect; None: not checked."""
+    """Pairs of faces that still intersect; None if not checked."""
     moved_m: float = 0.0
     """Largest distance of the repaired surface from the original [m]."""
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)

@@ -50,7 +50,7 @@ def face_areas(vertices: Floats, faces: FaceIndices) -> Floats:
 
 
 def outward_hull(points: Floats, simplices: NDArray[Any], normals: Floats) -> tuple[Floats, NDArray[np.int32]]:
-    """Return corners (H, 3) and outward triangles (G, 3) of qhull's simplices with their outward normals."""
+    """Return corners (H, 3) and outward triangles (G, 3) from qhull's simplices and outward normals."""
     corners, faces = compact(points, simplices)
     inward = np.einsum("ij,ij->i", face_vectors(corners, faces), normals) < 0
     faces[inward] = faces[inward][:, ::-1]
@@ -132,13 +132,13 @@ def open_edges(faces: Indices) -> int:
 
 
 def _by_edge(faces: Indices) -> tuple[Indices, Indices, Indices]:
-    """Return directed edges (3F,) sorted by undirected edge, and each one's first place and count (E,)."""
+    """Return directed edges (3F,) sorted by undirected edge, and the first place and count (E,) of each."""
     index, counts = edge_faces(faces)
     return np.argsort(index, kind="stable"), np.cumsum(counts) - counts, counts
 
 
 def pair_faces(faces: Indices) -> tuple[Indices, Indices, Mask]:
-    """Return the two faces at each manifold edge, (M,) and (M,), and a mask (M,): their windings agree."""
+    """Return the two faces, (M,) and (M,), at each manifold edge, and a mask (M,) of agreeing windings."""
     order, starts, counts = _by_edge(faces)
     pairs = starts[counts == 2]
     one, two = order[pairs], order[pairs + 1]

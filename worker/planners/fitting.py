@@ -99,7 +99,7 @@ def even_points(obj: ObjectModel, count: int, rng: np.random.Generator) -> tuple
 
 
 def _exits(start: Floats, way: Floats, corners: Floats, normal: Floats) -> tuple[NDArray[np.intp], Floats]:
-    """Intersect rays (n, 3), (n, 3) with triangles (F, 3, 3); return ray index and distance [m] of exits.
+    """Intersect rays from `start` (n, 3) with F triangles; return ray index and distance [m] of exits.
     A ray exits through a face whose normal points along the ray (Moeller and Trumbore 1997)."""
     edge1, edge2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     p = np.cross(way[:, None], edge2[None])

@@ -19,10 +19,10 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.environment import PlacedGrasps
 
-#: Scores (N,) of N grasps, in their scenes or around a free object (None). Smaller is better: below 1 a grasp holds at
-#: half friction, below 2 at full friction; from 2 on, more candidates are worth their cost. The third argument is the
-#: score to beat for each grasp, inf without one. A rollout may stop early if it cannot beat this score. Several threads
-#: may call the function at once.
+#: Returns scores (N,) of grasps in their scenes or, for None, around a free object. Smaller is better: below 1 a grasp
+#: holds at half friction, below 2 at full friction; from 2 on, more candidates are worth their cost. The third argument
+#: is the score to beat for each grasp, inf without one. A rollout may stop early if it cannot beat this score. Several
+#: threads may call the function at once.
 Rollout = Callable[[GraspSet, PlacedGrasps | None, NDArray[np.float64]], NDArray[np.float64]]
 
 
@@ -40,9 +40,9 @@ class PlanRequest:
     batch: int = 0
     """Number of the batch among those of one seed."""
     placed: PlacedGrasps | None = None
-    """Scenes: grasp i is in scene `placed.index[i]`; None: around a free object."""
+    """Scenes, with grasp i in scene `placed.index[i]`; None if the object is free."""
     rollout: Rollout | None = None
-    """Rollout that scores the candidates of a grasp; None: the planner's own merit selects one."""
+    """Rollout that scores the candidates of a grasp; if None, the planner's own merit selects one."""
     first: int = 0
     """Number of the first grasp within its batch; above 0 only for methods with `in_parts`."""
     others_have_place: bool = False
@@ -106,7 +106,7 @@ class Method:
     uses: tuple[str, ...] = ()
     """Settings of `Fidelity` that affect its grasps; other settings are ignored."""
     joined: Callable[[Any], BatchPlanner] | None = None
-    """Factory of the planner of several batches in one launch; None: batches are planned one by one."""
+    """Factory of the planner of several batches in one launch; if None, batches are planned one by one."""
     files: Mapping[str, Callable[[Path], str]] = field(default_factory=dict)
     """Options that users give as files, each with a function that caches the file in this process.
     The function returns the file's digest, which becomes the option's value."""

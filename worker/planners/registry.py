@@ -57,7 +57,7 @@ def method(name: str) -> Method:
 
 def planner(name: str, options: Mapping[str, Any] | None = None, *, in_scenes: bool = False) -> Planner:
     """Return the planner of a method with its options; strings are parsed as the option's type.
-    Raises InputError: unknown method, unknown option or value out of range; or the method does not plan `in_scenes`."""
+    Raises InputError: unknown method, unknown option, value out of range, or a method that `in_scenes` excludes."""
     known = method(name)
     if in_scenes and not known.in_scenes:
         able = ", ".join(one for one in method_names() if method(one).in_scenes)
@@ -68,7 +68,7 @@ def planner(name: str, options: Mapping[str, Any] | None = None, *, in_scenes: b
 
 
 def joined(name: str, options: Mapping[str, Any] | None = None) -> BatchPlanner | None:
-    """Return a method's planner of several batches in one launch; None: batches are planned one by one."""
+    """Return a method's planner of several batches in one launch; None if it plans them one by one."""
     make = method(name).joined
     return make(_options(name, options)) if make is not None else None
 

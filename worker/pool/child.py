@@ -26,7 +26,7 @@ class WorkItem:
 
     work: Callable[[Any, Any], Any]
     key: str  # key of the data shared with other items
-    shared: bytes | None  # pickled shared data; None: sent before
+    shared: bytes | None  # pickled shared data; None if sent before
     forget: tuple[str, ...]
     part: Any
 

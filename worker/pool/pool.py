@@ -206,7 +206,7 @@ class _Place:
 
 
 def start_child(command: Sequence[str], **options: Any) -> tuple[Connection, subprocess.Popen[bytes]]:
-    """Start a process with a pipe; its last argument is the file descriptor of its end. Raises OSError."""
+    """Start a process with a pipe, whose file descriptor becomes the last argument. Raises OSError."""
     ours, theirs = Pipe()
     with theirs:
         process = subprocess.Popen(

@@ -2,7 +2,7 @@
 
 Over a pipe the worker (`worker.process.main`) first sends a `Setup`, then orders of the form (name, argument).
 `service` compares store and Redis. `check` is answered by `ready`, `task` by `done` and then `idle`; `end` ends the
-process. Any answer may instead be `refused`, an error. `stop` with a reason is accepted at any time. The engine also
+process. `refused`, with an error, may replace any answer. `stop` with a reason is accepted at any time. The engine also
 sends `facts` for the list of workers (including progress) and `event`. It does not access Redis."""
 
 from __future__ import annotations
@@ -107,8 +107,8 @@ class Engine:
 
     def _admitted(self) -> bool:
         """Check the engine before the first task; with `Setup.patient`, wait in quarantine until it passes."""
-        # Only the most expensive stage is checked. Other stages load with their first task, and are checked after
-        # failures.
+        # Synthesis is the most expensive stage. If it is among the stages, the others are only checked after failures
+        # and load with their first task.
         stages = self._setup.stages
         first = (Stage.SYNTHESIZE,) if Stage.SYNTHESIZE in stages else stages
         fit = self._fitness.try_engine(first) or (self._setup.patient and self._wait_in_quarantine(first))
@@ -170,7 +170,7 @@ class Engine:
 
 
 class TaskResources:
-    """Resources of a task besides its message. A worker that grew too large (leaks) is replaced."""
+    """Resources of a task besides its message, and the memory limit above which a worker is replaced."""
 
     def __init__(self, settings: Settings, store: Store, device: Device) -> None:
         self.settings = settings
@@ -220,7 +220,7 @@ class TaskResources:
 
 def resident_mb(pid: int | None = None) -> float:
     """Return the resident memory of this process or another one [MiB].
-    If the system does not report it: this process's peak, or 0 for another process."""
+    If the system does not report it, return this process's peak, or 0 for another process."""
     try:
         pages = int(Path(f"/proc/{pid or 'self'}/statm").read_text().split()[1])
     except (OSError, ValueError, IndexError):

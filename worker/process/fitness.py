@@ -86,7 +86,7 @@ class Fitness:
     def wait_in_quarantine(
         self, stages: Collection[Stage], update: Callable[..., None], told_to_stop: Callable[[], bool]
     ) -> bool:
-        """Wait in quarantine, reported by `update`; return True once the worker is fit, False if it must stop."""
+        """Wait in quarantine, reported by `update`; return True once fit, False on a stop or a lasting fault."""
         log.warning("this worker takes no tasks: %s", self.reason)
         for pause in PAUSES_S:
             update(state="quarantined", reason=self.reason)

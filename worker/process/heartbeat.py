@@ -38,7 +38,7 @@ class Heartbeat:
         alive: Path | None = None,
         is_stopped: Callable[[], bool] = lambda: False,
     ) -> None:
-        """`lease_s` is the lifetime of the registration after a heartbeat [s]; each heartbeat touches `alive`.
+        """`lease_s` [s] is the registration's lifetime after a heartbeat; each one touches the file `alive`.
         No heartbeat is sent while `is_stopped` returns True: the worker hangs, although this thread runs."""
         self._connection: Any = connect(url, patience=0, timeout_s=_ANSWER_S)
         self._facts, self._lease_s = asdict(beat), lease_s
@@ -56,7 +56,7 @@ class Heartbeat:
         self._changed.set()
 
     def stop(self) -> None:
-        """End the registration and record a regular end; no-op before the first heartbeat."""
+        """End the registration and record a regular end; before `start`, do nothing."""
         if self._thread.ident is None:
             return
         self._over.set()

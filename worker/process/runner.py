@@ -130,7 +130,7 @@ class Runner:
         return self._event(EventKind.FINISHED, message, output=output, seconds=seconds)
 
     def _loss(self, error: Exception, context: TaskContext) -> str:
-        """Return the state of the device or pool process if it caused the error; else ""."""
+        """Return how the device or a pool process was lost if that caused the error; else ""."""
         try:
             self._check_device(context.device)
         except DeviceLost as lost:

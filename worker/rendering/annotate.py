@@ -16,7 +16,7 @@ BACKGROUND, TABLE, OBJECT = 0, 1, 2
 
 
 def tight_boxes(segmentation: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Return boxes (V, 4) x_min y_min x_max y_max [px] of visible object pixels (V, H, W); nan: none.
+    """Return boxes (V, 4) x_min y_min x_max y_max [px] of visible object pixels (V, H, W); nan if none.
     Edges are pixel edges: a single pixel (i, j) gives i, j, i + 1, j + 1."""
     mask = segmentation == OBJECT
     boxes = np.full((len(mask), 4), np.nan, np.float32)
@@ -27,7 +27,7 @@ def tight_boxes(segmentation: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 
 def box_corners(vertices: Floats) -> Floats:
-    """Return the corners (8, 3) of the object-aligned box; bits 0, 1, 2 of k select maximum x, y, z."""
+    """Return the corners (8, 3) of the axis-aligned box; bits 0, 1, 2 of row k select maximum x, y, z."""
     bits = (np.arange(8)[:, None] >> np.arange(3)) & 1
     return np.where(bits, vertices.max(axis=0), vertices.min(axis=0))
 
@@ -46,7 +46,7 @@ def parse_channels(words: Iterable[str]) -> tuple[str, ...]:
 
 
 def occlusion_ratio(segmentation: NDArray[np.uint8], alone: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Return the occluded share (V,) of the object's pixels; nan: the object is not in the picture.
+    """Return the occluded share (V,) of the object's pixels; nan if the object is not in the picture.
     `segmentation` (V, H, W) labels the scene, `alone` (V, H, W) are the object's pixels in a picture of the object
     alone."""
     whole = alone.sum(axis=(1, 2)).astype(float)

@@ -21,7 +21,7 @@ FIELD_OF_VIEW: Final = np.radians(40.0)
 BASELINE_M: Final = 0.06
 ELEVATION: Final = (np.radians(18.0), np.radians(62.0))  # elevation of a sampled camera above the table [rad]
 FILL: Final = (0.7, 1.0)  # share of the smaller field of view that the object's bounding ball fills
-NEAREST_M: Final = 0.25  # least distance from the object [m]: nearer, a picture of a stereo pair may cut it off
+NEAREST_M: Final = 0.25  # least distance from the object [m]: below it, a stereo picture may cut the object off
 AIM_JITTER: Final = 0.15  # largest offset of the aim from the object's centre along each axis, in bounding radii
 
 
@@ -98,9 +98,9 @@ def distance_to_fill(radius: float, field_of_view: float, fill: float) -> float:
 def sample_hemisphere(
     centre: Floats, radius: float, *, views: int, field_of_view: float, rng: np.random.Generator
 ) -> list[Floats]:
-    """Sample extrinsics of cameras around a ball (centre, radius [m]) that fills the field of view [rad].
-    They are on a hemisphere: azimuths are stratified, one per sector of 360 / views degrees; elevations are uniform in
-    area within `ELEVATION`."""
+    """Sample extrinsics of cameras on a hemisphere around a ball that fills the field of view [rad].
+    Azimuths are stratified, one per sector of 360 / views degrees. Elevations are uniform in area within
+    `ELEVATION`."""
     turn = rng.uniform(0, 2 * np.pi)
     extrinsics = []
     for view in range(views):
@@ -123,7 +123,7 @@ def stereo_pair(extrinsics: Floats, baseline: float) -> tuple[Floats, Floats]:
     return left, right
 
 
-ROTATION_ERROR: Final = 1e-5  # tolerance of rotations in a file: six digits are usual in JSON written by hand
+ROTATION_ERROR: Final = 1e-5  # tolerance of rotations in a file: JSON written by hand usually has six digits
 
 _Row3 = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
 _Row4 = Annotated[list[FiniteFloat], Field(min_length=4, max_length=4)]

@@ -17,7 +17,7 @@ from graspd.service.store.shards import Shard
 from graspd.worker.rendering.annotate import BACKGROUND, OBJECT, TABLE
 
 DepthFormat = Literal["exr", "png"]
-#: One step of a 16-bit depth PNG [m]: it reaches 6.5 m; 0 means no surface.
+#: One step of a 16-bit depth PNG [m]: the PNG reaches 6.5 m; 0 means no surface.
 PNG_STEP_M: Final = 1e-4
 _EYES: Final = ("mono", "left", "right")
 #: Datasets and their file names in Replicator's BasicWriter.
@@ -27,10 +27,10 @@ _DISTANCES: Final = {"image/depth": "distance_to_image_plane", "image/distance":
 def export_images(views: Shard, folder: Path, *, depth: DepthFormat = "exr") -> list[Path]:
     """Write every picture of a views shard under Replicator's BasicWriter file names; return the files.
     Per picture: `rgb_NNNN.png` (8 bits), `semantic_segmentation_NNNN.png` (8 bits, the labels themselves),
-    `view_NNNN.json`, and the depth as `distance_to_image_plane_NNNN.exr` (float32 [m], channel Z, inf: nothing) or
-    `.png` (16 bits, steps of 0.1 mm, 0: nothing). If the shard has them: `distance_to_camera_NNNN`, `normals_NNNN.exr`
-    (half, X Y Z), `rgb_hand_NNNN.png`. For all pictures: `labels.json`. The folder is created if absent. Raises
-    InputError: the folder cannot be written, or has such files already."""
+    `view_NNNN.json`, and the depth as `distance_to_image_plane_NNNN.exr` (float32 [m], channel Z, inf for no surface)
+    or `.png` (16 bits, steps of 0.1 mm, 0 for no surface). If the shard has them: `distance_to_camera_NNNN`,
+    `normals_NNNN.exr` (half, X Y Z), `rgb_hand_NNNN.png`. For all pictures: `labels.json`. The folder is created if
+    absent. Raises InputError: the folder cannot be written, or has such files already."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -64,7 +64,7 @@ def _one(views: Shard, view: int, folder: Path, depth: DepthFormat) -> list[Path
 
 
 def describe(views: Shard, view: int) -> dict[str, Any]:
-    """Return camera and boxes of one picture; null where the object is not visible."""
+    """Return camera and boxes of one picture; a box is None where the object is not visible."""
     height, width = views["image/rgb"].shape[1:3]
     e = np.asarray(views["camera/extrinsics"][view], float)
     said: dict[str, Any] = {

@@ -24,7 +24,7 @@ from graspd.worker.rendering.scenery import Appearance, Solid
 _HAND: Final = Appearance(hexadecimal("#59636e"), roughness=0.42, metalness=0.35)
 _PALM: Final = Appearance(hexadecimal("#434b54"), roughness=0.48, metalness=0.35)
 _TIP: Final = Appearance(hexadecimal("#2fa7a0"), roughness=0.38)
-_AWAY_M: Final = -50.0  # depth of a hidden hand: under the floor, out of every picture [m]
+_AWAY_M: Final = -50.0  # z of a hidden hand [m]: under the floor, out of every picture
 
 
 @dataclass(frozen=True)
@@ -33,10 +33,10 @@ class DrawnHand:
 
     hand: HandModel
     grasp: NDArray[np.int32]
-    """(S,) row of the grasp in the scene shard (in the base shard if planned in its scene); -1: no hand."""
+    """(S,) row of the grasp in the scene shard (in the base shard if planned in its scene); -1 for no hand."""
     hand_pose: Floats  # (S, 7) root link in the table frame; ignored where there is no grasp
     joint_positions: Floats  # (S, J)
-    wrist: Floats | None = None  # (S, U) wrist angles for drawing the links above the hand's root; None: not drawn
+    wrist: Floats | None = None  # (S, U) wrist angles for drawing the links above the hand's root; None hides them
 
     def body_poses(self) -> Floats:
         """Return poses (S, B, 7) of the drawn bodies in the table frame."""

@@ -26,7 +26,7 @@ THREE_SIDES: Final = tuple(np.radians([-35.0, 85.0, 205.0]).tolist())
 ELEVATION: Final = np.radians(20.0)
 FIELD_OF_VIEW: Final = np.radians(24.0)
 SAMPLES: Final = 12
-#: Hand parts farther than this from the object's hull are not framed [m]: a forearm may leave the picture.
+#: Hand parts farther than this from the object's bounding ball are not framed [m]: a forearm may leave the picture.
 NEAR_M: Final = 0.14
 _TOGETHER: Final = 16  # grasps traced together: bounds the memory
 
@@ -56,7 +56,7 @@ def grasp_pictures(
     run: ExecutionContext = DEFAULT_CONTEXT,
     samples: int = SAMPLES,
 ) -> NDArray[np.uint8]:
-    """Render root poses (N, 7) in the object frame and joints (N, J) from A sides: (N, A, H, W, 3) sRGB.
+    """Render hands at root poses (N, 7) in the object frame from A sides; return sRGB (N, A, H, W, 3).
     Azimuths [rad] are about the object's z axis; 0 looks across the direction in which the palm approaches. Object and
     hand fill the picture of `size` [px]. Raises TaskCancelled: `run.cancelled()` returned True."""
     hand_pose = moved(np.atleast_2d(np.asarray(hand_pose, float)), np.negative(obj.centre))

@@ -91,7 +91,7 @@ def write_png(image: Image.Image, path: Path) -> None:
 def _shoot(
     solids: Sequence[Solid], poses: Floats, looks: list[Appearance], points: Floats, azimuths: ArrayLike
 ) -> NDArray[np.uint8]:
-    """Render W worlds (W, H, W, 3), each from its azimuth; every camera frames the same points."""
+    """Render N worlds (N, H, W, 3), each from its azimuth; every camera frames the same points."""
     worlds = len(poses)
     stage = Tracer([Box(FLOOR_SIZE), *solids], "cpu")
     floors = np.tile(floor_pose(points), (worlds, 1, 1))
@@ -114,7 +114,7 @@ def _page(pictures: NDArray[np.uint8], captions: Sequence[str]) -> Image.Image:
 
 
 def _upright(hand: HandModel) -> Floats:
-    """Return the root pose with the approach along +y, right of a camera on +x, and fingertips up."""
+    """Return the root pose with fingertips up and the approach along +y, to the right seen from +x."""
     poses = body_poses(hand, IDENTITY_POSE, hand.expand(closing_posture(hand, 0.0)))[0]
     centres = {piece.body: apply(poses[piece.body], piece.vertices).mean(axis=0) for piece in hand.pieces}
     tips = np.mean([centres.get(body, poses[body, :3]) for body in hand.fingertips], axis=0)

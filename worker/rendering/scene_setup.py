@@ -43,8 +43,8 @@ from graspd.worker.rendering.scenery import (
 )
 from graspd.worker.rendering.tracer import Tracer
 
-#: Largest number of further draws of a camera. The first draw that sees at least this share of the object past the
-#: supports is used, else the best.
+#: Largest number of further draws of a camera, and share of the object that a draw must see past the supports. The
+#: first such draw is used, else the best.
 _DRAWS: Final = 32
 _SEEN: Final = 0.8
 #: Height at which hidden solids are out of every picture [m].
@@ -63,7 +63,7 @@ class CameraPlan:
     views: int
     width: int
     height: int
-    baseline_m: float | None  # baseline of stereo pairs; None: mono
+    baseline_m: float | None  # baseline of stereo pairs [m]; None for single cameras
     given: GivenCameras = SAMPLED
 
     @property
@@ -87,7 +87,7 @@ class CameraPlan:
         points: Floats = _NOWHERE,
     ) -> Floats:
         """Return extrinsics (placements * eyes, 4, 4) around a ball with a free view of the points.
-        Left comes before right."""
+        The left camera of a pair comes before the right one."""
         middles: Sequence[Floats]
         if self.given.extrinsics is not None:
             middles = list(self.given.extrinsics)
@@ -191,7 +191,7 @@ class _Scene:
         self.turn = float(rng.uniform(0, 2 * np.pi))
         yaw = rng.uniform(0, 2 * np.pi)
         self.poses = np.concatenate([slab_poses(supports, centre, yaw), poses])
-        # Drawn last, so that neighbours and walls do not change the appearance of the rest.
+        # Random draws for neighbours and walls come last, so that they do not change the appearance of the rest.
         others = [object_look(rng) for _ in objects[1:]]
         walls = table_look(rng) if len(supports) > 1 else table
         self.looks: list[Appearance] = [

@@ -59,10 +59,10 @@ class Pictures:
     """Pictures of V cameras."""
 
     rgb: NDArray[np.uint8]  # (V, H, W, 3) sRGB
-    depth: NDArray[np.float32]  # (V, H, W) along the optical axis [m]; inf: nothing
-    shape: NDArray[np.int64]  # (V, H, W) index of the solid at the pixel's centre; -1: nothing
+    depth: NDArray[np.float32]  # (V, H, W) along the optical axis [m]; inf without a surface
+    shape: NDArray[np.int64]  # (V, H, W) index of the solid at the pixel's centre; -1 without one
     normal: NDArray[np.float32] | None = None
-    """(V, H, W, 3) unit shading normal in the world's frame, zero for nothing; only if requested."""
+    """(V, H, W, 3) unit shading normal in the world's frame, zero without a surface; only if requested."""
 
 
 @dataclass(frozen=True)
@@ -84,9 +84,9 @@ class CameraShot:
 
 Supports = Sequence[HalfSpace | BoxSupport]
 
-TABLE_SIZE: Final = (1.2, 0.9, 0.04)  # a half-space is drawn as a slab whose top is its plane [m]
+TABLE_SIZE: Final = (1.2, 0.9, 0.04)  # size [m] of the slab that shows a half-space: its top is the plane
 TABLE: Final = (HalfSpace(),)  # default support of objects
-_FAR_M: Final = 0.35  # distance of an object from the origin, along a plane, above which its slab is centred at it [m]
+_FAR_M: Final = 0.35  # distance [m] along a plane from origin to object above which the slab is centred at the object
 
 
 def slabs(supports: Supports) -> list[Box]:
@@ -135,7 +135,7 @@ def visible_share(supports: Supports, eye: Floats, points: Floats) -> float:
 
 
 def _crosses(eye: Floats, points: Floats, pose: Floats, half: Floats) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Check whether lines from the eye to points cross a box (slabs test of Kay and Kajiya 1986)."""
+    """Return a mask (P,) of points whose line to the eye crosses a box (Kay and Kajiya 1986)."""
     inside = invert(pose)
     start = quat_rotate(inside[3:], eye) + inside[:3]
     along = quat_rotate(inside[3:], points) + inside[:3] - start

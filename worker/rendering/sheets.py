@@ -38,13 +38,13 @@ def best(quality: Arrays, count: int, among: NDArray[np.bool_]) -> NDArray[np.in
 
 
 def best_kept(scene: Arrays, base: Arrays) -> NDArray[np.int32]:
-    """Return the row (S,) of each scene's valid grasp with the largest epsilon; -1: none."""
+    """Return the row (S,) of each scene's valid grasp with the largest epsilon; -1 if it has none."""
     epsilon = metric_at_threshold(base, "quality/epsilon")[np.asarray(scene["grasp/base_index"])]
     return _best_of_scenes(scene, np.where(np.asarray(scene["grasp/valid"], bool), epsilon, -np.inf))
 
 
 def best_in_scenes(base: Arrays, among: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """Return the row (S,) with the largest epsilon planned in each scene, among a mask (N,); -1: none."""
+    """Return the row (S,) of each scene with the largest epsilon among a mask (N,); -1 if it has none."""
     return _best_of_scenes(
         base, np.where(among, np.nan_to_num(metric_at_threshold(base, "quality/epsilon"), nan=-1.0), -np.inf)
     )
@@ -174,7 +174,7 @@ def _caption(
     x, y = at
     draw.line([(x, y + 1), (x + width - 1, y + 1)], fill=RULE)
     text(draw, (x, y + 26), str(rank), 17, ACCENT)
-    # Ranks of up to three digits, then equal columns.
+    # Space for ranks of up to three digits, then equal columns.
     left, step = x + 34, (width - 34) / max(1, len(pairs))
     for k, (label, value) in enumerate(pairs):
         text(draw, (left + k * step, y + 18), label, 11, QUIET)
@@ -276,7 +276,7 @@ def text(
 
 
 def depth_colours(depth: NDArray[np.float32], near: float, far: float) -> NDArray[np.uint8]:
-    """Return colours (..., 3) of depths: light is near, dark is far, grey is nothing."""
+    """Return colours (..., 3) of depths: light is near, dark is far, grey is no surface."""
     t = np.clip((np.where(np.isfinite(depth), depth, near) - near) / max(far - near, 1e-9), 0, 1) * (len(_DEPTH) - 1)
     low = np.minimum(t.astype(int), len(_DEPTH) - 2)
     anchors = _DEPTH.astype(float)
@@ -292,5 +292,5 @@ def png(image: Image.Image) -> bytes:
 
 
 def with_palette(page: bytes) -> bytes:
-    """Return the PNG in 256 colours: a third of the bytes, for pages of documents."""
+    """Return the PNG in 256 colours, for documentation: a third of the bytes."""
     return png(Image.open(io.BytesIO(page)).convert("RGB").quantize(256, method=Image.Quantize.MEDIANCUT))

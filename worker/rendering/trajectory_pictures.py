@@ -42,7 +42,7 @@ from graspd.worker.rendering.scenery import Appearance, Box, Solid, Supports, sl
 from graspd.worker.rendering.tracer import Tracer
 from graspd.worker.scenes.neighbours import Neighbours
 
-#: Postures of a strip, where a grasp has them.
+#: Postures in a strip of pictures: of a grasp with a lift, and of a free grasp.
 STRIP: Final = ("standoff", "pregrasp", "grasp", "lift")
 FREE_STRIP: Final = ("pregrasp", "grasp", "squeeze")
 #: Candidate sides: number of azimuths, and heights above the horizon [rad].
@@ -64,9 +64,9 @@ class PictureScenes:
 
     supports: Supports = ()
     object_pose: Floats = field(default_factory=lambda: np.array(IDENTITY_POSE)[None])  # (S, 7) in the scene frame
-    index: NDArray[np.intp] | None = None  # (N,) scene of each grasp; None: all in the first
+    index: NDArray[np.intp] | None = None  # (N,) scene of each grasp; None if all are in the first
     neighbours: Neighbours | None = None
-    wrist: Floats | None = None  # (N, U) wrist angles for drawing the links above the hand's root; None: not drawn
+    wrist: Floats | None = None  # (N, U) wrist angles for drawing the links above the hand's root; None hides them
 
     def centred(self, obj: ObjectModel) -> PictureScenes:
         """Return the scenes with the frames of their object `obj` and of the neighbours at their centres."""
@@ -91,9 +91,9 @@ def trajectory_pictures(
     run: ExecutionContext = DEFAULT_CONTEXT,
     samples: int = SAMPLES,
 ) -> NDArray[np.uint8]:
-    """Render N grasps of F postures, frame of the object at rest, from A sides: (N, A, F, H, W, 3) sRGB.
-    Sides are ordered by how much of object and fingers they show. `whole` frames the whole hand; otherwise parts far
-    from the object may leave the picture. Raises TaskCancelled: `run.cancelled()` returned True."""
+    """Render N grasps of F postures from A sides; return sRGB (N, A, F, H, W, 3).
+    Postures are in the frame of the object at rest. Sides that show more of object and fingers come first. `whole`
+    frames the whole hand; else far parts may be cut off. Raises TaskCancelled: `run.cancelled()` returned True."""
     if not frames:
         return np.zeros((0, sides, 0, size[1], size[0], 3), np.uint8)
     stage = _Stage(hand, obj, around, len(frames[0]), run, np.inf if whole else NEAR_M)

@@ -62,9 +62,9 @@ def render(
         obj: the object.
         object_pose: (S, 7) rest poses in the table frame.
         views: camera placements per scene, unless cameras are given.
-        stereo: a rectified left and right picture per placement.
+        stereo: whether a placement has rectified left and right pictures.
         width, height: picture size [px].
-        seed: of cameras, materials and lights; same seed, same pixels. Scene s depends on (seed, s) alone.
+        seed: seed of cameras, materials and lights, and thus of all pixels. Scene s depends on (seed, s) alone.
         run: receives the number of finished pictures; polled before each launch. Pixels do not depend on its threads.
         baseline_m: distance of the eyes.
         samples: rays per pixel.

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def stage_table() -> Mapping[Stage, StageFunction]:
-    """Return the stages. Their modules are imported at the first task, so that a worker starts at once."""
+    """Return each stage's function. It imports its module at the first task, so a worker starts at once."""
     return {stage: partial(_run, stage) for stage in Stage}
 
 

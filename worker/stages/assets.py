@@ -83,7 +83,7 @@ def _neighbour(store: Store, name: str, digest: str) -> ObjectModel:
     def load() -> ObjectModel:
         obj = prepared_object(store, digest, name=name, face_error_m=NEIGHBOUR_FACE_ERROR_M)
         publish_model(store, AssetKind.OBJECT, obj)
-        with suppress(MeshError):  # without pieces its hull is the obstacle
+        with suppress(MeshError):  # without pieces, the object's hull is the obstacle
             pieces_of(store, obj)
         return obj
 

@@ -70,10 +70,10 @@ class SelfTest:
     by_object: dict[str, float]
     table: float
     table_n: int
-    best: BestGrasp | None = None  # None: no grasp held
+    best: BestGrasp | None = None  # None if no grasp held
     lost: float = 0.0  # share of failed grasps that lost the object during closing; the others fail under the pushes
-    give_m: float = math.inf  # fingertip motion within which its stiffest servo goes from zero to its limit [m]
-    limit: Limit | None = None  # payload on a table at full actuator force; None: it lifts nothing
+    give_m: float = math.inf  # fingertip motion [m] within which the stiffest servo goes from zero to its limit
+    limit: Limit | None = None  # payload on a table at full actuator force; None if no grasp lifts
 
     @property
     def line(self) -> str:
@@ -111,7 +111,7 @@ def failed_facts(reason: str, says: str = "suspicious") -> dict[str, Any]:
 
 
 def self_test_facts(hand: Callable[[], HandModel], run: ExecutionContext = DEFAULT_CONTEXT) -> dict[str, Any]:
-    """Return the facts of a self-test; one without a grasp, or with an error, is reported and not raised.
+    """Return the facts of a self-test; the facts report an error of the test instead of raising it.
     Raises TaskCancelled: `run.cancelled()` returned True."""
     try:
         return self_test(hand(), run).facts()
@@ -233,7 +233,7 @@ def fitting_width(hand: HandModel) -> float:
 
 
 def _tip(hand: HandModel, body: int, pose: Floats) -> Floats:
-    """Return a finger's end [m]: its last joint, or its pad if one joint at the base closes it."""
+    """Return a finger's end [m]: its last joint, or its pad if only one joint closes it."""
     closing, at = 0, body
     while at > 0:
         closing += int(hand.closing[hand.dof[at]] != 0)

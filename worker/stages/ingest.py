@@ -36,7 +36,7 @@ _OUT_OF_MEMORY: Final = ("MemoryError", "bad_alloc", "Cannot allocate", "failed 
 _FINDING_BYTES: Final = 2**20
 _MODEL: Final = "model.glb"
 _MODEL_BYTES: Final = 2**24
-#: CPU time of a check above which none is left for the model [s]; the first task with the asset then makes the model.
+#: CPU time of a check [s] above which the first task with the asset makes its 3D model.
 _MODEL_CPU_S: Final = 8.0
 
 
@@ -158,7 +158,7 @@ def _child(kind: str, name: str, source: str, target: str, memory_bytes: str, cp
 
         found = check_hand(files, name)
     elif AssetKind(kind) is AssetKind.NETWORK:
-        # The API checks networks: a check here replaces its lost or damaged result.
+        # The API checks networks. A check here replaces a lost or damaged result of the API.
         found = check_network(files, name)
     else:
         from graspd.worker.objects.check import check_object

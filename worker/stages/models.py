@@ -68,7 +68,7 @@ _GREY: Final = (0.45, 0.5, 0.55)  # sRGB of parts without a colour, if other par
 
 
 def hand_glb(hand: HandModel) -> bytes:
-    """Return the hand at joint positions zero with its root link at the origin; metres."""
+    """Return the hand as glTF [m] at joint positions zero, with its root link at the origin."""
     document = Document()
     points = sample_surface(hand, SURFACE_POINTS)
     nodes: list[dict[str, Any]] = []
@@ -98,7 +98,7 @@ def hand_glb(hand: HandModel) -> bytes:
 
 
 def object_glb(obj: ObjectModel) -> bytes:
-    """Return the prepared mesh in the object's own frame; metres.
+    """Return the prepared mesh as glTF [m] in the object's own frame.
     The node's translation is the middle of the mesh, since glTF coordinates have 32 bits."""
     document = Document()
     primitive = document.triangles(obj.centred.vertices, obj.faces, obj.corner_normals)

@@ -37,7 +37,7 @@ def batches_of(message: TaskMessage) -> list[TaskMessage]:
 
 
 def joined(message: TaskMessage, made: Sequence[Output], *, base_rows: Sequence[range] = ()) -> Output:
-    """Join the outputs of batches, which have equal columns except for rechecks; one output is unchanged.
+    """Join the outputs of batches; their columns are equal except for rechecks. One output is unchanged.
     Columns that refer to rows of the base shard follow `base_rows`, the rows of each batch in it."""
     if len(made) == 1:
         return made[0]
@@ -74,8 +74,8 @@ def base_rows(base: Shard, message: TaskMessage) -> list[range]:
 
 def _summed(told: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Combine the records of several batches.
-    Counts and seconds are summed. Shares are averaged, weighted with the numbers of planned grasps. Other planner
-    records are those of the first batch."""
+    Counts and seconds are summed. Shares are averaged, weighted with the numbers of planned grasps. Other
+    entries are those of the first batch."""
     found = dict(told[0])
     planned = [one.get("planned", 0) for one in told]
     for name, value in told[0].items():

@@ -23,7 +23,7 @@ from graspd.worker.stages.context import Output, TaskContext, batch_seed
 
 
 def run(message: TaskMessage, context: TaskContext) -> Output:
-    """Render `request.views` camera placements of each scene, with the hand for grasps planned in scenes."""
+    """Render `request.views` camera placements of each scene; with the hand if grasps were planned there."""
     request = message.request
     stage = Stage.SYNTHESIZE if request.in_scene else Stage.SCENE
     shard = load_input(message, context, stage)
@@ -53,7 +53,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
 
 
 def _drawn(base: Shard, message: TaskMessage, context: TaskContext) -> DrawnHand | None:
-    """Select the best valid grasp of each scene; None if no scene has one."""
+    """Select the best valid grasp of each scene; return None if the shard has no grasps."""
     hand = hand_of(context.store, message)
     among = validity.selection(base.arrays, unvalidated=message.request.validation == "none")
     rows = best_in_scenes(base.arrays, among)

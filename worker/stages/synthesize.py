@@ -63,7 +63,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
             empty_on=(NoStartFound,) if scenes else (),
         )
     except InputError as error:
-        # Errors of hand and object have their own classes; those below mean that the hand does not reach into scenes.
+        # Errors of hand and object have other classes. These two mean that the hand does not reach into the scenes.
         if scenes and type(error) in (InputError, NoStartFound):
             raise SceneError(str(error)) from None
         raise

@@ -228,7 +228,7 @@ def test_a_urdf_is_read_as_programs_write_it(written: str) -> None:
         (b" \r\n", "h.urdf contains nothing but spaces"),
         (b'<?xml version="1.0"?>', "h.urdf is empty; export it again"),
         (claw().replace('name="test"', 'name="test" name="b"').encode(), "duplicate attribute"),
-        (b"<sdf/>", "the XML root is <sdf>, a URDF begins with <robot>"),
+        (b"<sdf/>", "the XML root is <sdf>, but a URDF begins with <robot>"),
         (b'<!DOCTYPE robot [<!ENTITY a "b">]><robot name="&a;"/>'.decode().encode("utf-16"), "entities are refused"),
     ],
 )

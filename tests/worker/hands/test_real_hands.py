@@ -128,7 +128,7 @@ def test_shadows_arm_is_left_out_told_or_kept(shared_data: Path) -> None:
     assert whole.root_link == "world" and whole.dofs == 24
     assert "forearm" in {piece.link for piece in whole.pieces}
     files, _ = bare_files(shared_data, "shadow")
-    note = "WRJ2, WRJ1 above the palm left out, poses are those of 'palm' (--root world)"
+    note = "WRJ2, WRJ1 above the palm left out; poses are those of 'palm' (--root world)"
     assert note in check_hand(files, "shadow")["facts"]["notes"]
     assert not any("left out" in one for one in check_hand(files, "shadow", {"root": "world"})["facts"]["notes"])
     hand = bare(shared_data, "shadow")

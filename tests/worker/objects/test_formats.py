@@ -174,10 +174,10 @@ def test_accessors_beyond_their_buffer_and_cycles_are_refused() -> None:
     [
         ("ascii.ply", b"format ascii 1.0\n", b"", "no format"),
         ("ascii.ply", b"vertex_indices", b"corners", "no list vertex_indices"),
-        ("ascii.ply", b"element face 12", b"element face 13", "13 rows of face are stated, 12 are there"),
+        ("ascii.ply", b"element face 12", b"element face 13", "13 rows of face are stated, but 12 are there"),
         ("little.ply", b"element face 12", b"element face 13", "states more data"),
         ("binary.stl", stl_bytes(*box())[80:], b"", "too few for an STL"),
-        ("binary.stl", struct.pack("<I", 12), struct.pack("<I", 13), "states 13 faces, the file has 12"),
+        ("binary.stl", struct.pack("<I", 12), struct.pack("<I", 13), "states 13 faces, but the file has 12"),
         ("binary.stl", stl_bytes(*box()), b"no vertices\n" * 9, "neither binary STL nor text with facets"),
         ("ascii.stl", b"endloop\nendfacet\nendsolid", b"vertex 0 0 0\nendsolid", "fewer than three vertices"),
         ("m.off", off(box()), b"", "the file is empty"),

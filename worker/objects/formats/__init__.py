@@ -31,7 +31,7 @@ READERS: Final[dict[str, Callable[..., Soup]]] = {
 
 #: Python's quotation of text that it cannot parse as a number.
 _NO_NUMBER: Final = re.compile(r": (?:np\.bytes_\()?b?'(.{1,40}?)'")
-#: Formats whose readers use files beside the mesh for its colours.
+#: Formats whose readers take colours from other files, which the mesh names.
 _WITH_LOOKS: Final = (".obj", ".dae")
 
 

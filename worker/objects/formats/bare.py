@@ -1,4 +1,4 @@
-"""PLY (ASCII, binary of both byte orders), STL (binary, ASCII) and OFF, but no colours or normals."""
+"""PLY (ASCII, binary of both byte orders), STL (binary, ASCII) and OFF, without colours and normals."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ class _Ascii:
     def read(self, element: _Element) -> tuple[dict[str, np.ndarray], _Lists]:
         rows = self._lines[self._at : self._at + element.count]
         if len(rows) < element.count:
-            raise MeshError(f"truncated: {element.count} rows of {element.name} are stated, {len(rows)} are there")
+            raise MeshError(f"truncated: {element.count} rows of {element.name} are stated, but {len(rows)} are there")
         self._at += element.count
         if not any(p.count_type for p in element.properties):
             width = len(element.properties)
@@ -127,7 +127,7 @@ class _Binary:
         return {}, uniform if uniform is not None else self._row_by_row(element)
 
     def _uniform(self, element: _Element) -> _Lists | None:
-        """Read all rows at once if all lists have the first one's length: usually triangles only."""
+        """Read all rows at once if all lists are as long as the first, as in triangle meshes; else None."""
         first = self._at
         (name,) = self._row_by_row(_Element(element.name, min(element.count, 1), element.properties)).items()
         self._at = first
@@ -188,7 +188,7 @@ def read_stl(data: bytes) -> Soup:
         raise MeshError("neither binary STL nor text with facets; export the mesh again")
     held = (len(data) - _HEADER) / _RECORD.itemsize
     if _declared_count(data) > held:
-        raise MeshError(f"truncated: the header states {_declared_count(data)} faces, the file has {int(held)}")
+        raise MeshError(f"truncated: the header states {_declared_count(data)} faces, but the file has {int(held)}")
     # Some exporters append their own data; all faces stated in the header are present.
     return _binary(data, _declared_count(data))
 

@@ -47,7 +47,7 @@ def _parse(data: bytes) -> Element:
         if isinstance(element.tag, str):
             element.tag = element.tag.rpartition("}")[2]
     if root.tag != "COLLADA":
-        raise MeshError(f"the XML root is <{root.tag[:40]}>, a DAE file begins with <COLLADA>")
+        raise MeshError(f"the XML root is <{root.tag[:40]}>, but a DAE file begins with <COLLADA>")
     return root
 
 
@@ -119,7 +119,7 @@ class _Library:
         return self._colours[material]
 
     def _picture(self, effect: Element, sampler: str) -> str:
-        """Return the file of a sampler: it names a surface, which names an image."""
+        """Return the picture's file of a sampler: the sampler names a surface, and this names an image."""
         name = sampler
         for _ in range(2):
             param = next((p for p in effect.iter("newparam") if p.get("sid") == name), None)
@@ -166,7 +166,7 @@ def _numbers(element: Element | None) -> np.ndarray:
 
 
 def _instances(root: Element, library: _Library) -> Iterator[tuple[str, np.ndarray, dict[str, str]]]:
-    """Return geometry, 4x4 matrix and material of each symbol for every mesh in the scene."""
+    """Yield every mesh in the scene: geometry, 4x4 matrix, and material of each symbol."""
     shown = root.find("scene/instance_visual_scene")
     scene = library.named(shown.get("url")) if shown is not None else root.find("library_visual_scenes/visual_scene")
 
@@ -205,7 +205,7 @@ def _matrix(node: Element) -> np.ndarray:
 
 
 def _rotation(x: float, y: float, z: float, degrees: float) -> np.ndarray:
-    """Apply Rodrigues' formula; a zero axis gives no rotation."""
+    """Return the rotation by Rodrigues' formula; a zero axis gives no rotation."""
     length = math.sqrt(x * x + y * y + z * z)
     if length < 1e-12:
         return np.eye(3)

@@ -1,4 +1,4 @@
-"""GLB (binary glTF 2.0): triangles of all meshes of the scene, in its frame and metres, with colours.
+"""GLB (binary glTF 2.0): triangles of all meshes, in the scene's frame and in metres, with colours.
 
 A colour is the base colour of the material, times the mean of its texture if the file contains the texture."""
 

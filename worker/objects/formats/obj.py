@@ -19,7 +19,7 @@ _NO_COLOUR = [b"nan", b"nan", b"nan"]
 
 
 def no_files(reference: str) -> bytes | None:
-    """Return None: resolver for a mesh without other files."""
+    """Return None, as the resolver of a mesh without other files."""
     return None
 
 
@@ -81,7 +81,7 @@ def _material_colours(
 
 
 def _face_colours(shades: list[list[bytes]], faces: np.ndarray) -> np.ndarray | None:
-    """Return colours (F, 3), NaN: none; quantised coarsely, since each colour is drawn as a part."""
+    """Return colours (F, 3), NaN if unknown; quantised coarsely, since each is drawn as a part."""
     if all(shade is _NO_COLOUR for shade in shades) or (faces >= len(shades)).any() or (faces < 0).any():
         return None
     known = np.array(shades, dtype="S40").astype(float).reshape(-1, 3)
@@ -117,7 +117,7 @@ def _lines(data: bytes) -> Iterable[bytes]:
 MAX_MATERIALS: Final = 1024
 Nearby = Callable[[str], bytes | None]
 
-"""Returns the bytes of a file by its name in a mesh; None: it is not among the hand's files."""
+"""Returns the bytes of a file by its name in a mesh; None if the file is not there."""
 
 
 def read_materials(data: bytes, nearby: Nearby) -> dict[bytes, Floats]:
@@ -142,7 +142,7 @@ def read_materials(data: bytes, nearby: Nearby) -> dict[bytes, Floats]:
 
 
 def colour_of(reference: str, nearby: Nearby) -> Floats | None:
-    """Return the mean colour of a picture beside the mesh; None if it is missing or unreadable."""
+    """Return the mean colour of a picture that a mesh names; None if it is missing or unreadable."""
     try:
         data = nearby(reference)
         return None if data is None else mean_colour(data)
@@ -168,7 +168,7 @@ UNREADABLE: Final = (ValueError, OSError, SyntaxError)
 def mean_colour(data: bytes) -> Floats:
     """Compute the sRGB mean (3,) of a PNG or JPEG, 0 .. 1.
     Raises ValueError, OSError, SyntaxError: too large, or not such a picture (`UNREADABLE`)."""
-    from PIL import Image  # few meshes have pictures, and every process reads meshes
+    from PIL import Image  # loaded late: few meshes have pictures
 
     bomb = Image.DecompressionBombWarning
     try:

@@ -26,10 +26,10 @@ class Soup:
     vertices: NDArray[np.float64]
     faces: NDArray[np.int64]
     colours: NDArray[np.float64] | None = None
-    """(F, 3) sRGB colour of each face, 0 .. 1, NaN if not stated; None: no face has one."""
+    """(F, 3) sRGB colour of each face, 0 .. 1, NaN if not stated; None if no face has one."""
 
     def by_colour(self) -> list[tuple[tuple[float, float, float] | None, NDArray[np.intp]]]:
-        """Return each colour with the indices of its faces; None: faces without a colour."""
+        """Return each colour with the indices of its faces; faces without a colour are under None."""
         if self.colours is None:
             return [(None, np.arange(len(self.faces)))]
         # NaN is not equal to itself; no colour is below 0.

@@ -1,4 +1,4 @@
-"""Antipodal starts: opposed fingers around two surface points, slightly farther apart than these.
+"""Antipodal starts: opposed fingers around two surface points, slightly farther apart than the points.
 
 Two surface points with opposite normals are antipodal (Nguyen, "Constructing force-closure grasps", 1988). Pairs are
 found by comparing samples of the surface with one another.
@@ -59,7 +59,7 @@ THINNEST_M: Final = 0.002
 #: Least and largest clearance between pad and object, on each side [m].
 ROOM_M: Final = (0.003, 0.015)
 #: Horizontal distance from the centre of mass at which the probability of a pair falls by a factor of e [m], and least
-#: factor. `SELDOM` reduces it for pairs hard to reach, and for pairs with a cosine to the vertical above `STEEP`. Share
+#: factor. A factor `SELDOM` applies to pairs hard to reach or with a cosine to the vertical above `STEEP`. Share
 #: of Allegro grasps on six objects that hold at half friction: .28 with 30 mm and a least factor of .02, else .38.
 BESIDE_M: Final = 0.02
 FAR: Final = 0.005
@@ -172,7 +172,7 @@ def end_clearance(pairs: Crossings, scene: Environment, width: float) -> Floats:
 
 @dataclass(frozen=True)
 class AntipodalHands:
-    """n hands with fingers on both sides of the object: rotations (n, 3, 3), retreat directions (n, 3)."""
+    """n hands with fingers on both sides of the object; rotations `turn`, retreat directions `away`."""
 
     known: Oppositions
     posture: NDArray[np.intp]
@@ -198,7 +198,7 @@ class AntipodalHands:
 
 
 def place_across(hand: HandModel, obj: ObjectModel, opening: Openings, uniform: Floats, ways: Floats) -> AntipodalHands:
-    """Place hands across pairs by random numbers (n, 6); `ways` (K, 3): free directions of retreat."""
+    """Place hands across pairs by random numbers (n, 6); `ways` (K, 3) are free directions of retreat."""
     known = opening.known
     if opening.upright and (upright := ways @ opening.up > UPRIGHT).any():
         ways = ways[upright]
@@ -383,13 +383,13 @@ class ReachSampling:
 
     @classmethod
     def of(cls, model: Model) -> ReachSampling | None:
-        """Return None if the hand has no opposed fingers, or the object is too wide everywhere."""
+        """Create the sampling; None without opposed fingers, or if the object is too wide everywhere."""
         known = _grips(model.hand.model, model.obj.model, model.device)
         return None if known is None else cls(model, *known)
 
     def starts(self, seeds: NDArray[np.int32], first: NDArray[np.int32], retreats: Floats) -> tuple[HandState, Any]:
         """Return each start's first draw that passes the ball test, from draw number `first` (n,) on.
-        Also return the draws' numbers (n,), -1 if none passes. `retreats`: ascending distances of retreat [m]."""
+        Also return the draws' numbers (n,), -1 if none passes. `retreats` are ascending distances [m]."""
         m, count = self.model, len(seeds)
         with wp.ScopedDevice(m.device):
             number = wp.empty(count, dtype=wp.int32)

@@ -29,7 +29,7 @@ class Batches:
 
     def __init__(self, asked: Sequence[BatchRequest], obj: ObjectModel, warm: WarmStart | None = None) -> None:
         """All batches have one fidelity; all or none are in scenes, with the same supports and neighbours.
-        In scenes, `warm` proposes the starts of hands; None: `scene_starts` finds them."""
+        In scenes, `warm` proposes the starts of hands; without it, `scene_starts` finds them."""
         self.asked, self.warm = asked, warm
         wanted = [one.wanted for one in asked]
         self.fidelity = wanted[0].fidelity
@@ -110,7 +110,7 @@ class Batches:
         ]
 
     def rollout(self, grasps: GraspSet, rows: Rows, beat: Floats) -> Floats:
-        """Return scores (n,) of grasps of these rows in their batches' rollouts; `beat` (n,): scores to beat.
+        """Return scores (n,) of grasps `rows` in their batches' rollouts; `beat` (n,) are the scores to beat.
         Grasps of stopped batches have score 0."""
         owners, scores = self.owner[rows], np.zeros(len(grasps))
         placed = self.placed.take(rows) if self.placed is not None else None

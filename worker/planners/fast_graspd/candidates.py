@@ -73,7 +73,7 @@ Seat = Callable[[NDArray[np.intp], NDArray[np.intp]], Refinements]
 """Runs the fine phase for some grasps (n,), given the rows (n, each) of their starts."""
 
 RolloutOf = Callable[[GraspSet, NDArray[np.intp], Floats], Floats]
-"""Scores (k,) grasps, given their numbers (k,) and the scores to beat (k,); see `worker.planners.Rollout`."""
+"""Returns scores (k,) of grasps from their numbers (k,) and scores to beat (k,); see `worker.planners.Rollout`."""
 
 
 @dataclass
@@ -98,7 +98,7 @@ class Selection:
     def take(
         self, found: GraspSet, refined: Refinements, rows: NDArray[np.intp], which: NDArray[np.intp], score: Floats
     ) -> None:
-        """Store candidates `rows` (k,) of the grasps `which` (k,) if better or the grasp's first."""
+        """Store candidates `rows` (k,) of the grasps `which` (k,) that are better or a grasp's first."""
         state, losses = refined.state[rows], refined.losses[rows]
         for k in np.flatnonzero((score < self.score[which]) | ~self.has(which)):
             grasp = int(which[k])
@@ -188,8 +188,8 @@ def _reduce_squeeze(
 
 #: Friction coefficient in the balance of contact forces. It is below those of all tests, as a reserve.
 FRICTION: Final = 0.3
-#: The same in scenes. The merit with this friction predicts lifts at half friction with AUC .80, with `FRICTION` with
-#: .74 (refined Allegro and Shadow hands with a merit below .1).
+#: The same in scenes. The merit with this friction predicts lifts at half friction with an AUC of .80, against .74 with
+#: `FRICTION` (refined Allegro and Shadow hands with a merit below .1).
 SCENE_FRICTION: Final = 0.15
 #: Weight of L_stable relative to the residual of the balance.
 STABILITY: Final = 0.05

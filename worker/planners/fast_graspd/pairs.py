@@ -1,4 +1,4 @@
-"""Device data that batches of one (hand, object, fidelity) share, cached between batches."""
+"""Device data that batches of one hand, object and fidelity share, cached between batches."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from graspd.worker.simulation.sampling import object_samples
 
 #: Cell of the coarse distance grid [m].
 FIELD_CELL: Final = 0.005
-#: Number of hand points tested against other links, in the coarse and the fine phase; object samples in the coarse one.
+#: Numbers of hand points tested against other links in the coarse and the fine phase, and of object samples (coarse).
 COARSE_SELF_POINTS: Final = 400
 FINE_SELF_POINTS: Final = 1000
 COARSE_SAMPLES: Final = 1500

@@ -116,7 +116,7 @@ class LaunchPart:
 def plan(
     hand: HandModel, obj: ObjectModel, wanted: PlanRequest, run: ExecutionContext, *, warm: WarmStart | None = None
 ) -> GraspSet:
-    """See `worker.planners.Planner`; for `warm` see `Batches`."""
+    """Plan one batch, see `worker.planners.Planner`; for `warm` see `Batches`."""
     (found,) = plan_joined(hand, obj, [BatchRequest(wanted, run)], warm=warm)
     if isinstance(found, Exception):
         raise found
@@ -126,7 +126,7 @@ def plan(
 def plan_joined(
     hand: HandModel, obj: ObjectModel, asked: Sequence[BatchRequest], *, warm: WarmStart | None = None
 ) -> list[GraspSet | Exception]:
-    """See `worker.planners.BatchPlanner`; for `warm` see `Batches`."""
+    """Plan batches, see `worker.planners.BatchPlanner`; for `warm` see `Batches`."""
     began = time.perf_counter()
     batches = Batches(asked, obj, warm)
     run = asked[0].run
@@ -250,7 +250,7 @@ class _Starts:
     state: HandState
     depth: Floats
     touch: Floats | None
-    """Initial dilation for each hand, as a share of `DILATION`: the object just touches it. None: 1."""
+    """Initial dilation with which the object just touches each hand, as a share of `DILATION`; 1 if None."""
 
     def take(self, which: NDArray[np.intp], each: int) -> _Starts:
         hands = (which[:, None] * each + np.arange(each)).ravel()

@@ -62,7 +62,7 @@ RETREATS: Final = (0.0, 0.01, 0.02, 0.035, 0.055, 0.08, 0.11)
 DRAWS: Final = 96
 #: Number of draws whose normal random numbers are generated together.
 DRAWN: Final = 8
-#: Half the width of a palm [m], number of approach directions, and least cosine with the nearest free direction.
+#: Half the width of a palm [m], number of directions, and least cosine of an approach with the nearest free one.
 PALM_RADIUS: Final = 0.04
 DIRECTIONS: Final = 256
 NEAR_WAY: Final = 0.98
@@ -75,7 +75,7 @@ CANDIDATES: Final = 48
 _UNIFORM: Final = 7
 
 
-#: Antipodal hands, and their indices among the draws.
+#: Indices among the draws, and the antipodal hands at these indices.
 _AcrossPairs = list[tuple[NDArray[np.intp], AntipodalHands]]
 
 
@@ -198,7 +198,7 @@ def _raise_draws(
     scene: NDArray[np.intp],
     probe: Probe,
 ) -> Floats:
-    """Raise draws `rows` in scenes (n,), at all retreats, by the clearance missing at the nearest.
+    """Raise draws `rows` in scenes (n,), at all retreats, by the clearance missing at the nearest retreat.
     Return the distance (n, len(RETREATS)) of their pairs from the middle of the pads [m], 0 for other draws. Retreat
     steps alone are too coarse for low objects: fingers would end above the object, not beside it."""
     off = np.zeros((len(scene), len(RETREATS)))
@@ -228,7 +228,7 @@ class _SceneDraws:
     def order(
         self, uniform: Floats, scene: NDArray[np.intp], reaching: NDArray[np.bool_], placed: PlacedGrasps
     ) -> tuple[NDArray[np.intp], Floats]:
-        """Return draws and distances (n, REACHES) of `select_draws`; 0 and inf for hands not `reaching`."""
+        """Return draws and distances (n, REACHES) of `select_draws`; 0 and inf unless `reaching`."""
         order, least = np.zeros((len(scene), REACHES), np.intp), np.full((len(scene), REACHES), np.inf)
         for s in np.unique(scene[reaching]):
             rows = np.flatnonzero(reaching & (scene == s))

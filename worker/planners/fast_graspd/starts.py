@@ -69,7 +69,7 @@ def frames_about(z: Floats) -> Floats:
 
 
 class _Pair:
-    """Data that all draws of a hand around an object share; `gap`: palm's nearest, farthest distance [m]."""
+    """Data that all draws of a hand around an object share; `gap` [m] is the range of the palm's distance."""
 
     def __init__(self, hand: HandModel, obj: ObjectModel, gap: tuple[float, float] = GAP) -> None:
         self.hand, self.centre, self.gap = hand, obj.centre_of_mass, gap
@@ -200,7 +200,7 @@ def clear_starts(model: Model, generators: list[np.random.Generator], *, each: i
 def open_further(
     model: Model, generators: list[np.random.Generator], state: HandState, depth: Floats, wanted: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """Retry `wanted` starts (n,) deeper than `NO_PLACE` with hands further open; return their mask (n,).
+    """Redraw `wanted` starts (n,) deeper than `NO_PLACE` with hands further open; return their mask (n,).
     The pre-shape of some hands leaves no gap as wide as the object. `generators` continue from
     `clear_starts`. Better starts replace those in `state`, and their depths those in `depth`."""
     hand, obj = model.hand.model, model.obj.model
@@ -305,7 +305,7 @@ class JawStarts:
 
     @classmethod
     def of(cls, hand: HandModel, obj: ObjectModel) -> JawStarts | None:
-        """Return None if the hand is no gripper; raise InputError if the object does not fit between the jaws."""
+        """Return the starts of a gripper, else None; raise InputError if the object does not fit the jaws."""
         jaws, pairs = jaws_of(hand), fitting_pairs(hand, obj)
         if jaws is None or pairs is None:
             return None

@@ -19,7 +19,7 @@ class PlacedSolid:
     upper: wp.vec3f
     place: wp.vec3f  # origin of the solid [m]
     turn: wp.mat33f  # rotation from the world's axes to the solid's
-    mesh: wp.uint64  # id of a `wp.Mesh` in its own frame; 0: a box around its origin
+    mesh: wp.uint64  # id of a `wp.Mesh` in its own frame; 0 for a box around its origin
     half: wp.vec3f  # half the extents of the box [m]
     first_corner: wp.int32  # first index of the mesh's corner normals
 
@@ -28,7 +28,7 @@ class PlacedSolid:
 class RayHit:
     """First hit of a ray."""
 
-    shape: wp.int32  # -1: nothing
+    shape: wp.int32  # index of the solid; -1 without a hit
     distance: wp.float32  # in lengths of the ray's direction
     normal: wp.vec3f  # unit normal in the world's frame; on meshes interpolated between corner normals
 
@@ -62,7 +62,7 @@ def passes_through(lower: wp.vec3f, upper: wp.vec3f, origin: wp.vec3f, inverse: 
 
 @wp.func
 def box_distance(half: wp.vec3f, origin: wp.vec3f, direction: wp.vec3f):
-    """Return the distance to the first face of a box, or from inside to the exit face; -1: no hit.
+    """Return the distance to the first face of a box, or from inside to the exit face; -1 without a hit.
     Also return the axis of the face's normal."""
     inverse = inverse_of(direction)
     a = wp.cw_mul(-half - origin, inverse)
