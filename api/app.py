@@ -1,4 +1,4 @@
-"""HTTP application. It has no state between requests that other processes would need."""
+"""HTTP application. It keeps no state between requests that another process would need."""
 
 from __future__ import annotations
 

@@ -151,7 +151,7 @@ class Assets:
             return None
 
     def _holder(self, kind: AssetKind, name: str) -> str:
-        """Return the digest that a name refers to; empty: the name is free."""
+        """Return the digest that a name refers to; empty if the name is free."""
         # Names of other projects do not count here, not even for an admin.
         known = self._find(kind, name, replace(project_scope(), everything=False))
         # A refused upload does not occupy its name: a fixed file may use it.

@@ -136,7 +136,7 @@ class Pictures:
 
 
 def paint_depth(depth: NDArray[Any]) -> NDArray[np.uint8]:
-    """Colour depth (H, W) [m] as (H, W, 3) over the range of this picture; dark without a surface."""
+    """Colour depth (H, W) [m] as (H, W, 3) over the picture's range; pixels without a surface are dark."""
     seen = np.isfinite(depth)
     painted = np.empty((*depth.shape, 3), np.uint8)
     painted[:] = _NOTHING
