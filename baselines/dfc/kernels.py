@@ -25,7 +25,7 @@ W_DISTANCE = wp.constant(100.0)
 W_PENETRATION = wp.constant(100.0)
 W_SELF = wp.constant(10.0)
 W_JOINTS = wp.constant(1.0)
-#: Key points of the hand closer than this to each other count as self-penetration [m].
+#: Distance [m] below which two key points of the hand count as self-penetration.
 GAP = wp.constant(0.02)
 STEP0 = wp.constant(0.005)
 STEP_EVERY = wp.constant(50.0)
@@ -279,7 +279,7 @@ def accept(
     contact_inout: wp.array2d(dtype=wp.int32),
     taken_inout: wp.array(dtype=wp.int32),
 ):
-    """Accept or reject the proposal. The first is always accepted (its old energy is infinite). Over B."""
+    """Accept or reject the proposal; accept the first (the old energy is infinite). Launch over B."""
     b = wp.tid()
     rng = rng_inout[b]
     uniform = wp.randf(rng)

@@ -144,7 +144,7 @@ METHOD: Final = Method(
     uses=("face_error_m",),
     quick={"steps": FIRST_STEP + 400},
 )
-#: Bounds of the palm's position about the centre of mass [m], and its largest jump: GraspIt!'s values, there in mm.
+#: Bounds of the palm's position about the centre of mass [m], and its largest jump; GraspIt! has these values in mm.
 PLACE: Final = ((-0.25, 0.25), (-0.25, 0.25), (-0.25, 0.35))
 PLACE_JUMP: Final = 0.15
 #: Bounds of theta and phi (axis) and alpha (angle) of the rotation; phi is periodic.
@@ -159,7 +159,7 @@ START_TRIES: Final = 5000
 ROUNDS: Final = 500
 #: Limit on rounds, as a multiple of the moves; rounds without a free neighbour count.
 PATIENCE: Final = 3
-#: Two states with a smaller difference are near-duplicates (GraspIt!).
+#: Difference below which two states are near-duplicates, as in GraspIt!.
 ALIKE: Final = 0.2
 NOT_YET: Final = 1e9
 #: Number of virtual contacts on each closing link, and on the palm.

@@ -50,7 +50,7 @@ class AssetFacts:
 
 @dataclass(frozen=True)
 class Contents:
-    """Input of a card; a folder has no `record`, and only an export has a `snapshot`."""
+    """Input of a card; a folder of shards has no `record`, and has a `snapshot` only if it is an export."""
 
     name: str
     shards: Shards

@@ -193,7 +193,7 @@ def _directions(cell: CellTally) -> Row | None:
 
 
 def _types(cell: CellTally) -> Row | None:
-    """Return the number of grasps of each type; None if no shard has types."""
+    """Return the number of grasps of each type, and its entropy; None if no shard has types."""
     told = cell.column("grasp_type")
     if not len(told):
         return None
