@@ -35,7 +35,7 @@ EDGE = 260
 THIN_MM = 8.0
 #: An object is wide for a hand whose pads open to less than this multiple of the object's least extent.
 ROOMY = 1.25
-#: Penetration in MuJoCo minus that on the mesh is a cause if it exceeds that of held grasps by this [mm].
+#: A cause of failure: MuJoCo's penetration minus the mesh's is larger by this [mm] than in held grasps.
 PUSHED_MM = 0.3
 
 

@@ -37,7 +37,7 @@ from graspd.service.store.store import open_store
 from tests.fakes import add_assets, engine_of, fake_stages, make_shard, request
 from tests.memory_queue import MemoryQueue
 
-#: A batch of 32 grasps takes at least this long on two cores (docs/explanation/performance.md) [s].
+#: Least time of a batch of 32 grasps on two cores [s] (docs/explanation/performance.md).
 BATCH_S: Final = 1.0
 
 

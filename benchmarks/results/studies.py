@@ -411,7 +411,7 @@ STUDIES: Final = (
     ),
     Study(
         "learned",
-        "planner seeds from a network, compared with the planner's own",
+        "starts from a network, compared with the planner's own",
         ("results/learned.*",),
         (
             "python -m benchmarks.learned --network WORK/barrett.npz WORK/allegro.npz --data DATA --seeds 3 "
