@@ -60,7 +60,7 @@ class Cell:
 
     @property
     def cpu_seconds(self) -> float:
-        """CPU time of planning [s], which depends less on other load than wall time."""
+        """CPU time of planning [s]; it depends less on other load than wall time."""
         return float(self.grasps.info["cpu_seconds"])  # type: ignore[arg-type]
 
     @cached_property

@@ -107,7 +107,7 @@ def _median(values: NDArray[np.float64], digits: int) -> str:
 
 
 def chosen(found: dict[str, Any]) -> list[int]:
-    """Return rows of failures, one of each common kind, then more of the first kind; last a held grasp."""
+    """Return rows of failures, one per common kind, then more of the first kind; then a held grasp."""
     kinds = [kind(reason) for reason in found["reasons"]]
     order = [name for name, _ in Counter(kinds).most_common() if name != "held"]
     rows = [kinds.index(name) for name in order[:SHOWN]]

@@ -241,7 +241,7 @@ def _copy(connection: Connection, table: Table, rows: Sequence[dict[str, Any]]) 
 
 
 class _without_indexes:  # noqa: N801
-    """Drop the secondary indexes of a table and recreate them after the block, which is much faster."""
+    """Drop the secondary indexes of a table and recreate them after the block, for faster inserts."""
 
     def __init__(self, connection: Connection, table: Table) -> None:
         self._connection, self._table = connection, table

@@ -49,7 +49,7 @@ LARGE: Final = 1_000_000
 
 
 def cpu_s(pid: int) -> float:
-    """Return the processor time of a process [s], which depends less on other load than wall time."""
+    """Return the processor time of a process [s]; it depends less on other load than wall time."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 

@@ -57,7 +57,7 @@ class Rates:
     """Network losses of one node, for up to `longest_cut_s`, uniformly distributed."""
     longest_cut_s: float = 120.0
     zone_per_week: float = 1.0
-    """Failures of a zone, which kill a third of all nodes at once."""
+    """Failures of a zone; each kills a third of all nodes at once."""
     replaced_after_s: float = 180.0
     """Time until the worker of a new node takes tasks: boot, pull of images, check of its engine."""
     controller_killed_per_day: float = 1.0

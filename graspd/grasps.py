@@ -310,7 +310,7 @@ class Grasps:
         """
         if len(self.objects) > 1:
             raise InputError(f"a file holds grasps on one object; these are on {', '.join(self.objects)}")
-        # For several files, the attributes are those of the first file: they do not describe another object.
+        # With several files, the attributes are those of the first file, and do not describe another object.
         if self.objects and self.objects != [str(self._attributes.get("object", ""))]:
             raise InputError(
                 f"these grasps were selected from several objects; open the file of {self.objects[0]} alone"

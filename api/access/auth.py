@@ -106,7 +106,7 @@ def is_allowed(request: HTTPConnection, scope: Scope) -> bool:
 
 
 def _refuse_strangers(request: HTTPConnection) -> None:
-    """Refuse requests from other machines, and from proxies, which may forward anyone's requests."""
+    """Refuse requests from other machines, and from proxies, because these may forward any request."""
     passed_on = next((name for name in _OF_PROXIES if name in request.headers), None)
     address = request.client.host if request.client else ""
     if passed_on is None and not _is_remote(address):

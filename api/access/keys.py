@@ -76,7 +76,7 @@ class Key(BaseModel):
 
     @model_validator(mode="after")
     def _has_an_id(self) -> Self:
-        # Keys stored before ids existed get an id from their name, which both secrets of a rotation share.
+        # Keys stored before ids existed get an id from their name, because both secrets of a rotation share the name.
         self.id = self.id or _sha256(f"name {self.name}")[:16]
         return self
 
@@ -149,7 +149,7 @@ class KeyFile:
         return token
 
     def rotate(self, name: str, *, grace: timedelta = timedelta(0), lifetime: timedelta | None = None) -> str:
-        """Replace and return a key's secret; the old one is valid for `grace`; scope, project, limits persist."""
+        """Return a new secret of a key; the old one stays valid for `grace`; scope, project, limits persist."""
         token = PREFIX + secrets.token_urlsafe(32)
         with self._changing() as document:
             old = _live(document, name)

@@ -110,7 +110,7 @@ class SubmissionClaim:
 
 @dataclass(frozen=True)
 class _Holder:
-    """Owner of counters: a key, which counts jobs per day, or a project, which counts requested grasps."""
+    """Owner of counters: a key (counts jobs per day) or a project (counts requested grasps per day)."""
 
     name: str
     words: str
@@ -141,7 +141,7 @@ class _Holder:
 
 
 class Quotas:
-    """Counters of keys and projects; `unfinished` returns those of the given ids that have not ended."""
+    """Counters of keys and projects; `unfinished` returns the ids, of those given, that have not ended."""
 
     def __init__(
         self,
@@ -277,7 +277,7 @@ class Idempotency:
     """Idempotency-Key (IETF draft): the same key with a different body is an input error.
 
     Identical requests give the same job even without a key, because a job's id depends on its content. Redis stores the
-    request's digest under each key for a day, but no response; if Redis loses it, only this check is lost.
+    request's digest under each key for a day, but no response. If Redis loses the digest, only this check is lost.
     """
 
     def __init__(self, connection: Any) -> None:

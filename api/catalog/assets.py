@@ -132,7 +132,7 @@ class Assets:
         log.info("%s %s deleted", kind, asset.name)
 
     def _mark(self, kind: AssetKind, name: str, files: MutableMapping[str, bytes], project: str) -> str:
-        """Add the project's mark to the files, which makes them private to the project; return their digest."""
+        """Make the files private to the project by adding its mark; return their digest."""
         files.update(project_mark(files, ""))
         digest = digest_files(kind, files)
         if not project:

@@ -103,7 +103,7 @@ _COLUMNS: Final = (*GraspView.model_fields, "tags")
 
 
 class GraspExports:
-    """Writer of selected grasps to files, which stay on the service's disk until the response is sent."""
+    """Writer of selected grasps to files; a file stays on the service's disk until it is sent."""
 
     def __init__(self, services: Services, grasps: Grasps, tags: Tags) -> None:
         self._services = services

@@ -72,7 +72,7 @@ class Search:
 
     def run(self, seeds: list[list[int]], *, steps: int, keep: int, tell: StepCounter) -> HandState:
         """Return the `keep` best states of each chain, best first, grouped by chain.
-        `seeds` are those of the chains. A chain ends when the schedule's counter reaches `steps`. `tell` receives one
+        `seeds` has each chain's seeds. A chain ends when the schedule's counter reaches `steps`. `tell` receives one
         unit of work per move. Raises InputError: no free hand pose around the object. TaskCancelled: through `tell`."""
         chains = len(seeds)
         random = np.array([np.random.SeedSequence(seed).generate_state(1)[0] for seed in seeds], np.uint32)
@@ -183,7 +183,7 @@ def clash_grid(pair: Pair, eigen: Eigengrasps) -> NDArray[np.int32]:
 
 
 def _sorted(best: Floats, energy: Floats, begun: Floats) -> Floats:
-    """Return states (chains * keep, 8), best first; missing ones repeat a chain's last one, or its start."""
+    """Return states (chains * keep, 8), best first; the chain's last one, or its start, fills gaps."""
     out = np.empty_like(best)
     for c, (states, energies) in enumerate(zip(best, energy, strict=True)):
         found = [k for k in np.argsort(energies, kind="stable") if energies[k] < NOT_YET / 2]

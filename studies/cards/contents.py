@@ -66,7 +66,7 @@ class Contents:
 
 def contents_of_store(store: Store, dataset: str, snapshot: str | None = None, cache: Path | None = None) -> Contents:
     """Return a snapshot of a dataset, by default the newest.
-    Raises NotFoundError: the dataset or the snapshot does not exist. StoreUnavailable."""
+    Raises NotFoundError: the dataset or the snapshot does not exist; StoreUnavailable: the store does not answer."""
     taken = newest_snapshot(store, dataset, snapshot)
     record = load_dataset(store, dataset)
     return Contents(

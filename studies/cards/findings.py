@@ -10,7 +10,7 @@ import numpy as np
 
 Row = Mapping[str, Any]
 
-#: A cell's yield below this share of the median over its hand's cells is low.
+#: Share of the median yield of a hand's cells, below which a cell's yield is low.
 _LITTLE: Final = 0.5
 #: A joint hardly moves if 98 of 100 grasps use less than this share of its range.
 _STILL: Final = 0.05

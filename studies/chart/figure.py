@@ -360,7 +360,7 @@ def _size(axes: Any, text: str) -> tuple[float, float]:
 
 
 def _candidates(point: Boxes, size: tuple[float, float], pixels: float) -> list[Boxes]:
-    """Return boxes around the point, (4,) each: left, bottom, right, top [px]; preferred ones first."""
+    """Return boxes (left, bottom, right, top) [px] around the point, preferred ones first."""
     found = []
     for reach, turn in product(_REACHES_PT, _TURNS):
         across, up = math.cos(math.radians(turn)), math.sin(math.radians(turn))

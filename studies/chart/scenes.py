@@ -59,7 +59,7 @@ _NOTHING: Final = {**{f"{name}_count": 0 for name in SHARES}, "robust_sum": 0.0,
 
 @dataclass
 class ObjectScenes:
-    """An object and its scenes, which are created for the first setting without a cached result."""
+    """An object and its scenes; the scenes are created for the first setting without a cached result."""
 
     thing: ChartObject
     spec: SceneSpec
