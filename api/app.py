@@ -1,4 +1,4 @@
-"""HTTP application. It has no state between requests that other processes would need."""
+"""HTTP application. It keeps no state between requests that another process would need."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ _LOOPBACK_NAMES = frozenset({"127.0.0.1", "localhost", "::1"})
 
 
 def create_app(settings: Settings, services: Services | None = None) -> FastAPI:
-    """Create the application with given services, or with its own, which it opens and closes."""
+    """Create the application with given services, or with its own services, opened and closed by it."""
     proxy = Proxy(settings)
     keys = KeyFile(settings.resolved_keys_file, closed=proxy.is_on)
     if not (proxy.is_on or keys.has_live_key or is_loopback(settings.host)):

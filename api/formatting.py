@@ -12,7 +12,7 @@ NONE: Final = "–"
 
 
 def metric(value: float | None) -> str:
-    """Format with about three digits, more from 1000 on; positive values below 0.001 as "< 0.001"."""
+    """Format with about three digits (more from 1000 on); values between 0 and 0.001 as "< 0.001"."""
     if value is None or value != value:
         return NONE
     if value == 0:

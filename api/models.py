@@ -41,10 +41,10 @@ class Job(Validated):
         "valid", description="kind of its stored grasps: valid, feasible (not validated) or kept (all candidates)"
     )
     progress: float = Field(ge=0, le=1)
-    eta_s: float | None = Field(None, description="expected time until the job ends [s]; absent: unknown")
+    eta_s: float | None = Field(None, description="expected time until the job ends [s]; null if unknown")
     created: str
-    owner: str = Field("", description="id of the key that submitted it; empty: none or unknown")
-    project: str = Field("", description="its project; empty: the unnamed project")
+    owner: str = Field("", description="id of the key that submitted it; empty if none or unknown")
+    project: str = Field("", description="its project; empty for the unnamed project")
     finished: str | None = None
     reason: str | None = Field(None, description="why it failed, or found fewer grasps than requested")
     stages: list[StageStatus]
@@ -52,7 +52,7 @@ class Job(Validated):
 
 @insert_fields(last=mean_fields())
 class MeanMetrics(BaseModel):
-    """Means over a job's valid grasps (all stored ones if not validated); absent while there are none."""
+    """Means over a job's valid grasps (all stored ones if not validated); null while there are none."""
 
     if TYPE_CHECKING:
 
@@ -88,7 +88,7 @@ class JobDetail(Job):
     hand_digest: str
     object_digest: str
     choice: Choice | None = Field(None, description="how a chart resolved the fidelity auto, if requested")
-    note: str | None = Field(None, description="why fewer grasps than requested were found; absent: not applicable")
+    note: str | None = Field(None, description="why fewer grasps than requested were found; null if enough")
     outcomes: dict[str, int] = Field(
         {}, description="rejected candidates by outcome, if the job found fewer grasps than requested"
     )
@@ -97,7 +97,7 @@ class JobDetail(Job):
     attempts: list[AttemptView]
     mean: MeanMetrics
     diversity: Diversity | None = Field(
-        None, description="diversity of the valid grasps (all stored ones if not validated); absent: none"
+        None, description="diversity of the valid grasps (all stored ones if not validated); null without grasps"
     )
     shards: list[Shard]
 
@@ -142,7 +142,7 @@ class Posture(BaseModel):
 class Waypoint(BaseModel):
     """One posture on the trajectory of a grasp, in the frame of the object at rest."""
 
-    name: str = Field(description="standoff, pregrasp, grasp, squeeze, lift; empty: an intermediate posture")
+    name: str = Field(description="standoff, pregrasp, grasp, squeeze, lift; empty between them")
     place: float = Field(description="position on a slider: named postures at 0, 1, 2, ..., others evenly spaced")
     hand_pose: list[float] = Field(description="pose of the root link: x y z [m], quaternion w x y z")
     joint_positions: list[float] = Field(description="joint positions in the order of joint_names [rad or m]")
@@ -166,8 +166,8 @@ class GraspScene(BaseModel):
     supports: list[HalfSpace | Box]
     neighbours: list[Neighbour] = Field(default_factory=list)
     clearance_m: float | None = Field(None, description="least distance of the hand from supports and neighbours")
-    lift: str | None = Field(None, description="outcome of the lift test; None: not tested")
-    lift_hard: bool | None = Field(None, description="whether it lifts at half friction; None: not tested")
+    lift: str | None = Field(None, description="outcome of the lift test; null if not tested")
+    lift_hard: bool | None = Field(None, description="whether it lifts at half friction; null if not tested")
 
 
 class Push(BaseModel):
@@ -187,14 +187,14 @@ class GraspDetail(GraspView):
     thresholds_m: list[float] = Field(description="contact thresholds of `sweep`")
     sweep: dict[str, list[float | None]] = Field(description="metrics at each threshold")
     way: list[Waypoint] = Field(description="trajectory from the standoff, if any, to the squeeze or the lift")
-    scene: GraspScene | None = Field(None, description="scene in which it was planned; None: around a free object")
-    pushes: list[Push] = Field(description="verdict per direction of push; empty: not validated")
-    verdict_margin: float | None = Field(None, description="largest ratio of motion to its limit; below 1: held")
+    scene: GraspScene | None = Field(None, description="scene in which it was planned; null for a free object")
+    pushes: list[Push] = Field(description="verdict per direction of push; empty if not validated")
+    verdict_margin: float | None = Field(None, description="largest ratio of motion to its limit; held if below 1")
     validated_by: Literal["mujoco", "mujoco_warp"] | None = Field(
         None, description="engine of the verdict: MuJoCo on the CPU (the reference) or MuJoCo Warp (the prefilter)"
     )
     recheck: bool | None = Field(
-        None, description="verdict under the unmodified DexGraspBench protocol; None: not rechecked"
+        None, description="verdict under the unmodified DexGraspBench protocol; null if not rechecked"
     )
     friction: float | None = Field(None, description="Coulomb coefficient of the metrics")
 
@@ -253,7 +253,7 @@ class Part(BaseModel):
     """State of one part that the API needs."""
 
     ok: bool
-    latency_ms: float | None = Field(None, description="response time [ms]; null: no response")
+    latency_ms: float | None = Field(None, description="response time [ms]; null without a response")
     detail: str = ""
 
 
@@ -272,7 +272,7 @@ class Worker(WorkerView):
     """Worker and its present task."""
 
     stage: Stage | None = Field(None, description="stage of the current task")
-    lease_age_s: float | None = Field(None, description="time since its last heartbeat [s]; absent once it is gone")
+    lease_age_s: float | None = Field(None, description="time since its last heartbeat [s]; null once it is gone")
 
 
 class Histogram(BaseModel):

@@ -139,7 +139,7 @@ def error_response(request: Request, error: Exception) -> JSONResponse:
 
 
 def _allowed_methods(request: Request) -> list[str]:
-    """Return the methods of all routes at this path (RFC 9110 §15.5.6); one route has only its own."""
+    """Return the methods of all routes at this path (RFC 9110 §15.5.6); a route knows only its own."""
     return [
         method
         for method in ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE")

@@ -23,7 +23,7 @@ from graspd.api.app import create_app
 from graspd.service.run.address import bind
 from graspd.service.settings import Settings
 
-#: Longest time that a stop of the server waits for event streams, which only clients end [s].
+#: Longest wait of a stopping server for event streams [s], because only clients end them.
 _GRACE_S = 3
 _TOO_SLOW: Final = b"HTTP/1.1 408 Request Timeout\r\nConnection: close\r\nContent-Length: 0\r\n\r\n"
 

@@ -59,7 +59,7 @@ def load_pair(hand: HandModel, obj: ObjectModel, device: str, *kernels: ModuleTy
 
 
 def free_starts(pair: Pair, *, seed: int, batch: int, indices: range) -> HandState:
-    """Sample a collision-free start per grasp, the palm towards a random surface point (Grasp'D, 2022)."""
+    """Sample a collision-free start per grasp, with the palm towards a random surface point (Grasp'D)."""
     return sample_starts(pair.model(pair.coarse), seed=seed, batch=batch, indices=indices, each=1)
 
 

@@ -60,7 +60,7 @@ class Cell:
 
     @property
     def cpu_seconds(self) -> float:
-        """CPU time of planning [s], which depends less on other load than wall time."""
+        """CPU time of planning [s]; it depends less on other load than wall time."""
         return float(self.grasps.info["cpu_seconds"])  # type: ignore[arg-type]
 
     @cached_property
@@ -94,7 +94,7 @@ class Cell:
         return found
 
     def verdicts(self, level: Level, hard: bool) -> dict[str, Any]:
-        """Return `success` and `reasons` of each grasp, wall and CPU seconds, and the `terms` of the verdict."""
+        """Return each grasp's `success` and `reasons`, wall and CPU seconds, and a digest of conditions."""
 
         def make() -> dict[str, Any]:
             grasps, began = self.grasps, time.process_time()

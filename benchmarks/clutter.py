@@ -4,8 +4,8 @@ usage: python -m benchmarks.clutter DATA_DIR [--hand allegro] [--targets 025_mug
            [--seconds 60] [--json OUT]                            DATA_DIR holds hands/ and objects/
 
 Neighbours are drawn from the other objects and dropped with the target. The time includes planning and validation, but
-not kernels, convex pieces and drops. A second is two seconds of processor time, for two cores, so other load changes
-the figures little. The gap is the distance to the nearest neighbour."""
+not kernels, convex pieces and drops. A second stands for two seconds of processor time (two cores), so other load
+changes the figures little. The gap is the distance to the nearest neighbour."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ ROOMS: Final = (
 )
 #: Attributes of a shard that depend on the run, not on its result.
 OF_THE_RUN: Final = {"seconds", "created"}
-#: Fields of a record that depend on the run; checksums cover times, and attributes are compared in shards.
+#: Fields of a record that depend on the run, such as checksums over times. Attributes are compared in shards.
 PASSING: Final = {"created", "origin", "at", "seconds", "sha256", "checksum", "size_bytes", "worker", "attributes"}
 #: Folders of a store with random identities of each service.
 DRAWN: Final = {"marks", "service"}

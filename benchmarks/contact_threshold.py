@@ -57,7 +57,7 @@ def sweep(cell: Cell) -> dict[str, Any]:
 
 
 def collect(args: argparse.Namespace) -> dict[str, Any]:
-    """Return hand -> friction -> metric -> {mean, low, high}, lists over thresholds; low, high: quartiles."""
+    """Return hand -> friction -> metric -> {mean, low, high} by threshold; low and high are quartiles."""
     out: dict[str, Any] = {}
     for hand in args.hands:
         found = []

@@ -35,7 +35,7 @@ EDGE = 260
 THIN_MM = 8.0
 #: An object is wide for a hand whose pads open to less than this multiple of the object's least extent.
 ROOMY = 1.25
-#: Penetration in MuJoCo minus that on the mesh is a cause if it exceeds that of held grasps by this [mm].
+#: A cause of failure: MuJoCo's penetration minus the mesh's is larger by this [mm] than in held grasps.
 PUSHED_MM = 0.3
 
 
@@ -107,7 +107,7 @@ def _median(values: NDArray[np.float64], digits: int) -> str:
 
 
 def chosen(found: dict[str, Any]) -> list[int]:
-    """Return rows of failures, one of each common kind, then more of the first kind; last a held grasp."""
+    """Return rows of failures, one per common kind, then more of the first kind; then a held grasp."""
     kinds = [kind(reason) for reason in found["reasons"]]
     order = [name for name, _ in Counter(kinds).most_common() if name != "held"]
     rows = [kinds.index(name) for name in order[:SHOWN]]

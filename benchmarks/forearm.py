@@ -87,7 +87,7 @@ class Found:
     lowest: np.ndarray
     """(N,) lowest heights [mm]."""
     inside: np.ndarray
-    """(N,) whether they collide with a support or neighbour."""
+    """(N,) whether the links collide with a support or neighbour."""
 
 
 def look(upstream: Upstream, made: SynthesisResult, beside: list[trimesh.Trimesh]) -> Found:

@@ -63,7 +63,7 @@ Flags = NDArray[np.bool_]
 
 
 def with_our_shapes(same: HandMatch) -> HandModel:
-    """Return the other model with the collision shapes of `same.ours`: isolates their effect on verdicts."""
+    """Return the other model with the collision shapes of `same.ours`, to isolate the shapes' effect."""
     there = np.zeros(same.ours.bodies, np.intp)
     there[same.bodies] = np.arange(same.theirs.bodies)
     frames = invert(same.frames)[there]

@@ -43,7 +43,7 @@ class Entry:
     title: str
     source: str
     path: str = ""
-    """Path below the sources; empty: built in."""
+    """Path below the sources; empty if built in."""
     options: dict[str, Any] = field(default_factory=dict)
     said: str = ""
     """The options in words, for the page."""

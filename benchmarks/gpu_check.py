@@ -29,7 +29,7 @@ STACK_BYTES = 512
 HOT_REGISTERS = 128
 #: Registers of kernels that would spill with fewer: the 6 x 6 system and its factor stay in registers.
 KNOWN = {("simulation.kernels.contact.direct", 100): 135}
-#: Kernels of every iteration of the planner, which determine the speed on a GPU.
+#: Kernels that run in every iteration of the planner, and so determine the speed on a GPU.
 HOT = ("gather", "object_in_pieces", "pieces_in_pieces", "direct", "obstacle")
 
 

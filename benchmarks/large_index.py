@@ -56,7 +56,7 @@ def fill(index: Index, store: Store, *, grasps: int = 1_000_000, jobs: int = 100
     with index.database.writing() as connection:
         maker.insert(connection)
     with index.database.reading() as connection:
-        if connection.dialect.name == "postgresql":  # it would otherwise do so later
+        if connection.dialect.name == "postgresql":  # it would otherwise vacuum later
             own = ", ".join(metadata.tables)  # only the tables of the index
             connection.execution_options(isolation_level="AUTOCOMMIT").exec_driver_sql(f"VACUUM ANALYZE {own}")
     return maker.counts
@@ -241,7 +241,7 @@ def _copy(connection: Connection, table: Table, rows: Sequence[dict[str, Any]]) 
 
 
 class _without_indexes:  # noqa: N801
-    """Drop the secondary indexes of a table and recreate them after the block, which is much faster."""
+    """Drop the secondary indexes of a table and recreate them after the block, for faster inserts."""
 
     def __init__(self, connection: Connection, table: Table) -> None:
         self._connection, self._table = connection, table

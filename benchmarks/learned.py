@@ -1,4 +1,4 @@
-"""Planner seeds from a network against fast_graspd's own: time to the first valid grasp, and rate.
+"""Starts from a network compared with fast_graspd's own: time to the first valid grasp, and rate.
 
 usage: python -m benchmarks.learned --network NET.npz [OTHER.npz ...] [--data DATA_DIR] [--objects NAME ...]
            [--many 32] [--seeds 5] [--starts 4 ...] [--out FOLDER]

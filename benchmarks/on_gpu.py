@@ -83,7 +83,7 @@ def stages(hand: HandModel, obj: ObjectModel, device: str, batch: int) -> dict[s
     planner.grasps_of(hand, obj, parts, 0.0, device=device)
     grasps, around = timed(lambda: planner.grasps_of(hand, obj, again, 0.0, device=device))
     few, pieces = grasps.take(np.arange(min(batch, VALIDATED))), decompose(obj)
-    # An untimed call compiles the models of the validator and the kernels of the metrics, which are cached.
+    # An untimed call compiles and caches the models of the validator and the kernels of the metrics.
     warm = grasps.take(np.arange(min(batch, 16)))
     validate(hand, obj, warm, pieces=pieces)
     measure(hand, obj, warm)

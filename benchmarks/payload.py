@@ -1,4 +1,4 @@
-"""Error and CPU time of payloads, compared with full tests of each mass; ratio of bound to payload.
+"""Error and CPU time of payloads, compared with full tests; ratio of load capacity to payload.
 
 usage: python -m benchmarks.payload DATA_DIR [--hands allegro ...] [--objects 025_mug ...] [--grasps 8] [--scenes 4]
            [--seed 1500] [--free] [--page OUT.md]
@@ -127,7 +127,7 @@ def main() -> None:
 
 def of_pair(given: Any, hand: HandModel, name: str, mass: float) -> tuple[Floats, Floats, Floats, float]:
     """Return for each valid grasp of a pair the ratio of payload to full tests, and both CPU times [ms].
-    The last value is the bound of all grasps divided by their largest payload."""
+    The last value is the grasps' largest load capacity divided by their largest payload."""
     grasps, obj, placed = valid_grasps(given, hand, given.data / "objects" / name / "clean.stl", mass)
     around = (placed.supports,) if placed is not None else ()
     # A root on a weld yields, so that hand and object move.
@@ -171,7 +171,7 @@ def every(grasps: GraspSet) -> NDArray[np.intp]:
 def valid_grasps(
     given: Any, hand: HandModel, mesh: Path, mass: float
 ) -> tuple[GraspSet, ObjectModel, PlacedGrasps | None]:
-    """Return valid grasps in the frame of the object's centre, and their scenes; None: the object is free."""
+    """Return valid grasps in the frame of the object's centre, the object, and scenes (None if free)."""
     obj = object_from_path(str(mesh), face_error_m=FIDELITIES["standard"].face_error_m).with_mass(mass=mass)
     request = JobOptions(grasps=given.grasps, rechecks=0, seed=given.seed)
     scenes = None

@@ -105,7 +105,7 @@ def main() -> None:
 
 
 def lift_share(hand: HandModel, folder: Path, grasps: int) -> float | None:
-    """Return the share of candidates that lift an object off a table; None: it does not fit or is refused."""
+    """Return the share of candidates that lift an object off a table; None if it is refused or too wide."""
     obj, jaws = object_from_path(folder / "clean.stl"), jaws_of(hand)
     widest = oppositions_of(hand).widest if jaws is None else jaws.opening
     if np.mean(crossings_of(obj).width <= widest) < FITTING:

@@ -150,7 +150,7 @@ def _neighbours(objects: Sequence[ObjectModel], device: str, seed: int) -> bytes
 
 
 def _past(poses: Floats, obj: ObjectModel, beside: Neighbours) -> GivenCameras:
-    """Return a camera that sees the object past its nearest neighbour, which hides a part of it."""
+    """Return a camera that sees the object past its nearest neighbour; the neighbour hides a part."""
     middles = np.stack([apply(pose, o.centre_of_mass) for o, pose in zip(beside.objects, beside.poses[0], strict=True)])
     middle = apply(poses[0], obj.centre_of_mass)
     nearest = int(np.argmin(np.linalg.norm(middles - middle, axis=1)))

@@ -37,7 +37,7 @@ from graspd.service.store.store import open_store
 from tests.fakes import add_assets, engine_of, fake_stages, make_shard, request
 from tests.memory_queue import MemoryQueue
 
-#: A batch of 32 grasps takes at least this long on two cores (docs/explanation/performance.md) [s].
+#: Least time of a batch of 32 grasps on two cores [s] (docs/explanation/performance.md).
 BATCH_S: Final = 1.0
 
 
@@ -49,7 +49,7 @@ LARGE: Final = 1_000_000
 
 
 def cpu_s(pid: int) -> float:
-    """Return the processor time of a process [s], which depends less on other load than wall time."""
+    """Return the processor time of a process [s]; it depends less on other load than wall time."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 

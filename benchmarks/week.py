@@ -49,15 +49,15 @@ class Rates:
     """Rates and durations of interruptions."""
 
     reclaimed_per_day: float = 1 / 3
-    """Of one node, with notice. Clouds with published rates reclaim 5 to 20 % of spot nodes a month; this is 50 times
-    as much."""
+    """Reclaims of one node, with notice. Clouds with published rates reclaim 5 to 20 % of spot nodes a month; this is
+    at least 50 times as much."""
     killed_per_day: float = 1 / 30
-    """Of one node, without notice: out of memory, kernel crash, power failure."""
+    """Ends of one node without notice: out of memory, kernel crash, power failure."""
     cut_off_per_day: float = 1 / 10
-    """Of one node: loss of the network for up to `longest_cut_s`, uniformly distributed."""
+    """Network losses of one node, for up to `longest_cut_s`, uniformly distributed."""
     longest_cut_s: float = 120.0
     zone_per_week: float = 1.0
-    """A third of all nodes killed at once."""
+    """Failures of a zone; each kills a third of all nodes at once."""
     replaced_after_s: float = 180.0
     """Time until the worker of a new node takes tasks: boot, pull of images, check of its engine."""
     controller_killed_per_day: float = 1.0

@@ -201,7 +201,7 @@ def _entry() -> None:
 
 def main() -> None:
     mark_process()
-    # Commands do not draw with MuJoCo, whose import would start a process to search for GLFW without this setting.
+    # Commands do not draw with MuJoCo. Without this setting, its import would start a process to search for GLFW.
     os.environ.setdefault("MUJOCO_GL", "disable")
     # Without this setting pydantic searches all installed packages for plugins. To enable plugins, set the variable to
     # "".

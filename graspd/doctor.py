@@ -68,7 +68,7 @@ def _exit(code: int) -> None:
 
 
 def all_checks(settings: Settings, *, full: bool = False) -> list[Check]:
-    """Return the checks of all packages; those of a missing package report that it is not installed."""
+    """Return the checks of all packages; a check of a missing package reports that it is not installed."""
     checks = checks_of(settings, full=full)
     if missing_extra("graspd.api"):
         checks.append(_missing_extra("keys", "api"))
@@ -109,7 +109,7 @@ _FULL_S: Final = 24 * 3600.0
 
 
 def checks_of(settings: Settings, *, full: bool = False) -> list[Check]:
-    """Return the checks that need neither engine nor API. `full`: compare the whole index with the store."""
+    """Return the checks without engine and API; with `full`, all index rows are compared with the store."""
     full_s = _FULL_S if full else 120.0
     return [
         Check("disk", partial(machine.disk, settings)),

@@ -130,7 +130,7 @@ class Grasps:
 
     @property
     def joint_names(self) -> list[str]:
-        """(J) names of the hand's moving joints, the order of all joint positions."""
+        """(J) names of the hand's moving joints, in the order of all joint positions."""
         names = self._attributes.get("joint_names", [])
         return [str(name) for name in names] if isinstance(names, list) else []
 
@@ -147,7 +147,7 @@ class Grasps:
 
     @property
     def outcomes(self) -> dict[str, int]:
-        """Numbers of dropped candidates by outcome (docs/explanation/quality.md)."""
+        """Numbers of rejected candidates by outcome (docs/explanation/quality.md)."""
         return {name: int(count) for name, count in json.loads(str(self._attributes.get("outcomes", "{}"))).items()}
 
     @property
@@ -192,12 +192,12 @@ class Grasps:
 
     @property
     def is_valid(self) -> NDArray[np.bool_]:
-        """(N,) feasible, and held by the validator; in a scene: lifted."""
+        """(N,) whether each grasp is feasible and held in validation; in a scene, lifted."""
         return validity.valid(self._columns)
 
     @property
     def is_feasible(self) -> NDArray[np.bool_]:
-        """(N,) feasible: within the limits of penetration and contact."""
+        """(N,) whether each grasp is within the limits of penetration and contact."""
         return validity.feasible(self._columns)
 
     @property
@@ -240,7 +240,7 @@ class Grasps:
         return self[self.is_valid]
 
     def where(self, rows: Rows | Callable[[Grasps], Rows]) -> Grasps:
-        """Select by a mask (N,), by row numbers, or by a function that makes either.
+        """Select by a mask (N,), by row numbers, or by a function that returns one of these.
 
         Example: `grasps.where(lambda g: g.metric("epsilon") > 0.3)`.
         """
@@ -310,7 +310,7 @@ class Grasps:
         """
         if len(self.objects) > 1:
             raise InputError(f"a file holds grasps on one object; these are on {', '.join(self.objects)}")
-        # For several files, the attributes are those of the first file: they do not describe another object.
+        # With several files, the attributes are those of the first file, and do not describe another object.
         if self.objects and self.objects != [str(self._attributes.get("object", ""))]:
             raise InputError(
                 f"these grasps were selected from several objects; open the file of {self.objects[0]} alone"

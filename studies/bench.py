@@ -52,8 +52,8 @@ def bench(
     """Time each combination of fidelity, batch, joins and threads; `say` receives a line per combination.
     `load` loads the object at a fidelity's simplification error bound [m]; `joins` are numbers of batches per launch.
     The median of `repeats` timed calls is reported, after an untimed call. A GPU ignores `threads`. Return `device`,
-    `runs[]` with a row per combination, `start` with seconds to the first and the next grasp, `kernels`, and
-    `host_ms_per_grasp`: None on a GPU, where waiting threads are busy."""
+    `runs[]` with a row per combination, `start` with seconds to the first and the next grasp, and `kernels`. It also
+    has `host_ms_per_grasp`, but None on a GPU, because waiting threads are busy there."""
     first = fidelities[0]
     nominal = load(first.face_error_m)
     start = _start_times(hand, nominal, first, device)
@@ -183,7 +183,7 @@ def _iterations_used(
 def _timed(
     model: Model, data: Data, state: HandState, schedule: Schedule, fidelity: Fidelity
 ) -> tuple[dict[str, float], HandState]:
-    """Return kernel seconds per iteration, medians over `SAMPLED` iterations in the schedule's middle."""
+    """Return each kernel's median seconds over `SAMPLED` middle iterations, and the hands at the end."""
     data.set_schedule(schedule)
     data.set_state(state)
     launches = record_iteration(model, data, fidelity.optimizer)

@@ -186,7 +186,7 @@ def _lift_rates(verdicts: LiftVerdicts, clear: NDArray[np.bool_]) -> dict[str, A
 
 
 def _in_models(found: Robustness, verdicts: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return a row's shares; add to each verdict its share (None: not tested) and first failing axis."""
+    """Return a row's shares; add to each verdict its share (None if not tested) and first failing axis."""
     tried = np.isfinite(found.share)
     for one, share, weakest in zip(verdicts, found.share, found.weakest, strict=True):
         known = math.isfinite(share)
@@ -208,7 +208,7 @@ def _verdict_rows(
     reasons: Sequence[str],
     kind: type[IntEnum],
 ) -> list[dict[str, Any]]:
-    """Return for each grasp: row, held, outcomes of its pushes or lift, margin (None: diverged), reason."""
+    """Return for each grasp row, held, outcomes of pushes or lift, margin (None if diverged), reason."""
     return [
         {
             "row": row,
@@ -298,7 +298,7 @@ def _models(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _rate(rows: list[dict[str, Any]], key: str, weight: str) -> float | None:
-    """Return the mean over rows that have the key, weighted by their number of grasps."""
+    """Return the mean over rows in which `key` is known, weighted by their `weight`."""
     known = [row for row in rows if row[key] is not None]
     total = sum(row[weight] for row in known)
     return _plain(sum(row[key] * row[weight] for row in known) / total) if total else None

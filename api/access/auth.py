@@ -40,13 +40,13 @@ def caller_id() -> str:
 
 
 def project_scope() -> ProjectScope:
-    """Return the projects that the caller sees: its own, or all with `admin` or while there are no keys."""
+    """Return the projects that the caller sees: its own; all for `admin`, and while there are no keys."""
     key = caller.get()
     return EVERYTHING if key is None else ProjectScope(key.project, everything=key.scope.includes(Scope.ADMIN))
 
 
 class ForeignResource(ApiError):
-    """Refusal to change a resource that another key submitted."""
+    """Refusal to change a resource of another project or key."""
 
 
 def authorize(request: HTTPConnection, scope: Scope) -> Key | None:
@@ -77,7 +77,7 @@ def is_still_authorized(request: HTTPConnection, scope: Scope) -> bool:
 
 
 def may_change(owner: str, project: str = "") -> bool:
-    """Check whether the present key may change a resource; without owner and project, only `admin` may."""
+    """Check whether the caller may change a resource; one without owner and project needs `admin`."""
     key = caller.get()
     if key is None or key.scope.includes(Scope.ADMIN):
         return True
@@ -106,7 +106,7 @@ def is_allowed(request: HTTPConnection, scope: Scope) -> bool:
 
 
 def _refuse_strangers(request: HTTPConnection) -> None:
-    """Refuse requests from other machines, and from proxies, which may forward anyone's requests."""
+    """Refuse requests from other machines, and from proxies, because these may forward any request."""
     passed_on = next((name for name in _OF_PROXIES if name in request.headers), None)
     address = request.client.host if request.client else ""
     if passed_on is None and not _is_remote(address):
@@ -163,7 +163,7 @@ class Proxy:
         return bool(self._secret)
 
     def find(self, scope: AsgiScope) -> Key | None:
-        """Return a key with the rights of the first group in the settings that the person has, or None."""
+        """Return a key with the rights of the person's group that is first in the settings, or None."""
         if not self.is_on or not self._is_from_proxy(scope):
             return None
         headers = Headers(scope=scope)

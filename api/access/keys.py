@@ -31,7 +31,7 @@ SESSION_S: Final = 12 * 3600
 
 
 class Scope(StrEnum):
-    """Permission of a key; each includes those before. `submit` covers its project, `admin` all projects."""
+    """Permission of a key; each includes earlier ones. `submit` covers its project, `admin` all projects."""
 
     READ = "read"
     SUBMIT = "submit"
@@ -43,7 +43,7 @@ class Scope(StrEnum):
 
 
 class KeyLimits(BaseModel):
-    """Limits of one key. None: as in the settings; 0: no limit."""
+    """Limits of one key. None means the limit of the settings, 0 means no limit."""
 
     requests_per_minute: int | None = Field(None, ge=0)
     concurrency: int | None = Field(None, ge=0, description="concurrent requests")
@@ -52,7 +52,7 @@ class KeyLimits(BaseModel):
 
 
 class ProjectLimits(BaseModel):
-    """Shared limits of the keys of one project. None or 0: no limit."""
+    """Shared limits of the keys of one project. None and 0 mean no limit."""
 
     grasps_in_flight: int | None = Field(None, ge=0, description="maximum grasps in unfinished jobs")
     grasps_per_day: int | None = Field(None, ge=0, description="requested grasps per day (UTC)")
@@ -76,7 +76,7 @@ class Key(BaseModel):
 
     @model_validator(mode="after")
     def _has_an_id(self) -> Self:
-        # Keys stored before ids existed: both secrets of a rotation have the same name, and so get the same id.
+        # Keys stored before ids existed get an id from their name, because both secrets of a rotation share the name.
         self.id = self.id or _sha256(f"name {self.name}")[:16]
         return self
 
@@ -94,7 +94,7 @@ class _Document(BaseModel):
 
 
 class KeyFile:
-    """File of the keys. `closed`: requests need credentials even before the first key."""
+    """Key file; with `closed`, requests need credentials even before the first key."""
 
     def __init__(self, path: Path, *, closed: bool = False) -> None:
         self.path = path
@@ -149,7 +149,7 @@ class KeyFile:
         return token
 
     def rotate(self, name: str, *, grace: timedelta = timedelta(0), lifetime: timedelta | None = None) -> str:
-        """Return a key's new secret; the old one stays valid for `grace`; scope, project and limits persist."""
+        """Return a new secret of a key; the old one stays valid for `grace`; scope, project, limits persist."""
         token = PREFIX + secrets.token_urlsafe(32)
         with self._changing() as document:
             old = _live(document, name)
@@ -237,7 +237,7 @@ class KeyFile:
 
     @contextmanager
     def _changing(self) -> Iterator[_Document]:
-        """Yield a copy of the document, which replaces the file at the end; a lock serialises commands."""
+        """Yield a copy of the document, then write it to the file; a lock serialises commands."""
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
             with self.path.with_name(f".{self.path.name}.lock").open("w") as lock:

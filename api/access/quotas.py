@@ -1,8 +1,8 @@
 """Quotas of keys and projects: grasps in unfinished jobs, jobs or grasps per day. Idempotency keys.
 
-Redis counts in one atomic step for all API processes; its loss resets quotas, but loses no job. From submission to end,
-a job counts with its requested grasps. The index is queried for ended jobs only if the quota would be exceeded, so a
-submission needs one round trip.
+All API processes count in Redis, each submission in one atomic step. A loss of Redis resets quotas, but loses no job.
+From submission to end, a job counts with its requested grasps. The index is queried for ended jobs only if the quota
+would be exceeded, so a submission needs one round trip.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from graspd.service.model.errors import InputError, QueueUnavailable, QuotaError
 from graspd.service.settings import Settings
 
 log = logging.getLogger(__name__)
-#: Counters of a key expire after this time without a submission [s].
+#: Time without a submission [s] after which the counters of a key expire.
 _KEPT_S: Final = 30 * 86400
 _AT_ONCE: Final = 1000
 
-#: A submission still pending after this time belongs to a dead process [s].
+#: Time [s] after which a pending submission is taken as that of a dead process.
 _PENDING_S: Final = 60
 
 # KEYS[1] holds the sum under `grasps`, and an entry under each job: its grasps, the last claim that counted them, and
@@ -91,7 +91,7 @@ end
 return found
 """
 
-#: Drops the entry of one claim, unless a later one took it over.
+#: Drops the entry of one claim, unless a later claim took it over.
 _UNDO: Final = """
 local known = redis.call('HGET', KEYS[1], ARGV[1])
 if known and string.match(known, '^%d+ (%w+)') == ARGV[2] then
@@ -110,7 +110,7 @@ class SubmissionClaim:
 
 @dataclass(frozen=True)
 class _Holder:
-    """Owner of counters: a key, which counts jobs per day, or a project, which counts requested grasps."""
+    """Owner of counters: a key (counts jobs per day) or a project (counts requested grasps per day)."""
 
     name: str
     words: str
@@ -141,7 +141,7 @@ class _Holder:
 
 
 class Quotas:
-    """Counters of keys and projects; `unfinished` returns those of the given ids that have not ended."""
+    """Counters of keys and projects; `unfinished` returns the ids, of those given, that have not ended."""
 
     def __init__(
         self,
@@ -160,7 +160,7 @@ class Quotas:
 
     @contextmanager
     def claim(self, key: Key | None, job: str, grasps: int, *, is_new: bool = True) -> Iterator[SubmissionClaim]:
-        """Count the job that this context submits or retries (not `is_new`); undo if it fails or makes no job."""
+        """Count the job that the context submits or retries (not `is_new`); undo the count if there is none."""
         claim = SubmissionClaim()
         if key is None:
             yield claim
@@ -277,7 +277,7 @@ class Idempotency:
     """Idempotency-Key (IETF draft): the same key with a different body is an input error.
 
     Identical requests give the same job even without a key, because a job's id depends on its content. Redis stores the
-    request's digest under each key for a day, but no response; if Redis loses it, only this check is lost.
+    request's digest under each key for a day, but no response. If Redis loses the digest, only this check is lost.
     """
 
     def __init__(self, connection: Any) -> None:

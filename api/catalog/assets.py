@@ -132,7 +132,7 @@ class Assets:
         log.info("%s %s deleted", kind, asset.name)
 
     def _mark(self, kind: AssetKind, name: str, files: MutableMapping[str, bytes], project: str) -> str:
-        """Add the project's mark to the files, which makes them private to the project; return their digest."""
+        """Make the files private to the project by adding its mark; return their digest."""
         files.update(project_mark(files, ""))
         digest = digest_files(kind, files)
         if not project:
@@ -151,7 +151,7 @@ class Assets:
             return None
 
     def _holder(self, kind: AssetKind, name: str) -> str:
-        """Return the digest that a name refers to; empty: the name is free."""
+        """Return the digest that a name refers to; empty if the name is free."""
         # Names of other projects do not count here, not even for an admin.
         known = self._find(kind, name, replace(project_scope(), everything=False))
         # A refused upload does not occupy its name: a fixed file may use it.

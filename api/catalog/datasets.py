@@ -144,7 +144,7 @@ _AT_ONCE: Final = 200
 
 @dataclass(frozen=True)
 class Pair:
-    """Hand and object with their cell in each dataset; None: the dataset has no such cell."""
+    """Hand and object with their cell in each dataset; None if a dataset has no such cell."""
 
     hand: str
     object: str
@@ -168,7 +168,7 @@ class Comparison:
     pairs: list[Pair]
     """Ordered by hand; empty if a dataset has more than `MOST_CELLS` cells."""
     metrics: dict[Metric, list[Distribution | None]]
-    """Distributions over each dataset's valid grasps (all, if it requests others too), in the same bins."""
+    """Distributions, in the same bins, over valid grasps if a dataset requests these, else over all its grasps."""
 
 
 def _settings(one: DatasetView, other: DatasetView) -> Iterator[tuple[str, str, str]]:

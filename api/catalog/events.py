@@ -1,4 +1,4 @@
-"""Server-sent events, which end when their key does; feed of ended jobs and datasets; webhooks."""
+"""Server-sent events, until the key is invalid; feed of ended jobs and datasets; webhooks."""
 
 from __future__ import annotations
 

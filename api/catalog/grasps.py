@@ -56,7 +56,7 @@ class Grasps:
         return self._index.grasps.page(self._filter(query), sort=sort, limit=limit, cursor=cursor)
 
     def members(self, query: models.GraspQuery) -> list[Grasp]:
-        """Return identifiers of all grasps that pass every filter; LimitError: too many for a selection."""
+        """Return identifiers of all grasps that pass every filter; LimitError if they are too many."""
         found = self._index.grasps.members(self._filter(query), limit=MOST_TAGGED + 1)
         if len(found) > MOST_TAGGED:
             raise LimitError(f"more than {MOST_TAGGED} grasps pass this filter, the maximum of a selection; narrow it")
@@ -110,7 +110,7 @@ class Grasps:
             raise NotFoundError(f"{key} holds no grasps that can be shown: {error}") from None
 
     def statistics(self, job: JobView | models.JobDetail) -> tuple[list[models.Histogram], models.Diversity | None]:
-        """Return distributions and diversity of a job's valid grasps; if not validated, of all stored grasps."""
+        """Return distributions and diversity of a job's valid grasps; without validation, of all stored ones."""
         validated = job.request.validation != "none"
         count = job.valid if validated else job.grasps
         return self._statistics(job.id, validated, count) if count else ([], None)
@@ -160,7 +160,7 @@ def _posture(file: Shard, name: str, row: int) -> models.Posture:
 
 
 def validated_by(file: Shard, row: int) -> Literal["mujoco", "mujoco_warp"] | None:
-    """Return the validator of a grasp in a base shard; None: the shard has no verdicts."""
+    """Return the validator of a grasp in a base shard; None if the shard has no verdicts."""
     if "quality/success" not in file.arrays:
         return None
     validated = file.arrays.get("quality/validated_by")

@@ -185,7 +185,7 @@ class Jobs:
         )
 
     def _running(self, job_id: str) -> list[TaskView]:
-        """Return running tasks, then the first waiting tasks that have a reason."""
+        """Return running tasks, then those of the first waiting tasks that have a reason to wait."""
         tasks = self._services.index.jobs.tasks
         running = tasks(job=job_id, state=State.RUNNING, limit=_PAGE).items
         waiting = tasks(job=job_id, state=State.QUEUED, limit=_LOOKED_AT).items
@@ -194,7 +194,7 @@ class Jobs:
 
 #: Shortest time between two observations [s]: with a shorter one, report times would dominate the rate.
 _LEAST_SPAN_S: Final = 1.0
-#: Least share done for a rate: before this share, a task mostly loads data.
+#: Least finished share of a task for a rate: before it, a task mostly loads data.
 _LEAST_SHARE: Final = 0.03
 _KEPT_TASKS: Final = 4096
 
@@ -224,12 +224,12 @@ class TaskRates:
 
 
 def stage_statuses(job: JobView, tasks: Sequence[TaskView], paces: TaskRates) -> list[StageStatus]:
-    """Return the stages of a job; `tasks` are its running tasks, and waiting ones that have a reason."""
+    """Return the stages of a job; `tasks` are its running tasks, and waiting ones with a reason to wait."""
     return [_status(stage, [task for task in tasks if task.stage is stage.stage], paces) for stage in job.stages]
 
 
 def eta_of_job(job: JobView, stages: Sequence[StageStatus]) -> float | None:
-    """Return the expected time until the job ends [s], summed over stages; None if a rate is unknown."""
+    """Return the expected time until a running job ends [s], summed over stages; None if unknown."""
     if job.state is not State.RUNNING:
         return None
     remaining = [stage for stage in stages if stage.progress < 1]
@@ -254,7 +254,7 @@ def _status(stage: StageProgress, tasks: list[TaskView], paces: TaskRates) -> St
 
 
 def _rate(stage: StageProgress, running: list[TaskView], paces: TaskRates) -> float | None:
-    """Return tasks per second, from the progress of running tasks, else from finished ones."""
+    """Return tasks per second of running tasks; of finished tasks if those rates are unknown."""
     known = [pace for task in running if (pace := paces.of(task)) is not None]
     if known:
         return sum(known) * len(running) / len(known)

@@ -166,7 +166,7 @@ class Probes:
         self._lock = threading.Lock()
 
     def health(self) -> Health:
-        """Return the state of Redis, index and store, which must answer, and of controller and workers."""
+        """Return the state of Redis, index and store (all must answer), of controller and workers."""
         with self._lock:
             now = time.monotonic()
             if self._known is None or now - self._known[0] > KEPT_S:

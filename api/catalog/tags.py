@@ -45,7 +45,7 @@ class Tags:
         return next(tag for tag in self.all() if tag.id == wanted)
 
     def of(self, grasps: Collection[Grasp]) -> dict[Grasp, list[str]]:
-        """Return the tag names of each of the given grasps that has tags."""
+        """Return the names of the tags of the given grasps; grasps without tags are omitted."""
         return self._services.index.tags.of(grasps, scope=project_scope())
 
     def chosen(self, selection: Selection) -> list[Grasp]:
@@ -103,7 +103,7 @@ _COLUMNS: Final = (*GraspView.model_fields, "tags")
 
 
 class GraspExports:
-    """Writer of selected grasps to files, which stay on the service's disk until the response is sent."""
+    """Writer of selected grasps to files; a file stays on the service's disk until it is sent."""
 
     def __init__(self, services: Services, grasps: Grasps, tags: Tags) -> None:
         self._services = services
@@ -111,7 +111,7 @@ class GraspExports:
         self._tags = tags
 
     def made(self, places: Sequence[Grasp], format: Format, said: Mapping[str, Any]) -> tuple[int, Iterator[bytes]]:
-        """Write these grasps, all in scope, and the selection `said` to a file; return its size and bytes."""
+        """Write grasps that are in scope, and their selection `said`, to a file; return its size and bytes."""
         file = TemporaryFile()  # noqa: SIM115 (it is closed once it is sent)
         try:
             {"csv": self._csv, "json": self._json, "zip": self._zip}[format](file, places, said)

@@ -79,7 +79,7 @@ class PairedBar:
 
 
 def paired_bars(both: Sequence[Distribution | None]) -> list[PairedBar]:
-    """Return the bins of two distributions over the same range, each as shares of its own grasps."""
+    """Return the bins of two distributions over one range, as shares of each distribution's grasps."""
     first = next(each for each in both if each is not None)
     bins = len(first.counts)
     shares = [[n / each.count for n in each.counts] if each is not None else [0.0] * bins for each in both]
@@ -120,7 +120,7 @@ class Tile:
 
     @property
     def shade(self) -> str:
-        """CSS class of the cell's colour: by yield; `none` without validated grasps."""
+        """CSS class of the cell's colour, by yield; `none` if no grasp is validated."""
         return "none" if self.share is None else f"y{min(STEPS, int(STEPS * self.share + 0.5))}"
 
 

@@ -48,7 +48,7 @@ class Fix:
     """Keys of `asset.json` that the button sets, as JSON; null means the value of the field next to the button."""
     words: str
     asks: str = ""
-    """Key whose value is in the field next to the button; empty: none."""
+    """Key whose value is in the field next to the button; empty if there is no field."""
     label: str = ""
     attributes: str = ""
 
@@ -64,11 +64,11 @@ class Refusal:
 @dataclass(frozen=True)
 class AssetChoice:
     name: str = ""
-    """Name of the job's asset; empty: not chosen yet."""
+    """Name of the job's asset; empty until one is chosen."""
     refused: Refusal | None = None
     file: str = ""
     held: str = ""
-    """Digest of the refused file in the store; empty: the user must choose the file again."""
+    """Digest of the refused file in the store; if empty, the user must choose the file again."""
 
     def place(self, kind: AssetKind) -> str:
         return FILE_FIELDS[kind] if self.file else kind.value
@@ -192,7 +192,7 @@ def choices(assets: Assets, kind: AssetKind, shown: str, one: AssetChoice) -> li
 
 
 def asset_choices(assets: Assets, kind: AssetKind) -> list[tuple[str, str]]:
-    """Return the names to choose from; names still being checked are marked."""
+    """Return the names to choose from, with a mark on assets that are still being checked."""
     try:
         known = assets.page(kind, limit=200).items
     except GraspdError:

@@ -73,7 +73,7 @@ class FormInput:
 
 
 def inputs_of(section: str = "", *, cells: bool = False) -> list[FormInput]:
-    """Return the fields of a job's form (`cells`: of a dataset's form) in one section, or in all."""
+    """Return the fields of a job's form, or of a dataset's with `cells`; an empty section means all."""
     shown = [(row, row.form) for row in rows(JobOptions, "job") if row.form is not None]
     return [
         FormInput.of(row, form) for row, form in shown if section in ("", form.section) and (form.cells or not cells)
@@ -213,7 +213,7 @@ class Expectations:
         self._lock = threading.Lock()
 
     def of(self, form: Mapping[str, Any]) -> list[tuple[str, str, Estimate | None]]:
-        """Return each offered fidelity, its description and its estimate for a form; None: no estimate."""
+        """Return each offered fidelity, its description, and its estimate for a form; None if unknown."""
         wanted = {
             key: value for key, value in form.items() if key not in ("hand", "object", "fidelity") and value != ""
         }

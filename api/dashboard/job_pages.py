@@ -98,7 +98,7 @@ def _pictures(job: JobDetail) -> list[dict[str, Any]]:
 
 #: Number of cached shards. A shard of 48 pictures takes a few megabytes; a page requests several of its pictures.
 _KEPT_SHARDS: Final = 2
-#: Colours of depth from near to far: light and warm to dark and cool, with monotonically falling lightness.
+#: Colours of depth, from near (light, warm) to far (dark, cool); the lightness falls monotonically.
 _DEPTH_COLOURS: Final = np.array(
     [(252, 244, 190), (250, 203, 116), (240, 148, 87), (205, 92, 103), (142, 58, 121), (78, 38, 108), (24, 18, 56)],
     np.float64,
@@ -136,7 +136,7 @@ class Pictures:
 
 
 def paint_depth(depth: NDArray[Any]) -> NDArray[np.uint8]:
-    """Colour depth (H, W) [m] as (H, W, 3) over the range of this picture; dark without a surface."""
+    """Colour depth (H, W) [m] as (H, W, 3) over the picture's range; pixels without a surface are dark."""
     seen = np.isfinite(depth)
     painted = np.empty((*depth.shape, 3), np.uint8)
     painted[:] = _NOTHING

@@ -149,7 +149,7 @@ def is_recent(worker: WorkerView) -> bool:
 
 
 def stage_depths(overview: Overview) -> list[tuple[str, int]]:
-    """Return waiting tasks by stage; empty if Redis does not answer, which the page reports elsewhere."""
+    """Return numbers of waiting tasks by stage; empty if Redis does not answer, as the page reports."""
     try:
         depths = overview.depths()
     except UnavailableError:

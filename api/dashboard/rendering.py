@@ -45,7 +45,7 @@ def environment() -> Environment:
 
 
 def render(request: Request, template: str, *, status: int = 200, **context: Any) -> HTMLResponse:
-    """Render a page. `page`: navigation entry; `events`: stream of updates; `poll_s`: update interval [s]."""
+    """Render a page; `page` is its navigation entry, `events` its update stream, `poll_s` an interval [s]."""
     defaults = {"page": "", "events": "", "refresh_s": 0, "poll_s": 0, "health": request.app.state.overview.health()}
     context = defaults | context
     context |= {

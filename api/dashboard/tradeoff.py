@@ -56,7 +56,7 @@ IN_SCENES: Final[dict[str, Axis]] = {
 
 
 class Run(BaseModel):
-    """Run of a method at a fidelity on a hand and object; in a scene: planned there or filtered there."""
+    """Run of a method at a fidelity on a hand and object; in a scene its grasps are planned or filtered."""
 
     method: str
     fidelity: str
@@ -169,7 +169,7 @@ def load(store: Store) -> list[Measured]:
 
 
 def draw(measured: Measured, *, axis: str, hand: str = "", object: str = "") -> Drawing:
-    """Draw every method and fidelity over the runs of a hand and an object (empty: all)."""
+    """Draw every method and fidelity over the runs of a hand and an object; an empty name means all."""
     shown = measured.axes[axis]
     chosen = [run for run in measured.runs if hand in ("", run.hand) and object in ("", run.object)]
     names = sorted({run.name for run in measured.runs})
@@ -230,7 +230,7 @@ def _place_labels(points: list[Point]) -> list[Point]:
         offers = [(move, is_left) for move in _MOVES for is_left in (False, True)]
         boxes = [point.label_box(move, is_left=is_left) for move, is_left in offers]
         costs = [sum(_overlap_area(box, other) for other in taken) + _outside_cost(box) for box in boxes]
-        # Of equal places the first one, nearest to the point, is used.
+        # Of equally good places the first one is used, because it is nearest to the point.
         best = costs.index(min(costs))
         move, is_left = offers[best]
         taken.append(boxes[best])

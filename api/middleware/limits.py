@@ -1,4 +1,4 @@
-"""Limits of requests: rate and concurrency for each caller; permission, size and duration of bodies.
+"""Limits of requests: rate and concurrency for each caller; size and duration of bodies.
 
 Rates follow GCRA (ITU-T I.371 annex A), a leaky bucket. One number is stored per caller: the time at which the bucket
 is empty again. Requests in progress form a sorted set with an expiry time each, so that requests of a killed process
@@ -36,7 +36,7 @@ _FREE: Final = ("/static/", "/healthz", "/readyz")
 
 
 class RateLimit(HttpMiddleware):
-    """Finds the key of a request (`scope["state"]["key"]`) and enforces the limits of that key.
+    """Stores the key of a request in `scope["state"]["key"]` and enforces the limits of that key.
 
     A request without a key counts against its address. While there are no keys, there are no limits.
     Refusals are 429 with Retry-After; every counted response has RateLimit and RateLimit-Policy
@@ -127,7 +127,7 @@ def _refusal(admission: Admission, allowance: Allowance, headers: dict[str, str]
 
 log = logging.getLogger(__name__)
 WINDOW_S: Final = 60
-#: A request without renewal for this long no longer counts as in progress [s].
+#: Time without renewal [s] after which a request no longer counts as in progress.
 HELD_S: Final = 60.0
 _ANSWER_S: Final = 0.5
 #: Time without limits after a failure of Redis [s], because limits do not justify a delay of every request.
@@ -178,7 +178,7 @@ class Allowance:
 
 @dataclass(frozen=True)
 class Admission:
-    """Decision on a request. `refused` names the exceeded limit: rate, concurrency, or empty."""
+    """Decision on a request. `refused` is the exceeded limit, rate or concurrency; empty if admitted."""
 
     refused: str
     remaining: int
@@ -307,7 +307,7 @@ class BodyLimit(HttpMiddleware):
 
 
 def _body_refusal(scope: Scope, limit: int, *, is_upload: bool) -> Exception | None:
-    """Return the reason to refuse a body before it is read; None: no reason."""
+    """Return the reason to refuse a body before it is read; None if there is no reason."""
     given = dict(scope["headers"])
     if b"transfer-encoding" in given and b"content-length" in given:
         # With two lengths, a proxy may use the other one, and the rest would be parsed as the next request.

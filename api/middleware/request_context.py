@@ -133,7 +133,7 @@ class Head(HttpMiddleware):
             nonlocal is_over
             if message["type"] == "http.response.start":
                 await send(message)
-                # A response without a length may be endless, so it ends now; others run on and close their files.
+                # A response without a length may be endless, so it ends now. The others run on and close their files.
                 is_last = all(name.lower() != b"content-length" for name, _ in message["headers"])
             else:
                 is_last = not message.get("more_body", False)

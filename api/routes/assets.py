@@ -156,8 +156,8 @@ def store_upload(
 ) -> AssetView:
     """Store an upload, so far a temporary file, as an immutable asset with a check task.
 
-    `said`: `self_test`, `shared` and `rename`, as in `Assets.add`. The number of concurrent uploads is limited, which
-    bounds their memory.
+    `said` has `self_test`, `shared` and `rename`, as in `Assets.add`. The number of concurrent uploads is limited, to
+    bound their memory.
     """
     filename = file.filename or ""
     with _upload_slot():

@@ -67,7 +67,7 @@ def object_to_pieces(
     # Data out:
     near_inout: wp.array2d(dtype=wp.float32),
 ):
-    """Lower the distances by object samples within `margin`, which find object edges. Over (B, P)."""
+    """Lower the distances by object samples within `margin`, for object edges. Launch over (B, P)."""
     b, piece = wp.tid()
     if active_in[b] == 0:
         return
@@ -200,7 +200,7 @@ def advance(
     active_inout: wp.array(dtype=wp.int32),
     pivot_inout: wp.array(dtype=wp.vec3),
 ):
-    """Move the hand along its approach until its nearest body is `standoff` from the object. Over B."""
+    """Move the hand along its approach until a body is `standoff` from the object. Launch over B."""
     b = wp.tid()
     if active_inout[b] == 0:
         return

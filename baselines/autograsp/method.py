@@ -71,7 +71,7 @@ METHOD: Final = Method(
 TOUCH_M: Final = 2e-4
 #: Distances are capped at this [m].
 REACH_M: Final = 0.03
-#: Fingers with a smaller gap reduce each other's steps [m].
+#: Gap [m] below which fingers reduce each other's steps.
 MARGIN_M: Final = 0.005
 #: Share of a gap that is crossed in one step. Large distances come from a grid with errors of up to a third.
 SHARE: Final = 0.6

@@ -25,7 +25,7 @@ W_DISTANCE = wp.constant(100.0)
 W_PENETRATION = wp.constant(100.0)
 W_SELF = wp.constant(10.0)
 W_JOINTS = wp.constant(1.0)
-#: Key points of the hand closer than this to each other count as self-penetration [m].
+#: Distance [m] below which two key points of the hand count as self-penetration.
 GAP = wp.constant(0.02)
 STEP0 = wp.constant(0.005)
 STEP_EVERY = wp.constant(50.0)
@@ -119,7 +119,7 @@ def force_closure(
     energy_out: wp.array2d(dtype=wp.float32),
     wrench_inout: Wrenches,
 ):
-    """Compute E_fc = |sum (n, x cross n)|^2 and E_dis = sum |d|: columns 0 and 1. Launch over B.
+    """Compute E_fc = |sum (n, x cross n)|^2 and E_dis = sum |d| (columns 0 and 1). Launch over B.
     Gradients treat normals as constant."""
     b = wp.tid()
     f = wp.vec3(0.0)
@@ -156,7 +156,7 @@ def penetration(
     energy_inout: wp.array2d(dtype=wp.float32),
     wrench_inout: Wrenches,
 ):
-    """Compute E_pen, the sum of depths of object samples in hand pieces: column 2. Launch over (B, P)."""
+    """Compute E_pen (column 2), the sum of depths of object samples in hand pieces. Launch over (B, P)."""
     b, piece = wp.tid()
     body = pieces_in.body[piece]
     q = piece_rotation(pieces_in, piece, b, body_q_in)
@@ -198,7 +198,7 @@ def self_penetration(
     energy_inout: wp.array2d(dtype=wp.float32),
     wrench_inout: Wrenches,
 ):
-    """Compute E_spen, the sum of max(0, gap - distance) over pairs: column 3. Launch over (B, pairs)."""
+    """Compute E_spen (column 3), the sum of max(0, gap - distance) over pairs. Launch over (B, pairs)."""
     b, pair = wp.tid()
     i = first_in[pair]
     j = second_in[pair]
@@ -223,7 +223,7 @@ def limits(
     energy_out: wp.array2d(dtype=wp.float32),
     gradient_inout: wp.array2d(dtype=wp.float32),
 ):
-    """Compute E_joints, the sum of violations of the limits: column 4. Launch over B."""
+    """Compute E_joints (column 4), the sum of violations of the limits. Launch over B."""
     b = wp.tid()
     total = float(0.0)
     for d in range(q_in.shape[1]):
@@ -251,7 +251,7 @@ def total_energy(terms: wp.array2d(dtype=wp.float32), b: wp.int32):
 
 @wp.func
 def accepted(rise: wp.float32, t: wp.float32, uniform: wp.float32):
-    """Return 1 if the energy falls, else 1 with probability exp(-rise / t) and 0 otherwise (Metropolis)."""
+    """Return 1 if the energy falls, or with probability exp(-rise / t) if it rises; else 0 (Metropolis)."""
     if rise < 0.0:
         return 1
     if uniform < wp.exp(-rise / t):
@@ -279,7 +279,7 @@ def accept(
     contact_inout: wp.array2d(dtype=wp.int32),
     taken_inout: wp.array(dtype=wp.int32),
 ):
-    """Accept or reject the proposal. The first is always accepted (its old energy is infinite). Over B."""
+    """Accept or reject the proposal; accept the first (the old energy is infinite). Launch over B."""
     b = wp.tid()
     rng = rng_inout[b]
     uniform = wp.randf(rng)

@@ -74,7 +74,7 @@ def multipliers(
     pull_out: wp.array2d(dtype=vec6),
     residual_out: wp.array2d(dtype=wp.float32),
 ):
-    """Compute the tasks' residuals |wanted + sum F| [N], multipliers, and pulls on forces. Over (B, M).
+    """Compute residuals |wanted + sum F| [N], multipliers and pulls on forces. Launch over (B, M).
     The modified differential method of multipliers (Platt & Barr 1988) enforces residual <= tolerance."""
     b, j = wp.tid()
     if active_in[b] == 0:
@@ -96,7 +96,7 @@ def multipliers(
 
 @wp.func
 def relaxed(physics: ForceModel, force: wp.vec3, wanted: wp.vec3, actual: wp.vec3):
-    """Return the gradient with respect to F of mismatch |F - f|^2 plus the task's pull."""
+    """Return the gradient of mismatch |F - f|^2 with respect to F, plus the pull of `multipliers`."""
     return 2.0 * physics.mismatch * (force - actual) + wanted
 
 
@@ -123,7 +123,7 @@ def relax(
     total_inout: wp.array2d(dtype=vec6),
     wrench_inout: Wrenches,
 ):
-    """Step every force by Adamax, then add the gradient of sum |f - F|^2 on the bodies. Over (B, N)."""
+    """Step every force by Adamax, then add the bodies' gradient of sum |f - F|^2. Launch over (B, N)."""
     b, i = wp.tid()
     if active_in[b] == 0:
         return

@@ -49,7 +49,7 @@ class Search:
         self.points = sample_surface(pair.hand.model, POINTS)
 
     def run(self, starts: HandState, *, steps: int, tell: StepCounter) -> tuple[HandState, Floats]:
-        """Return hands after `steps` iterations, and force residuals (n,) of their tasks; 1: no contact force."""
+        """Return hands after `steps` iterations, and their force residuals (n,); 1 without contact force."""
         n = len(starts.pivot)
         back = quat_rotate(starts.rotation, self.pair.hand.model.palm.approach)
         batch = _Batch(self, replace(starts, pivot=starts.pivot - BACKOFF_M * back), steps)
@@ -185,7 +185,7 @@ class _Batch:
         return out
 
     def residual(self) -> Floats:
-        """Return (n,) largest relative residuals of the tasks with a moving object; 1: no contact force."""
+        """Return (n,) largest relative residuals over velocities of a moving object; 1 without contact force."""
         return self.gap.numpy()[:, 1:].max(axis=1).astype(float) / float(np.linalg.norm(self.wanted[1]))
 
 

@@ -297,7 +297,7 @@ def insert_best(
     best: wp.array2d(dtype=vec8),
     best_energy: wp.array2d(dtype=wp.float32),
 ):
-    """Insert a better state into the best ones; it replaces a near-duplicate, or else the worst state."""
+    """Insert a better state into the best ones, in place of a near-duplicate, if any, or of the worst."""
     row = wp.int32(0)
     for k in range(best_energy.shape[1]):
         if best_energy[b, k] > best_energy[b, row]:

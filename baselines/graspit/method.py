@@ -72,7 +72,7 @@ class Search:
 
     def run(self, seeds: list[list[int]], *, steps: int, keep: int, tell: StepCounter) -> HandState:
         """Return the `keep` best states of each chain, best first, grouped by chain.
-        `seeds` are those of the chains. A chain ends when the schedule's counter reaches `steps`. `tell` receives one
+        `seeds` has each chain's seeds. A chain ends when the schedule's counter reaches `steps`. `tell` receives one
         unit of work per move. Raises InputError: no free hand pose around the object. TaskCancelled: through `tell`."""
         chains = len(seeds)
         random = np.array([np.random.SeedSequence(seed).generate_state(1)[0] for seed in seeds], np.uint32)
@@ -144,7 +144,7 @@ METHOD: Final = Method(
     uses=("face_error_m",),
     quick={"steps": FIRST_STEP + 400},
 )
-#: Bounds of the palm's position about the centre of mass [m], and its largest jump: GraspIt!'s values, there in mm.
+#: Bounds of the palm's position about the centre of mass [m], and its largest jump; GraspIt! has these values in mm.
 PLACE: Final = ((-0.25, 0.25), (-0.25, 0.25), (-0.25, 0.35))
 PLACE_JUMP: Final = 0.15
 #: Bounds of theta and phi (axis) and alpha (angle) of the rotation; phi is periodic.
@@ -159,7 +159,7 @@ START_TRIES: Final = 5000
 ROUNDS: Final = 500
 #: Limit on rounds, as a multiple of the moves; rounds without a free neighbour count.
 PATIENCE: Final = 3
-#: Two states with a smaller difference are near-duplicates (GraspIt!).
+#: Difference below which two states are near-duplicates, as in GraspIt!.
 ALIKE: Final = 0.2
 NOT_YET: Final = 1e9
 #: Number of virtual contacts on each closing link, and on the palm.
@@ -183,7 +183,7 @@ def clash_grid(pair: Pair, eigen: Eigengrasps) -> NDArray[np.int32]:
 
 
 def _sorted(best: Floats, energy: Floats, begun: Floats) -> Floats:
-    """Return states (chains * keep, 8), best first; missing ones repeat a chain's last one, or its start."""
+    """Return states (chains * keep, 8), best first; the chain's last one, or its start, fills gaps."""
     out = np.empty_like(best)
     for c, (states, energies) in enumerate(zip(best, energy, strict=True)):
         found = [k for k in np.argsort(energies, kind="stable") if energies[k] < NOT_YET / 2]

@@ -156,7 +156,7 @@ def table_height(supports: Sequence[Obstacle]) -> float:
 def _clear(
     model: Model, drawn: HandState, away: Floats, scene: NDArray[np.intp], placed: PlacedGrasps
 ) -> tuple[HandState, Floats]:
-    """Return, per start (n), the collision-free hand that retreats least, and its depth [m]; inf: none.
+    """Return, per start (n), the collision-free hand that retreats least, and its depth [m]; inf if none.
     A hand that lacks clearance from obstacles is raised first."""
     count, probe = len(scene), Probe(model, len(scene), room=ROOM)
     draws = len(drawn.pivot) // count

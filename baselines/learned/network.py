@@ -41,7 +41,7 @@ _TINY: Final = 1e-6
 
 @dataclass(frozen=True)
 class Proposals:
-    """n grasps in the cloud's frame; joint positions may exceed limits, which are no network input."""
+    """n grasps in the cloud's frame; joints may exceed their limits, because the network has no limits."""
 
     hand_pose: Floats
     """(n, 7) pose of the hand's root link at the grasp: x y z [m], quaternion w x y z."""

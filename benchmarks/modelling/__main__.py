@@ -23,7 +23,7 @@ DROPPED = ("025_mug", "024_bowl", "011_banana")
 SHAPED = ("025_mug", "011_banana")
 PICTURED = "025_mug"
 BUILT_IN = ("mug", "bottle", "block")
-#: Studies, with numbers of grasps (for `drops`: drops) per object, chosen for a few minutes of one core.
+#: Studies, with numbers of grasps or drops per object, chosen for a few minutes of one core.
 STUDIES = {"motion": 32, "shape": 24, "drops": 32, "pictures": 0, "scenes": 24}
 
 

@@ -41,7 +41,7 @@ PLAIN = FIDELITIES["standard"].model_copy(update={"starts": 1, "finalists": 1})
 
 @dataclass
 class Spent:
-    """CPU seconds of a block, which depend less on other load than wall time."""
+    """CPU seconds of a block; they depend less on other load than wall time."""
 
     seconds: float = 0.0
 

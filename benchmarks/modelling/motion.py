@@ -26,7 +26,7 @@ from graspd.worker.validation.displacement import simulated_displacement_cm
 from graspd.worker.validation.model import MujocoOptions, Scene, build
 
 STEPS = (1, 3, 10)
-#: Hand points of the rollouts: between those of the planner's coarse and fine phase.
+#: Number of hand points of the rollouts, between those of the planner's coarse and fine phases.
 POINTS = 800
 #: Contact thresholds that represent pads which yield by this distance [m].
 PADS_M = (0.0005, 0.001, 0.002, 0.005)

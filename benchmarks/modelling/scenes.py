@@ -136,7 +136,7 @@ def validated(tables: list[OnTable]) -> list[Row]:
 
 
 def straight(tables: list[OnTable]) -> Row:
-    """Return the share of grasps that are clear except on the approach, which is straight."""
+    """Return the share of grasps that are obstructed only on the straight approach."""
     lost = [
         (np.minimum(np.minimum(one.way.contact, one.way.closing), one.way.lifting) >= MARGIN_M) & ~one.way.clear
         for one in tables

@@ -187,7 +187,7 @@ class Runner:
                 write(file, text)
 
     def _without_raw(self, page: Path) -> Callable[[re.Match[str]], str]:
-        """Return a function that replaces links to raw results, which are not in git, by their text."""
+        """Return a function that replaces links to raw results by their text: raw results are not in git."""
 
         def replaced(link: re.Match[str]) -> str:
             target = (page.parent / link[2]).resolve()

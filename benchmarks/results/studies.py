@@ -15,9 +15,9 @@ IN_SCENES: Final = ("synthesize", "scene")
 ALL: Final = ("synthesize", "scene", "render")
 #: Requirements of studies besides DATA, SOURCES and BEFORE.
 SERVICE, BROWSER, GPU, TORCH, PREFILTER = "a service", "a browser", "a GPU", "PyTorch", "mujoco-warp"
-#: Suffixes of raw results, which are not in git.
+#: Suffixes of raw results. Raw results are not in git.
 RAW: Final = frozenset({".json", ".csv", ".svg", ".sha256"})
-#: Files written by hand, which are in git.
+#: Files with such a suffix that are in git, because they are written by hand.
 NOT_RAW: Final = frozenset({"results/pilot/assets.json"})
 #: Files that the study `predictor` leaves in WORK.
 NETWORK = "trained networks"
@@ -411,7 +411,7 @@ STUDIES: Final = (
     ),
     Study(
         "learned",
-        "planner seeds from a network, compared with the planner's own",
+        "starts from a network, compared with the planner's own",
         ("results/learned.*",),
         (
             "python -m benchmarks.learned --network WORK/barrett.npz WORK/allegro.npz --data DATA --seeds 3 "
@@ -696,5 +696,5 @@ def files_of(study: Study, docs: Path) -> list[Path]:
 
 
 def is_raw(path: str) -> bool:
-    """Return whether a path under the folder of the docs is a raw result, which is not in git."""
+    """Return whether a path under the folder of the docs is a raw result. Raw results are not in git."""
     return Path(path).suffix in RAW and path not in NOT_RAW

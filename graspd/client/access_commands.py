@@ -180,7 +180,7 @@ def limit_project(
     grasps_in_flight: Annotated[int | None, typer.Option(min=0, help="Grasps in unfinished jobs; 0: no limit.")] = None,
     grasps_per_day: Annotated[int | None, typer.Option(min=0, help="Requested grasps per day; 0: no limit.")] = None,
     gpu_seconds_per_day: Annotated[
-        int | None, typer.Option(min=0, help="GPU seconds per day (UTC); above it, new jobs are refused; 0: no limit.")
+        int | None, typer.Option(min=0, help="GPU seconds per day (UTC) until new jobs are refused; 0: no limit.")
     ] = None,
     json: JsonFlag = False,
 ) -> None:

@@ -1,6 +1,6 @@
 """`graspd hands add`, `objects add`, `networks add`: upload an asset or a set, and wait for its check.
 
-A hand is a folder, or a model file with the files that it needs; they are packed into one ZIP.
+A hand is a folder, or a model file with the files that it needs. All its files are packed into one ZIP.
 """
 
 from __future__ import annotations
@@ -131,7 +131,7 @@ def _add(
 
 @contextmanager
 def upload_of(path: Path) -> Iterator[tuple[Path, str]]:
-    """Yield the file to send (`path` or a temporary ZIP), and the hand's main file in it (empty: unknown)."""
+    """Yield the file to send (`path` or a temporary ZIP), and the hand's main file in the ZIP, if known."""
     alone = not path.is_dir() and (path.suffix.lower() not in SUFFIXES or not path.is_file())
     files, main = ({}, "") if alone else files_of_hand(path)
     if len(files) <= 1 and not path.is_dir():

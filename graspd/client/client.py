@@ -31,7 +31,7 @@ _STREAM_TIMEOUT: Final = httpx.Timeout(40.0, connect=5.0)
 _POLL_S: Final = 0.3
 _DATASET_POLL_S: Final = 1.0
 _PAGE: Final = 200
-#: Waits before retries if the service reports too many requests [s].
+#: Waits [s] before retries if the service reports too many requests.
 _WAITS_S: Final = (2.0, 5.0, 10.0, 20.0)
 
 View = TypeVar("View", bound=BaseModel)

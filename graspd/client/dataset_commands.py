@@ -373,7 +373,7 @@ def _estimate(client: Client, matrix: dict[str, Any], files: Objects | None) -> 
 
 
 def _upload(client: Client, files: Objects, set_name: str, console: Console) -> list[str]:
-    """Upload the objects of a folder as a set; return the refused ones, which are excluded."""
+    """Upload the objects of a folder as a set without refused objects; return the refused ones."""
     told = upload_set(client, files, set_name, say=lambda line: console.print(line, soft_wrap=True))
     refused = [one["name"] for one in told if one["verdict"] == "refuse"]
     if len(refused) == len(told):

@@ -1,6 +1,6 @@
 """Terminal output of the commands: progress, jobs, assets, estimates and datasets.
 
-A job's progress is one bar per stage with rate and time left on a terminal, and plain lines elsewhere.
+On a terminal, a job's progress is one bar per stage with rate and time left; elsewhere it is plain lines.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ UrlOption = Annotated[
 
 
 def open_client(url: str | None, *, key: str | None = None) -> Client:
-    """Return a client of the API from the option, the settings or the data folder, with the settings' key."""
+    """Return a client of the API at `url` (default: settings, data folder) with `key` (default: settings)."""
     settings = load_settings()
     if key is None and settings.api_key:
         key = settings.api_key.get_secret_value()

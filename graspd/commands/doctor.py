@@ -45,7 +45,7 @@ def run_child(arguments: Sequence[str]) -> subprocess.CompletedProcess[str]:
 
 
 def gpu(settings: Settings, *, child: Child = run_child, has_driver: Callable[[], bool] | None = None) -> Finding:
-    """Check which GPUs Warp finds, and their free memory; `has_driver`: a driver seems to be installed."""
+    """Check which GPUs Warp finds, and their free memory; `has_driver` tells if a driver is installed."""
     found, wrong = _run_check(child, ["gpus"])
     if wrong:
         return bad(
@@ -56,9 +56,9 @@ def gpu(settings: Settings, *, child: Child = run_child, has_driver: Callable[[]
     fix = "install driver R580 or newer; containers need NVIDIA's toolkit and --gpus all; check CUDA_VISIBLE_DEVICES"
     if not gpus:
         if settings.device.startswith("cuda"):
-            return bad(f"GRASPD_DEVICE is {settings.device}, and no GPU is found; {needed}", fix)
+            return bad(f"GRASPD_DEVICE is {settings.device}, but no GPU is found; {needed}", fix)
         if (has_driver or _has_driver)():
-            return bad(f"this machine has an NVIDIA driver, and no GPU can be used; {needed}", fix)
+            return bad(f"this machine has an NVIDIA driver, but no GPU can be used; {needed}", fix)
         return good("none; work runs on the CPU")
     if settings.device.startswith("cuda") and settings.device not in [one["name"] for one in gpus]:
         return bad(

@@ -111,7 +111,7 @@ def evaluate_command(
             case = load_case(file, hand=hand, obj=object)
             if copies and (case.placed is None) == (protocol == "lift"):
                 raise InputError(
-                    f"{file}: -o needs --protocol lift for grasps in scenes, else --protocol dexgraspbench"
+                    f"{file}: -o needs --protocol lift for grasps in scenes, or dexgraspbench for free grasps"
                 )
             twin = None
             if other is not None:

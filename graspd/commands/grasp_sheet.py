@@ -137,7 +137,7 @@ HIGH: Final = 0.75
 FILM_SAMPLES: Final = 24
 #: Used share of the velocity limits of joints and hand.
 SPEED: Final = 0.5
-#: Time for which the open hand is shown before its motion, and the lifted object before the animation repeats [s].
+#: Times [s] for which the open hand is shown before its motion, and the lifted object before a repetition.
 BEFORE_S: Final = 0.4
 AFTER_S: Final = 1.4
 

@@ -210,7 +210,7 @@ def _scenes(path: Path) -> Shard:
 
 
 def _best_grasps(base: Shard, hand: str | None) -> DrawnHand | None:
-    """Return the best valid grasp of each scene of a base shard; if not validated, the best feasible."""
+    """Return the best valid grasp of each scene; of an unvalidated shard, the best feasible grasp."""
     validated = validity.valid(base.arrays).any()
     rows = best_in_scenes(base.arrays, validity.selection(base.arrays, unvalidated=not validated))
     if not len(base["grasp/hand_pose"]):

@@ -274,9 +274,7 @@ ATTRIBUTES: Final[dict[str, RootAttribute]] = {
     "reason": RootAttribute("text", "why a command found fewer grasps than requested; absent: none are missing", _BASE),
     "grasps_wanted": RootAttribute("integer", "number of grasps requested, if the command was interrupted", _BASE),
     "robust": RootAttribute(
-        "text",
-        "JSON: perturbed models in which each valid grasp was validated, and the required share; absent: not requested",
-        _BASE,
+        "text", "JSON: number of perturbed models per valid grasp, and the required share; absent: not requested", _BASE
     ),
     "verdict_level": RootAttribute("text", "level of validation; `none`: not validated", _BASE),
     "verdict_key": RootAttribute(

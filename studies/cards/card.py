@@ -43,7 +43,7 @@ def write_card(
     """Read all shards and write the card; replace the files of an earlier card.
     `progress` is called after each shard with the number of shards read and of all shards. Return the figures, as in
     `card.json`, and under `plots` the names of the pictures. Raises InputError: the folder cannot be created, the
-    dataset has no grasp, or a checksum differs. StoreUnavailable."""
+    dataset has no grasp, or a checksum differs; StoreUnavailable: the store does not answer."""
     if not contents.shards.of("base"):
         raise InputError(f"{contents.name} has no base shard, so its card would be empty")
     try:

@@ -50,7 +50,7 @@ class AssetFacts:
 
 @dataclass(frozen=True)
 class Contents:
-    """Input of a card; a folder has no `record`, and only an export has a `snapshot`."""
+    """Input of a card; a folder of shards has no `record`, and has a `snapshot` only if it is an export."""
 
     name: str
     shards: Shards
@@ -66,7 +66,7 @@ class Contents:
 
 def contents_of_store(store: Store, dataset: str, snapshot: str | None = None, cache: Path | None = None) -> Contents:
     """Return a snapshot of a dataset, by default the newest.
-    Raises NotFoundError: the dataset or the snapshot does not exist. StoreUnavailable."""
+    Raises NotFoundError: the dataset or the snapshot does not exist; StoreUnavailable: the store does not answer."""
     taken = newest_snapshot(store, dataset, snapshot)
     record = load_dataset(store, dataset)
     return Contents(

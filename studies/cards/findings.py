@@ -10,15 +10,15 @@ import numpy as np
 
 Row = Mapping[str, Any]
 
-#: A cell's yield below this share of the median over its hand's cells is low.
+#: Share of the median yield of a hand's cells, below which a cell's yield is low.
 _LITTLE: Final = 0.5
 #: A joint hardly moves if 98 of 100 grasps use less than this share of its range.
 _STILL: Final = 0.05
-#: A larger share of grasps with a joint at its limit is reported.
+#: Share of grasps with a joint at its limit, above which the joint is reported.
 _AT_LIMIT: Final = 0.5
-#: A larger share of empty directions of an object is reported.
+#: Share of an object's directions without grasps, above which they are reported.
 _EMPTY: Final = 0.25
-#: A larger ratio of valid grasps between hands or objects is reported.
+#: Ratio of valid grasps between hands or objects, above which it is reported.
 _UNEVEN: Final = 1.2
 #: A direction is preferred above this multiple of its share under uniform directions.
 _PEAKED: Final = 1.25

@@ -193,7 +193,7 @@ def _directions(cell: CellTally) -> Row | None:
 
 
 def _types(cell: CellTally) -> Row | None:
-    """Return the number of grasps of each type; None if no shard has types."""
+    """Return the number of grasps of each type, and its entropy; None if no shard has types."""
     told = cell.column("grasp_type")
     if not len(told):
         return None
@@ -202,7 +202,7 @@ def _types(cell: CellTally) -> Row | None:
 
 
 def _cells(contents: Contents, tally: Tally) -> list[Row]:
-    """Return a row per cell (hand x object): all cells of the matrix if known, else cells with shards."""
+    """Return a row per cell (hand x object) of the matrix; if this is unknown, per cell with shards."""
     asked = contents.record.options.grasps if contents.record else None
     pairs = [(hand, obj) for hand in contents.hands for obj in contents.objects] if contents.record else [*tally.cells]
     rows = []

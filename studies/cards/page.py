@@ -68,7 +68,7 @@ def render_card(card: Row, plots: Mapping[str, str]) -> str:
 
 
 def head(card: Row) -> dict[str, Any]:
-    """Return the YAML head: every value is a JSON value, which is valid YAML."""
+    """Return the YAML head; every value is a JSON value, because JSON is valid YAML."""
     made = card["composition"]
     tags = ["grasping", "dexterous-manipulation", "synthetic", "graspd", *(hand["name"] for hand in made["hands"])]
     return {

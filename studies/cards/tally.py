@@ -82,7 +82,7 @@ Array = NDArray[Any]
 Floats32 = NDArray[np.float32]
 #: Number of a cell's first grasps from which its diversity is computed.
 SAMPLED: Final = 512
-#: A cell's arrays are merged if they are more than this.
+#: Number of arrays of a cell above which they are merged.
 _UNPACKED: Final = 16
 #: Grasps with all numbers equal to this many decimals (metres, radians) count as repeated.
 _DIGITS: Final = 6
@@ -134,7 +134,7 @@ class CellTally:
         return np.concatenate(self.columns[name]) if self.columns.get(name) else np.empty(0, np.float32)
 
     def directions(self) -> Floats32:
-        """Return (valid, 3) `towards`; empty if the hand's palm is unknown."""
+        """Return directions (N, 3) to the palm; empty if it is unknown."""
         return np.concatenate(self.towards) if self.towards else np.empty((0, 3), np.float32)
 
 

@@ -1,4 +1,4 @@
-"""Run of a chart: settings from names on the command line, each on every pair, repeats interleaved."""
+"""Run of a chart: every setting named on the command line on every pair, with interleaved repeats."""
 
 from __future__ import annotations
 
@@ -127,8 +127,8 @@ def settings_of(
     run: ExecutionContext,
 ) -> list[Setting]:
     """Return a setting for every method, fidelity and batch; methods without fidelities have one each.
-    Of the latter, those with an option `steps` take seconds per grasp. They get `baseline_batch` grasps per call, the
-    others `batches[0]`. Raises InputError: a method is unknown, or an option belongs to no method."""
+    Without fidelities, a method gets `batches[0]` grasps per call, or `baseline_batch` if it has an option `steps`,
+    because its grasps take seconds each. Raises InputError: a method is unknown, or an option belongs to no method."""
     variants = [_variant(text) for text in methods]
     given = _options_of(options, [name for name, _, _ in variants])
     found: list[Setting] = []

@@ -109,7 +109,7 @@ def _over_speed(
     words: str,
     label: PointLabel | None = None,
 ) -> list[Label]:
-    """Plot one accuracy over the speed, with the Pareto front; return its labels."""
+    """Plot one accuracy over the speed, with the Pareto front; return the labels of the points."""
     known = [row for row in rows if row[key] is not None]
     labels = _panel(axes, known, styles, x=SPEED, y=key, label=label)
     front = sorted((row for row in known if key in row["front"] and row[SPEED]), key=lambda row: row[SPEED])
@@ -208,7 +208,7 @@ def _error(row: Row, key: str) -> list[list[float]]:
 
 
 def _label(row: Row, rows: Sequence[Row]) -> str:
-    """Return the fidelity, plus batch size if there are several; a method with one setting: its name."""
+    """Return fidelity, and batch size if it varies; the method's name if it has only one setting."""
     own = [r for r in rows if r["method"] == row["method"]]
     if len(own) == 1:
         return str(row["method"])
@@ -217,7 +217,7 @@ def _label(row: Row, rows: Sequence[Row]) -> str:
 
 
 def one_of_several(row: Row, rows: Sequence[Row]) -> str:
-    """Return the fidelity if the method has several, else no text: the legend has the method's name."""
+    """Return the fidelity if the method has several, else no text, because the legend has its name."""
     return str(row["fidelity"]) if sum(r["method"] == row["method"] for r in rows) > 1 else ""
 
 
@@ -360,7 +360,7 @@ def _size(axes: Any, text: str) -> tuple[float, float]:
 
 
 def _candidates(point: Boxes, size: tuple[float, float], pixels: float) -> list[Boxes]:
-    """Return boxes around the point, (4,) each: left, bottom, right, top [px]; preferred ones first."""
+    """Return boxes (left, bottom, right, top) [px] around the point, preferred ones first."""
     found = []
     for reach, turn in product(_REACHES_PT, _TURNS):
         across, up = math.cos(math.radians(turn)), math.sin(math.radians(turn))

@@ -125,7 +125,7 @@ def _head(chart: Row) -> str:
 
 
 def summary_table(rows: Sequence[Row]) -> str:
-    """Return a row per method and fidelity, the fastest first; bold: on the Pareto front."""
+    """Return a row per method and fidelity, the fastest first; bold if on the Pareto front."""
     lines = [
         "| method | fidelity | batch | valid/s | first valid s | held/s, planner only | dexgraspbench | hard | "
         "robust | "
@@ -197,7 +197,7 @@ def runs_table(runs: Sequence[Row]) -> str:
 
 
 def best_table(runs: Sequence[Row]) -> str:
-    """Return the paper's table 2: contact area, intersection volume, ε, wrench volume, displacement."""
+    """Return means as in the paper's table 2: contact area, intersection, ε, wrench volume, displacement."""
     groups: dict[tuple[str, str, str], list[Row]] = {}
     for run in runs:
         groups.setdefault((run["hand"], run["method"], run["fidelity"]), []).append(run["best"])

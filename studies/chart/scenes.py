@@ -1,10 +1,10 @@
-"""Comparison of grasps planned in a scene with grasps of a free object filtered in the same scene.
+"""Comparison of two modes: grasps planned in a scene, and free grasps filtered in the same scene.
 
-Methods that plan in scenes run in both modes, other methods only in the second. In both modes the grasps use the
-scenes of an object in turn. The tests are equal: clear trajectory, lift, lift under the unmodified protocol,
-lift at half friction, and lift in models around the nominal one. Speed is lifted grasps per second; on a CPU per
-core-second, which is independent of other load. It is measured for planner and postures alone, and end to end: with
-trajectory, validator and metrics of lifted grasps."""
+Methods that cannot plan in scenes run only in the second mode. In both modes the grasps use the scenes of an object in
+turn. The tests are equal: clear trajectory, lift, lift under the unmodified protocol, lift at half friction, and lift
+in models around the nominal one. Speed is lifted grasps per second, on a CPU per core-second, so that other load does
+not change it. It is measured for planner and postures alone, and end to end: with trajectory, validator, and metrics of
+lifted grasps."""
 
 from __future__ import annotations
 
@@ -52,14 +52,14 @@ SPEEDS: Final = (("valid_per_second", "seconds"), ("end_to_end_per_second", "end
 FORM: Final = 2
 #: Key of the speed in candidates, for each speed in lifted grasps.
 RAW: Final = {"valid_per_second": "grasps_per_second", "end_to_end_per_second": "candidates_end_to_end_per_second"}
-#: Above this time per grasp [s] the time to the first grasp is not measured in an extra run.
+#: Time per grasp [s] from which on the time to the first grasp is not measured in an extra run.
 _SHORT_S: Final = 1.0
 _NOTHING: Final = {**{f"{name}_count": 0 for name in SHARES}, "robust_sum": 0.0, "first_seconds": 0.0}
 
 
 @dataclass
 class ObjectScenes:
-    """An object and its scenes, which are created for the first setting without a cached result."""
+    """An object and its scenes; the scenes are created for the first setting without a cached result."""
 
     thing: ChartObject
     spec: SceneSpec

@@ -140,7 +140,7 @@ def summed(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def mark_fronts(rows: Sequence[dict[str, Any]], metrics: Mapping[str, bool]) -> None:
     """Add `front`: the accuracies in which no faster row (end to end) is better.
-    `metrics`: True if more is better."""
+    `metrics` tells for each accuracy whether more is better."""
     for row in rows:
         row["front"] = []
     for key, more in metrics.items():

@@ -54,7 +54,7 @@ class Setting:
     knobs: Fidelity
     options: Mapping[str, Any] = field(default_factory=dict)
     batch: int = 32
-    """Number of grasps per call, which is one repeat."""
+    """Number of grasps per call; a call is one repeat."""
     warm: Mapping[str, Any] = field(default_factory=dict)
     """Options of the call before the first timed one."""
     run: ExecutionContext = DEFAULT_CONTEXT
@@ -100,7 +100,7 @@ class Rollout:
     success: list[NDArray[np.int8]] = field(default_factory=list)
     """Verdicts of the standard level."""
     kept: list[NDArray[np.int8]] = field(default_factory=list)
-    """1: valid, that is held and feasible."""
+    """1 if valid, that is, held and feasible."""
     columns: list[dict[str, Floats]] = field(default_factory=list)
     first_calls: list[float] = field(default_factory=list)
     """Seconds of calls with `first_grasps` grasps, end to end."""
@@ -168,7 +168,7 @@ class Rollout:
             self.shares.append(shares)
 
     def time_first(self, grasps: int) -> None:
-        """Time a call of a few grasps, for the first valid one; above 1 s per grasp, scale the batch's time."""
+        """Time a call of a few grasps; above 1 s per grasp, scale the time of the whole batch instead."""
         self.first_grasps = grasps
         each = self.end_seconds[-1] / self.setting.batch
         if each > 1.0:

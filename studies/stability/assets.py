@@ -154,8 +154,8 @@ def shape_cell(
     **asked: Any,
 ) -> MapCell:
     """Return the map's cell of a hand on a mesh; candidates are planned and validated as in a job.
-    `place` has panel, x and y of the cell. The `mesh` in metres is prepared like an upload; `allow_open`: it may be
-    open. `options` has size and execution context of the job, `asked` its fidelity or method."""
+    `place` has panel, x and y of the cell. The `mesh` in metres is prepared like an upload; `allow_open` permits an
+    open one. `options` has size and execution context of the job, `asked` its fidelity or method."""
     request = JobRequest(hand="hand", object="shape", grasps=options.count, want="candidates", rechecks=0, **asked)
     try:
         obj = prepared(mesh, request.knobs.face_error_m, allow_open=allow_open)
@@ -183,12 +183,12 @@ FINGERS: Final = (1, 2, 3, 4, 5, 6, 8)
 COUPLINGS: Final[tuple[Coupling, ...]] = ("each joint", "distal follows", "one drive per finger", "one drive")
 #: Size relative to a human hand, whose fingers are about 10 cm long.
 SIZES: Final = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
-#: Rotation of the distal joint over that of the previous one.
+#: Rotation of the distal joint, divided by that of the previous joint.
 RATIOS: Final = (-0.5, 0.0, 0.5, 1.0, 1.5, 2.0)
 #: Cube that these hands grasp [mm].
 CUBE_MM: Final = 50.0
 
-#: Palm, links and their radius [m] of a hand of size 1, from the palm outward.
+#: Radius and height of the palm, lengths of the links from it outward, and their radius [m], at size 1.
 _PALM_M, _LINKS_M, _RADIUS_M = (0.032, 0.02), (0.045, 0.035, 0.027), 0.009
 #: Outward lean of open fingers, and limits of their joints [rad].
 _LEAN: Final = 0.45

@@ -102,7 +102,7 @@ def force_based(*, dt: float, speed: float, stiffness: float, mass: float = 1.0)
 
 
 def _extremes(points: Floats, flight: Iterator[tuple[Floats, float]]) -> tuple[float, float]:
-    """Return largest energy and deepest penetration of a flight, which yields centres and energies."""
+    """Return largest energy and deepest penetration of a flight, given as pairs of centre and energy."""
     most, deepest = 1.0, 0.0
     for centre, energy in flight:
         most, deepest = max(most, energy), max(deepest, _largest_depth(points, centre))

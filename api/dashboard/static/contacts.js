@@ -104,7 +104,7 @@ function colourOf(distance, out) {
 export class Contacts {
   constructor(hand, thing) {
     this.hand = hand;
-    // Relative to the mesh: numbers have 32 bits, and the origin of an object's frame may be far away.
+    // Points are relative to the mesh, because numbers have 32 bits and the object's origin may be far away.
     this.frame = thing.mesh;
     this.field = new DistanceField(thing.geometry);
     let count = 0;

@@ -8,7 +8,7 @@ const POINTS = 0;
 /** Content of a GLB file: `{extras, nodes: [{name, translation, rotation, extras, children, solid, collision, points}]}`. */
 export function readGlb(buffer) {
   const view = new DataView(buffer);
-  if (view.getUint32(0, true) !== 0x46546c67) throw new Error("the model is no binary glTF");
+  if (view.getUint32(0, true) !== 0x46546c67) throw new Error("the model is not binary glTF");
   const length = view.getUint32(12, true);
   const json = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 20, length)));
   const base = 20 + length + 8;

@@ -1,4 +1,4 @@
-// Surroundings of an object: tables, walls, boards and other objects; and viewpoints from which they do not hide it.
+// Surroundings of an object: tables, walls, boards, other objects; viewpoints with a free view of the object.
 import { BufferAttribute, BufferGeometry, Group, Mesh, MeshStandardMaterial, Quaternion, Vector3 } from "./vendor/three.min.js";
 import { loadGlb } from "./glb.js";
 import { Thing } from "./figures.js";
@@ -100,7 +100,7 @@ export function staged(grasp, hand, thing) {
   return { all, scenery: grasp.scene ? new Scenery(grasp.scene) : null };
 }
 
-/** Direction nearest to a wanted one from which no wall hides the object, and the camera is above the planes. */
+/** Viewing direction nearest to a wanted one, with no wall in front of the object and the camera above all planes. */
 export function freeSide(wanted, scene, centre) {
   const around = Math.atan2(wanted.y, wanted.x);
   const planes = scene.supports.filter((support) => support.kind === "half_space");
