@@ -17,29 +17,7 @@ from graspd.service.settings import Settings
 from graspd.service.store.store import open_store
 from tests.shell import completed
 from tests.waiting import PATIENCE_S, until_a_worker_is_idle
-
-GRIPPER = """\
-<robot name="pincer">
-  <link name="base">
-    <collision><origin xyz="0 0 -0.01"/><geometry><box size="0.12 0.04 0.02"/></geometry></collision>
-  </link>
-  <link name="left">
-    <collision><origin xyz="0 0 0.04"/><geometry><box size="0.01 0.03 0.08"/></geometry></collision>
-  </link>
-  <link name="right">
-    <collision><origin xyz="0 0 0.04"/><geometry><box size="0.01 0.03 0.08"/></geometry></collision>
-  </link>
-  <joint name="slide_left" type="prismatic">
-    <parent link="base"/><child link="left"/><origin xyz="-0.055 0 0"/><axis xyz="1 0 0"/>
-    <limit lower="0" upper="0.05" effort="20" velocity="1"/>
-  </joint>
-  <joint name="slide_right" type="prismatic">
-    <parent link="base"/><child link="right"/><origin xyz="0.055 0 0"/><axis xyz="-1 0 0"/>
-    <limit lower="0" upper="0.05" effort="20" velocity="1"/>
-  </joint>
-</robot>
-"""
-
+from tests.worker.hands.urdfs import gripper_urdf
 
 #: Runs `graspd` as a user does; gives its exit code, the JSON object on the last line, and standard error.
 Shell = Callable[..., tuple[int, dict[str, Any], str]]
@@ -49,7 +27,7 @@ Shell = Callable[..., tuple[int, dict[str, Any], str]]
 def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A hand without meshes, a box in millimetres, and a folder of two objects."""
     folder = tmp_path_factory.mktemp("files")
-    (folder / "pincer.urdf").write_text(GRIPPER)
+    (folder / "pincer.urdf").write_bytes(gripper_urdf(coupled=False))
     trimesh.creation.box((60.0, 40.0, 30.0)).export(folder / "brick.stl")
     (folder / "toys").mkdir()
     trimesh.creation.icosphere(subdivisions=2, radius=0.02).export(folder / "toys" / "ball.ply")

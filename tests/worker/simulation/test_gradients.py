@@ -25,6 +25,7 @@ from graspd.worker.simulation.obstacles import DeviceObstacles, PosedFeatures
 from graspd.worker.simulation.projection import Projection, ProjectionOptions
 from graspd.worker.simulation.record import OPTIMIZERS, record_evaluation, record_iteration, record_placement
 from graspd.worker.simulation.sampling import object_samples
+from tests.worker.models import unit_vectors
 from tests.worker.simulation.rigs import ball, rig, still
 
 _GOLDEN = (np.sqrt(5) - 1) / 2
@@ -94,8 +95,7 @@ def nearest_edges(hand: HandModel, bodies: np.ndarray, obstacle: Obstacle, far: 
 
 def random_state(hand: HandModel, count: int, seed: int = 0) -> HandState:
     rng = np.random.default_rng(seed)
-    rotation = rng.normal(size=(count, 4))
-    rotation /= np.linalg.norm(rotation, axis=1, keepdims=True)
+    rotation = unit_vectors(rng, count, 4)
     q = hand.lower + rng.random((count, hand.dofs)) * (hand.upper - hand.lower)
     return HandState(0.05 * rng.normal(size=(count, 3)), rotation, q)
 
@@ -333,13 +333,7 @@ def test_a_step_moves_and_turns_a_hand_against_its_gradient(optimizer: str) -> N
     np.testing.assert_allclose(found.q[0], np.clip(state.q[0] + step[6:], hand.lower, hand.upper), atol=1e-6)
 
 
-def sphere_points(count: int, seed: int) -> np.ndarray:
-    """(N, 3) on the unit sphere."""
-    points = np.random.default_rng(seed).normal(size=(count, 3))
-    return points / np.linalg.norm(points, axis=1, keepdims=True)
-
-
-BALL = sphere_points(300, seed=5) * 0.04 + [0.33, 0.02, 0.02]
+BALL = unit_vectors(np.random.default_rng(5), 300) * 0.04 + [0.33, 0.02, 0.02]
 SCENES = {
     "table": (Obstacle.half_space([0.1, -0.2, 1.0], -0.02),),
     "a table to press into": (replace(Obstacle.half_space([0.1, -0.2, 1.0], -0.02), tips_m=-0.001),),

@@ -16,7 +16,7 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.scenes.placement import MOST_PLANES, enclosing_solid
 from graspd.worker.simulation.environment import CLEAR_M, Environment, Obstacle, PlacedGrasps
 from graspd.worker.simulation.obstacles import FAR_M, PosedFeatures, body_clearance, obstacle_clearance
-from tests.worker.models import piece, two_finger_hand
+from tests.worker.models import piece, two_finger_hand, unit_vectors
 
 TILTED = np.array([0.1, -0.2, 0.3, 0.8, 0.2, -0.4, 0.4])
 TILTED[3:] /= np.linalg.norm(TILTED[3:])
@@ -66,8 +66,8 @@ def test_nonsense_is_refused(make) -> None:
 
 
 def random_postures(hand: HandModel, count: int, rng: np.random.Generator) -> Posture:
-    turn = rng.normal(size=(count, 4))
-    pose = np.column_stack([rng.normal(size=(count, 3)) * 0.12, turn / np.linalg.norm(turn, axis=1, keepdims=True)])
+    turn = unit_vectors(rng, count, 4)
+    pose = np.column_stack([rng.normal(size=(count, 3)) * 0.12, turn])
     return Posture(pose, hand.expand(rng.uniform(hand.lower, hand.upper, (count, hand.dofs))))
 
 
@@ -227,8 +227,7 @@ def test_no_hand_is_nearer_to_a_solid_than_it_says_by_mujoco(name: str) -> None:
 
 
 def test_an_outer_solid_holds_its_points_and_is_a_box_of_a_box() -> None:
-    points = np.random.default_rng(0).normal(size=(400, 3))
-    points *= 0.03 / np.linalg.norm(points, axis=1, keepdims=True)
+    points = 0.03 * unit_vectors(np.random.default_rng(0), 400)
     solid, error = enclosing_solid(points)
     assert len(solid.planes) <= MOST_PLANES and solid.distance(points).max() <= 1e-9
     radius = np.linalg.norm(solid.corners, axis=1).max()
