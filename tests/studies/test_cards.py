@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 
 from graspd.cli import build
 from graspd.service.model import names
-from graspd.service.model.errors import InputError, NotFoundError
+from graspd.service.model.errors import InputError
 from graspd.service.model.metrics import BANDS, SECTORS, evenness
 from graspd.service.model.planning import message_of, plan
 from graspd.service.model.records import JobRecord, Snapshot
@@ -218,11 +218,6 @@ def test_what_a_folder_does_not_know_is_said_to_be_missing(export: Path, tmp_pat
     assert "No licence was stated for this dataset" in page and "Not measured: robustness" in page
 
 
-def test_a_dataset_without_a_snapshot_says_how_to_take_one(kitchen: Case) -> None:
-    with pytest.raises(NotFoundError, match="graspd datasets snapshot pantry"):
-        contents_of_store(kitchen.services.store, "pantry")
-
-
 def test_licences_can_be_given_for_what_was_added_without(kitchen: Case, tmp_path: Path) -> None:
     said = tmp_path / "assets.json"
     said.write_text(json.dumps({"objects": {"*": {"licence": "CC0-1.0"}, "mug": {"source": "a potter"}}}))
@@ -273,7 +268,7 @@ def test_the_command_writes_the_card_of_a_dataset(kitchen: Case, tmp_path: Path,
 
 @pytest.mark.parametrize(
     ("words", "says"),
-    [("pantry", "has no snapshot"), ("./nowhere", "does not exist"), (f"kitchen --snapshot {'0' * 32}", "0" * 32)],
+    [("pantry", "datasets snapshot pantry"), ("./nowhere", "not exist"), (f"kitchen --snapshot {'0' * 32}", "0" * 32)],
 )
 def test_a_mistake_is_one_line_and_exit_2(kitchen, tmp_path, monkeypatch, words: str, says: str) -> None:
     monkeypatch.setenv("GRASPD_DATA_DIR", str(kitchen.folder.parent))
