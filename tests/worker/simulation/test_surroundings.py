@@ -71,16 +71,6 @@ def random_postures(hand: HandModel, count: int, rng: np.random.Generator) -> Po
     return Posture(pose, hand.expand(rng.uniform(hand.lower, hand.upper, (count, hand.dofs))))
 
 
-@pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
-def test_the_distance_of_a_hand_from_a_plane_is_mujocos(name: str) -> None:
-    """1e-5 m: MuJoCo keeps meshes in float32 and its distances converge to 1e-6."""
-    hand = hand_from_path(name)
-    postures = random_postures(hand, 8, np.random.default_rng(3))
-    plane = Obstacle.half_space([0.3, -0.5, 0.8], -0.2)
-    found = obstacle_clearance(hand, postures, [Environment((plane,), plane.planes[0, :3])])
-    np.testing.assert_allclose(found, mujoco_distances(hand, postures, plane), atol=1e-5)
-
-
 def test_only_fingertips_have_more_room_over_what_they_may_touch() -> None:
     hand = hand_from_path("barrett")
     posture = Posture(np.array([[0, 0, 0, 1.0, 0, 0, 0]]), hand.expand(hand.preshape[None]))
