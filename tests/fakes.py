@@ -216,10 +216,10 @@ def engine_of(table: Mapping[Stage, StageFunction], check: Check | None = None) 
 def main() -> None:
     """A worker process with these stages: `python -m tests.fakes`.
 
-    FAKE_POISON names a batch that kills its worker, FAKE_LEAK_MB is memory that each task keeps, FAKE_LOCK_S is how
-    long each task holds the interpreter lock; while there is a file FAKE_HOLD no task ends, and while there is a file
-    FAKE_BROKEN nothing works. With FAKE_DIE_UNTOLD the worker that puts the first shard is killed before it tells; a
-    file of that name says so. Of the options of `graspd worker` it takes `--burst` and `--idle`.
+    FAKE_LEAK_MB is memory that each task keeps, FAKE_LOCK_S is how long each task holds the interpreter lock; while
+    there is a file FAKE_HOLD no task ends, and while there is a file FAKE_BROKEN nothing works. With FAKE_DIE_UNTOLD
+    the worker that puts the first shard is killed before it tells; a file of that name says so. Of the options of
+    `graspd worker` it takes `--burst` and `--idle`.
     """
     from graspd.service.cli import log_to_stderr
     from graspd.service.settings import Settings
@@ -227,7 +227,6 @@ def main() -> None:
     from graspd.worker.process.main import run_worker
 
     table = fake_stages()
-    poison = os.environ.get("FAKE_POISON")
     leaked: list[bytes] = []
 
     broken = Path(os.environ.get("FAKE_BROKEN", "none"))
@@ -240,8 +239,6 @@ def main() -> None:
         if broken.exists():
             raise ImportError("libengine.so")
         hold_interpreter(float(os.environ.get("FAKE_LOCK_S", "0")))
-        if str(message.batch) == poison:
-            os.kill(os.getpid(), 9)
         leaked.append(b"1" * (2**20 * int(os.environ.get("FAKE_LEAK_MB", "0"))))
         return fake_synthesize(message, context)
 

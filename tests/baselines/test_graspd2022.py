@@ -12,7 +12,7 @@ from graspd.baselines.graspd2022 import kernels, method
 from graspd.baselines.graspd2022.method import Search, _Batch, distance_grid, physics_of
 from graspd.worker.simulation.data import HandState
 from graspd.worker.simulation.kernels.surface import Surface, field_distance
-from tests.worker.models import object_from_mesh, two_finger_hand
+from tests.worker.models import object_from_mesh, two_finger_hand, unit_vectors
 
 RADIUS = 0.05
 SPHERE = object_from_mesh(trimesh.creation.icosphere(subdivisions=4, radius=RADIUS))
@@ -52,9 +52,8 @@ def probed(points: np.ndarray, velocity: tuple[float, ...] = (0, 0, 0), grid=Non
 def test_grid_tells_spheres_distance_with_error_of_second_order(cells: int) -> None:
     """Trilinear interpolation of |x| - R is off by at most 3/8 h^2 max |d''|, and |d''| <= 2 / |x| in the cell."""
     rng = np.random.default_rng(3)
-    direction = rng.normal(size=(2000, 3))
-    reach = rng.uniform(0.03, 0.12, size=2000)
-    points = direction / np.linalg.norm(direction, axis=1, keepdims=True) * reach[:, None]
+    direction, reach = unit_vectors(rng, 2000), rng.uniform(0.03, 0.12, size=2000)
+    points = direction * reach[:, None]
     cell = 2 * (RADIUS + 0.10) / cells
     error = np.abs(probed(points, grid=grid_of_sphere(cells))[0] - (reach - RADIUS))
     bound = 0.375 * 2 * cell**2 / np.maximum(reach - np.sqrt(3) * cell, 0.005)

@@ -56,10 +56,14 @@ def job_template(found: Document) -> Document:
     return found["spec"]["jobTargetRef"]
 
 
-def pods() -> Iterator[tuple[str, Document]]:
-    for found in documents("Deployment", "StatefulSet", "ScaledJob"):
+def templates(*kinds: str) -> Iterator[tuple[str, Document]]:
+    for found in documents(*kinds):
         holder = job_template(found) if found["kind"] == "ScaledJob" else found["spec"]
-        yield found["metadata"]["name"], holder["template"]["spec"]
+        yield found["metadata"]["name"], holder["template"]
+
+
+def pods() -> list[tuple[str, Document]]:
+    return [(name, template["spec"]) for name, template in templates("Deployment", "StatefulSet", "ScaledJob")]
 
 
 def containers() -> list[tuple[str, Document]]:
@@ -245,11 +249,8 @@ def test_everything_is_shut_but_identities_of_the_cloud_by_name() -> None:
 def test_workers_reach_no_database() -> None:
     (to_index,) = [found for found in documents("NetworkPolicy") if found["metadata"]["name"] == "to-index"]
     allowed = to_index["spec"]["podSelector"]["matchLabels"]
-    for found in documents("Deployment", "ScaledJob"):
-        name = found["metadata"]["name"]
-        holder = job_template(found) if found["kind"] == "ScaledJob" else found["spec"]
-        labels = holder["template"]["metadata"]["labels"]
-        assert (allowed.items() <= labels.items()) is not name.startswith("worker"), name
+    for name, template in templates("Deployment", "ScaledJob"):
+        assert (allowed.items() <= template["metadata"]["labels"].items()) is not name.startswith("worker"), name
 
 
 def test_compose_and_kubernetes_run_the_same_redis() -> None:

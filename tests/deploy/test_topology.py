@@ -97,16 +97,12 @@ def topology(tmp_path: Path, s3_server: S3Server, postgres_server: PostgresServe
         redis.wait(timeout=30)
 
 
-def key_of(topology: Topology) -> str:
-    made = topology.graspd("api", "keys", "add", "admin", "--scope", "admin")
-    assert made.returncode == 0, made.stderr
-    return made.stdout.split()[0]
-
-
 @pytest.mark.s3
 @pytest.mark.postgres
 def test_services_of_the_compose_file_do_a_job_together(topology: Topology, monkeypatch: pytest.MonkeyPatch) -> None:
-    headers = bearer(key_of(topology))
+    made = topology.graspd("api", "keys", "add", "admin", "--scope", "admin")
+    assert made.returncode == 0, made.stderr
+    headers = bearer(made.stdout.split()[0])
     for number, port in enumerate(topology.ports):
         topology.start(f"api-{number}", "api", "graspd", "api", GRASPD_PORT=str(port))
     topology.start("controller", "controller", "graspd", "controller")

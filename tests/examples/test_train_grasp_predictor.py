@@ -19,9 +19,9 @@ from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.prepare import object_from_path
+from tests.api.factories import poses
 from tests.service.readers import box_scenes
 
-JOINTS = 3
 Floats = np.ndarray[Any, np.dtype[np.float64]]
 
 
@@ -31,17 +31,10 @@ def hand() -> HandModel:
     return hand_from_path("barrett")
 
 
-def poses(count: int, seed: int) -> Floats:
-    rng = np.random.default_rng(seed)
-    quaternions = rng.normal(size=(count, 4))
-    quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
-    return np.concatenate([rng.normal(size=(count, 3)), quaternions], axis=1)
-
-
-def grasps_of(count: int = 5, seed: int = 0) -> GraspSet:
-    rng = np.random.default_rng(seed)
-    grasp, pregrasp, squeeze = (Posture(poses(count, seed), rng.normal(size=(count, JOINTS))) for _ in range(3))
-    approach = np.repeat(grasp.hand_pose[:, None], 4, axis=1)
+def grasps_of(rng: np.random.Generator, count: int = 5) -> GraspSet:
+    roots = poses(rng, count)
+    grasp, pregrasp, squeeze = (Posture(roots, rng.normal(size=(count, 3))) for _ in range(3))
+    approach = np.repeat(roots[:, None], 4, axis=1)
     approach[..., :3] += np.linspace(0.1, 0, 4)[:, None] * np.array([0.0, 0.6, 0.8])
     return GraspSet(grasp, pregrasp, squeeze, np.zeros(count), approach=approach)
 
@@ -58,7 +51,8 @@ def block_of(size: tuple[float, float, float], *, turned: float = 0.0, at: tuple
 
 
 def test_a_row_is_its_grasp_where_the_object_lies() -> None:
-    grasps, lying = grasps_of(), poses(1, 7)[0]
+    rng = np.random.default_rng(7)
+    grasps, lying = grasps_of(rng), poses(rng, 1)[0]
     found = decode(rows_of(grasps, np.repeat(lying[None], 5, axis=0)), np.zeros(3))
     expected = compose(lying, grasps.grasp.hand_pose)
     np.testing.assert_allclose(found.hand_pose[:, :3], expected[:, :3], atol=1e-12)

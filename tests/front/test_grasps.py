@@ -20,7 +20,7 @@ from graspd.service.model.transforms import compose
 from graspd.service.store.shards import write_shard
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
-from tests.api.factories import scene_columns
+from tests.api.factories import poses, scene_columns
 from tests.worker.commands_run import graspd as command
 from tests.worker.commands_run import refused
 from tests.worker.models import attributes_of
@@ -33,9 +33,7 @@ def columns(count: int, *, scenes: int = 0, seed: int = 0, thresholds: Any = THR
     rng = np.random.default_rng(seed)
     made: dict[str, Any] = {"quality/thresholds_m": thresholds}
     for name in ("grasp", "pregrasp", "squeeze"):
-        pose = rng.normal(size=(count, 7))
-        pose[:, 3:] /= np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
-        made[f"{name}/hand_pose"], made[f"{name}/joint_positions"] = pose, rng.normal(size=(count, 3))
+        made[f"{name}/hand_pose"], made[f"{name}/joint_positions"] = poses(rng, count), rng.normal(size=(count, 3))
     for metric in GRASP_METRICS:
         if not metric.optional:
             values = np.arange(count, dtype=float)

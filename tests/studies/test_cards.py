@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 
 from graspd.cli import build
 from graspd.service.model import names
-from graspd.service.model.errors import InputError, NotFoundError
+from graspd.service.model.errors import InputError
 from graspd.service.model.metrics import BANDS, SECTORS, evenness
 from graspd.service.model.planning import message_of, plan
 from graspd.service.model.records import JobRecord, Snapshot
@@ -136,7 +136,15 @@ def _finish(services: Services, record: JobRecord, change: Change) -> None:
         rng = np.random.default_rng([task.batch, *map(ord, request.hand + request.object)])
         if task.stage is Stage.SYNTHESIZE:
             joints = hand_from_path(request.hand).joint_names
-            base = _base(rng, joints, task.count, task.batch)
+            base = factories._base(rng, task.count, request)
+            for posture in ("grasp", "pregrasp", "squeeze"):
+                base[f"{posture}/joint_positions"] = rng.uniform(0.0, 0.5, (task.count, len(joints)))
+            if STILL_JOINT in joints:
+                base["grasp/joint_positions"][:, joints.index(STILL_JOINT)] = -1.0
+            base |= {"quality/valid": np.ones(task.count, np.uint8), "quality/success": np.ones(task.count, np.int8)}
+            base["quality/simulated_displacement_cm"] = rng.gamma(2.0, 0.025, task.count)
+            if task.batch == 0:
+                base["quality/recheck"] = np.where(np.arange(task.count) < 8, 1, -1).astype(np.int8)
             change(request.hand, request.object, base)
             made = len(base["quality/valid"])
             if place:
@@ -157,26 +165,6 @@ def _finish(services: Services, record: JobRecord, change: Change) -> None:
         manifest, data = shard_of(message, output, device="cpu", seconds=SECONDS[task.stage], worker="w1")
         publish_shard(services.store, manifest, data)
         services.index.write.add_manifests([manifest])
-
-
-def _base(rng: np.random.Generator, joints: tuple[str, ...], count: int, batch: int) -> dict[str, Array]:
-    columns: dict[str, Array] = {"quality/thresholds_m": np.array([0.001, 0.005])}
-    for posture in ("grasp", "pregrasp", "squeeze"):
-        columns[f"{posture}/hand_pose"] = factories.poses(rng, count)
-        columns[f"{posture}/joint_positions"] = rng.uniform(0.0, 0.5, (count, len(joints)))
-    if STILL_JOINT in joints:
-        columns["grasp/joint_positions"][:, joints.index(STILL_JOINT)] = -1.0
-    for name, scale in (("contact_area_cm2", 40.0), ("epsilon", 0.3), ("wrench_volume", 3.0)):
-        columns[f"quality/{name}"] = rng.gamma(9.0, scale / 9, (count, 2))
-    small = {"intersection_volume_cm3": 0.01, "penetration_depth_mm": 0.3, "self_penetration_depth_mm": 0.01}
-    for name, scale in (small | {"simulated_displacement_cm": 0.05, "stability_loss": 0.05}).items():
-        columns[f"quality/{name}"] = rng.gamma(2.0, scale / 2, count)
-    columns["quality/contact_links"] = rng.integers(2, 9, count).astype(np.int32)
-    columns["quality/valid"] = np.ones(count, np.uint8)
-    columns["quality/success"] = np.ones(count, np.int8)
-    if batch == 0:
-        columns["quality/recheck"] = np.where(np.arange(count) < 8, 1, -1).astype(np.int8)
-    return columns
 
 
 def test_the_page_its_links_and_figures_agree_with_the_card(kitchen: Case) -> None:
@@ -230,11 +218,6 @@ def test_what_a_folder_does_not_know_is_said_to_be_missing(export: Path, tmp_pat
     assert "No licence was stated for this dataset" in page and "Not measured: robustness" in page
 
 
-def test_a_dataset_without_a_snapshot_says_how_to_take_one(kitchen: Case) -> None:
-    with pytest.raises(NotFoundError, match="graspd datasets snapshot pantry"):
-        contents_of_store(kitchen.services.store, "pantry")
-
-
 def test_licences_can_be_given_for_what_was_added_without(kitchen: Case, tmp_path: Path) -> None:
     said = tmp_path / "assets.json"
     said.write_text(json.dumps({"objects": {"*": {"licence": "CC0-1.0"}, "mug": {"source": "a potter"}}}))
@@ -285,7 +268,7 @@ def test_the_command_writes_the_card_of_a_dataset(kitchen: Case, tmp_path: Path,
 
 @pytest.mark.parametrize(
     ("words", "says"),
-    [("pantry", "has no snapshot"), ("./nowhere", "does not exist"), (f"kitchen --snapshot {'0' * 32}", "0" * 32)],
+    [("pantry", "datasets snapshot pantry"), ("./nowhere", "not exist"), (f"kitchen --snapshot {'0' * 32}", "0" * 32)],
 )
 def test_a_mistake_is_one_line_and_exit_2(kitchen, tmp_path, monkeypatch, words: str, says: str) -> None:
     monkeypatch.setenv("GRASPD_DATA_DIR", str(kitchen.folder.parent))

@@ -4,7 +4,6 @@ import json
 
 import numpy as np
 import pytest
-import trimesh
 from typer.testing import CliRunner
 
 from graspd.commands.evaluate import app
@@ -17,12 +16,10 @@ from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.surface import piece_distance
 from tests.worker.commands_run import graspd, refused
-from tests.worker.models import object_from_mesh
-from tests.worker.quality.helpers import pad_hand, posture
+from tests.worker.quality.helpers import BOX, pad_hand, posture
 
 CONTRACT = {"n", "protocol", "gsr", "osr", "sgs", "pd_mm", "spd_mm", "ca_cm2", "iv_cm3", "epsilon", "wrench_volume"}
 CONTRACT |= {"sd_cm", "diversity"}
-BOX = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))
 HAND = pad_hand()
 
 

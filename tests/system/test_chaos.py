@@ -59,19 +59,6 @@ def test_redis_killed_in_the_middle_comes_back_with_its_tasks(start: Start) -> N
     assert differences(system.services.index, system.services.store) == []
 
 
-@pytest.mark.slow
-def test_a_job_that_kills_its_worker_fails_and_the_others_go_on(start: Start) -> None:
-    system = start(environment={"FAKE_POISON": "1"}, lease_s=2.0, task_attempts=2, retry_backoff_s=0.1)
-    poisoned = system.submit(wanted(grasps=64))
-    healthy = system.submit(wanted(seed=7))
-    bad, good = system.finish(poisoned, healthy)
-    assert good.state is State.SUCCEEDED
-    assert (bad.state, bad.stages[0].succeeded, bad.stages[0].failed) == (State.FAILED, 1, 1)
-    attempts = system.services.index.jobs.attempts(job=poisoned)
-    assert [(a.number, a.kind, a.last) for a in attempts] == [(2, "WorkerLost", True), (1, "WorkerLost", False)]
-    assert differences(system.services.index, system.services.store) == []
-
-
 def test_a_worker_told_to_stop_hands_its_task_back_at_once(start: Start) -> None:
     system = start()
     system.hold.touch()

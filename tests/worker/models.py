@@ -16,6 +16,12 @@ from graspd.worker.scenes.kinds import rest_poses, supports_of
 from graspd.worker.simulation.environment import Scenes
 
 
+def unit_vectors(rng: np.random.Generator, count: int, size: int = 3) -> np.ndarray:
+    """(N, size) directions drawn evenly; of size 4 quaternions of rotations."""
+    found = rng.normal(size=(count, size))
+    return found / np.linalg.norm(found, axis=1, keepdims=True)
+
+
 def object_from_mesh(mesh: trimesh.Trimesh, name: str = "thing") -> ObjectModel:
     """An `ObjectModel` of a watertight mesh as it stands: nothing repaired, nothing simplified."""
     hull = mesh.convex_hull

@@ -32,7 +32,7 @@ from graspd.worker.simulation.data import HandState
 from graspd.worker.simulation.environment import Obstacle, PlacedGrasps
 from graspd.worker.simulation.obstacles import DeviceObstacles
 from tests.networks import random_network
-from tests.worker.models import on_tables
+from tests.worker.models import assert_same_grasps, on_tables, unit_vectors
 
 FEW = {"coarse_iterations": 20, "fine_iterations": 6, "polish_iterations": 2}
 QUICK = resolve_fidelity("draft").model_copy(update=FEW)
@@ -69,15 +69,10 @@ def made(hand: HandModel, obj: ObjectModel, network: ProposalNetwork, count: int
     return synthesize(hand, obj, wanted, run, method="learned", options=options)
 
 
-def assert_same(one: GraspSet, other: GraspSet) -> None:
-    for name, values in one.to_columns().items():
-        np.testing.assert_array_equal(values, other.to_columns()[name], err_msg=name)
-
-
 @pytest.mark.slow
 def test_a_grasp_depends_on_seed_and_index_alone(hand, network) -> None:
     small, large = made(hand, BLOCK, network, 2), made(hand, BLOCK, network, 8, threads=2)
-    assert_same(small, large.take(slice(0, 2)))
+    assert_same_grasps(small, large.take(slice(0, 2)))
     assert not np.allclose(small.grasp.hand_pose, made(hand, BLOCK, network, 2, seed=2).grasp.hand_pose)
     q = hand.reduce(large.grasp.joint_positions)
     assert (q >= hand.lower - 1e-5).all() and (q <= hand.upper + 1e-5).all()
@@ -91,8 +86,8 @@ def test_joined_batches_are_those_of_separate_launches(hand, network) -> None:
     asked = [BatchRequest(one, ExecutionContext(threads=1)) for one in wanted]
     found = joins(method("learned").options(**options))(hand, BLOCK, asked)
     for one, alone in zip(found, wanted, strict=True):
-        assert isinstance(one, GraspSet)
-        assert_same(one, synthesize(hand, BLOCK, alone, ExecutionContext(threads=1), method="learned", options=options))
+        expected = synthesize(hand, BLOCK, alone, ExecutionContext(threads=1), method="learned", options=options)
+        assert_same_grasps(one, expected)
 
 
 def proposing(network: ProposalNetwork, found: Proposals, anchor: np.ndarray) -> ProposalNetwork:
@@ -213,8 +208,7 @@ def test_cameras_stand_where_pictures_have_them() -> None:
 
 
 def cloud(count: int = 64, seed: int = 1) -> tuple[Floats, Floats]:
-    normals = np.random.default_rng(seed).normal(size=(count, 3))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = unit_vectors(np.random.default_rng(seed), count)
     return 0.05 * normals + [0.3, -0.2, 0.5], normals
 
 

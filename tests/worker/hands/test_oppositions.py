@@ -126,8 +126,8 @@ def test_without_opposing_digits_grasps_are_not_even_planned() -> None:
         validated_grasps(pointer(), ball, JobOptions(want="candidates", grasps=1), count=1)
 
 
-def test_what_a_hand_can_hold_is_asked_once_on_a_machine(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+@pytest.mark.usefixtures("own_cache")
+def test_what_a_hand_can_hold_is_asked_once_on_a_machine(monkeypatch: pytest.MonkeyPatch) -> None:
     # Without the cache in memory, as a process that begins.
     assert [oppositions._can_hold.__wrapped__(hand) for hand in (gripper(), pointer())] == [True, False]
     monkeypatch.setattr(oppositions, "opposes", lambda hand: pytest.fail("asked again"))

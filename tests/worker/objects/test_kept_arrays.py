@@ -52,12 +52,6 @@ TOLERANCE_M = 5e-7  # positions are single precision: half a micrometre at half 
 OTHERS = [{"batch": 1}, {"stage": Stage.SCENE}, {"hand_digest": "d" * 32}, {"object_digest": "d" * 32}]
 
 
-@pytest.fixture
-def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    return tmp_path / "graspd"
-
-
 def made(number: float) -> dict[str, np.ndarray]:
     return {"a": np.full((2, 3), number), "b": np.arange(4)}
 

@@ -42,13 +42,13 @@ from graspd.worker.simulation.environment import Environment, Obstacle, Scenes
 from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.obstacles import MARGIN_M, DeviceObstacles, body_clearance
 from tests.worker.models import object_from_mesh
-from tests.worker.simulation.rigs import ball, object_of
+from tests.worker.simulation.rigs import ball
 
 #: A box that an Allegro hand spans in one direction only, and half of its width there [m].
 SIDES = (0.1, 0.24, 0.24)
 HALF = SIDES[0] / 2
 BLOCK = object_from_path("block", face_error_m=1e-3)
-CUBE = object_of(trimesh.creation.box((0.06, 0.06, 0.06)))
+CUBE = object_from_mesh(trimesh.creation.box((0.06, 0.06, 0.06)))
 DRAFT = FIDELITIES["draft"]
 UP = np.array([0.0, 0, 1])
 SIZE = np.array([0.05, 0.06, 0.08])
@@ -63,7 +63,7 @@ def draft_model(hand: HandModel, obj: ObjectModel, scenes: Sequence[Environment]
 
 
 def model_of(sides: tuple[float, float, float]) -> Model:
-    return draft_model(hand_from_path("allegro"), object_of(trimesh.creation.box(sides)))
+    return draft_model(hand_from_path("allegro"), object_from_mesh(trimesh.creation.box(sides)))
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ from graspd.worker.grasps import Posture
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
-from graspd.worker.hands.surface import sample_surface
+from graspd.worker.hands.surface import farthest_points, sample_surface
 from graspd.worker.objects import disk_cache
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.quality import diversity, probe
@@ -29,8 +29,8 @@ from graspd.worker.quality.intervals import wilson, wilson_of_mean
 from graspd.worker.quality.probe import HAND_POINTS, REACH_M, Probe
 from graspd.worker.quality.table import measure
 from graspd.worker.quality.volume import VOXEL_M, Overlap, SharedVolume
-from tests.worker.models import object_from_mesh, two_finger_hand
-from tests.worker.quality.helpers import choose_contacts, grasp_set, pad_hand, plate_hand, posture
+from tests.worker.models import object_from_mesh, two_finger_hand, unit_vectors
+from tests.worker.quality.helpers import BOX, grasp_set, pad_hand, plate_hand, posture
 from tests.worker.simulation.rigs import ball
 
 #: Single precision of coordinates around 0.1 m.
@@ -38,7 +38,6 @@ SINGLE = 1e-6
 #: Area is a sum over points: one point more or less at each edge of the zone.
 ONE_ROW = 0.03
 
-BOX = object_from_mesh(trimesh.creation.box((0.06, 0.04, 0.05)))
 SMALL_PLATES = plate_hand((0.03, 0.03, 0.01))
 GOOD = {"penetration_depth_mm": 0.5, "self_penetration_depth_mm": 0.0, "contact_links": 3.0}
 HAND = plate_hand((0.05, 0.04, 0.01))
@@ -187,8 +186,8 @@ def test_bodies_of_many_postures_are_as_far_as_their_points_say(reach: float) ->
     """In double precision down to points in float32: 1e-7 m at 0.2 m."""
     hand, ball = hand_from_path("allegro"), object_from_mesh(trimesh.creation.icosphere(subdivisions=2, radius=0.04))
     probe, rng = Probe(hand, ball, hand_points=400), np.random.default_rng(5)
-    turned = rng.normal(size=(40, 4))
-    pose = np.column_stack([rng.uniform(-0.12, 0.12, (40, 3)), turned / np.linalg.norm(turned, axis=1, keepdims=True)])
+    turned = unit_vectors(rng, 40, 4)
+    pose = np.column_stack([rng.uniform(-0.12, 0.12, (40, 3)), turned])
     joints = hand.expand(rng.uniform(hand.lower, hand.upper, (40, hand.dofs)))
     points = probe.posed_points(body_poses(hand, pose, joints))
     by_point = probe.signed_distance(points.reshape(-1, 3), reach=reach)[0].reshape(40, -1)
@@ -205,7 +204,9 @@ def test_contacts_of_many_sets_are_those_chosen_one_set_at_time() -> None:
     index, count = spread_contacts(near, place, normal, scale=0.5, limit=12)
     for b in range(3):
         for t in range(4):
-            alone = choose_contacts(near[b, t], place[b], normal[b], scale=0.5, limit=12)
+            alone = np.flatnonzero(near[b, t])
+            if len(alone) > 12:
+                alone = alone[farthest_points(np.hstack([place[b, alone] / 0.5, normal[b, alone]]), 12)]
             assert index[b, t, : count[b, t]].tolist() == alone.tolist()
     assert (count[:, 0] == 0).all() and (count[:, 1] > 0).all() and (count[:, 1] <= 12).all()
 
@@ -267,12 +268,6 @@ def test_a_piece_in_the_object_and_an_object_in_a_piece_are_kept() -> None:
     assert kept.tolist() == [[False, True, False]] and shared[0, 1] > 0
 
 
-@pytest.fixture
-def own_cache(tmp_path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    return tmp_path / "graspd" / "coarse_grids"
-
-
 def distances_of(found: Probe) -> tuple[np.ndarray, ...]:
     points = np.random.default_rng(0).uniform(-0.05, 0.05, (500, 3))
     return (found.skin.coarse.numpy(), *found.signed_distance(points))
@@ -284,7 +279,7 @@ def same(one: tuple[np.ndarray, ...], other: tuple[np.ndarray, ...]) -> bool:
 
 def test_later_process_measures_with_what_the_first_one_computed(own_cache, monkeypatch) -> None:
     first = distances_of(Probe(FINGERS, BALL, hand_points=100, object_points=64))
-    assert len(list(own_cache.iterdir())) == 1
+    assert len(list(own_cache.rglob("coarse_grids/*"))) == 1
 
     def never(self, points, reach: float = 0.0):
         raise AssertionError("it is there already")
@@ -295,13 +290,13 @@ def test_later_process_measures_with_what_the_first_one_computed(own_cache, monk
     assert same(distances_of(again), first)
     monkeypatch.setattr(probe, "binary_name", lambda module: "that of another processor")
     Probe(FINGERS, BALL, hand_points=100, object_points=64)
-    assert len(list(own_cache.iterdir())) == 2
+    assert len(list(own_cache.rglob("coarse_grids/*"))) == 2
 
 
 @pytest.mark.parametrize("harm", ["shape", "kind", "name"])
 def test_an_entry_that_is_not_sound_is_made_again(own_cache, harm: str) -> None:
     first = distances_of(Probe(FINGERS, BALL, hand_points=100, object_points=64))
-    (file,) = own_cache.iterdir()
+    (file,) = own_cache.rglob("coarse_grids/*")
     whole, grid = file.read_bytes(), first[0]
     harms = {"shape": {"coarse": grid[1:]}, "kind": {"coarse": grid.astype(float)}, "name": {"other": grid}}
     disk_cache._write(file, harms[harm])

@@ -181,14 +181,6 @@ def test_the_radius_alone_is_that_of_the_whole_hull(count: int, friction: float,
     assert found == pytest.approx(whole, abs=1e-12)  # the same planes, made in another order
 
 
-def test_radius_alone_of_a_cube_and_of_a_cloud_beside_the_origin() -> None:
-    corners = np.array(np.meshgrid(*[[-1.0, 1.0]] * 6)).reshape(6, -1).T
-    inner = np.random.default_rng(0).uniform(-0.9, 0.9, (60, 6))
-    assert hull_of(np.vstack([inner, corners]), False)[0] == pytest.approx(1.0, rel=JOGGLED)
-    beside = [np.random.default_rng(seed).normal(size=(120, 6)) + 5.0 for seed in range(3)]
-    assert all(hull_of(points, False)[0] <= 0 for points in beside)
-
-
 def test_many_hulls_at_once_are_those_of_each_alone() -> None:
     """Clouds of different sizes, a flat one and one too small among them; a volume only where it is asked for."""
     sets = [contacts(count, seed=count) for count in (4, 20, 9)]

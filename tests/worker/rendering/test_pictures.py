@@ -24,7 +24,6 @@ from graspd.worker.rendering.pictures import THREE_SIDES, grasp_pictures
 from graspd.worker.rendering.scenery import TABLE, TABLE_SIZE, slab_poses, slabs, visible_share
 from graspd.worker.rendering.trajectory_pictures import KINDS, PictureScenes, animation, trajectory_pictures
 from graspd.worker.stages.models import hand_glb
-from tests.worker.commands_run import refused
 from tests.worker.hands.urdfs import joint, link, robot
 from tests.worker.models import object_from_mesh, two_finger_hand
 
@@ -300,8 +299,3 @@ def test_a_model_for_viewers_has_the_colours(coloured: HandModel) -> None:
     meshes = [mesh for mesh in scene.geometry.values() if len(getattr(mesh, "faces", ()))]
     colours = {tuple(colour) for mesh in meshes for colour in mesh.visual.vertex_colors[:, :3].tolist()}
     assert {(255, 0, 0), (0, 0, 255)} <= colours
-
-
-@pytest.mark.parametrize("said", ["--closing ja=2", "--closing ja", "--xacro x"])
-def test_an_option_that_cannot_be_read_is_the_callers_mistake(said: str) -> None:
-    assert said.split()[0] in refused(f"hands check allegro --no-self-test {said}")

@@ -11,7 +11,7 @@ from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.scenes import Neighbours, drop_together, transfer
 from graspd.worker.scenes.clearance import MARGIN_M, Rejection, approach
 from graspd.worker.scenes.neighbours import FARTHEST_M, neighbour_clearance
-from tests.worker.models import object_from_mesh, two_finger_hand
+from tests.worker.models import object_from_mesh, two_finger_hand, unit_vectors
 
 HAND = two_finger_hand()
 #: Tessellations lie inside round pieces by r (1 - cos(pi / 48)), and a sphere of 642 corners by 0.4 % of r.
@@ -23,8 +23,7 @@ DOWN = np.concatenate([[0, 0, 0.25], quat_from_axis_angle(np.array([1.0, 0, 0]),
 
 
 def postures(rng: np.random.Generator, count: int) -> Posture:
-    quaternion = rng.normal(size=(count, 4))
-    quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
+    quaternion = unit_vectors(rng, count, 4)
     pose = np.concatenate([rng.uniform(-0.1, 0.3, (count, 3)), quaternion], 1)
     return Posture(pose, rng.uniform(-0.3, 1, (count, 2)))
 

@@ -117,10 +117,9 @@ def test_convex_objects_rest_on_faces_as_often_as_theory_says(name):
 
 
 @pytest.fixture
-def dropped(monkeypatch, tmp_path) -> list[tuple[int, int]]:
+def dropped(monkeypatch, own_cache) -> list[tuple[int, int]]:
     """Keys of the drops that are simulated, with a disk cache of their own and none in memory."""
     monkeypatch.setattr(simulate, "REFERENCE_DROPS", 8)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     keys: list[tuple[int, int]] = []
     whole = simulate._redo_until_rest
     monkeypatch.setattr(simulate, "_redo_until_rest", lambda table, key: keys.append(key) or whole(table, key))
@@ -131,10 +130,10 @@ def dropped(monkeypatch, tmp_path) -> list[tuple[int, int]]:
 @pytest.mark.parametrize(
     "kept", [None, {"face": np.full(8, 99)}, {"face": np.zeros(3, np.int64)}, {"face": np.zeros(8)}, {"other": UP}]
 )
-def test_reference_drops_are_simulated_once_or_if_not_kept_whole(dropped, tmp_path, kept) -> None:
+def test_reference_drops_are_simulated_once_or_if_not_kept_whole(dropped, own_cache, kept) -> None:
     first = drop(bracket(), count=1, seed=5)
     assert len(dropped) == 1 + simulate.REFERENCE_DROPS
-    (file,) = tmp_path.rglob("drops/*.npz")
+    (file,) = own_cache.rglob("drops/*.npz")
     if kept is not None:
         np.savez(file, **kept)
     again = drop(bracket(), count=1, seed=5)

@@ -6,22 +6,16 @@ import trimesh
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.surface import sample_surface
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.objects.prepare import build
-from graspd.worker.objects.repair import RepairedMesh
 from graspd.worker.simulation import kernels
 from graspd.worker.simulation.data import Data, Schedule
 from graspd.worker.simulation.device import DeviceHand, DeviceObject
 from graspd.worker.simulation.model import LossOptions, Model
 from graspd.worker.simulation.sampling import object_samples
-
-
-def object_of(mesh: trimesh.Trimesh) -> ObjectModel:
-    vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int32)
-    return build(RepairedMesh(vertices, faces), 0.0)
+from tests.worker.models import object_from_mesh
 
 
 def ball(radius: float = 0.035, subdivisions: int = 3) -> ObjectModel:
-    return object_of(trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius))
+    return object_from_mesh(trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius))
 
 
 def still(dilation: float = 0.0, weight: float = 0.0) -> Schedule:

@@ -10,6 +10,7 @@ from graspd.studies.stability.gradients import SOLVERS, reference_gradient, run_
 from graspd.worker.simulation import reference
 from graspd.worker.simulation.model import NEAR_GAP, initial_motions
 from graspd.worker.simulation.reference import Contacts, World
+from tests.worker.models import unit_vectors
 
 END_TOLERANCE = 2e-6  # float32 solves of 6 x 6 systems with condition numbers up to 1e3, motions of 1e-3 m
 #: Cosine between the kernel's adjoint and central differences: contacts that switch on or off within the difference,
@@ -24,8 +25,7 @@ EACH = pytest.mark.parametrize("name", SOLVERS)
 
 def ring(rng: np.random.Generator, count: int = 24, gap: float = -1e-4, spread: float = 2e-4) -> Contacts:
     """Contacts all around a ball of 4 cm."""
-    normals = rng.normal(size=(count, 3))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = unit_vectors(rng, count)
     return Contacts(0.04 * normals, normals, gap + spread * rng.normal(size=count), rng.uniform(0.5, 1.5, count))
 
 

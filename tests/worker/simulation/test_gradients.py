@@ -6,7 +6,6 @@ from typing import get_args
 
 import numpy as np
 import pytest
-import warp as wp
 
 from graspd.service.model.errors import InputError
 from graspd.service.model.fidelity import Fidelity
@@ -19,18 +18,17 @@ from graspd.worker.hands.surface import piece_distance, sample_surface
 from graspd.worker.scenes.placement import enclosing_solid
 from graspd.worker.simulation.data import HandState, Schedule
 from graspd.worker.simulation.environment import Environment, Obstacle
-from graspd.worker.simulation.kernels import kinematics, wrenches
 from graspd.worker.simulation.model import REFERENCE_POINTS, REFERENCE_SAMPLES, REFERENCE_SELF_POINTS, LossOptions
 from graspd.worker.simulation.obstacles import DeviceObstacles, PosedFeatures
 from graspd.worker.simulation.projection import Projection, ProjectionOptions
 from graspd.worker.simulation.record import OPTIMIZERS, record_evaluation, record_iteration, record_placement
 from graspd.worker.simulation.sampling import object_samples
+from tests.worker.models import unit_vectors
 from tests.worker.simulation.rigs import ball, rig, still
 
 _GOLDEN = (np.sqrt(5) - 1) / 2
 HANDS = ("allegro", "barrett", "shadow")
 EACH_HAND = pytest.mark.parametrize("name", HANDS)
-FK_TOLERANCE = 3e-7  # float32 positions of a hand 0.2 m large through at most 8 joints
 
 
 Energy = Callable[[HandState], float]
@@ -92,14 +90,6 @@ def nearest_edges(hand: HandModel, bodies: np.ndarray, obstacle: Obstacle, far: 
     return out
 
 
-def random_state(hand: HandModel, count: int, seed: int = 0) -> HandState:
-    rng = np.random.default_rng(seed)
-    rotation = rng.normal(size=(count, 4))
-    rotation /= np.linalg.norm(rotation, axis=1, keepdims=True)
-    q = hand.lower + rng.random((count, hand.dofs)) * (hand.upper - hand.lower)
-    return HandState(0.05 * rng.normal(size=(count, 3)), rotation, q)
-
-
 def root_poses(hand: HandModel, state: HandState) -> np.ndarray:
     return np.concatenate([state.pivot - quat_rotate(state.rotation, hand.palm.centre), state.rotation], axis=1)
 
@@ -123,39 +113,6 @@ def differences(energy: Energy, state: HandState, columns: int, step: float) -> 
     """Central differences by the columns of a gradient: root translation, root rotation, dofs."""
     ends = [[energy(moved(state, c, s)) for s in (step, -step)] for c in range(columns)]
     return np.array([(high - low) / (2 * step) for high, low in ends])
-
-
-@EACH_HAND
-def test_the_kernel_places_bodies_where_float64_kinematics_does(name: str) -> None:
-    hand = hand_from_path(name)
-    state = random_state(hand, 6)
-    model, data = rig(hand, ball(), capacity=6)
-    data.set_state(state)
-    record_placement(model, data).run()
-    np.testing.assert_allclose(data.body_p.numpy(), bodies_of(hand, state)[..., :3], atol=FK_TOLERANCE)
-
-
-@EACH_HAND
-def test_transpose_is_the_derivative_of_the_map_it_belongs_to(name: str) -> None:
-    """Random forces at random points: their work by the transpose equals central differences in float64."""
-    hand = hand_from_path(name)
-    rng = np.random.default_rng(3)
-    state = random_state(hand, 1, seed=3)
-    local = 0.02 * rng.normal(size=(hand.bodies, 3))
-    force = rng.normal(size=(hand.bodies, 3))
-
-    def work(at: HandState) -> float:
-        return float((apply(bodies_of(hand, at)[0], local) * force).sum())
-
-    expected = differences(work, state, 6 + hand.dofs, step=1e-6)
-    model, data = rig(hand, ball(), capacity=1)
-    data.set_state(state)
-    record_placement(model, data).run()
-    wrench = np.concatenate([force, np.cross(apply(bodies_of(hand, state)[0], local), force)], axis=1)
-    data.wrench.assign(np.round(wrench[None] / wrenches.UNIT).astype(np.int64))
-    wp.launch(kinematics.backward, 1, inputs=[model.hand.tree], outputs=[data.hands, data.gradient], device="cpu")
-    # Sums of up to 23 float32 products of size 1.
-    np.testing.assert_allclose(data.gradient.numpy()[0], expected, atol=2e-5)
 
 
 def fist_in_ball(hand: HandModel) -> HandState:
@@ -333,13 +290,7 @@ def test_a_step_moves_and_turns_a_hand_against_its_gradient(optimizer: str) -> N
     np.testing.assert_allclose(found.q[0], np.clip(state.q[0] + step[6:], hand.lower, hand.upper), atol=1e-6)
 
 
-def sphere_points(count: int, seed: int) -> np.ndarray:
-    """(N, 3) on the unit sphere."""
-    points = np.random.default_rng(seed).normal(size=(count, 3))
-    return points / np.linalg.norm(points, axis=1, keepdims=True)
-
-
-BALL = sphere_points(300, seed=5) * 0.04 + [0.33, 0.02, 0.02]
+BALL = unit_vectors(np.random.default_rng(5), 300) * 0.04 + [0.33, 0.02, 0.02]
 SCENES = {
     "table": (Obstacle.half_space([0.1, -0.2, 1.0], -0.02),),
     "a table to press into": (replace(Obstacle.half_space([0.1, -0.2, 1.0], -0.02), tips_m=-0.001),),

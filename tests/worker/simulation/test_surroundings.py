@@ -16,7 +16,7 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.scenes.placement import MOST_PLANES, enclosing_solid
 from graspd.worker.simulation.environment import CLEAR_M, Environment, Obstacle, PlacedGrasps
 from graspd.worker.simulation.obstacles import FAR_M, PosedFeatures, body_clearance, obstacle_clearance
-from tests.worker.models import piece, two_finger_hand
+from tests.worker.models import piece, two_finger_hand, unit_vectors
 
 TILTED = np.array([0.1, -0.2, 0.3, 0.8, 0.2, -0.4, 0.4])
 TILTED[3:] /= np.linalg.norm(TILTED[3:])
@@ -66,19 +66,9 @@ def test_nonsense_is_refused(make) -> None:
 
 
 def random_postures(hand: HandModel, count: int, rng: np.random.Generator) -> Posture:
-    turn = rng.normal(size=(count, 4))
-    pose = np.column_stack([rng.normal(size=(count, 3)) * 0.12, turn / np.linalg.norm(turn, axis=1, keepdims=True)])
+    turn = unit_vectors(rng, count, 4)
+    pose = np.column_stack([rng.normal(size=(count, 3)) * 0.12, turn])
     return Posture(pose, hand.expand(rng.uniform(hand.lower, hand.upper, (count, hand.dofs))))
-
-
-@pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
-def test_the_distance_of_a_hand_from_a_plane_is_mujocos(name: str) -> None:
-    """1e-5 m: MuJoCo keeps meshes in float32 and its distances converge to 1e-6."""
-    hand = hand_from_path(name)
-    postures = random_postures(hand, 8, np.random.default_rng(3))
-    plane = Obstacle.half_space([0.3, -0.5, 0.8], -0.2)
-    found = obstacle_clearance(hand, postures, [Environment((plane,), plane.planes[0, :3])])
-    np.testing.assert_allclose(found, mujoco_distances(hand, postures, plane), atol=1e-5)
 
 
 def test_only_fingertips_have_more_room_over_what_they_may_touch() -> None:
@@ -227,8 +217,7 @@ def test_no_hand_is_nearer_to_a_solid_than_it_says_by_mujoco(name: str) -> None:
 
 
 def test_an_outer_solid_holds_its_points_and_is_a_box_of_a_box() -> None:
-    points = np.random.default_rng(0).normal(size=(400, 3))
-    points *= 0.03 / np.linalg.norm(points, axis=1, keepdims=True)
+    points = 0.03 * unit_vectors(np.random.default_rng(0), 400)
     solid, error = enclosing_solid(points)
     assert len(solid.planes) <= MOST_PLANES and solid.distance(points).max() <= 1e-9
     radius = np.linalg.norm(solid.corners, axis=1).max()

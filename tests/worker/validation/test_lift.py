@@ -3,7 +3,6 @@
 The trial of candidates is the test of the validator itself, which is then not done again.
 """
 
-import dataclasses
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -68,11 +67,11 @@ def grasp(squeeze: float, way: np.ndarray | None = None) -> GraspSet:
     approach[..., :3] += np.linspace(0.1, 0, 6)[:, None] * (np.array([0, 0, -1.0]) if way is None else way)
     lift = Posture(press.hand_pose - np.array([0, 0, 0.1, 0, 0, 0, 0]), press.joint_positions)
     found = GraspSet(touch, open_, press, np.full(1, np.nan))
-    return dataclasses.replace(found, approach=approach, coming=open_.joint_positions, lift=lift)
+    return replace(found, approach=approach, coming=open_.joint_positions, lift=lift)
 
 
 def placed(count: int) -> PlacedGrasps:
-    return dataclasses.replace(PLACED, index=np.zeros(count, int))
+    return replace(PLACED, index=np.zeros(count, int))
 
 
 def lift_test() -> Lift:
@@ -106,7 +105,7 @@ def test_a_hand_that_comes_through_box_or_table_has_touched_them() -> None:
 @pytest.mark.parametrize(("tips_m", "touched"), [(None, True), (0.0, True), (-0.0005, True), (-0.001, False)])
 def test_fingertips_press_into_the_table_as_deep_as_it_says(tips_m: float | None, touched: bool) -> None:
     """A way that ends with the pads 0.8 mm in the table."""
-    placed = dataclasses.replace(PLACED, supports=(dataclasses.replace(PLACED.supports[0], tips_m=tips_m),))
+    placed = replace(PLACED, supports=(replace(PLACED.supports[0], tips_m=tips_m),))
     given = grasp(0.05)
     down = obstacle_clearance(HAND, given.grasp, PLACED.scenes)[0] + 0.0008
     for part in (given.grasp.hand_pose, given.pregrasp.hand_pose, given.squeeze.hand_pose, given.approach[0]):
@@ -141,7 +140,7 @@ def beside(place: tuple[float, float], size: tuple[float, float, float], mass: f
     other = object_from_mesh(trimesh.creation.box(size)).with_mass(mass=mass)
     neighbour = Neighbour(other, (other.hull_vertices,), (), 0.0)
     pose = np.array([[[*place, size[2] / 2, 1.0, 0, 0, 0]]])
-    placed = dataclasses.replace(PLACED, neighbours=(neighbour,), neighbour_pose=pose)
+    placed = replace(PLACED, neighbours=(neighbour,), neighbour_pose=pose)
     return Lift(build(HAND, BOX, WHOLE, MujocoOptions(), placed.supports, placed.neighbours), placed)
 
 
@@ -313,7 +312,7 @@ def test_neighbours_stand_beside_the_object_in_every_model() -> None:
 
 
 def test_a_lift_needs_a_scene_and_a_way_of_each_grasp() -> None:
-    without, few = dataclasses.replace(MANY, approach=None), WHERE.take(slice(0, 2))
+    without, few = replace(MANY, approach=None), WHERE.take(slice(0, 2))
     for grasps, where, level in ((MANY, few, "lift"), (without, WHERE, "lift"), (MANY, WHERE, "no")):
         with pytest.raises(InputError):
             robust(HAND, BOX, grasps, placed=where, level=level, pieces=WHOLE)  # type: ignore[arg-type]

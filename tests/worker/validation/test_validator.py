@@ -1,6 +1,5 @@
 """The validator: what any engine must say of simple grasps, and that its levels say the same."""
 
-import dataclasses
 import inspect
 import re
 import threading
@@ -175,13 +174,13 @@ def test_terms_depend_not_on_grasps_but_on_everything_else(monkeypatch: pytest.M
     terms = verdict_key(PADS, BOX, "dexgraspbench", False, pieces=WHOLE)
     found = [validate(PADS, BOX, grasp_of(force=force), level="dexgraspbench", pieces=WHOLE) for force in (10.0, 20.0)]
     assert [verdicts.terms for verdicts in found] == [terms, terms] and found[0].key != found[1].key
-    heavier = dataclasses.replace(PADS, masses=PADS.masses * 2)
+    heavier = replace(PADS, masses=PADS.masses * 2)
     others = {
         terms,
         verdict_key(PADS, BOX, "dexgraspbench", True, pieces=WHOLE),
         verdict_key(PADS, BOX, "fast", False, pieces=WHOLE),
         verdict_key(heavier, BOX, "dexgraspbench", False, pieces=WHOLE),
-        verdict_key(PADS, BOX, "dexgraspbench", False, pieces=dataclasses.replace(WHOLE, digest="other")),
+        verdict_key(PADS, BOX, "dexgraspbench", False, pieces=replace(WHOLE, digest="other")),
     }
     for constant in ("control.postures.TOTAL_NORMAL_FORCE", "validation.protocol.HOLD_S", "validation.model.FRICTION"):
         with monkeypatch.context() as patch:
@@ -244,7 +243,7 @@ def test_coupled_joints_stay_coupled_while_moving() -> None:
 
 
 def test_actuators_never_exceed_the_effort() -> None:
-    weak = dataclasses.replace(PADS, effort=np.array([2.0, 3.0]))
+    weak = replace(PADS, effort=np.array([2.0, 3.0]))
     scene = build(weak, BOX, WHOLE, MujocoOptions())
     data = placed_data(scene, CONTACT.joint_positions[0], CONTACT.hand_pose[0])
     scene.command(data, CONTACT.hand_pose[0], CONTACT.joint_positions[0] + 0.08)
@@ -329,6 +328,7 @@ class Scripted(Test):
 
     def __init__(self, moved: Motion, turned: Motion) -> None:
         self._moved, self._turned, self.elapsed = moved, turned, 0.0
+        self.data = mujoco.MjData(mujoco.MjSpec().compile())
 
     def _run(self, seconds: float) -> None:
         self.elapsed += seconds
@@ -338,12 +338,6 @@ class Scripted(Test):
 
     def _motion(self) -> tuple[float, float]:
         return float(np.linalg.norm(self._offset())), MAX_ROTATION * self._turned(self.elapsed)
-
-    def _validate(self, rollout: Rollout) -> Outcome:
-        moved, turned = self._motion()
-        if moved >= MAX_DISPLACEMENT_M:
-            return Outcome.DISPLACED
-        return Outcome.ROTATED if turned >= MAX_ROTATION else Outcome.HELD
 
 
 def still(time: float) -> float:

@@ -58,6 +58,7 @@ class Stand:
         def zeros(*shape: int, dtype=wp.float32):
             return wp.zeros((nworld, *shape), dtype=dtype)
 
+        numbers = {"qpos": model.nq, "qvel": model.nv, "qacc_warmstart": model.nv, "ctrl": model.nu}
         room = nworld * nconmax
         contact = SimpleNamespace(
             worldid=wp.zeros(room, dtype=wp.int32),
@@ -69,16 +70,12 @@ class Stand:
             njmax=njmax,
             naconmax=room,
             contact=contact,
-            qpos=zeros(model.nq),
-            qvel=zeros(model.nv),
-            qacc_warmstart=zeros(model.nv),
-            ctrl=zeros(model.nu),
+            **{name: zeros(count) for name, count in numbers.items()},
             mocap_pos=zeros(model.nmocap, dtype=wp.vec3),
             mocap_quat=zeros(model.nmocap, dtype=wp.quat),
             xfrc_applied=zeros(model.nbody, dtype=wp.spatial_vector),
             overflow=zeros(dtype=wp.int32),
-            nacon=wp.zeros(1, dtype=wp.int32),
-            ncollision=wp.zeros(1, dtype=wp.int32),
+            **{name: wp.zeros(1, dtype=wp.int32) for name in ("nacon", "ncollision")},
         )
 
     _FIELDS = ("qpos", "qvel", "qacc_warmstart", "ctrl", "mocap_pos", "mocap_quat", "xfrc_applied")
