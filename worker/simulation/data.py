@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from graspd.service.model.transforms import Floats
 from graspd.worker.simulation.device import joint_units, to_wxyz, to_xyzw
 from graspd.worker.simulation.kernels import contact, kinematics, packing, penalties
-from graspd.worker.simulation.model import MAX_DILATION, REFERENCE_POINTS, Model
+from graspd.worker.simulation.model import REFERENCE_POINTS, Model
 
 #: Kinds of penetration, see `kinematics.Depths`; arrays of the data that are fields of `kinematics.Hands`.
 _DEPTHS: Final = ("points", "object", "links", "obstacles")
@@ -128,9 +128,7 @@ class Data:
 
     def set_schedule(self, schedule: Schedule) -> None:
         """Upload the per-iteration tables; earlier records keep the tables they were recorded with.
-        Raises ValueError: a dilation above `MAX_DILATION`."""
-        if len(schedule) and schedule.dilation.max() > MAX_DILATION:
-            raise ValueError(f"the dilation may be at most {MAX_DILATION} m")
+        Dilations are at most `MAX_DILATION`."""
         with wp.ScopedDevice(self.device):
             self.schedule = Tables(schedule, self.unit)
 
