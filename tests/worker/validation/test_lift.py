@@ -3,7 +3,6 @@
 The trial of candidates is the test of the validator itself, which is then not done again.
 """
 
-import dataclasses
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -46,9 +45,8 @@ HAND = pad_hand()
 BOX = object_from_mesh(trimesh.creation.box((2 * HALF, 0.04, HEIGHT)))
 WHOLE = ConvexPieces((BOX.hull_vertices,), 1.0, 0.0, "box")
 #: The hand's base is at -z of the object: the box stands on its head, so that the hand comes from above.
-PLACED = PlacedGrasps(
-    (Obstacle.half_space([0, 0, 1], 0.0),), np.array([[0, 0, HEIGHT / 2, 0, 1, 0, 0.0]]), np.zeros(1, int)
-)
+UPSIDE_DOWN = np.array([[0, 0, HEIGHT / 2, 0, 1, 0, 0.0]])
+PLACED = PlacedGrasps((Obstacle.half_space([0, 0, 1], 0.0),), UPSIDE_DOWN, np.zeros(1, int))
 #: Joint value at which the pads touch.
 TOUCH = 0.065
 #: Squeeze [m] whose two normal forces F = kp d hold a pull of 1 N by friction: 2 mu F = 1 N; the same for the pulls.
@@ -68,11 +66,11 @@ def grasp(squeeze: float, way: np.ndarray | None = None) -> GraspSet:
     approach[..., :3] += np.linspace(0.1, 0, 6)[:, None] * (np.array([0, 0, -1.0]) if way is None else way)
     lift = Posture(press.hand_pose - np.array([0, 0, 0.1, 0, 0, 0, 0]), press.joint_positions)
     found = GraspSet(touch, open_, press, np.full(1, np.nan))
-    return dataclasses.replace(found, approach=approach, coming=open_.joint_positions, lift=lift)
+    return replace(found, approach=approach, coming=open_.joint_positions, lift=lift)
 
 
 def placed(count: int) -> PlacedGrasps:
-    return dataclasses.replace(PLACED, index=np.zeros(count, int))
+    return replace(PLACED, index=np.zeros(count, int))
 
 
 def lift_test() -> Lift:
@@ -106,7 +104,7 @@ def test_a_hand_that_comes_through_box_or_table_has_touched_them() -> None:
 @pytest.mark.parametrize(("tips_m", "touched"), [(None, True), (0.0, True), (-0.0005, True), (-0.001, False)])
 def test_fingertips_press_into_the_table_as_deep_as_it_says(tips_m: float | None, touched: bool) -> None:
     """A way that ends with the pads 0.8 mm in the table."""
-    placed = dataclasses.replace(PLACED, supports=(dataclasses.replace(PLACED.supports[0], tips_m=tips_m),))
+    placed = replace(PLACED, supports=(replace(PLACED.supports[0], tips_m=tips_m),))
     given = grasp(0.05)
     down = obstacle_clearance(HAND, given.grasp, PLACED.scenes)[0] + 0.0008
     for part in (given.grasp.hand_pose, given.pregrasp.hand_pose, given.squeeze.hand_pose, given.approach[0]):
@@ -141,7 +139,7 @@ def beside(place: tuple[float, float], size: tuple[float, float, float], mass: f
     other = object_from_mesh(trimesh.creation.box(size)).with_mass(mass=mass)
     neighbour = Neighbour(other, (other.hull_vertices,), (), 0.0)
     pose = np.array([[[*place, size[2] / 2, 1.0, 0, 0, 0]]])
-    placed = dataclasses.replace(PLACED, neighbours=(neighbour,), neighbour_pose=pose)
+    placed = replace(PLACED, neighbours=(neighbour,), neighbour_pose=pose)
     return Lift(build(HAND, BOX, WHOLE, MujocoOptions(), placed.supports, placed.neighbours), placed)
 
 
@@ -313,7 +311,7 @@ def test_neighbours_stand_beside_the_object_in_every_model() -> None:
 
 
 def test_a_lift_needs_a_scene_and_a_way_of_each_grasp() -> None:
-    without, few = dataclasses.replace(MANY, approach=None), WHERE.take(slice(0, 2))
+    without, few = replace(MANY, approach=None), WHERE.take(slice(0, 2))
     for grasps, where, level in ((MANY, few, "lift"), (without, WHERE, "lift"), (MANY, WHERE, "no")):
         with pytest.raises(InputError):
             robust(HAND, BOX, grasps, placed=where, level=level, pieces=WHOLE)  # type: ignore[arg-type]
@@ -321,7 +319,7 @@ def test_a_lift_needs_a_scene_and_a_way_of_each_grasp() -> None:
 
 SQUEEZES = (-0.005, 1.3 * LEAST, 4 * LEAST)
 THREE = joined([grasp(squeeze) for squeeze in SQUEEZES])
-THREE_PLACES = PlacedGrasps(PLACED.supports, PLACED.object_pose, np.zeros(3, int))
+THREE_PLACES = placed(3)
 
 
 @pytest.fixture
@@ -358,9 +356,7 @@ def test_a_lift_of_anything_else_is_not_known(lifts: list[int], other: str) -> N
     if other == "squeeze":
         grasps = joined([grasp(squeeze + 1e-6) for squeeze in SQUEEZES])
     if other == "scene":
-        where = PlacedGrasps(
-            PLACED.supports, PLACED.object_pose + np.array([1e-6, 0, 0, 0, 0, 0, 0]), THREE_PLACES.index
-        )
+        where = replace(THREE_PLACES, object_pose=PLACED.object_pose + np.array([1e-6, 0, 0, 0, 0, 0, 0]))
     validate_lifts(HAND, BOX, grasps, where, pieces=WHOLE, hard=other == "friction", known=known)
     assert len(lifts) == 6
 
