@@ -243,8 +243,8 @@ REFUSED = {
     "is no Barrett hand": lambda at: published.read_ddgc(ddgc(at), hand="allegro", obj="block", number=1),
     "no grasp of 'a' on 'cup'": lambda at: published.read_multidex(at, robot="a", object_name="cup", **GIVEN),
     "q has 3 numbers": lambda at: published.read_multidex(at, robot="a", object_name="mug", **GIVEN),
-    "no file of reference grasps: it holds no object": lambda at: friction(listed(at)),
-    "no record of GraspGen: it holds no object": lambda at: graspgen.read(listed(at), **GIVEN),
+    "no file of reference grasps: it .* object": lambda at: friction(listed(at)),
+    "no record of GraspGen: it .* object": lambda at: graspgen.read(listed(at), **GIVEN),
     "joint 'row', which is a key": lambda at: dexgraspnet2._write_grasps(None, ROW_OF, at, None),
     "has no joint 'elbow'": lambda at: joints_by_name(HAND, ["elbow"], [[0.0]], what="x"),
     "1 joint values for 2 joints": lambda at: joints_by_name(HAND, ["elbow", "wrist"], [[0.0]], what="x"),
@@ -264,7 +264,7 @@ def test_what_cannot_be_read_or_written_is_refused(words: str, tmp_path: Path, m
 def test_a_shard_with_the_joints_of_another_hand_is_refused(stored: Shard, tmp_path: Path) -> None:
     arrays = {path: column[..., :5] if path.endswith("positions") else column for path, column in stored.arrays.items()}
     (tmp_path / "x.h5").write_bytes(write_shard("base", arrays, stored.attributes))
-    with pytest.raises(InputError, match="has 5 joints, barrett 8"):
+    with pytest.raises(InputError, match=r"has 5 joints, .*plan again"):
         load_case(tmp_path / "x.h5")
 
 
