@@ -87,7 +87,7 @@ def _shard(path: Path, hand: str | None, obj: str | None) -> Case:
     model, thing = hand_of_shard(shard, hand), object_of_shard(shard, obj)
     grasps = GraspSet.from_columns(shard.arrays)
     if (joints := grasps.grasp.joint_positions.shape[1]) != len(model.joint_names):
-        raise InputError(f"{path} has {joints} joints, but {model.name} has {len(model.joint_names)}; give --hand")
+        raise InputError(f"{path} has {joints} joints, but {model.name} has {len(model.joint_names)}; plan again")
     said = shard.attributes
     return Case(
         path.name,

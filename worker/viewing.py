@@ -149,9 +149,7 @@ class Viewer:
 
     def __init__(self, shown: ViewerContent, *, host: str = "127.0.0.1", port: int = 8080) -> None:
         """Start the server on the first free port from number `port` on; 0 takes any free port.
-        Raises InputError: viser is not installed, the file holds no grasps, or the address cannot be used."""
-        if said := missing():
-            raise InputError(said)
+        Raises InputError: the file holds no grasps, or the address cannot be used."""
         self._shown, self._arrays = shown, shown.shard.arrays
         self._choices = _rows_by_filter(shown.shard)
         self._rows = next(iter(self._choices.values()))

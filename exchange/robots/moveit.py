@@ -6,7 +6,7 @@ ROS quaternions are x y z w. `effort` [N m or N] of the squeeze is stiffness tim
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -15,7 +15,6 @@ from graspd.exchange.imported import mesh_file, urdf_of
 from graspd.exchange.plan import plain_name
 from graspd.exchange.robots.bundle import Bundle, dump_yaml, numbers
 from graspd.exchange.robots.execution import RobotTrajectory
-from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import Floats
 
 #: Share of a straight motion that must be possible before MoveIt attempts a grasp.
@@ -125,9 +124,6 @@ def _trajectory(bundle: Bundle, path: RobotTrajectory) -> dict[str, Any]:
 def _hand(folder: Path, files: Mapping[str, bytes]) -> list[Path]:
     written = []
     for name, data in files.items():
-        parts = PurePosixPath(name).parts
-        if not parts or ".." in parts or PurePosixPath(name).is_absolute() or "\\" in name:
-            raise InputError(f"the hand's file {name[:80]!r} leads out of its folder")
         written.append(folder / name)
         written[-1].parent.mkdir(parents=True, exist_ok=True)
         written[-1].write_bytes(data)

@@ -9,6 +9,7 @@ from graspd.baselines.common import inside_points, load_pair
 from graspd.baselines.graspit import kernels
 from graspd.baselines.graspit.kernels import FIRST_STEP
 from graspd.baselines.graspit.method import EACH, ON_PALM, Search, eigengrasps
+from graspd.service.model.errors import InputError
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.planners.threads import StepCounter
@@ -115,3 +116,10 @@ def test_annealing_lowers_energy_and_keeps_states_that_differ() -> None:
     kept = search.run([[3]], steps=FIRST_STEP + 1500, keep=4, tell=StepCounter(1, DEFAULT_CONTEXT))
     apart = np.linalg.norm(kept.pivot[:, None] - kept.pivot[None], axis=2)
     assert len(kept.pivot) == 4 and np.any(apart[np.triu_indices(4, 1)] > 0.005)
+
+
+def test_a_hand_that_fits_nowhere_is_told() -> None:
+    boards = [trimesh.creation.box((0.8, 0.8, 0.03)).apply_translation([0, 0, 0.045 * k]) for k in range(-10, 11)]
+    shelves = load_pair(two_finger_hand(), object_from_mesh(trimesh.util.concatenate(boards)), "cpu", kernels)
+    with pytest.raises(InputError, match="no free place"):
+        Search(shelves).run([[0]], steps=FIRST_STEP + 1, keep=1, tell=StepCounter(1, DEFAULT_CONTEXT))

@@ -70,12 +70,9 @@ def _exported(name: str, format_: str):
     return folder
 
 
-checkout, data, folder = (
-    _exported("checkout", "dexlearn"),
-    _exported("data", "graspgen"),
-    _exported("folder", "huggingface"),
-)
-recorded, root = _exported("recorded", "lerobot"), _exported("root", "dexgraspnet2")
+checkout, data = _exported("checkout", "dexlearn"), _exported("data", "graspgen")
+folder, recorded = _exported("folder", "huggingface"), _exported("recorded", "lerobot")
+root = _exported("root", "dexgraspnet2")
 
 
 @pytest.fixture(scope="session")

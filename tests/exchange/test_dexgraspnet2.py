@@ -7,14 +7,14 @@ src/utils/pc.py, how graspness is made src/preprocess/dex_graspness.py, both as 
 7824d859a8da1d942bc38709a9d217dfb548db5d.
 """
 
+import io
 import random
 import shutil
 import tracemalloc
 import zipfile
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import cast
 
 import numpy as np
 import pytest
@@ -42,8 +42,6 @@ from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.rendering.annotate import TABLE
 from tests.worker.commands_run import graspd, refused
 
-#: Of its configuration: how far a grasp's point may be from the cloud [m].
-MAX_POINT_DIS = 0.006
 #: Of GraspNet: what is farther from the box around the objects is cut off [m].
 OUTLIER = 0.02
 TRAIN, VAL = range(90), range(90, 100)
@@ -57,68 +55,50 @@ ABOVE = np.array([[0.0, 0, 0.1]])
 K = np.array([[100.0, 0, 1], [0, 100, 0.5], [0, 0, 1]])
 
 
-@dataclass
-class Sample:
-    point_clouds: np.ndarray
-    seg: np.ndarray
-    rot: np.ndarray
-    """(N, 3, 3)"""
-    trans: np.ndarray
-    qpos: np.ndarray
-    """(N, J) in the order of the joint names given"""
-    point: np.ndarray
-    """(N, 3)"""
-    near: np.ndarray
-    """(N,) whether the grasp's point is near a point of the cloud: others are not taken"""
-    graspness: np.ndarray
-    """logarithms, of each point of the cloud"""
-    has_graspness: bool
-
-
-def views_of(split: range) -> list[tuple[str, int]]:
-    return [(f"scene_{number:04}", view) for number in split for view in range(256)]
-
-
-def some_views(root: Path, split: range, count: int, seed: int) -> list[tuple[str, int]]:
-    """Views that are drawn and are there; a scene that is missing makes it draw again."""
-    draw = random.Random(seed)
-    there = [view for view in views_of(split) if (root / "data" / "scenes" / view[0]).is_dir()]
-    return draw.sample(there, count)
-
-
-def sample(root: Path, scene: str, view: int, robot: str, joint_names: list[str]) -> Sample:
+def sample(root: Path, scene: str, view: int, hand) -> SimpleNamespace:
     path = root / "data" / "scenes" / scene / "realsense"
-    with Image.open(path / "depth_gt" / f"{view:04}.png") as file:
-        depth = np.array(file)
-    with Image.open(path / "label_gt" / f"{view:04}.png") as file:
-        seg = np.array(file)
+    pictures = [(path / kind / f"{view:04}.png").read_bytes() for kind in ("depth_gt", "label_gt")]
+    depth, seg = (np.array(Image.open(io.BytesIO(picture))) for picture in pictures)
     meta = scipy.io.loadmat(path / "meta" / f"{view:04}.mat")
     poses, align = np.load(path / "camera_poses.npy"), np.load(path / "cam0_wrt_table.npy")
     cloud = _points(depth, meta["intrinsic_matrix"], meta["factor_depth"])
     assert seg.any(), "a view without objects is drawn anew"
     mask = (depth > 0) & _workspace(cloud, seg, align @ poses[view])
     cloud, seg = cloud[mask], seg[mask]
-    parts = [np.load(file) for file in sorted((root / "data" / "dex_grasps_new" / scene / robot).iterdir())]
-    grasps = {key: np.concatenate([part[key] for part in parts]) for key in parts[0].files}
+    (file,) = (root / "data" / "dex_grasps_new" / scene / "barrett").iterdir()
+    grasps = load_npz(file)
     turn, place = poses[view][:3, :3], poses[view][:3, 3]
-    point = (grasps["point"] - place) @ turn
     values = root / "data" / "dex_graspness_new" / scene / "realsense" / f"{view:04}.npy"
     graspness = np.zeros(len(cloud), np.float32)
     if values.exists():
         graspness = np.log(np.load(values).reshape(-1) + 1e-3)
         # It draws points by number and takes the same numbers here: another length is another cloud.
         assert len(graspness) == len(cloud)
-    return Sample(
-        cloud,
-        seg,
-        np.einsum("ji,njk->nik", turn, grasps["rotation"]),
-        (grasps["translation"] - place) @ turn,
-        np.stack([grasps[name] for name in joint_names], axis=-1),
-        point,
-        np.linalg.norm(cloud[None] - point[:, None], axis=2).min(axis=1) <= MAX_POINT_DIS,
-        graspness,
-        values.exists(),
+    pose = meta["poses"][:, :, 0]
+    return SimpleNamespace(
+        view=view,
+        file=file,
+        camera=poses[view],
+        on_table=align @ poses[view],
+        placed=lambda points: points @ pose[:, :3].T + pose[:, 3],
+        point_clouds=cloud,
+        seg=seg,
+        rot=np.einsum("ji,njk->nik", turn, grasps["rotation"]),
+        trans=(grasps["translation"] - place) @ turn,
+        qpos=np.stack([grasps[name] for name in hand.joint_names], axis=-1),
+        row=grasps["row"],
+        point=(grasps["point"] - place) @ turn,
+        graspness=graspness,  # logarithms, of each point of the cloud
+        has_graspness=values.exists(),
     )
+
+
+def drawn(root: Path, split: range, hand, count: int, seed: int):
+    """Samples of views that are there; a scene that is missing makes it draw again."""
+    views = [(f"scene_{number:04}", view) for number in split for view in range(256)]
+    there = [view for view in views if (root / "data" / "scenes" / view[0]).is_dir()]
+    for scene, view in random.Random(seed).sample(there, count):
+        yield sample(root, scene, view, hand)
 
 
 def _points(depth: np.ndarray, intrinsics: np.ndarray, factor: np.ndarray) -> np.ndarray:
@@ -169,8 +149,7 @@ def split(root: Path) -> range:
 
 def test_every_view_that_may_be_drawn_can_be_read(root: Path, hand) -> None:
     for split in (TRAIN, VAL):
-        for scene, view in some_views(root, split, 6, seed=3):
-            found = sample(root, scene, view, "barrett", list(hand.joint_names))
+        for found in drawn(root, split, hand, 6, seed=3):
             assert set(np.unique(found.seg)) <= {0, 1} and (found.seg == 1).sum() > 20
             count = len(found.trans)
             assert found.rot.shape == (count, 3, 3) and found.qpos.shape == (count, 8) and count
@@ -180,14 +159,13 @@ def test_every_view_that_may_be_drawn_can_be_read(root: Path, hand) -> None:
 def test_a_fingertip_stands_where_ours_does_in_the_camera(root, split, hand, stored: Shard, on_tables: Path) -> None:
     pictures = Pictures(open_shards(on_tables))
     tip = hand.fingertips[0]
-    for scene, view in some_views(root, split, 6, seed=4):
-        found = sample(root, scene, view, "barrett", list(hand.joint_names))
-        rows = np.load(root / "data" / "dex_grasps_new" / scene / "barrett" / "block.npz")["row"]
+    for found in drawn(root, split, hand, 6, seed=4):
+        rows = found.row
         in_root = body_poses(hand, np.tile(IDENTITY_POSE, (len(rows), 1)), found.qpos)[:, tip, :3]
         there = np.einsum("nij,nj->ni", found.rot, in_root) + found.trans
         (number,) = set(stored["grasp/scene_index"][rows].tolist())
         # The picture of the same scene and view, two a scene; others are these again.
-        seen = [one for one in pictures if one["object"] == "block" and one["scene"] == number][view % 2]
+        seen = [one for one in pictures if one["object"] == "block" and one["scene"] == number][found.view % 2]
         poses = compose(seen["object/pose"], stored["grasp/hand_pose"][rows])
         ours = body_poses(hand, poses, stored["grasp/joint_positions"][rows])[:, tip, :3]
         np.testing.assert_allclose(there, ours, atol=ROUNDING_M)
@@ -196,48 +174,34 @@ def test_a_fingertip_stands_where_ours_does_in_the_camera(root, split, hand, sto
 
 def test_the_object_of_the_cloud_is_where_grasps_mean_it(root, split, hand, block) -> None:
     mesh = trimesh.Trimesh(block.vertices, block.faces, process=False)
-    for scene, view in some_views(root, split, 4, seed=5):
-        found = sample(root, scene, view, "barrett", list(hand.joint_names))
-        path = root / "data" / "scenes" / scene / "realsense"
-        first = dexgraspnet2._object_pose(root / "data" / "dex_grasps_new" / scene / "barrett" / "block.npz", 0)
-        there = compose(pose_from_matrix(np.linalg.inv(np.load(path / "camera_poses.npy")[view])), first)
+    for found in drawn(root, split, hand, 4, seed=5):
+        there = compose(pose_from_matrix(np.linalg.inv(found.camera)), dexgraspnet2._object_pose(found.file, 0))
         points = found.point_clouds[found.seg == 1]
         local = (points - there[:3]) @ trimesh.transformations.quaternion_matrix(there[3:])[:3, :3]
         assert np.abs(trimesh.proximity.closest_point(mesh, local)[1]).max() < POINT_M
-        on_table = np.load(path / "cam0_wrt_table.npy") @ np.load(path / "camera_poses.npy")[view]
-        rest = found.point_clouds[found.seg == 0]
-        assert np.abs(apply(pose_from_matrix(on_table), rest)[:, 2]).max(initial=0) < POINT_M
-
-
-def placed(root: Path, scene: str, view: int, points: np.ndarray) -> np.ndarray:
-    """Points of the object's frame in the camera of a view."""
-    meta = scipy.io.loadmat(root / "data" / "scenes" / scene / "realsense" / "meta" / f"{view:04}.mat")
-    pose = meta["poses"][:, :, 0]
-    return np.asarray(points @ pose[:, :3].T + pose[:, 3])
+        rest = apply(pose_from_matrix(found.on_table), found.point_clouds[found.seg == 0])
+        assert np.abs(rest[:, 2]).max(initial=0) < POINT_M
 
 
 def test_a_grasp_points_where_its_script_says(root, split, hand, stored: Shard, block) -> None:
-    surface, names = surface_samples(block), list(hand.joint_names)
+    surface = surface_samples(block)
     pads = [fingertip_pad(hand, tip).centre for tip in hand.fingertips]
-    (scene, view), *_ = some_views(root, split, 1, seed=6)
-    found = sample(root, scene, view, "barrett", names)
-    rows = np.load(root / "data" / "dex_grasps_new" / scene / "barrett" / "block.npz")["row"]
-    for number, row in enumerate(rows):
+    (found,) = drawn(root, split, hand, 1, seed=6)
+    for number, row in enumerate(found.row):
         pose = stored["grasp/hand_pose"][row].astype(float)
         bodies = body_poses(hand, pose[None], stored["grasp/joint_positions"][row][None])[0]
         # A Barrett's thumb is its third finger.
         first, second, thumb = (apply(bodies[tip], pad) for tip, pad in zip(hand.fingertips, pads, strict=True))
         best = pointed(apply(pose, hand.palm.centre), ((first + second) / 2 + thumb) / 2, surface)
-        np.testing.assert_allclose(found.point[number], placed(root, scene, view, surface)[best], atol=ROUNDING_M)
-    assert len(rows)
+        np.testing.assert_allclose(found.point[number], found.placed(surface)[best], atol=ROUNDING_M)
+    assert len(found.row)
 
 
 def test_graspness_is_that_of_its_script(root: Path, split: range, hand, block) -> None:
     surface = surface_samples(block)
-    for scene, view in some_views(root, split, 3, seed=7):
-        found = sample(root, scene, view, "barrett", list(hand.joint_names))
+    for found in drawn(root, split, hand, 3, seed=7):
         assert found.has_graspness
-        there = placed(root, scene, view, surface)
+        there = found.placed(surface)
         mine = np.flatnonzero(found.seg == 1)
         for number in mine[:: max(1, len(mine) // 40)]:
             value = graspness_at(found.point_clouds[number], there, found.point)
@@ -248,8 +212,7 @@ def test_graspness_is_that_of_its_script(root: Path, split: range, hand, block) 
 
 def test_graspness_belongs_to_cloud_that_a_depth_camera_tells(on_tables: Path, hand, tmp_path: Path) -> None:
     graspd("export --format dexgraspnet2 --noise stereo -o", tmp_path, on_tables)
-    for scene, view in some_views(tmp_path, TRAIN, 4, seed=8):
-        found = sample(tmp_path, scene, view, "barrett", list(hand.joint_names))
+    for found in drawn(tmp_path, TRAIN, hand, 4, seed=8):
         assert found.has_graspness and (found.graspness[found.seg == 1] > np.log(1e-3)).any()
 
 
@@ -265,37 +228,48 @@ def test_a_view_of_nothing_has_no_cloud_and_no_graspness(on_tables: Path, hand, 
     graspd("export --format dexgraspnet2 -o", tmp_path / "out", shards)
     for folder in (tmp_path / "out" / "data" / "dex_graspness_new").glob("*/realsense"):
         assert sorted(file.name for file in folder.iterdir()) == [f"{view:04}.npy" for view in range(1, 256, 2)]
-        assert sample(tmp_path / "out", folder.parent.name, 3, "barrett", list(hand.joint_names)).has_graspness
+        assert sample(tmp_path / "out", folder.parent.name, 3, hand).has_graspness
 
 
-def test_grasps_of_others_have_no_more_than_their_joints(root: Path, tmp_path: Path) -> None:
+@pytest.fixture
+def copied(root: Path, tmp_path: Path) -> tuple[Path, dict]:
+    """A file for grasps beside a copy of their scene, and the grasps."""
     (file, *_) = sorted((root / "data" / "dex_grasps_new").rglob("block.npz"))
-    bare = {name: values for name, values in load_npz(file).items() if name not in dexgraspnet2._OURS}
-    changed = moved(root, file, tmp_path)
-    np.savez(changed, **bare)
-    (back,) = dexgraspnet2.read(changed, hand="barrett", obj="block")
+    scene = Path("data", "scenes", file.parents[1].name)
+    shutil.copytree(root / scene, tmp_path / scene)
+    copy = tmp_path / file.relative_to(root)
+    copy.parent.mkdir(parents=True)
+    return copy, load_npz(file)
+
+
+def test_grasps_of_others_have_no_more_than_their_joints(copied: tuple[Path, dict]) -> None:
+    file, whole = copied
+    bare = {name: values for name, values in whole.items() if name not in dexgraspnet2._OURS}
+    np.savez(file, **bare)
+    (back,) = dexgraspnet2.read(file, hand="barrett", obj="block")
     assert back.published is None and len(back.grasps.pregrasp) == len(bare["point"])
-    np.savez(changed, **bare | {"thumb": np.zeros(len(bare["point"]))})
+    np.savez(file, **bare | {"thumb": np.zeros(len(bare["point"]))})
     with pytest.raises(InputError, match="no joint 'thumb'"):
-        dexgraspnet2.read(changed, hand="barrett", obj="block")
+        dexgraspnet2.read(file, hand="barrett", obj="block")
 
 
-def moved(root: Path, file: Path, folder: Path) -> Path:
-    scene = file.parents[1].name
-    meta = folder / "data" / "scenes" / scene / "realsense" / "meta"
-    meta.mkdir(parents=True)
-    there = root / "data" / "scenes" / scene / "realsense" / "meta" / "0000.mat"
-    (meta / "0000.mat").write_bytes(there.read_bytes())
-    place = folder / "data" / "dex_grasps_new" / scene / "barrett"
-    place.mkdir(parents=True)
-    return place / file.name
-
-
-def test_a_file_without_its_scene_is_told(root: Path, tmp_path: Path) -> None:
-    (file, *_) = sorted((root / "data" / "dex_grasps_new").rglob("block.npz"))
-    shutil.copytree(file.parents[1], tmp_path / "data" / "dex_grasps_new" / "scene_0000")
-    with pytest.raises(InputError, match="needs its scene"):
-        dexgraspnet2.read(next(tmp_path.rglob("block.npz")), hand="barrett", obj="block")
+@pytest.mark.parametrize(
+    ("change", "poses", "said"),
+    [
+        ({"rotation": np.full((3, 3), np.nan)}, None, "pose is not finite"),
+        ({"squeeze_qpos": np.zeros((1, 3))}, None, r"squeeze_qpos has the shape \(1, 3\)"),
+        ({}, np.zeros((2, 4, 1)), "has no pose of object 0"),
+        ({}, np.zeros((3, 4, 1000)), "larger than 64 KiB"),
+        ({}, np.zeros(0), "needs its scene"),
+    ],
+)
+def test_grasps_or_a_scene_that_are_none_are_told(change, poses, said: str, copied, tmp_path: Path) -> None:
+    np.savez(copied[0], **copied[1] | change)
+    meta = next(tmp_path.rglob("0000.mat"))
+    if poses is not None:
+        scipy.io.savemat(meta, {"poses": poses}) if len(poses) else meta.unlink()
+    with pytest.raises(InputError, match=said):
+        dexgraspnet2.read(copied[0], hand="barrett", obj="block")
 
 
 def test_archives_are_neither_unpickled_nor_believed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -320,7 +294,12 @@ def test_what_shows_no_scene_or_no_clear_grasp_is_told(on_tables: Path, tmp_path
     monkeypatch.setattr(dexgraspnet2, "by_scene", lambda pictures: [[none]])
     lots = [SimpleNamespace(id="base")]
     with pytest.raises(InputError, match="no grasp is valid and clear"):
-        dexgraspnet2.write(lots, cast(Pictures, None), tmp_path, frozenset())
+        dexgraspnet2.write(lots, None, tmp_path, frozenset())
+
+
+def test_more_scenes_than_its_splits_have_numbers_are_told(on_tables: Path, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(dexgraspnet2, "TRAIN", (range(1),))
+    assert "2 scenes of objects to train on, but" in refused("export --format dexgraspnet2 -o", tmp_path, on_tables)
 
 
 @pytest.mark.parametrize(("degrees", "best"), [(4.5, 1), (5.5, 0)])

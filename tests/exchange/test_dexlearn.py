@@ -7,9 +7,9 @@ twin in hugs-dex/HUGS-DexLearn at 95a3c2aa2808ab2e6db0f03d59ceb15cc3c7bebf (`loa
 
 import json
 import shutil
-from dataclasses import dataclass
 from glob import glob
 from pathlib import Path
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -36,21 +36,6 @@ ROUNDING_M = 1e-8
 POINT_M = 2e-5
 
 
-@dataclass
-class Sample:
-    file: Path
-    grasp_type_id: int
-    hand_trans: np.ndarray
-    """(K, 3, 3): pregrasp, grasp, squeeze"""
-    hand_rot: np.ndarray
-    """(K, 3, 3, 3)"""
-    hand_joint: np.ndarray
-    """(K, 3, J)"""
-    clouds: list[np.ndarray]
-    """(P, 3) each, at the scale of the first grasp"""
-    scene: dict
-
-
 class Data:
     def __init__(self, root: Path, name: str) -> None:
         said = yaml.safe_load((root / "dexlearn" / "config" / "data" / f"{name}.yaml").read_text())
@@ -62,7 +47,7 @@ class Data:
     def split(self, name: str) -> list[str]:
         return list(json.loads((self.objects / self.config["split_path"] / f"{name}.json").read_text()))
 
-    def samples(self, split: str) -> list[Sample]:
+    def samples(self, split: str) -> list[SimpleNamespace]:
         found = []
         for kind in self.types:
             files = [f for name in self.split(split) for f in _glob(f"{self.grasps}/{kind}/{name}/**/**.npy")]
@@ -77,7 +62,8 @@ class Data:
         scenes = [self._scene(Path(file)) for file in files]
         return [scene | {"clouds": self._clouds(scene)} for scene in scenes]
 
-    def _sample(self, file: Path, kind: str) -> Sample:
+    def _sample(self, file: Path, kind: str) -> SimpleNamespace:
+        """Of K grasps: positions (K, 3, 3), rotations (K, 3, 3, 3), joints (K, 3, J); clouds of the first's scale."""
         grasp = np.load(file, allow_pickle=True).item()
         pose = np.stack([grasp["pregrasp_qpos"], grasp["grasp_qpos"], grasp["squeeze_qpos"]], axis=-2)
         assert pose.ndim == 3, "one grasp a file is not implemented there"
@@ -86,7 +72,10 @@ class Data:
         if "scene_scale" in grasp:
             clouds = [cloud * grasp["scene_scale"][0] for cloud in clouds]
         number = int(kind.split("_")[0]) if self.config["grasp_type_cond"] else 0
-        return Sample(file, number, pose[..., :3], _matrices(pose[..., 3:7]), pose[..., 7:], clouds, scene)
+        turn = Rotation.from_quat(pose[..., 3:7].reshape(-1, 4), scalar_first=True).as_matrix()
+        hand = {"hand_trans": pose[..., :3], "hand_rot": turn.reshape(*pose.shape[:-1], 3, 3)}
+        hand |= {"hand_joint": pose[..., 7:], "grasp_type_id": number}
+        return SimpleNamespace(file=file, clouds=clouds, scene=scene, **hand)
 
     def _scene(self, file: Path) -> dict:
         scene = np.load(file, allow_pickle=True).item()
@@ -105,11 +94,6 @@ def _glob(pattern: str) -> list[str]:
     return glob(pattern, recursive=True)  # noqa: PTH207 (its pattern `**.npy` is none for pathlib)
 
 
-def _matrices(quaternions: np.ndarray) -> np.ndarray:
-    flat = Rotation.from_quat(quaternions.reshape(-1, 4), scalar_first=True).as_matrix()
-    return np.asarray(flat.reshape(*quaternions.shape[:-1], 3, 3))
-
-
 def test_all_that_may_be_drawn_is_there(checkout: Path) -> None:
     data = Data(checkout, NAME)
     assert data.config["joint_num"] == 8 and data.config["traj_length"] == 3
@@ -124,7 +108,7 @@ def test_all_that_may_be_drawn_is_there(checkout: Path) -> None:
     assert data.types and len(data.test_scenes()) == 2
 
 
-def every(checkout: Path, name: str) -> list[Sample]:
+def every(checkout: Path, name: str) -> list[SimpleNamespace]:
     data = Data(checkout, NAME)
     return [one for split in ("train", "test") for one in data.samples(split) if name in one.file.parts]
 

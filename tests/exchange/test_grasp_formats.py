@@ -1,7 +1,9 @@
 """Grasps through the formats of others and back; files that would run code, or are nested deep, are refused."""
 
 import os
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,19 +12,21 @@ from scipy.spatial.transform import Rotation
 from graspd.client.dataset_commands import read_spec
 from graspd.commands.exchange import read_sets
 from graspd.commands.studies import _read_maps as read_stability
-from graspd.exchange import dexgraspbench, published
+from graspd.exchange import dexgraspbench, dexgraspnet2, graspgen, published
 from graspd.exchange.bench_hand import _read as read_mapping
-from graspd.exchange.bench_scene import save_record
+from graspd.exchange.bench_scene import object_of_scene, save_record
 from graspd.exchange.imported import Origin, joints_by_name, load_npy, scaled_object, verdicts
+from graspd.exchange.inputs import expand, load_case
 from graspd.exchange.published import friction
 from graspd.exchange.scoring import write_scored
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import compose, quat_to_matrix
 from graspd.service.readers.trajectories import scene_spec_of
-from graspd.service.store.shards import Shard, read_shard
+from graspd.service.store.shards import Shard, read_shard, write_shard
 from graspd.studies.cards.contents import Contents, with_provenance
-from graspd.worker.files.provenance import options_of
+from graspd.worker.files.provenance import options_of, scenes_of_shard
 from graspd.worker.hands.load import hand_from_path
+from tests.worker.commands_run import refused
 
 TINY = 1e-9  # positions and quaternions are only re-ordered, not computed with
 DEEP = "[" * 100_000 + "]" * 100_000
@@ -115,14 +119,18 @@ def test_multidex_gives_the_grasps_of_one_robot_on_one_object(hand, tmp_path: Pa
     np.testing.assert_allclose(found.grasps.grasp.joint_positions, 0.4, atol=1e-6)
 
 
-def test_ddgcs_quaternion_and_joints_are_put_in_our_order(hand, tmp_path: Path) -> None:
-    place = np.array([[0.1, 0.2, 0.3, 0.0, 0.0, np.sin(0.5), np.cos(0.5)]])
-    angles = np.array([[0.1, 0.2, 0.3, 0.1, 0.5, 0.6, 0.7, 0.8]])
-    for name, values in (("translation", place), ("representation", angles)):
+def ddgc(folder: Path) -> Path:
+    """Grasps of two objects: one without an orientation, and one."""
+    place, angles = [0.1, 0.2, 0.3, 0.0, 0.0, np.sin(0.5), np.cos(0.5)], [0.1, 0.2, 0.3, 0.1, 0.5, 0.6, 0.7, 0.8]
+    for name, values in (("representation", [[angles], [angles]]), ("translation", [[place[:3]], [place]])):
         rows = np.empty(2, dtype=object)
-        rows[:] = [[], values.tolist()]
-        np.save(tmp_path / f"barrett_{name}_3.npy", rows, allow_pickle=True)
-    (found,) = read_sets("ddgc", tmp_path / "barrett_translation_3.npy", "barrett", "block", {"number": 1})
+        rows[:] = values
+        np.save(folder / f"barrett_{name}_3.npy", rows, allow_pickle=True)
+    return folder / "barrett_translation_3.npy"
+
+
+def test_ddgcs_quaternion_and_joints_are_put_in_our_order(hand, tmp_path: Path) -> None:
+    (found,) = read_sets("ddgc", ddgc(tmp_path), "barrett", "block", {"number": 1})
     np.testing.assert_allclose(found.grasps.grasp.hand_pose[0, 3:], [np.cos(0.5), 0, 0, np.sin(0.5)], atol=TINY)
     joints = dict(zip(hand.joint_names, found.grasps.grasp.joint_positions[0], strict=True))
     assert abs(joints["finger_3_medial"]) == pytest.approx(0.7)
@@ -133,10 +141,13 @@ def test_imported_grasps_are_scored_and_say_where_they_come_from(hand, block, gr
     dexgraspbench.write(hand, block, grasps, range(len(grasps)), tmp_path / "bench")
     (found,) = dexgraspbench.read(tmp_path / "bench", hand="barrett", obj="block")
     origin = Origin("dexgraspbench", "a test", "CC0-1.0")
-    path = write_scored(found, origin, tmp_path / "out", validation="fast", friction=1)
+    asked = {"validation": "fast", "friction": 1}
+    path = write_scored(found, origin, tmp_path / "out", **asked)
     shard = read_shard(path, kind="base")
     assert (shard.attributes["source"], shard.attributes["licence"]) == ("a test", "CC0-1.0")
     assert len(shard["quality/epsilon"]) == len(grasps) and set(np.unique(shard["quality/success"])) <= {0, 1}
+    with pytest.raises(InputError, match="give another folder as --output"):
+        write_scored(found, origin, tmp_path / "out", **asked)
 
 
 def test_published_reference_grasps_come_in_by_name(shared_data: Path) -> None:
@@ -146,9 +157,7 @@ def test_published_reference_grasps_come_in_by_name(shared_data: Path) -> None:
     assert found.published.mean() == pytest.approx(0.64, abs=0.005)  # the rate that DATA.md states
 
 
-def test_a_missing_joint_is_told_and_two_scales_are_two_objects() -> None:
-    with pytest.raises(InputError, match="has no joint 'elbow'"):
-        joints_by_name(hand_from_path("barrett"), ["elbow"], [[0.0]], what="x")
+def test_verdicts_are_known_or_not_and_two_scales_are_two_objects() -> None:
     assert verdicts([1, 0, True, None, "yes", 300, float("nan")]).tolist() == [1, 0, 1, -1, -1, -1, -1]
     # What is kept of a pair between calls is found by digest.
     assert len({scaled_object("block", scale).digest for scale in (1.0, 0.5, 2.0)}) == 3
@@ -172,6 +181,7 @@ def test_grasps_of_a_training_format_come_back(name: str, files: str, rounding: 
     for file in sorted(exported(name).glob(files)) if files else [exported(name)]:
         for back in read_sets(name, file, "barrett", "block", options):
             assert back.published is not None and (back.placed is None) == (name in ("dexgraspnet2", "graspgen"))
+            assert (back.grasps.approach is None) == (name != "lerobot")
             for k, pose in enumerate(back.grasps.grasp.hand_pose):
                 (row,) = np.flatnonzero(np.abs(stored["grasp/hand_pose"][:, :3] - pose[:3]).max(axis=1) < rounding)
                 found.append(int(row))
@@ -182,6 +192,10 @@ def test_grasps_of_a_training_format_come_back(name: str, files: str, rounding: 
                     assert abs(given.hand_pose[k, 3:] @ ours[3:]) == pytest.approx(1, abs=1e-6)
                     joints = stored[f"{what}/joint_positions"][row]
                     np.testing.assert_allclose(given.joint_positions[k], joints, atol=rounding)
+                if back.grasps.approach is not None:
+                    lift, way = stored["grasp/lift"][row], stored["grasp/approach"][row]
+                    np.testing.assert_allclose(back.grasps.approach[k, :, :3], way[:, :3], atol=rounding)
+                    np.testing.assert_allclose(back.grasps.lift.hand_pose[k, :3], lift[:3], atol=rounding)
                 if back.placed is not None:
                     rest = stored["scene/object_pose"][stored["grasp/scene_index"][row]]
                     there = back.placed.object_pose[back.placed.index[k]]
@@ -189,17 +203,80 @@ def test_grasps_of_a_training_format_come_back(name: str, files: str, rounding: 
     assert sorted(found) == np.flatnonzero(stored["quality/valid"]).tolist()
 
 
-@pytest.mark.parametrize(
-    ("name", "hand", "says"),
-    [
-        ("foo", "h", "no import format"),
-        ("multidex", "h", "--robot and --name"),
-        ("ddgc", None, "give --hand and --object"),
-    ],
-)
-def test_what_no_import_can_read_is_told(name: str, hand: str | None, says: str, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=says):
-        read_sets(name, tmp_path, hand, "o", {"robot": "", "object_name": "", "number": 0})
+def kept(folder: Path, *contents) -> Path:
+    for number, content in enumerate(contents):
+        save_record(folder / f"{number}.npy", content)
+    return folder
+
+
+def listed(folder: Path, text: str = "[]") -> Path:
+    (folder / "x.json").write_text(text)
+    return folder / "x.json"
+
+
+HAND, GIVEN = hand_from_path("barrett"), {"hand": "barrett", "obj": "block"}
+QPOS = {f"{name}_qpos": np.zeros(15) for name in dexgraspbench.POSTURES}
+SIX = {"task": {"obj_name": "x"}, "scene": {"x": {"pose": np.zeros(6), "scale": [1.0]}}}
+NO_SCENE = Shard("base", {}, {"scene/object_pose": np.zeros((1, 7)), "grasp/scene_index": np.zeros(1)})
+ROW_OF = SimpleNamespace(hand=replace(HAND, joint_names=("row", *HAND.joint_names[1:])))
+#: What readers and writers refuse, by their words.
+REFUSED = {
+    "no import format 'foo'": lambda at: read_sets("foo", at, "h", "o", {}),
+    "give --hand and --object": lambda at: read_sets("ddgc", at, None, "o", {}),
+    "--robot and --name": lambda at: read_sets("multidex", at, "h", "o", {"robot": ""}),
+    "no shards": expand,
+    r"nothing\.h5 does not exist": lambda at: load_case(at / "nothing.h5"),
+    "name both: --hand and --object": load_case,
+    "no file of reference grasps: KeyError": lambda at: load_case(listed(at, "{}")),
+    "cannot be read: No such file": lambda at: graspgen.read(at / "none.json", **GIVEN),
+    "has no .npy files": lambda at: load_case(at, **GIVEN),
+    "holds no dictionary": lambda at: load_case(kept(at, np.zeros(3)), **GIVEN),
+    "has no pregrasp_qpos": lambda at: load_case(kept(at, {}), **GIVEN),
+    "numbers of pregrasps, .* differ": lambda at: load_case(
+        kept(at, QPOS | {"grasp_qpos": np.zeros((2, 15))}), **GIVEN
+    ),
+    r"\(scale 0.5, scale 1\)": lambda at: load_case(kept(at, QPOS, QPOS | {"obj_scale": 0.5}), **GIVEN),
+    "has a pose of 6 numbers": lambda at: object_of_scene(kept(at / "assets", SIX), "assets/0.npy"),
+    "no list of grasps with `qpos`": lambda at: published.read_dexgraspnet(kept(at, np.zeros(3)) / "0.npy", **GIVEN),
+    "object 2 was requested": lambda at: published.read_ddgc(ddgc(at), number=2, **GIVEN),
+    r"grasps of shape \(1, 3\)": lambda at: published.read_ddgc(ddgc(at), **GIVEN),
+    "is no Barrett hand": lambda at: published.read_ddgc(ddgc(at), hand="allegro", obj="block", number=1),
+    "no grasp of 'a' on 'cup'": lambda at: published.read_multidex(at, robot="a", object_name="cup", **GIVEN),
+    "q has 3 numbers": lambda at: published.read_multidex(at, robot="a", object_name="mug", **GIVEN),
+    "no file of reference grasps: it .* object": lambda at: friction(listed(at)),
+    "no record of GraspGen: it .* object": lambda at: graspgen.read(listed(at), **GIVEN),
+    "joint 'row', which is a key": lambda at: dexgraspnet2._write_grasps(None, ROW_OF, at, None),
+    "has no joint 'elbow'": lambda at: joints_by_name(HAND, ["elbow"], [[0.0]], what="x"),
+    "1 joint values for 2 joints": lambda at: joints_by_name(HAND, ["elbow", "wrist"], [[0.0]], what="x"),
+    "does not say which": lambda at: scenes_of_shard(NO_SCENE),
+    "is not a valid scene": lambda at: scene_spec_of(Shard("base", {"scene": DEEP}, {})),
+}
+
+
+@pytest.mark.parametrize("words", REFUSED)
+def test_what_cannot_be_read_or_written_is_refused(words: str, tmp_path: Path, monkeypatch) -> None:
+    # torch, which reads the files of MultiDex, may be missing.
+    monkeypatch.setattr(published, "_metadata", lambda path: [(np.zeros(3), "mug", "a")])
+    with pytest.raises(InputError, match=words):
+        REFUSED[words](tmp_path)
+
+
+def test_a_shard_with_the_joints_of_another_hand_is_refused(stored: Shard, tmp_path: Path) -> None:
+    arrays = {path: column[..., :5] if path.endswith("positions") else column for path, column in stored.arrays.items()}
+    (tmp_path / "x.h5").write_bytes(write_shard("base", arrays, stored.attributes))
+    with pytest.raises(InputError, match=r"has 5 joints, .*plan again"):
+        load_case(tmp_path / "x.h5")
+
+
+#: What an export begins with.
+BEGUN = {"dexgraspnet2": "data", "dexlearn": "assets/object/graspd", "graspgen": "grasps", "huggingface": "grasps"}
+BEGUN |= {"lerobot": "meta", "webdataset": "pictures-000000.tar"}
+
+
+@pytest.mark.parametrize("format_", BEGUN)
+def test_an_export_does_not_write_over_another(format_: str, on_tables: Path, tmp_path: Path) -> None:
+    (tmp_path / BEGUN[format_]).mkdir(parents=True)
+    assert "give another folder as --output" in refused(f"export --format {format_} -o", tmp_path, on_tables)
 
 
 @pytest.mark.parametrize(
@@ -223,6 +300,3 @@ def test_a_file_that_is_nested_deep_is_refused_in_one_line(name: str, reader, tm
 
 def test_an_attribute_that_is_nested_deep_says_nothing() -> None:
     assert options_of(DEEP) == {}
-    shard = Shard("base", {"scene": DEEP}, {})
-    with pytest.raises(InputError, match="is not a valid scene"):
-        scene_spec_of(shard)

@@ -38,7 +38,6 @@ def record_of(data: Path, uuid: str) -> dict:
         for member in shard:
             # WebDataset's rule: a sample's key ends at the first dot of the name, the rest says what of it a member is.
             parts = re.fullmatch(r"((?:.*/|)[^.]+)[.]([^/]*)", member.name)
-            assert parts is not None
             if parts[1] == uuid and parts[2] == "grasps.json":
                 found.append(json.loads(shard.extractfile(member).read()))  # type: ignore[union-attr]
     assert len(found) == 1
@@ -111,8 +110,8 @@ def test_what_nobody_validated_has_no_label(on_tables: Path, tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"transforms": [np.zeros((4, 4)).tolist()] * 8}, "no poses"),
-        ({"transforms": [np.diag([1.0, 1, -1, 1]).tolist()] * 8}, "no poses"),
+        ({"transforms": [np.zeros((4, 4)).tolist()] * 8}, "not poses"),
+        ({"transforms": [np.diag([1.0, 1, -1, 1]).tolist()] * 8}, "not poses"),
         ({"transforms": [[1, 2], [3]]}, "no record"),
         ({"object_in_gripper": [True]}, "shape"),
         ({"squeeze_pose": [[0, 0, 0, 1, 0, 0, 0]]}, "numbers of pregrasps"),
@@ -140,5 +139,3 @@ def test_links_compressed_and_large_files_are_not_followed(data: Path, tmp_path:
         tar.addfile(tarfile.TarInfo("block.grasps.json"), io.BytesIO())
     with pytest.raises(InputError, match="no tar file"):
         graspgen.read(tmp_path / "packed.tar", hand="barrett", obj="block")
-    with pytest.raises(InputError, match="cannot be read: No such file"):
-        graspgen.read(tmp_path / "none.json", hand="barrett", obj="block")

@@ -9,13 +9,16 @@ from graspd.exchange.plan import prim_name, prim_names
 from graspd.service.model.errors import GraspdError
 
 
-@pytest.mark.parametrize("suffix", sorted(READERS))
-def test_a_file_that_its_library_cannot_read_is_named(suffix: str, tmp_path) -> None:
+@pytest.mark.parametrize(
+    ("suffix", "content"),
+    [*((suffix, b"\x00<broken\n1,2\xff") for suffix in READERS), (".csv", b"1,2\n3\n"), (".usd", b"#usda 1.0\n")],
+)
+def test_a_file_that_its_library_cannot_read_is_named(suffix: str, content: bytes, tmp_path) -> None:
     with (
         pytest.raises(GraspdError, match=rf"broken\{suffix} was written but .* cannot read it"),
         check_written_files(tmp_path),
     ):
-        (tmp_path / f"broken{suffix}").write_bytes(b"\x00<broken\n1,2\xff")
+        (tmp_path / f"broken{suffix}").write_bytes(content)
 
 
 def test_files_that_were_there_before_are_not_looked_at(tmp_path) -> None:

@@ -21,14 +21,10 @@ from tests.indexes import open_services
 
 H, W = 24, 32
 K = np.array([[30.0, 0, 17], [0, 28, 11], [0, 0, 1]])
-
-
-def camera() -> np.ndarray:  # type: ignore[type-arg]
-    """World to camera: somewhere above, looking at the origin."""
-    extrinsics = np.eye(4)
-    extrinsics[:3, :3] = Rotation.from_euler("xyz", [2.6, 0.2, 0.4]).as_matrix()
-    extrinsics[:3, 3] = [0.02, -0.01, 0.6]
-    return extrinsics
+#: World to camera: somewhere above, looking at the origin.
+CAMERA = np.eye(4)
+CAMERA[:3, :3] = Rotation.from_euler("xyz", [2.6, 0.2, 0.4]).as_matrix()
+CAMERA[:3, 3] = [0.02, -0.01, 0.6]
 
 
 @pytest.fixture
@@ -38,10 +34,10 @@ def views() -> Shard:
     pose[:3, 3] = [0.05, 0.02, 0.04]
     local = box_corners(np.array([[-0.02, -0.03, -0.05], [0.04, 0.01, 0.02]]))
     world = local @ pose[:3, :3].T + pose[:3, 3]
-    corners = world @ camera()[:3, :3].T + camera()[:3, 3]
+    corners = world @ CAMERA[:3, :3].T + CAMERA[:3, 3]
     arrays = {
         "camera/intrinsics": K[None],
-        "camera/extrinsics": camera()[None],
+        "camera/extrinsics": CAMERA[None],
         "camera/scene_index": np.zeros(1, np.int32),
         "camera/eye": np.zeros(1, np.uint8),
         "camera/stereo_baseline_m": np.zeros(1),
@@ -61,7 +57,7 @@ def test_3d_box_of_replicators_layout_has_the_corners_of_ours(views: Shard, tmp_
     (row,) = np.load(tmp_path / "bounding_box_3d_0000.npy")
     local = box_corners(np.array([[row[f"{axis}_{end}"] for axis in "xyz"] for end in ("min", "max")], float))
     world = np.concatenate([local, np.ones((8, 1))], axis=1) @ row["transform"].astype(float)  # row vectors
-    corners = world[:, :3] @ camera()[:3, :3].T + camera()[:3, 3]
+    corners = world[:, :3] @ CAMERA[:3, :3].T + CAMERA[:3, 3]
     np.testing.assert_allclose(corners, views["box/bounding_box_3d"][0], atol=1e-6)  # float32 of the file
 
 
@@ -73,7 +69,7 @@ def test_usds_matrices_put_a_point_on_the_same_pixel(views: Shard, tmp_path) -> 
     clip = np.concatenate([points, np.ones((20, 1))], axis=1) @ view @ projection  # row vectors, as USD has them
     ndc = clip[:, :2] / clip[:, 3:]
     pixels = np.stack([(ndc[:, 0] + 1) / 2 * W, (1 - ndc[:, 1]) / 2 * H], axis=1)
-    in_camera = (points @ camera()[:3, :3].T + camera()[:3, 3]) @ K.T
+    in_camera = (points @ CAMERA[:3, :3].T + CAMERA[:3, 3]) @ K.T
     np.testing.assert_allclose(pixels, in_camera[:, :2] / in_camera[:, 2:], atol=1e-9)
 
 
@@ -108,8 +104,8 @@ def test_every_picture_is_one_sample_with_its_grasps(tmp_path) -> None:
     expected = Pictures(shards)[1]
     with tarfile.open(path) as tar:
         record = json.loads(tar.extractfile("00000001.json").read())  # type: ignore[union-attr]
-        with Image.open(io.BytesIO(tar.extractfile("00000001.rgb.png").read())) as image:  # type: ignore[union-attr]
-            np.testing.assert_array_equal(np.array(image), expected["image/rgb"])
+        image = Image.open(io.BytesIO(tar.extractfile("00000001.rgb.png").read()))  # type: ignore[union-attr]
+        np.testing.assert_array_equal(np.array(image), expected["image/rgb"])
     np.testing.assert_allclose(record["grasps"]["hand_pose"], expected["grasp/hand_pose"])
     assert record["grasp_frame"] == "camera"
     with pytest.raises(InputError, match="no picture"):

@@ -10,6 +10,7 @@ import itertools
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,7 +23,8 @@ from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import apply, compose, pose_from_matrix
 from graspd.service.readers import Pictures, open_shards
 from graspd.worker.hands.kinematics import body_poses
-from tests.worker.commands_run import refused
+from graspd.worker.hands.load import hand_from_path
+from tests.worker.commands_run import graspd, refused
 
 pq = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed; pip install 'graspd[parquet]'")
 #: Poses in float64 from one frame into another [m].
@@ -44,8 +46,7 @@ def rows_of(folder: Path, table: str, name: str) -> list[dict]:
 
 def picture(cell: dict) -> np.ndarray:
     assert cell["path"] is None
-    with Image.open(io.BytesIO(cell["bytes"])) as image:
-        return np.array(image)
+    return np.array(Image.open(io.BytesIO(cell["bytes"])))
 
 
 def test_its_card_names_all_files_and_columns_of_pictures(folder: Path) -> None:
@@ -108,6 +109,13 @@ def test_what_is_no_table_of_grasps_is_told(folder: Path, tmp_path: Path, monkey
         huggingface.read(folder, hand="barrett", obj="block")
 
 
+def test_grasps_of_another_kind_of_scene_are_refused(folder: Path, tmp_path: Path) -> None:
+    rows = [row | {"scene_kind": "bin"} for row in rows_of(folder, "grasps", "block")]
+    pq.write_table(parquet.arrow().Table.from_pylist(rows), tmp_path / "x.parquet")
+    with pytest.raises(InputError, match="kind 'bin'; only table and free"):
+        huggingface.read(tmp_path / "x.parquet", hand="barrett", obj="block")
+
+
 def test_the_package_itself_reads_the_folder(folder: Path, tmp_path: Path, stored) -> None:
     datasets = pytest.importorskip("datasets", reason="`pip install datasets` runs this test")
     grasps = datasets.load_dataset(str(folder), "grasps", cache_dir=str(tmp_path))
@@ -116,7 +124,6 @@ def test_the_package_itself_reads_the_folder(folder: Path, tmp_path: Path, store
     assert np.array(pictures["train"][0]["rgb"]).shape == (72, 96, 3)
 
 
-pq = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed; pip install 'graspd[parquet]'")
 #: Joints and roots are float32 there: 6e-8 of a radian or metre, along a finger of 0.2 m and a chain of 4 [m].
 FLOAT32_M = 1e-6
 
@@ -131,8 +138,7 @@ def frames(recorded: Path) -> list[dict]:
     for row in rows:
         for name, feature in info["features"].items():
             if feature["dtype"] == "image":
-                with Image.open(io.BytesIO(row[name]["bytes"])) as image:
-                    row[name] = np.array(image)
+                row[name] = picture(row[name])
                 assert list(row[name].shape) == feature["shape"]
             elif feature["shape"] != [1]:
                 assert len(row[name]) == feature["shape"][0] == len(feature["names"])
@@ -212,21 +218,15 @@ def test_an_episode_is_the_way_of_its_grasp(recorded: Path, on_tables: Path, han
         assert any(np.array_equal(some[0]["observation.images.scene"], one) for one in seen)
 
 
-def test_grasps_come_back_with_their_ways(recorded: Path, stored) -> None:
-    (back,) = lerobot.read(recorded, hand="barrett", obj="block", object_name="block")
-    assert back.grasps.approach is not None and back.grasps.lift is not None
-    np.testing.assert_allclose(back.grasps.approach[..., :3], stored["grasp/approach"][..., :3], atol=FLOAT32_M)
-    np.testing.assert_allclose(back.grasps.lift.hand_pose[:, :3], stored["grasp/lift"][:, :3], atol=FLOAT32_M)
-
-
-def test_a_data_set_of_somebody_else_is_told(recorded: Path, tmp_path: Path) -> None:
-    other = tmp_path / "other"
-    shutil.copytree(recorded, other)
-    info = json.loads((other / "meta" / "info.json").read_text())
+def test_a_data_set_without_frames_or_of_somebody_else_is_told(recorded: Path, tmp_path: Path) -> None:
+    shutil.copytree(recorded / "meta", tmp_path / "meta")
+    with pytest.raises(InputError, match="no episodes of task"):
+        lerobot.read(tmp_path, hand="barrett", obj="block", object_name="block")
+    info = json.loads((tmp_path / "meta" / "info.json").read_text())
     info["features"]["observation.state"]["names"] = ["shoulder", "elbow"]
-    (other / "meta" / "info.json").write_text(json.dumps(info))
+    (tmp_path / "meta" / "info.json").write_text(json.dumps(info))
     with pytest.raises(InputError, match="was not exported by graspd"):
-        lerobot.read(other, hand="barrett", obj="block", object_name="block")
+        lerobot.read(tmp_path, hand="barrett", obj="block", object_name="block")
     with pytest.raises(InputError, match="lift the block, lift the mug"):
         lerobot.read(recorded, hand="barrett", obj="block", object_name="cup")
 
@@ -234,3 +234,17 @@ def test_a_data_set_of_somebody_else_is_told(recorded: Path, tmp_path: Path) -> 
 def test_grasps_without_pictures_are_no_episodes(on_tables: Path, tmp_path: Path) -> None:
     said = refused("export --format lerobot --all -o", tmp_path / "out", on_tables / "block.h5")
     assert "no picture shows" in said
+
+
+@pytest.mark.parametrize(("hands", "said"), [(["barrett"], "--scene table"), (["barrett", "allegro"], "several hands")])
+def test_free_grasps_or_two_hands_are_no_data_set(hands: list[str], said: str, tmp_path: Path) -> None:
+    lots = [SimpleNamespace(hand=hand_from_path(name), name="block", placed=None) for name in hands]
+    with pytest.raises(InputError, match=said):
+        lerobot.write(lots, None, tmp_path, frozenset())
+
+
+def test_pictures_of_several_sizes_are_no_data_set(on_tables: Path, tmp_path: Path) -> None:
+    shards = tmp_path / "shards"
+    shutil.copytree(on_tables, shards, ignore=shutil.ignore_patterns("block-views.h5"))
+    graspd("render --views 1 --width 48 --height 36 -o", shards / "block-views.h5", shards / "block.h5")
+    assert "do not fit into one" in refused("export --format lerobot --all -o", tmp_path / "out", shards)

@@ -5,8 +5,8 @@ import re
 import shutil
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,6 @@ from graspd.service.model.planning import message_of, plan
 from graspd.service.model.records import JobRecord, Snapshot
 from graspd.service.model.states import Stage
 from graspd.service.model.transforms import quat_from_axis_angle
-from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.datasets import actions
 from graspd.service.pipeline.datasets.export import export_shards
 from graspd.service.pipeline.datasets.spec import DatasetRequest
@@ -57,8 +56,6 @@ NAME = "kitchen"
 STILL_HAND, STILL_JOINT = "barrett", "finger_1_spread"
 SECONDS = {Stage.SYNTHESIZE: 2.0, Stage.SCENE: 0.5, Stage.RENDER: 1.5}
 Array = NDArray[Any]
-#: May change a base shard's columns, by hand and object, before it is written.
-Change = Callable[[str, str, dict[str, Array]], None]
 CHECK = ("sha256sum", "-c", "--strict", "checksums.sha256")
 MANY = [f"object-{number:03}" for number in range(200)]
 
@@ -67,7 +64,7 @@ MANY = [f"object-{number:03}" for number in range(200)]
 class Case:
     """A dataset's services and snapshot, its contents, the folder of its card, and the card's figures."""
 
-    services: Services
+    services: Any
     snapshot: Snapshot
     contents: Contents
     folder: Path
@@ -110,10 +107,8 @@ def export(kitchen: Case, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def unchanged(hand: str, obj: str, columns: dict[str, Array]) -> None: ...
-
-
-def dataset(folder: Path, change: Change = unchanged, fails: Any = None, grasps: int = 40, **options: Any) -> Services:
+def dataset(folder: Path, change: Any = None, fails: Any = None, grasps: int = 40, **options: Any):
+    """Grasps of each hand on each object; `change` may change the columns of a base shard before it is written."""
     services = open_services(Settings(data_dir=folder))
     factories.add_builtins(services)
     given = {"scenes": 2, "views": 1, "width": 24, "height": 16, "stereo": False, **options}
@@ -129,7 +124,7 @@ def dataset(folder: Path, change: Change = unchanged, fails: Any = None, grasps:
     return services
 
 
-def _finish(services: Services, record: JobRecord, change: Change) -> None:
+def _finish(services, record: JobRecord, change: Any) -> None:
     request, base = record.request, dict[str, Array]()
     place = {"scene": json_attribute(request.place.model_dump(mode="json"))} if request.in_scene else {}
     for task in plan(record):
@@ -145,7 +140,8 @@ def _finish(services: Services, record: JobRecord, change: Change) -> None:
             base["quality/simulated_displacement_cm"] = rng.gamma(2.0, 0.025, task.count)
             if task.batch == 0:
                 base["quality/recheck"] = np.where(np.arange(task.count) < 8, 1, -1).astype(np.int8)
-            change(request.hand, request.object, base)
+            if change is not None:
+                change(request.hand, request.object, base)
             made = len(base["quality/valid"])
             if place:
                 # At half the friction every other grasp of a scene lifts.
@@ -216,6 +212,12 @@ def test_what_a_folder_does_not_know_is_said_to_be_missing(export: Path, tmp_pat
     assert completed(CHECK, cwd=tmp_path / "plain").returncode == 0
     assert "| revisions of the stages | not recorded |" in page
     assert "No licence was stated for this dataset" in page and "Not measured: robustness" in page
+
+
+def test_pictures_without_their_grasps_have_no_card(kitchen: Case, tmp_path: Path) -> None:
+    pictures = replace(kitchen.contents, shards=Shards(kitchen.contents.shards.of("views")))
+    with pytest.raises(InputError, match="has no base shard"):
+        write_card(pictures, tmp_path)
 
 
 def test_licences_can_be_given_for_what_was_added_without(kitchen: Case, tmp_path: Path) -> None:

@@ -87,6 +87,7 @@ def test_all_files_are_written_and_agree(made: tuple[dict, Path]) -> None:
     ("words", "says"),
     [
         ("--methods magic", "magic"),
+        ("--methods graspit@", "write NAME, NAME:OPTION=VALUE"),
         ("--fidelities superb", "superb"),
         ("--batch many", "many"),
         ("--hands ,", "an option is empty"),

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from graspd.service.model.transforms import Floats
 from graspd.worker.simulation.device import joint_units, to_wxyz, to_xyzw
 from graspd.worker.simulation.kernels import contact, kinematics, packing, penalties
-from graspd.worker.simulation.model import MAX_DILATION, REFERENCE_POINTS, Model
+from graspd.worker.simulation.model import REFERENCE_POINTS, Model
 
 #: Fields of `kinematics.Depths`, and fields of `kinematics.Hands`.
 _DEPTHS: Final = ("points", "object", "links", "obstacles")
@@ -127,10 +127,8 @@ class Data:
         self.scene.assign(padded)
 
     def set_schedule(self, schedule: Schedule) -> None:
-        """Upload the per-iteration tables; launches recorded before still read the former tables.
-        Raises ValueError: a dilation above `MAX_DILATION`."""
-        if len(schedule) and schedule.dilation.max() > MAX_DILATION:
-            raise ValueError(f"the dilation may be at most {MAX_DILATION} m")
+        """Upload the per-iteration tables, with dilations up to `MAX_DILATION`.
+        Launches recorded before still read the former tables."""
         with wp.ScopedDevice(self.device):
             self.schedule = Tables(schedule, self.unit)
 

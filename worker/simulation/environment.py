@@ -38,10 +38,6 @@ class Obstacle:
     tips_m: float | None = None
     """Clearance of fingertips [m], negative if they may press into the body; None for that of the hand."""
 
-    def __post_init__(self) -> None:
-        if self.planes.ndim != 2 or self.planes.shape[1] != 4 or not len(self.planes):
-            raise InputError(f"an obstacle needs planes of shape (K, 4); got {self.planes.shape}")
-
     @classmethod
     def half_space(cls, normal: Sequence[float] | Floats, offset: float) -> Obstacle:
         """Return the half-space n.x <= offset; the normal need not have unit length.

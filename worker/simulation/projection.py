@@ -108,7 +108,8 @@ class Projection:
     @staticmethod
     def _found(states: Any, n: int) -> HandState:
         pivot, rotation, q = (array.numpy()[:n].copy() for array in (states.pivot, states.rotation, states.q))
-        return HandState(pivot, to_wxyz(rotation), q)
+        # A hand that no step improved has its rotation as given, in single precision.
+        return HandState(pivot, to_wxyz(rotation / np.linalg.norm(rotation, axis=1, keepdims=True)), q)
 
     def _add_equations(self, out: Launches) -> None:
         m, d, o, outputs = self.model, self.data, self.options, [self.residuals]

@@ -82,7 +82,6 @@ def test_joined_batches_are_those_of_separate_launches(hand, network) -> None:
     options = {"network": keep(network), "starts": 2}
     wanted = [PlanRequest(2, QUICK, 1, batch, placed=on_table(BLOCK, 2)) for batch in (0, 1)]
     joins = method("learned").joined
-    assert joins is not None
     asked = [BatchRequest(one, ExecutionContext(threads=1)) for one in wanted]
     found = joins(method("learned").options(**options))(hand, BLOCK, asked)
     for one, alone in zip(found, wanted, strict=True):

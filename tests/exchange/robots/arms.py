@@ -1,5 +1,6 @@
 """A six-joint arm of cylinders and boxes, shaped like the common ones: reach 0.85 m, a spherical wrist."""
 
+import csv
 from pathlib import Path
 
 #: Joint: parent offset [m], axis, limits [rad], velocity [rad/s]; link: radius and length of its cylinder [m].
@@ -13,37 +14,31 @@ JOINTS = [
 ]
 
 
-def write_arm(folder: Path, *, velocities: bool = True, scale: float = 1.0) -> Path:
-    lines = ['<robot name="six">', _link("base", 0.07, 0.08, -0.04)]
-    parent = "base"
-    for name, offset, axis, limit, velocity, radius, length in JOINTS:
-        x, y, z = (scale * part for part in offset)
-        lines.append(_link(f"{name}_link", radius, scale * length, scale * length / 2))
+def write_arm(folder: Path, *, velocities: bool = True) -> Path:
+    parts, parent = [_link("base", 0.07, 0.08, -0.04)], "base"
+    for name, (x, y, z), axis, limit, velocity, radius, length in JOINTS:
         speed = f' velocity="{velocity}"' if velocities else ""
-        lines.append(
-            f'<joint name="{name}" type="revolute"><parent link="{parent}"/><child link="{name}_link"/>'
-            f'<origin xyz="{x} {y} {z}"/><axis xyz="{axis}"/>'
-            f'<limit lower="{-limit}" upper="{limit}" effort="50"{speed}/></joint>'
-        )
+        limits = f'<limit lower="{-limit}" upper="{limit}" effort="50"{speed}/>'
+        place = f'<origin xyz="{x} {y} {z}"/><axis xyz="{axis}"/>{limits}'
+        parts += [_link(f"{name}_link", radius, length, length / 2), _joint(name, "revolute", parent, place)]
         parent = f"{name}_link"
-    lines.append('<link name="flange"/>')
-    lines.append(
-        f'<joint name="to_flange" type="fixed"><parent link="{parent}"/><child link="flange"/>'
-        '<origin xyz="0 0 0.03"/></joint>'
-    )
-    lines.append(_link("gripper", 0.03, 0.1, 0.05))
-    lines.append(
-        '<joint name="grip" type="prismatic"><parent link="flange"/><child link="gripper"/><axis xyz="0 0 1"/>'
-        '<limit lower="0" upper="0.02" effort="10"/></joint>'
-    )
-    lines.append("</robot>")
+    parts += ['<link name="flange"/>', _joint("flange", "fixed", parent, '<origin xyz="0 0 0.03"/>')]
+    slides = '<axis xyz="0 0 1"/><limit lower="0" upper="0.02" effort="10"/>'
+    parts += [_link("gripper", 0.03, 0.1, 0.05), _joint("gripper", "prismatic", "flange", slides)]
     file = folder / "six.urdf"
-    file.write_text("\n".join(lines))
+    file.write_text('<robot name="six">' + "".join(parts) + "</robot>")
     return file
 
 
+def _joint(name: str, kind: str, parent: str, rest: str) -> str:
+    child = name if kind != "revolute" else f"{name}_link"
+    return f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>{rest}</joint>'
+
+
 def _link(name: str, radius: float, length: float, middle: float) -> str:
-    return (
-        f'<link name="{name}"><collision><origin xyz="0 0 {middle}"/><geometry>'
-        f'<cylinder radius="{radius}" length="{length}"/></geometry></collision></link>'
-    )
+    solid = f'<geometry><cylinder radius="{radius}" length="{length}"/></geometry>'
+    return f'<link name="{name}"><collision><origin xyz="0 0 {middle}"/>{solid}</collision></link>'
+
+
+def rows(folder: Path, table: str = "trajectories") -> list[dict[str, str]]:
+    return list(csv.DictReader((folder / f"{table}.csv").read_text().splitlines()))

@@ -1,6 +1,5 @@
 """An arm that carries the hand: it is where the hand should be, within its limits, and runs into nothing."""
 
-import csv
 import re
 import sys
 from pathlib import Path
@@ -14,7 +13,7 @@ import yourdfpy
 from graspd.exchange.robots.execution import ASSUMED_RAD_S
 from graspd.exchange.robots.reach import read_arm
 from graspd.service.model.transforms import IDENTITY_POSE, compose, pose_from_matrix
-from tests.exchange.robots.arms import JOINTS, write_arm
+from tests.exchange.robots.arms import JOINTS, rows, write_arm
 from tests.worker.commands_run import graspd, refused
 
 MOUNT_POSE = "0 0 0.11 1 0 0 0"
@@ -39,11 +38,6 @@ def export(shard: Path, arm: Path, folder: Path, format_: str = "csv", base: str
 def carried(table_shard: Path, arm: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[dict, Path]:
     folder = tmp_path_factory.mktemp("carried")
     return export(table_shard, arm, folder), folder
-
-
-def rows(folder: Path, table: str = "trajectories") -> list[dict[str, str]]:
-    with (folder / f"{table}.csv").open() as file:
-        return list(csv.DictReader(file))
 
 
 def test_the_share_of_grasps_that_the_arm_reaches_is_told(carried: tuple[dict, Path]) -> None:

@@ -22,6 +22,7 @@ from tests.worker.models import object_from_mesh, two_finger_hand
 from tests.worker.quality.helpers import grasp_set, posture
 
 TOOL = tool_frame(None, "palm", {})
+LINKS = {"palm": (0, IDENTITY_POSE), "tcp": (0, np.array([0, 0, 0.1, 1, 0, 0, 0.0])), "tip": (2, IDENTITY_POSE)}
 
 
 def of_shard(file: Path) -> Executions:
@@ -58,7 +59,6 @@ def test_open_hand_touches_nothing_of_a_free_object_on_its_way(free: Executions)
                 assert rollout.penetration()[0] < 0.002
 
 
-@pytest.mark.slow
 def test_grasps_without_a_free_way_are_left_out_none_is_refused() -> None:
     hand = two_finger_hand()
     shell = trimesh.creation.icosphere(subdivisions=3, radius=0.12)
@@ -85,12 +85,11 @@ def test_in_scene_ways_of_shard_are_kept_in_frame_of_the_scene(table_shard: Path
 
 
 def test_the_tool_frame_is_a_link_or_a_pose(free: Executions) -> None:
-    links = {"palm": (0, IDENTITY_POSE), "tcp": (0, np.array([0, 0, 0.1, 1, 0, 0, 0.0])), "tip": (2, IDENTITY_POSE)}
     root = free.postures["grasp"].hand_pose
     for text in ("tcp", "0 0 0.1 1 0 0 0", "0,0,0.1,1,0,0,0"):
-        found = replace(free, tool=tool_frame(text, "palm", links))
+        found = replace(free, tool=tool_frame(text, "palm", LINKS))
         np.testing.assert_allclose(found.tool_pose("grasp")[:, :3], apply(root, np.array([0, 0, 0.1])), atol=1e-12)
-    assert tool_frame("palm", "palm", links).name == "palm"
+    assert tool_frame("palm", "palm", LINKS).name == "palm"
     rounded = execution.parse_pose("0 0 0 0.7071 0 0 0.7071", "--base")
     assert np.linalg.norm(rounded[3:]) == pytest.approx(1.0, abs=1e-12)
 
@@ -107,9 +106,8 @@ def test_the_tool_frame_is_a_link_or_a_pose(free: Executions) -> None:
     ],
 )
 def test_a_tool_frame_that_is_none_is_refused_in_a_line(text: str, said: str) -> None:
-    links = {"palm": (0, IDENTITY_POSE), "tcp": (0, IDENTITY_POSE), "tip": (2, IDENTITY_POSE)}
     with pytest.raises(InputError, match=said):
-        tool_frame(text, "palm", links)
+        tool_frame(text, "palm", LINKS)
 
 
 @pytest.mark.parametrize("speed", [0.2, 1.0])

@@ -1,6 +1,5 @@
 """Each format of robots, opened by what reads it; the page of robots works as it stands."""
 
-import csv
 import json
 import subprocess
 import sys
@@ -22,6 +21,7 @@ from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.rendering.hands import hand_parts
 from tests.conftest import REPOSITORY
+from tests.exchange.robots.arms import rows
 from tests.exchange.robots.conftest import COMMON
 from tests.worker.commands_run import graspd, refused
 
@@ -165,27 +165,29 @@ def test_moveit_grasps_have_the_fields_of_the_messages(table_shard: Path, tmp_pa
 
 def test_tables_name_their_columns_and_hold_what_the_shard_holds(free_shard: Path, tmp_path: Path) -> None:
     export(free_shard, "csv", tmp_path, "--tool-frame", "0 0 0.1 1 0 0 0")
-    with (tmp_path / "postures.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    postures, trajectories, grasps = (rows(tmp_path, name) for name in ("postures", "trajectories", "grasps"))
     case = load_case(free_shard)
-    for row in (row for row in rows if row["posture"] == "grasp"):
+    for row in (row for row in postures if row["posture"] == "grasp"):
         number = int(row["grasp"].removeprefix("grasp_"))
         tool = np.array([float(row[part]) for part in ("x", "y", "z", "qw", "qx", "qy", "qz")])
         root = compose(tool, invert(np.array([0, 0, 0.1, 1, 0, 0, 0])))
         np.testing.assert_allclose(root, case.grasps.grasp.hand_pose[number], atol=1e-8)
         joints = [float(row[name]) for name in case.hand.joint_names]
         np.testing.assert_allclose(joints, case.grasps.grasp.joint_positions[number], atol=1e-8)
-    with (tmp_path / "trajectories.csv").open() as file:
-        assert {row["phase"] for row in csv.DictReader(file)} == {"approach", "shape", "close", "squeeze", "lift"}
-    with (tmp_path / "grasps.csv").open() as file:
-        assert {row["tool_frame"] for row in csv.DictReader(file)} == {"tool"}
+    assert {row["phase"] for row in trajectories} == {"approach", "shape", "close", "squeeze", "lift"}
+    assert {row["tool_frame"] for row in grasps} == {"tool"}
 
 
 @pytest.mark.parametrize(
-    ("options", "said"), [("--tool-frame finger_1_distal_link", "moves with a finger"), ("--speed 1.5", "at most 1")]
+    ("options", "said"),
+    [
+        ("csv --tool-frame finger_1_distal_link", "moves with a finger"),
+        ("csv --speed 1.5", "at most 1"),
+        ("graspgen --held-out 1", "between 0 and 1"),
+    ],
 )
 def test_a_mistake_is_one_line_and_writes_nothing(options: str, said: str, free_shard: Path, tmp_path: Path) -> None:
-    assert said in refused(f"export --format csv {options}", free_shard, "-o", tmp_path / "out")
+    assert said in refused(f"export --format {options}", free_shard, "-o", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 

@@ -146,5 +146,6 @@ def test_a_number_decides_and_without_a_gpu_auto_is_the_cpu(monkeypatch: pytest.
     assert Device("auto").resolve() == "cuda:0", "each of the four was taken"
     monkeypatch.setattr(devices, "visible_gpus", list)
     assert Device("auto", number=1).resolve() == "cpu"
-    with pytest.raises(InputError, match=r"no device 'cuda:1'; there are: cpu"):
-        Device("cuda:1")
+    for wanted, said in (("cuda:1", "no device 'cuda:1'; there are: cpu"), ("gpu", "use cpu, cuda:0")):
+        with pytest.raises(InputError, match=said):
+            Device(wanted)

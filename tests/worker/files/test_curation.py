@@ -134,6 +134,11 @@ def test_none_of_that_kind_is_told_with_the_mend(base: Shard, wish: dict[str, bo
         select_grasps(base, **wish)
 
 
+def test_grasps_whose_type_is_not_recorded_are_not_balanced() -> None:
+    with pytest.raises(InputError, match="does not record the type"):
+        Balance(["type"])([VALIDATED])
+
+
 @pytest.fixture(scope="module")
 def boxes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return box_scenes.write(tmp_path_factory.mktemp("box"))

@@ -204,7 +204,6 @@ def test_a_robotiq_2f_85_opens_as_far_as_its_maker_says() -> None:
         pytest.skip("airo_models is not installed")
     hand = hand_from_path(Path(package.submodule_search_locations[0]) / "grippers/robotiq_2f_85")
     jaws = jaws_of(hand)
-    assert jaws is not None
     assert hand.dofs == 1
     # Its data sheet: 85 mm between the pads; the file's meshes are off by a millimetre.
     assert jaws.opening == pytest.approx(0.085, abs=0.002)

@@ -208,7 +208,6 @@ def test_the_mounting_reaches_up_the_wrist_from_rest_to_limits() -> None:
 
 def test_the_mounting_stands_where_the_robot_has_it() -> None:
     hand, whole = load(with_wrist()), load(with_wrist(), root="forearm")
-    assert hand.mounting is not None
     pitch, yaw = 0.3, -0.4
     q = np.array([{"pitch": pitch, "yaw": yaw}.get(name, 0.0) for name in whole.dof_names])
     at = body_poses(whole, IDENTITY_POSE, whole.expand(q))[0]
@@ -232,7 +231,6 @@ def test_a_stated_angle_holds_a_wrist_and_a_dropped_link_ends_it() -> None:
     fixed = load(with_wrist(), root="hub", fix={"pitch": 0.25}).mounting
     assert fixed is not None and fixed.joint_names == ("yaw",)
     free = load(with_wrist()).mounting
-    assert free is not None
     still, moved = body_poses(fixed, IDENTITY_POSE, [0.1])[0], body_poses(free, IDENTITY_POSE, [0.25, 0.1])[0]
     pairs = (fixed, still), (free, moved)
     ours, theirs = ({p.link: apply(at[p.body], p.vertices) for p in model.pieces} for model, at in pairs)

@@ -186,7 +186,6 @@ def test_what_a_tube_encloses_twice_counts_once() -> None:
     assert untangle(*everted_dumbbell()) is None, "what cannot be repaired safely is left"
     tube = crossing_tube()
     united = untangle(*tube)
-    assert united is not None
     assert signed_volume(*tube) - signed_volume(*united) == pytest.approx(SHARED, rel=ROUGHLY)
     left = crossings(*united)
     assert left is not None and not len(left)

@@ -1,6 +1,5 @@
 """Starts of free hands and starts across an object: pairs of opposite points, and hands that hold between them."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +8,7 @@ import trimesh
 
 from graspd.commands.synth import _format_summary
 from graspd.service.model.domain import JobOptions
+from graspd.service.model.errors import InputError
 from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.transforms import apply, quat_from_matrix, quat_rotate
@@ -20,11 +20,9 @@ from graspd.worker.hands.flat_pinches import flat_pinches
 from graspd.worker.hands.jaws import fingertip_pad, pads_of, thinnest_fingertip
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
-from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.pinch_postures import oppositions_of
-from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
-from graspd.worker.planners import PlanRequest, synthesize
+from graspd.worker.planners import PlanRequest, fitting_pairs, synthesize
 from graspd.worker.planners.fast_graspd import antipodal_starts, starts
 from graspd.worker.planners.fast_graspd.antipodal_starts import (
     Openings,
@@ -41,6 +39,7 @@ from graspd.worker.simulation.data import HandState
 from graspd.worker.simulation.environment import Environment, Obstacle, Scenes
 from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.obstacles import MARGIN_M, DeviceObstacles, body_clearance
+from tests.worker.hands.urdfs import gripper
 from tests.worker.models import object_from_mesh
 from tests.worker.simulation.rigs import ball
 
@@ -56,7 +55,7 @@ BOX = object_from_mesh(trimesh.creation.box(SIZE))
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 
 
-def draft_model(hand: HandModel, obj: ObjectModel, scenes: Sequence[Environment] = ()) -> Model:
+def draft_model(hand, obj, scenes: tuple[Environment, ...] = ()) -> Model:
     pair = pair_of(hand, obj, DRAFT, "cpu")
     obstacles = DeviceObstacles.create(hand, scenes, obj.centre_of_mass, "cpu") if scenes else None
     return pair.model(pair.coarse, obstacles)
@@ -143,11 +142,11 @@ def test_draws_are_those_of_each_generator_alone_and_look_at_the_object() -> Non
 
 
 @pytest.fixture(scope="module")
-def ring() -> HandModel:
+def ring():
     return ring_hand(6)
 
 
-def test_a_ring_of_six_has_a_place_only_when_it_opens(ring: HandModel) -> None:
+def test_a_ring_of_six_has_a_place_only_when_it_opens(ring) -> None:
     model, generators = draft_model(ring, CUBE), [start_generator(5, 0, i, 0) for i in range(4)]
     state, depth = clear_starts(model, generators)
     assert (depth > NO_PLACE).all()
@@ -155,6 +154,18 @@ def test_a_ring_of_six_has_a_place_only_when_it_opens(ring: HandModel) -> None:
     assert opened.tolist() == [1, 1, 1, 0] and (depth[:3] <= CLEAR).all() and depth[3] > NO_PLACE
     closed = ring.closing > 0
     assert (state.q[:3, closed].mean(axis=1) < ring.preshape[closed].mean()).all()
+
+
+def test_an_object_that_no_ring_of_fingers_takes_in_is_told(ring) -> None:
+    wide = draft_model(ring, object_from_mesh(trimesh.creation.box((0.2, 0.2, 0.2))))
+    with pytest.raises(InputError, match="check the object's units"):
+        starts.sample_starts(wide, seed=5, batch=0, indices=range(1), each=1)
+
+
+def test_a_pyramid_has_no_sides_for_a_gripper() -> None:
+    pyramid = trimesh.convex.convex_hull([[0, 0, 0], [0.05, 0.05, 0], [0.05, 0, 0.05], [0, 0.05, 0.05]])
+    with pytest.raises(InputError, match="no two opposite sides"):
+        fitting_pairs(gripper(), object_from_mesh(pyramid))
 
 
 def test_a_hand_that_has_a_place_keeps_it() -> None:
@@ -166,7 +177,7 @@ def test_a_hand_that_has_a_place_keeps_it() -> None:
         np.testing.assert_array_equal(was, now)
 
 
-def test_a_grasp_that_opened_does_not_depend_on_its_batch(ring: HandModel) -> None:
+def test_a_grasp_that_opened_does_not_depend_on_its_batch(ring) -> None:
     many, few = (
         synthesize(ring, CUBE, PlanRequest(count, DRAFT, seed=3), ExecutionContext(threads=threads)).grasp
         for count, threads in ((5, 3), (2, 1))

@@ -70,8 +70,11 @@ def test_one_that_was_killed_while_it_waited_is_replaced(pool: Pool) -> None:
     assert pool.map(works.times, "three", 3, range(6)) == [0, 3, 6, 9, 12, 15]
 
 
-def test_who_is_cancelled_waits_no_longer_and_others_are_served(tmp_path: Path) -> None:
-    with Pool(2) as pool:
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize(("processes", "patience_s"), [(2, 600), (1, 0)], ids=["by another", "by one in its place"])
+def test_who_is_cancelled_waits_no_longer_and_others_are_served(processes, patience_s, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr("graspd.worker.pool.pool._PATIENCE_S", patience_s)
+    with Pool(processes) as pool:
         with pytest.raises(TaskCancelled):
             pool.map(works.hang, "folder", tmp_path, [0], cancelled=lambda: any(tmp_path.iterdir()))
         assert pool.map(works.times, "three", 3, [1, 2]) == [3, 6]

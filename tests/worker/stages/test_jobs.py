@@ -177,14 +177,23 @@ def test_a_scene_without_a_way_in_fails_the_job_and_says_so(table: Bench) -> Non
     assert bench.last_attempt() == ("SceneError", True), "it is not tried again"
 
 
-@pytest.mark.parametrize("scene", ["table", "free"])
-def test_payload_out_of_reach_fails_job_with_what_the_hand_lifts(table: Bench, scene: str) -> None:
+@pytest.mark.parametrize(
+    ("scene", "grasps", "says", "error"),
+    [
+        ("table", 8, "is valid: ", "LoadError"),
+        ("free", 8, "is valid: ", "LoadError"),
+        # Too few for the limit of the hand.
+        ("table", 2, r"is valid in its scene \(table\): 2 below the required payload; ", "SceneError"),
+    ],
+)
+def test_payload_out_of_reach_fails_job_with_what_the_hand_lifts(table, scene: str, grasps: int, says, error) -> None:
     bench = Bench(table.store)
-    wanted = {"scene": scene, "scenes": 0, "views": 0, "grasps": 8, "budget": 4, "min_payload": 90}
+    wanted = {"scene": scene, "scenes": 0, "views": 0, "grasps": grasps, "budget": 1, "min_payload": 90}
     kind, words = bench.run(**TABLE | wanted)
     assert kind is EventKind.FAILED
-    assert re.search(r"none of 8 candidates is valid: barrett lifts [\d.]+ kg at friction .*; 90 kg are wanted", words)
-    assert bench.last_attempt() == ("LoadError", True), "it is not tried again"
+    says += r"barrett lifts [\d.]+ kg at friction .*; 90 kg are wanted"
+    assert re.search(f"none of {grasps} candidates {says}", words)
+    assert bench.last_attempt() == (error, True), "it is not tried again"
 
 
 @pytest.mark.parametrize(

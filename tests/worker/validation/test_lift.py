@@ -45,9 +45,8 @@ HAND = pad_hand()
 BOX = object_from_mesh(trimesh.creation.box((2 * HALF, 0.04, HEIGHT)))
 WHOLE = ConvexPieces((BOX.hull_vertices,), 1.0, 0.0, "box")
 #: The hand's base is at -z of the object: the box stands on its head, so that the hand comes from above.
-PLACED = PlacedGrasps(
-    (Obstacle.half_space([0, 0, 1], 0.0),), np.array([[0, 0, HEIGHT / 2, 0, 1, 0, 0.0]]), np.zeros(1, int)
-)
+UPSIDE_DOWN = np.array([[0, 0, HEIGHT / 2, 0, 1, 0, 0.0]])
+PLACED = PlacedGrasps((Obstacle.half_space([0, 0, 1], 0.0),), UPSIDE_DOWN, np.zeros(1, int))
 #: Joint value at which the pads touch.
 TOUCH = 0.065
 #: Squeeze [m] whose two normal forces F = kp d hold a pull of 1 N by friction: 2 mu F = 1 N; the same for the pulls.
@@ -320,7 +319,7 @@ def test_a_lift_needs_a_scene_and_a_way_of_each_grasp() -> None:
 
 SQUEEZES = (-0.005, 1.3 * LEAST, 4 * LEAST)
 THREE = joined([grasp(squeeze) for squeeze in SQUEEZES])
-THREE_PLACES = PlacedGrasps(PLACED.supports, PLACED.object_pose, np.zeros(3, int))
+THREE_PLACES = placed(3)
 
 
 @pytest.fixture
@@ -357,9 +356,7 @@ def test_a_lift_of_anything_else_is_not_known(lifts: list[int], other: str) -> N
     if other == "squeeze":
         grasps = joined([grasp(squeeze + 1e-6) for squeeze in SQUEEZES])
     if other == "scene":
-        where = PlacedGrasps(
-            PLACED.supports, PLACED.object_pose + np.array([1e-6, 0, 0, 0, 0, 0, 0]), THREE_PLACES.index
-        )
+        where = replace(THREE_PLACES, object_pose=PLACED.object_pose + np.array([1e-6, 0, 0, 0, 0, 0, 0]))
     validate_lifts(HAND, BOX, grasps, where, pieces=WHOLE, hard=other == "friction", known=known)
     assert len(lifts) == 6
 

@@ -25,7 +25,6 @@ from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import synthesize
 from graspd.worker.planners.port import PlanRequest
 from graspd.worker.validation.decomposition import decompose
-from graspd.worker.validation.key import Level
 from graspd.worker.validation.model import MujocoOptions, build
 from graspd.worker.validation.prefilter import prefilter as screening
 from graspd.worker.validation.prefilter.prefilter import ROWS, PrefilterOutcomes, WorldPool
@@ -55,27 +54,21 @@ class Stand:
         return SimpleNamespace(opt=SimpleNamespace(warn_overflow=1), mjm=model)
 
     def make_data(self, model, *, nworld: int, nconmax: int, njmax: int):
-        def zeros(*shape: int, dtype=wp.float32):
-            return wp.zeros((nworld, *shape), dtype=dtype)
-
-        numbers = {"qpos": model.nq, "qvel": model.nv, "qacc_warmstart": model.nv, "ctrl": model.nu}
-        room = nworld * nconmax
-        contact = SimpleNamespace(
-            worldid=wp.zeros(room, dtype=wp.int32),
-            geom=wp.zeros(room, dtype=wp.vec2i),
-            dist=wp.zeros(room, dtype=wp.float32),
-        )
+        room, number = nworld * nconmax, wp.int32
+        kinds = {"worldid": number, "geom": wp.vec2i, "dist": wp.float32}
+        sizes = {"qpos": model.nq, "qvel": model.nv, "qacc_warmstart": model.nv, "ctrl": model.nu}
+        bodies = {"mocap_pos": (model.nmocap, wp.vec3), "mocap_quat": (model.nmocap, wp.quat)}
+        bodies |= {"xfrc_applied": (model.nbody, wp.spatial_vector)}
         return SimpleNamespace(
             each=[mujoco.MjData(model) for _ in range(nworld)],
             njmax=njmax,
             naconmax=room,
-            contact=contact,
-            **{name: zeros(count) for name, count in numbers.items()},
-            mocap_pos=zeros(model.nmocap, dtype=wp.vec3),
-            mocap_quat=zeros(model.nmocap, dtype=wp.quat),
-            xfrc_applied=zeros(model.nbody, dtype=wp.spatial_vector),
-            overflow=zeros(dtype=wp.int32),
-            **{name: wp.zeros(1, dtype=wp.int32) for name in ("nacon", "ncollision")},
+            contact=SimpleNamespace(**{name: wp.zeros(room, dtype=kind) for name, kind in kinds.items()}),
+            **{name: wp.zeros((nworld, size), dtype=wp.float32) for name, size in sizes.items()},
+            **{name: wp.zeros((nworld, size), dtype=kind) for name, (size, kind) in bodies.items()},
+            overflow=wp.zeros(nworld, dtype=number),
+            nacon=wp.zeros(1, dtype=number),
+            ncollision=wp.zeros(1, dtype=number),
         )
 
     _FIELDS = ("qpos", "qvel", "qacc_warmstart", "ctrl", "mocap_pos", "mocap_quat", "xfrc_applied")
@@ -103,7 +96,8 @@ class Stand:
         self._load(data)
         for one in data.each:
             mujoco.mj_forward(model.mjm, one)
-        found = [(w, *geoms, dist) for w, one in enumerate(data.each) for geoms, dist in _contacts(one)]
+        met = [(w, one.contact) for w, one in enumerate(data.each) if one.ncon]
+        found = [(w, *g, d) for w, c in met for g, d in zip(c.geom.tolist(), c.dist.tolist(), strict=True)]
         data.nacon.fill_(len(found))
         data.ncollision.fill_(len(found))
         for name, values in (("worldid", [f[0] for f in found]), ("geom", [f[1:3] for f in found])):
@@ -113,10 +107,6 @@ class Stand:
         depth = data.contact.dist.numpy()
         depth[: len(found)] = [f[3] for f in found]
         data.contact.dist.assign(depth)
-
-
-def _contacts(data) -> list[tuple]:
-    return list(zip(data.contact.geom.tolist(), data.contact.dist.tolist(), strict=True)) if data.ncon else []
 
 
 def every_kind() -> GraspSet:
@@ -205,7 +195,7 @@ def stand_in(monkeypatch: pytest.MonkeyPatch):
     screening._pools.clear()
 
 
-def verdicts(run: ExecutionContext, level: Level = "standard", grasps: GraspSet | None = None) -> Verdicts:
+def verdicts(run: ExecutionContext, level: str = "standard", grasps: GraspSet | None = None) -> Verdicts:
     return validate(PADS, BOX, grasps or every_kind(), level=level, pieces=WHOLE, run=run)
 
 
@@ -268,13 +258,17 @@ def test_a_first_judge_that_the_cpu_contradicts_is_not_believed(standard: Verdic
 
 
 def test_where_a_gpu_has_no_memory_for_it_the_cpu_judges(monkeypatch, caplog: pytest.LogCaptureFixture) -> None:
-    def full(*_):
-        raise RuntimeError("Failed to allocate 4096 bytes on device 'cuda:0'")
+    def fails(*_):
+        raise RuntimeError(said)
 
-    monkeypatch.setattr(screening, "WorldPool", full)
+    monkeypatch.setattr(screening, "WorldPool", fails)
+    said = "Failed to allocate 4096 bytes on device 'cuda:0'"
     with caplog.at_level(logging.WARNING):
         found = verdicts(ON)
     assert (found.validated_by == ValidatedBy.MUJOCO).all() and "no memory for the prefilter" in caplog.text
+    said = "CUDA error 700 detected on device cuda:0: an illegal memory access was encountered"
+    with pytest.raises(RuntimeError, match="illegal memory access"):
+        verdicts(ON)
 
 
 def test_grasps_that_overflow_the_first_judge_are_the_cpus(stand_in: Stand, monkeypatch, caplog) -> None:

@@ -6,24 +6,23 @@ import signal
 import subprocess
 import sys
 import urllib.request
-from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import trimesh
-from typer.testing import CliRunner
 
+from graspd.service.model.errors import InputError
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.transforms import quat_from_axis_angle
 from graspd.service.store.shards import Shard, json_attribute, write_shard
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import hand_from_path
-from graspd.worker.hands.model import HandModel
-from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.rendering.hands import drawn_bodies
+from graspd.worker.viewing import Viewer, ViewerContent, _figures
+from tests.worker.commands_run import refused
 from tests.worker.models import attributes_of, object_from_mesh, quality_columns, two_finger_hand
 
 viser = pytest.importorskip("viser", reason="needs the extra: pip install graspd[view]")
@@ -54,9 +53,7 @@ def arrays(joints: int) -> dict[str, np.ndarray]:
 
 
 @contextmanager
-def viewing(hand: HandModel, obj: ObjectModel, columns: dict[str, np.ndarray]) -> Iterator:
-    from graspd.worker.viewing import Viewer, ViewerContent
-
+def viewing(hand, obj, columns: dict[str, np.ndarray]):
     said = {"hand": "two fingers", "object": "block", "scene": SCENE}
     made = Viewer(ViewerContent(Shard("base", said, columns), hand, obj), port=0)
     try:
@@ -66,7 +63,7 @@ def viewing(hand: HandModel, obj: ObjectModel, columns: dict[str, np.ndarray]) -
 
 
 @pytest.fixture(scope="module")
-def viewer() -> Iterator:
+def viewer():
     with viewing(HAND, BLOCK, arrays(2)) as made:
         yield made
 
@@ -118,8 +115,6 @@ def test_grasps_follow_one_another_each_in_its_own_scene(viewer) -> None:
 
 
 def test_what_grasp_lifts_and_whether_it_survives_shake_is_told() -> None:
-    from graspd.worker.viewing import _figures
-
     found = {"quality/payload_kg": np.array([np.nan, 0.8, 1.5]), "quality/shake_margin": np.array([np.nan, 0.2, 1.0])}
     shard = Shard("base", {}, {**arrays(2), **found})
     plain, good, bad = (_figures(shard, row) for row in range(GRASPS))
@@ -142,17 +137,18 @@ def test_a_grasp_in_a_bin_has_five_supports_that_can_be_hidden(viewer):
     assert not any(node.visible for node in nodes if node is not None)
 
 
-def test_without_viser_or_a_shard_one_line_says_so(tmp_path, monkeypatch):
-    from graspd.commands.render import app
+def test_a_file_without_grasps_is_not_shown() -> None:
+    none = {path: column[:0] for path, column in arrays(2).items()}
+    with pytest.raises(InputError, match="holds no grasps"), viewing(HAND, BLOCK, none):
+        pass
 
+
+def test_without_viser_or_a_shard_one_line_says_so(tmp_path, monkeypatch):
     file = tmp_path / "grasps.h5"
     file.write_text("nothing")
-    result = CliRunner().invoke(app, ["view", str(file)])
-    assert result.exit_code == 2 and "grasps.h5 is not a readable HDF5 file" in result.output
+    assert "grasps.h5 is not a readable HDF5 file" in refused("view", file)
     monkeypatch.setitem(sys.modules, "viser", None)
-    result = CliRunner().invoke(app, ["view", str(file)])
-    assert result.exit_code == 2 and "pip install 'graspd[view]'" in result.output
-    assert len(result.output.strip().splitlines()) == 1
+    assert refused("view", file).endswith("run pip install 'graspd[view]'")
 
 
 @pytest.mark.timeout(180)
