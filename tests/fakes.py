@@ -28,7 +28,7 @@ from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.datasets.actions import DatasetRounds
 from graspd.service.store.integrity import put_document
 from graspd.service.store.library import publish_asset
-from graspd.service.store.manifests import ShardManifest, load_shard, publish_shard
+from graspd.service.store.manifests import ShardManifest, load_manifest, load_shard, publish_shard
 from graspd.service.store.records import put_record, read_record
 from graspd.service.store.store import Store
 from graspd.worker.process.engine import Engine
@@ -40,6 +40,7 @@ from graspd.worker.stages.ranges import base_rows, batches_of, joined
 
 HAND_FILES = {"asset.json": b'{"file": "hand.urdf"}', "hand.urdf": b"<robot name='fake'/>"}
 OBJECT_FILES = {"asset.json": b'{"file": "ball.stl"}', "ball.stl": b"solid ball\nendsolid ball\n"}
+ACCEPTED = {"verdict": "accept", "message": "fine", "repairs": [], "facts": {}}
 _POSE = np.array([[0.0, 0, 0, 1, 0, 0, 0]])
 
 
@@ -103,16 +104,21 @@ def make_shard(store: Store, message: TaskMessage, *, worker: str = "w") -> Shar
     context = TaskContext(store)
     made = fake_stages()[message.stage](message, context)
     manifest, data = shard_of(message, made, device="cpu", seconds=0.5, worker=worker)
-    publish_shard(store, manifest, data)
-    return manifest
+    return manifest if publish_shard(store, manifest, data) else load_manifest(store, manifest.stage, manifest.shard_id)
+
+
+def put_asset(services: Services, kind: AssetKind, name: str, files: Mapping[str, bytes], check: Any = ACCEPTED) -> str:
+    """A hand, an object or a network, and what its check found; its digest."""
+    asset = publish_asset(services.store, kind, name, files)
+    if check is not None:
+        put_document(services.store, names.asset_check(kind, asset.digest), check)
+    services.index.write.add_asset(asset, check)
+    return asset.digest
 
 
 def add_assets(services: Services) -> None:
-    for kind, name, files in ((AssetKind.HAND, "gripper", HAND_FILES), (AssetKind.OBJECT, "ball", OBJECT_FILES)):
-        asset = publish_asset(services.store, kind, name, files)
-        check = {"verdict": "accept", "message": "fine", "repairs": [], "facts": {}}
-        put_document(services.store, names.asset_check(kind, asset.digest), check)
-        services.index.write.add_asset(asset, {"verdict": "accept", "message": "fine"})
+    put_asset(services, AssetKind.HAND, "gripper", HAND_FILES)
+    put_asset(services, AssetKind.OBJECT, "ball", OBJECT_FILES)
 
 
 def with_settings(services: Services, **changes: Any) -> Services:

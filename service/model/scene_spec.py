@@ -134,8 +134,6 @@ def parse_scene(
     text: str, *, faces: str = "drawn", touch: float | None = None, beside: Sequence[str] = ()
 ) -> SceneSpec:
     """Parse a scene: one of `KINDS` or a file. `touch` replaces the file's value. InputError if invalid."""
-    if faces not in ("drawn", "all"):
-        raise InputError(f"unknown faces {faces!r}; choose drawn or all")
     path = Path(text)
     if text not in KINDS and path.suffix.lower() not in SCENE_FILES:
         meant = did_you_mean(text, KINDS)

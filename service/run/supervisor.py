@@ -17,7 +17,7 @@ from typing import IO, Final, Self
 import httpx
 from pydantic import SecretStr
 
-from graspd.service.model.errors import GraspdError, InputError, UnavailableError
+from graspd.service.model.errors import GraspdError, UnavailableError
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.identity import identify_if_redis_answers, recorded
 from graspd.service.pipeline.leading import PART
@@ -53,8 +53,6 @@ class Supervisor:
         joining: ListenAddress | None = None,
     ) -> None:
         """`settings.port` 0 selects a free port; `joining` admits workers of other machines."""
-        if workers < 0:
-            raise InputError("the number of workers cannot be negative")
         self._wanted = settings
         self._workers = workers
         self._api = api

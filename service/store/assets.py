@@ -225,8 +225,6 @@ def describe(kind: AssetKind, name: str, files: Mapping[str, bytes], *, created:
 
 
 def asset_json(files: Mapping[str, bytes]) -> bytes:
-    if "asset.json" not in files:
-        raise InputError("asset.json, a JSON object that names the main file, is not among the files")
     if isinstance(files, ZipFiles) and files.size("asset.json") > MAX_BYTES:
         raise InputError(f"asset.json has more than {MAX_BYTES} bytes; leave out what is not needed")
     return files["asset.json"]

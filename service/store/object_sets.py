@@ -58,8 +58,6 @@ def read_set(path: Path, *, limit_bytes: int) -> dict[str, bytes]:
     """Read the files of a folder or ZIP, up to `limit_bytes`; ignore links to targets outside the folder."""
     if path.is_file():
         return unpack(path.read_bytes(), limit_bytes=limit_bytes)
-    if not path.is_dir():
-        raise InputError(f"{path} is neither a folder nor a ZIP of meshes")
     root, files, total = path.resolve(), dict[str, bytes](), 0
     for file in sorted(root.rglob("*")):
         wanted = file.suffix.lower() in SUFFIXES or file.name == "asset.json"

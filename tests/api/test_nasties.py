@@ -74,15 +74,16 @@ def test_the_answer_to_a_thousand_mistakes_is_short(http: TestClient) -> None:
 
 _NO_OPTIONS = (
     '5|[1]|null|{|[]|{"\\ud800": 1}|{"facts": "\\udfff"}|{"facts": 5}|{"facts": null}|{"facts": [1]}|{"file": 5}|'
-    '{"licence": ["x"]}|{"density": NaN}'
+    '{"licence": ["x"]}|{"density": NaN}|{"facts": "x"}'
 )
-_LONG_OPTIONS = (f'{{"a": {DEEP}}}', "{" * 60_000, f'{{"density": 1{"0" * 400}}}', f'{{"facts": "{"x" * 20_000}"}}')
+_LONG_OPTIONS = (f'{{"a": {DEEP}}}', "{" * 60_000, f'{{"density": 1{"0" * 400}}}', f'{{"x": "{"ü" * 60_000}"}}')
 
 
 def test_upload_options_that_are_no_short_object_are_refused(http: TestClient) -> None:
     for options in (*_NO_OPTIONS.split("|"), DEEP, *_LONG_OPTIONS):
         answer = http.post("/v1/objects", files={"file": ("box.stl", STL)}, data={"options": options})
         assert answer.status_code == 422, options[:40]
+    assert "leave out what is not needed" in answer.json()["detail"], "nothing but many bytes"
 
 
 _DESCRIPTIONS = (

@@ -26,6 +26,7 @@ from tests.conftest import REPOSITORY
         ({"payload": "perhaps"}, "--payload: ", "payload: "),
         ({"join": "many"}, "--join: must be a number of batches from 1 to 9999, or auto; got 'many'", "join: must be"),
         ({"friction": 9}, "--friction: ", "friction: must be more than 0 and at most 3; got 9"),
+        ({"fidelity": "paint"}, "--fidelity: unknown fidelity 'paint'; choose one of", "fidelity: unknown"),
         ({"threads": -1}, "--threads: ", "threads: must be at least 0; got -1"),
     ],
 )

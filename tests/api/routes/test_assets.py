@@ -30,6 +30,7 @@ from tests.service.store.test_asset_files import HOSTILE
 from tests.waiting import PATIENCE_S
 
 STL = b"solid box\nendsolid box\n"
+LONG_FACTS = b'{"file": "box.stl", "facts": {"x": "%s"}}' % (b"x" * 9000)
 
 
 def test_an_upload_is_kept_whole_and_waits_for_its_check(http: TestClient, services: Services) -> None:
@@ -77,14 +78,18 @@ def test_an_upload_over_the_limit_is_refused_and_leaves_nothing(http: TestClient
     assert http.get("/v1/objects").json() == before
 
 
-UNUSABLE = {"empty.stl": b"", "notes.txt": b"hello", "broken.zip": b"PK\x03\x04 not a zip"}
-UNUSABLE["slip.zip"] = zipped({"../../box.stl": STL})
-
-
-@pytest.mark.parametrize(("filename", "data"), UNUSABLE.items())
-def test_an_upload_that_cannot_be_used_is_said_so(http: TestClient, filename: str, data: bytes) -> None:
+@pytest.mark.parametrize(
+    ("filename", "data", "words"),
+    [
+        ("empty.stl", b"", "is empty"),
+        ("broken.zip", b"PK\x03\x04 not a zip", "not a readable ZIP"),
+        ("main.zip", zipped({"asset.json": b'{"file": "main.stl"}', "box.stl": STL}), "not among its files"),
+        ("facts.zip", zipped({"asset.json": LONG_FACTS, "box.stl": STL}), "leave some out"),
+    ],
+)
+def test_an_upload_that_cannot_be_used_is_said_so(http: TestClient, filename: str, data: bytes, words: str) -> None:
     answer = http.post("/v1/objects", files={"file": (filename, data)})
-    assert answer.status_code == 422 and answer.json()["detail"]
+    assert answer.status_code == 422 and words in answer.json()["detail"]
 
 
 def test_files_of_a_zip_are_its_folders_or_its_asset_jsons() -> None:

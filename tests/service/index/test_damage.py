@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from click.testing import Result
 from typer.testing import CliRunner
 
 from graspd.service.index.index import Index
@@ -14,7 +15,7 @@ from graspd.service.index.rebuild import differences, rebuild
 from graspd.service.model import names
 from graspd.service.model.errors import IndexUnavailable
 from graspd.service.model.planning import plan
-from graspd.service.model.states import AssetKind, State
+from graspd.service.model.states import AssetKind, Stage, State
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.controller import Controller
@@ -54,11 +55,6 @@ def a_job(services: Services) -> str:
     return services.index.jobs.page().items[0].id
 
 
-def manifest_of(services: Services) -> str:
-    made = make_shard(services.store, message_for(seed=99))
-    return names.shard_manifest(made.stage, made.shard_id)
-
-
 def attempt_of(services: Services) -> str:
     return fail_task(services, job := a_job(services), next(plan(record_of(services, job))), last=False)
 
@@ -75,7 +71,9 @@ def ball(services: Services) -> tuple[AssetKind, str]:
 #: Keys of records, which are there but for those of a dataset.
 RECORDS: dict[str, Callable[[Services], str]] = {
     "job": lambda services: names.job_record(a_job(services)),
-    "manifest": manifest_of,
+    "manifest": lambda services: names.shard_manifest(
+        Stage.SYNTHESIZE, make_shard(services.store, message_for()).shard_id
+    ),
     "attempt": attempt_of,
     "event": event_of,
     "asset": lambda services: names.asset_record(*ball(services)),
@@ -142,45 +140,41 @@ def test_an_index_removed_under_its_readers_is_made_again(services: Services, fi
     other.close()
 
 
-def scribble_over_the_log(folder: Path) -> None:
-    log = folder / "index.sqlite-wal"
-    with log.open("r+b") as file:
-        file.write(os.urandom(log.stat().st_size))
+def scribble(folder: Path, name: str = "index.sqlite", start: int = 0) -> None:
+    if name == "index.sqlite":
+        with sqlite3.connect(folder / name) as connection:
+            connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    with (folder / name).open("r+b") as file:
+        file.write(os.urandom(file.seek(0, os.SEEK_END) - file.seek(start)))
 
 
-def scribble_over_the_file(folder: Path) -> None:
-    with sqlite3.connect(folder / "index.sqlite") as connection:
-        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-    (folder / "index.sqlite").write_bytes(os.urandom((folder / "index.sqlite").stat().st_size))
+def index_rebuild(services: Services, *more: str) -> Result:
+    return CliRunner().invoke(app, ["index", "rebuild", *more, "--data-dir", str(services.settings.data_dir)])
 
 
-def scribble_over_its_tables(folder: Path) -> None:
-    with sqlite3.connect(folder / "index.sqlite") as connection:
-        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-    with (folder / "index.sqlite").open("r+b") as file:
-        file.seek(4096)
-        file.write(os.urandom(file.seek(0, 2) - 4096))
-
-
-HARMS = [scribble_over_the_log, scribble_over_the_file, scribble_over_its_tables]
+def test_a_check_tells_damage_and_replaces_nothing(services: Services) -> None:
+    scribble(services.settings.data_dir)
+    damaged = (services.settings.data_dir / "index.sqlite").read_bytes()
+    told = index_rebuild(services, "--check")
+    assert told.exit_code == 1 and "damaged" in told.output
+    assert (services.settings.data_dir / "index.sqlite").read_bytes() == damaged
 
 
 def test_a_damaged_file_gives_way_to_a_rebuilt_one(services: Services) -> None:
     rebuild(services.index, services.store)
-    scribble_over_the_file(services.settings.data_dir)
-    command = ["index", "rebuild", "--json", "--data-dir", str(services.settings.data_dir)]
-    told = CliRunner().invoke(app, command)
+    scribble(services.settings.data_dir)
+    told = index_rebuild(services, "--json")
     assert told.exit_code == 0, told.output
     assert json.loads(told.stdout.splitlines()[-1])["jobs"] == GOOD
     assert shown(services.index) == GOOD, "who had it open sees the new one"
-    assert CliRunner().invoke(app, [*command, "--check"]).exit_code == 0
+    assert index_rebuild(services, "--check").exit_code == 0
 
 
-@pytest.mark.parametrize("harm", HARMS)
-def test_a_controller_outlives_a_damaged_index(services: Services, harm: Callable[[Path], None]) -> None:
+@pytest.mark.parametrize(("name", "start"), [("index.sqlite-wal", 0), ("index.sqlite", 0), ("index.sqlite", 4096)])
+def test_a_controller_outlives_a_damaged_index(services: Services, name: str, start: int) -> None:
     controller = Controller(services)
     controller.round()
-    harm(services.settings.data_dir)
+    scribble(services.settings.data_dir, name, start)
     for _ in range(4):
         try:
             controller.round()

@@ -13,7 +13,7 @@ from graspd.service.model.digests import digest_json, job_id, shard_id
 from graspd.service.model.domain import BATCH_SIZE, RECHECKS, SCENES, JobOptions, JobRequest
 from graspd.service.model.metrics import AXIS_MEANINGS, MIN_DISTANCE_M, ROBUST_MODELS, Axis, axis_word
 from graspd.service.model.planning import MAX_BACKOFF_S, OUTCOMES, TaskFacts, message_of, plan, shortfall, sum_outcomes
-from graspd.service.model.records import JobRecord, Member
+from graspd.service.model.records import DatasetRecord, JobRecord, Member
 from graspd.service.model.renamed import original_request
 from graspd.service.model.states import Priority, Stage, State
 from graspd.service.model.version import STAGE_REVISIONS
@@ -117,12 +117,22 @@ def test_a_job_without_a_scene_keeps_its_id_and_its_record() -> None:
     assert message_of(job, task, attempt=1, max_attempt=3).model_dump(mode="json")["request"] == wanted
 
 
+MEMBERS = [Member(name="h", digest=HAND)], [Member(name="o", digest=OBJECT)]
+DATASET = describe("d", *MEMBERS, JobOptions(), lambda one: (one, None))
+
+
 def test_a_dataset_without_a_scene_keeps_its_digest() -> None:
-    hands, objects = [Member(name="h", digest=HAND)], [Member(name="o", digest=OBJECT)]
-    made = describe("d", hands, objects, JobOptions(), lambda one: (one, None))
     options = {name: value for name, value in PLAIN.items() if name not in ("options", "target")}
     said = {"hands": [["h", HAND]], "objects": [["o", OBJECT]], "options": original_request(options)}
-    assert made.digest == digest_json(said)
+    assert DATASET.digest == digest_json(said)
+
+
+@pytest.mark.parametrize(
+    ("words", "lists"), [("a job", {"jobs": []}), ("a fidelity", {"fidelities": ["x"]}), ("reasons", {"chosen": [0]})]
+)
+def test_a_dataset_whose_lists_do_not_fit_its_cells_is_refused(words: str, lists: Any) -> None:
+    with pytest.raises(ValidationError, match=f"a dataset has (the )?{words}"):
+        DatasetRecord.model_validate(DATASET.model_dump() | lists)
 
 
 def test_scenes_after_the_grasps_have_the_address_that_they_had() -> None:
@@ -186,7 +196,9 @@ def test_a_document_comes_back_and_fingertips_may_touch_unless_it_says_otherwise
         ({"scene": "shelf", "method": "learned", "options": {"network": "n"}}, "objects on a table"),
         ({"method": "learned", "options": {"network": "n"}}, "objects on a table"),
         ({"scene": "table", "scenes": 65}, "less than or equal to 64"),
-        ({"robust": 0.5, "validation": "none"}, "choose a validator"),
+        ({"robust": 0.5, "validation": "none"}, "robust counts verdicts: choose a validator"),
+        ({"scene": "table", "shake": True, "validation": "none"}, "shake is simulated by a validator"),
+        ({"mass": 0.1, "density": 500}, "mass and density exclude each other"),
         ({"robust": 1.5}, "less than or equal to 1"),
         ({"robust": NAN}, "finite number"),
         ({"robust_models": 65}, "less than or equal to 64"),

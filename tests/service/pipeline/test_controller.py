@@ -21,6 +21,7 @@ from graspd.service.pipeline.job_actions import Routes
 from graspd.service.pipeline.lease_reaper import LOST_AFTER_S
 from graspd.service.queue.port import Event, EventKind
 from graspd.service.store.library import publish_asset, stored_assets
+from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.process.runner import Runner
 from graspd.worker.stages.context import StopReason, TaskContext
 from tests.fakes import HAND_FILES, fake_stages, request, with_settings
@@ -49,22 +50,32 @@ class Bench:
         assert delivery is not None
         return delivery
 
-    def do(self, delivery: Delivery, **stages: Any) -> Event | None:
+    def do(self, delivery: Delivery, *, device: str = "cpu", **stages: Any) -> Event | None:
         table = fake_stages() | {Stage(name): stage for name, stage in stages.items()}
-        runner = Runner(table, worker="w", publish=self.queue.publish)
+        # The name of a device is all that these stages see of it.
+        runner = Runner(table, worker="w", publish=self.queue.publish, check_device=lambda device: None)
         raw = delivery.message.model_dump(mode="json", by_alias=True)
-        outcome = runner.run(raw, TaskContext(self.services.store))
+        outcome = runner.run(raw, TaskContext(self.services.store, ExecutionContext(device)))
         self.queue.finish(delivery)
         if outcome is not None:
             self.queue.publish(outcome)
         return outcome
 
-    def work_off(self, **stages: Any) -> None:
-        """Worker and controller in turns until nothing waits."""
+    def work_off(self, **how: Any) -> list[EventKind]:
+        """Worker and controller in turns until nothing waits; how each task ended."""
+        ends = []
         self.pass_time(1)
         while (delivery := self.queue.take("w")) is not None:
-            self.do(delivery, **stages)
+            ends += [event.kind for event in [self.do(delivery, **how)] if event is not None]
             self.pass_time(1)
+        return ends
+
+    def lose_workers(self) -> None:
+        """Every worker that takes the task falls silent."""
+        for _ in range(self.services.settings.task_attempts):
+            self.take()
+            self.pass_time(self.services.settings.lease_s + 2)
+        assert self.queue.take("w") is None
 
 
 @pytest.fixture
@@ -141,10 +152,7 @@ def test_a_worker_that_was_only_slow_changes_nothing(bench: Bench) -> None:
 
 def test_a_task_that_kills_every_worker_stops_after_its_attempts(bench: Bench) -> None:
     job, _ = job_actions.submit(bench.services, request(scenes=1))
-    for _ in range(bench.services.settings.task_attempts):
-        bench.take()
-        bench.pass_time(bench.services.settings.lease_s + 2)
-    assert bench.queue.take("w") is None
+    bench.lose_workers()
     failed = bench.services.index.jobs.get(job.id)
     assert failed.state is State.FAILED
     assert failed.reason is not None and "was lost: no heartbeat for 6 s" in failed.reason
@@ -388,10 +396,7 @@ def test_the_window_is_refilled_as_it_empties(bench: Bench) -> None:
 def test_an_upload_that_kills_every_worker_is_refused(bench: Bench) -> None:
     add_upload(bench)
     bench.pass_time(1)
-    for _ in range(bench.services.settings.task_attempts):
-        bench.take()
-        bench.pass_time(bench.services.settings.lease_s + 2)
-    assert bench.queue.take("w") is None
+    bench.lose_workers()
     assert bench.services.index.assets.get(AssetKind.HAND, "upload").verdict == "refuse"
 
 

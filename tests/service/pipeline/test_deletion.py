@@ -7,6 +7,7 @@ from unittest.mock import Mock
 import pytest
 
 from graspd.service.index.changes.removals import Removals
+from graspd.service.index.database import Database
 from graspd.service.index.rebuild import differences
 from graspd.service.model import names
 from graspd.service.model.errors import ConflictError, NotFoundError
@@ -19,35 +20,25 @@ from graspd.service.pipeline.datasets.spec import DatasetRequest
 from graspd.service.pipeline.deletion import GarbageCollector, delete_asset, delete_dataset, delete_job, restore
 from graspd.service.store.library import publish_asset
 from graspd.service.store.records import deletions, pending
-from tests.fakes import OBJECT_FILES, make_shard, plan_all, request, with_settings
-from tests.service.pipeline.datasets.makers import fail
+from tests.fakes import OBJECT_FILES, finish, plan_all, record_of, request, with_settings
+from tests.service.pipeline.datasets.makers import add_asset, done, fail
 
 
 def finished(services: Services, **changes: Any) -> str:
     """A job whose shards are there."""
     job, _ = job_actions.submit(services, request(**changes))
-    _make_all(services)
-    assert services.index.jobs.get(job.id).state is State.SUCCEEDED
+    finish(services, job.id)
     return job.id
 
 
-def _make_all(services: Services) -> None:
-    queue: Any = services.queue
-    while (delivery := queue.take("w")) is not None:
-        services.index.write.add_manifests([make_shard(services.store, delivery.message)])
-        queue.finish(delivery)
-        for job in services.index.jobs.page().items:
-            job_actions._start(services, job.id)
-
-
-def dataset(services: Services, name: str = "d", **changes: Any) -> str:
+def dataset(services: Services, name: str = "d", **changes: Any) -> None:
     """A finished dataset of one cell."""
-    wanted = DatasetRequest(name=name, hands=("gripper",), objects=("ball",), **{"grasps": 32, **changes})
-    actions.create(services, wanted)
-    plan_all(services)
-    _make_all(services)
-    assert services.index.datasets.get(name).state is State.SUCCEEDED
-    return name
+    done(services, name, hands=("gripper",), objects=("ball",), **changes)
+
+
+def tag(services: Services) -> None:
+    shard = next(shard.id for shard in services.index.shards.page(job=finished(services)).items if shard.kind == "base")
+    tagging.tag_grasps(services, "good", [(shard, 0), (shard, 3)], project="", owner="", permit=lambda _: None)
 
 
 def keys(services: Services, *prefixes: str) -> set[str]:
@@ -163,25 +154,29 @@ def _jobs(services: Services) -> list[str]:
     return [job.id for job in services.index.jobs.page().items]
 
 
-BALL = (AssetKind.OBJECT, "ball")
-#: What is there, how it is deleted, what of the index removes its rows, and where its objects lie.
-ACTS: dict[str, tuple[Callable[[Services], object], Callable[[Services], object], str, tuple[str, ...]]] = {
-    "job": (finished, lambda services: delete_job(services, _jobs(services)[0]), "remove_job", ("jobs",)),
-    "dataset": (dataset, lambda services: delete_dataset(services, "d"), "remove_dataset", ("datasets", "jobs")),
-    "object": (lambda _: None, lambda services: delete_asset(services, *BALL), "remove_asset", ("assets/object",)),
+Act = Callable[[Services], object]
+#: How it comes to be, if it is not there already, and how it is deleted.
+MAKE: dict[Any, Act] = {"job": finished, "dataset": dataset, "object": lambda _: None, "tag": tag}
+DELETE: dict[Any, Act] = {
+    "job": lambda services: delete_job(services, _jobs(services)[0]),
+    "dataset": lambda services: delete_dataset(services, "d", with_snapshots=True),
+    "object": lambda services: delete_asset(services, AssetKind.OBJECT, "ball"),
+    "tag": lambda services: tagging.delete_tag(services, tag_id("good", ""), permit=lambda _: None),
 }
+#: Where its objects lie.
+FOLDERS = {"job": ["jobs"], "dataset": ["datasets", "jobs"], "object": ["assets/object"]}
 
 
-@pytest.mark.parametrize("what", ACTS)
+@pytest.mark.parametrize("what", FOLDERS)
 def test_the_next_controller_carries_out_a_broken_deletion(
     services: Services, what: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    make, act, remove, folders = ACTS[what]
-    make(services)
+    remove, folders = f"remove_{what.replace('object', 'asset')}", FOLDERS[what]
+    MAKE[what](services)
     with monkeypatch.context() as patch:
         patch.setattr(Removals, remove, Mock(side_effect=KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
-            act(services)
+            DELETE[what](services)
     assert pending(services.store)
     real, place = type(services.store).delete, 0
     while keys(services, "deletions"):
@@ -203,45 +198,85 @@ def collect_garbage(services: Services) -> None:
     GarbageCollector(services).advance()
 
 
+def all_shown(services: Services) -> object:
+    jobs, datasets = services.index.jobs, services.index.datasets
+    told = [(job, jobs.attempts(job=job.id)) for job in jobs.page().items]
+    told += [(one, datasets.snapshots(one.name).items) for one in datasets.page().items]
+    return told, [(tag.name, tag.grasps) for tag in services.index.tags.all()]
+
+
 @COLLECTED
-def test_a_deleted_job_is_restored_as_it_was(services: Services, collected: bool) -> None:
-    job, _ = job_actions.submit(services, request())
-    fail(services, job.id)
-    before = services.index.jobs.get(job.id), services.index.jobs.attempts(job=job.id)
-    delete_job(services, job.id)
+@pytest.mark.parametrize("what", ["job", "dataset", "tag"])
+def test_what_was_deleted_is_restored_as_it_was(services: Services, what: Any, collected: bool) -> None:
+    MAKE[what](services)
+    if what == "dataset":
+        actions.snapshot(services, "d")
+    fail(services, job_actions.submit(services, request(seed=7))[0].id)
+    before = all_shown(services)
+    DELETE[what](services)
+    assert all_shown(services) != before
     if collected:
         collect_garbage(services)
-    restore(services, "job", job.id, permit=lambda _: None)
-    assert (services.index.jobs.get(job.id), services.index.jobs.attempts(job=job.id)) == before
+    restore(services, what, deletions(services.store, what)[0].id, permit=lambda _: None)
+    assert all_shown(services) == before
     assert not deletions(services.store)
     assert not GarbageCollector(services).advance()
     assert differences(services.index, services.store) == []
 
 
-@COLLECTED
-def test_a_deleted_dataset_is_restored_with_jobs_and_snapshots(services: Services, collected: bool) -> None:
-    dataset(services)
-    actions.snapshot(services, "d")
-    before = services.index.datasets.get("d"), services.index.datasets.snapshots("d").items, _jobs(services)
-    delete_dataset(services, "d", with_snapshots=True)
-    if collected:
-        collect_garbage(services)
-        assert _jobs(services) == []
-    restore(services, "dataset", "d", permit=lambda _: None)
-    collect_garbage(services)
-    assert (services.index.datasets.get("d"), services.index.datasets.snapshots("d").items, _jobs(services)) == before
-    assert not deletions(services.store)
-    assert differences(services.index, services.store) == []
+#: What gets the name of what was deleted.
+ANOTHER: dict[Any, Act] = {
+    "dataset": lambda services: dataset(services, grasps=64),
+    "object": lambda services: add_asset(services, "object", "ball", content="other"),
+    "tag": tag,
+}
 
 
-def test_what_was_made_again_is_not_written_over(services: Services) -> None:
-    dataset(services)
-    delete_dataset(services, "d")
+@pytest.mark.parametrize("what", ANOTHER)
+def test_what_was_made_again_is_not_written_over(services: Services, what: Any) -> None:
+    MAKE[what](services)
+    DELETE[what](services)
     collect_garbage(services)
-    dataset(services, "d", grasps=64)
-    with pytest.raises(ConflictError, match="there is a dataset 'd' again"):
-        restore(services, "dataset", "d", permit=lambda _: None)
-    assert services.index.datasets.get("d").asked == 64
+    ANOTHER[what](services)
+    before = {key: services.store.get(key) for key in keys(services, "assets", "datasets", "tags")}
+    with pytest.raises(ConflictError, match=r"there is .* '.*' (again|now); delete that first"):
+        restore(services, what, deletions(services.store, what)[0].id, permit=lambda _: None)
+    assert {key: services.store.get(key) for key in before} == before
+
+
+#: What is there, what others do just before the lock of a request, the request, and what it is told.
+MEANWHILE: list[tuple[Act, list[Act], Act, str]] = [
+    (finished, [DELETE["job"]], DELETE["job"], "there is no job"),
+    (
+        finished,
+        [DELETE["job"], collect_garbage],
+        lambda services: job_actions.enter(services, record_of(services, _jobs(services)[0]), keeps_assets=True),
+        "deleted just now; submit it again",
+    ),
+    (tag, [DELETE["tag"]], DELETE["tag"], "there is no tag"),
+    (
+        dataset,
+        [DELETE["dataset"], collect_garbage, ANOTHER["dataset"]],
+        lambda services: actions.snapshot(services, "d"),
+        "there is another one; try again",
+    ),
+]
+
+
+@pytest.mark.parametrize(("make", "rivals", "ask", "words"), MEANWHILE)
+def test_what_changed_before_the_lock_is_told(
+    services: Services, monkeypatch: pytest.MonkeyPatch, make: Act, rivals: list[Act], ask: Act, words: str
+) -> None:
+    def after_the_rivals(*given: Any) -> Any:
+        monkeypatch.undo()
+        for rival in rivals:
+            rival(services)
+        return Database.writing(*given)
+
+    make(services)
+    monkeypatch.setattr(Database, "writing", after_the_rivals)
+    with pytest.raises((ConflictError, NotFoundError), match=words):
+        ask(services)
 
 
 @COLLECTED
@@ -260,16 +295,6 @@ def test_a_job_is_restored_after_its_object(services: Services, collected: bool)
     assert services.index.assets.get(AssetKind.OBJECT, "ball") == before
     assert services.index.jobs.get(job).state is State.SUCCEEDED
     assert differences(services.index, services.store) == []
-
-
-def test_a_deleted_tag_is_restored_with_its_grasps(services: Services) -> None:
-    job = finished(services)
-    shard = next(shard.id for shard in services.index.shards.page(job=job).items if shard.kind == "base")
-    tagging.tag_grasps(services, "good", [(shard, 0), (shard, 3)], project="", owner="", permit=lambda _: None)
-    tagging.delete_tag(services, tag_id("good", ""), permit=lambda _: None)
-    restore(services, "tag", "good", permit=lambda _: None)
-    assert [(tag.name, tag.grasps) for tag in services.index.tags.all()] == [("good", 2)]
-    assert not deletions(services.store)
 
 
 def _after(count: int, real: Any) -> Any:

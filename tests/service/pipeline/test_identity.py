@@ -3,6 +3,7 @@
 import shutil
 import threading
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -48,6 +49,12 @@ def test_a_second_service_on_a_redis_is_refused(first: Services, tmp_path: Path)
     for take_over in (False, False, True):
         with pytest.raises(BusyError, match=r"Redis belongs to another graspd service.*GRASPD_REDIS_URL"):
             identify(second, take_over=take_over)
+
+
+def test_of_two_that_begin_on_one_redis_one_is_refused(first: Services, tmp_path: Path) -> None:
+    queue = Mock(first.queue, service=Mock(side_effect=[None, first.queue.service()]))
+    with pytest.raises(BusyError, match="Redis belongs to another"):
+        identify(service(tmp_path / "second", queue=queue))
 
 
 def test_a_worker_of_another_store_is_refused(first: Services, tmp_path: Path) -> None:
@@ -141,19 +148,6 @@ def test_what_is_forged_in_redis_stops_no_controller(first: Services) -> None:
     assert first.queue.service() == first.index.notes.service()
 
 
-class Moody(MemoryQueue):
-    """A queue whose Redis may be away."""
-
-    away = False
-    asked_in_vain = 0
-
-    def lead(self, holder: str, seconds: float) -> bool:
-        if self.away:
-            self.asked_in_vain += 1
-            raise QueueUnavailable("away")
-        return super().lead(holder, seconds)
-
-
 #: Longer than any test: no lease runs out on a busy machine.
 LEASE_S = 600.0
 
@@ -216,14 +210,14 @@ def test_a_lease_that_another_has_is_over_and_is_not_given_back() -> None:
     assert queue._lease[0] == "another"
 
 
-def test_while_redis_is_away_nobody_loses_the_lead() -> None:
-    queue, stop = Moody(), threading.Event()
+def test_while_redis_is_away_nobody_loses_the_lead(monkeypatch: pytest.MonkeyPatch) -> None:
+    queue, stop, away = MemoryQueue(), threading.Event(), Mock(side_effect=QueueUnavailable("away"))
     mine = leadership(queue)
     assert mine.wait(stop)
     with mine.held(stop) as over:
-        queue.away = True
-        until(lambda: queue.asked_in_vain > 3, "it tries again and again")
-        queue.away = False
+        with monkeypatch.context() as patch:
+            patch.setattr(queue, "lead", away)
+            until(lambda: away.call_count > 3, "it tries again and again")
         begun = queue._lease[1]
         until(lambda: queue._lease[1] > begun, "it is renewed")
         assert not over.is_set()

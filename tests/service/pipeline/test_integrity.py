@@ -14,17 +14,14 @@ from graspd.service.model.errors import DamagedShard
 from graspd.service.model.states import State
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
-from graspd.service.pipeline.controller import Controller
 from graspd.service.pipeline.integrity import BAD_MANIFEST, FOREIGN, MISSING, NO_MANIFEST, repair, scan
 from graspd.service.queue.port import EventKind
 from graspd.service.run import commands, store_commands
 from graspd.service.store.manifests import ShardManifest, load_manifest, load_shard
-from graspd.worker.execution_context import ExecutionContext
-from graspd.worker.process.runner import Runner
-from graspd.worker.stages.context import TaskContext
 from tests.damage import cut, flip, overwrite, remove
-from tests.fakes import fake_stages, request
+from tests.fakes import request
 from tests.service.conftest import service
+from tests.service.pipeline.test_controller import Bench
 
 SHARDS = 6
 
@@ -42,28 +39,11 @@ def findings(services: Services) -> list[Damage]:
 def shards(services: Services) -> list[ShardManifest]:
     """Finished shards, in the order of their batches."""
     job, _ = job_actions.submit(services, request(grasps=32 * SHARDS))
-    work_off(services)
+    Bench(services).work_off()
     assert services.index.jobs.get(job.id).state is State.SUCCEEDED
     listed = services.index.shards.page(job=job.id, limit=99).items
     found = [load_manifest(services.store, shard.stage, shard.id) for shard in listed]
     return sorted(found, key=lambda manifest: manifest.batch)
-
-
-def work_off(services: Services, *, device: str = "cpu", seed: int = 0) -> list[EventKind]:
-    """Worker and controller in turns until nothing waits."""
-    controller, ends = Controller(services), []
-    controller.round()
-    while (delivery := services.queue.take("w")) is not None:  # type: ignore[attr-defined]
-        # The name of a device is all that these stages see of it.
-        runner = Runner(fake_stages(), worker="w", publish=services.queue.publish, check_device=lambda device: None)
-        raw = delivery.message.model_dump(mode="json", by_alias=True)
-        outcome = runner.run(raw, TaskContext(services.store, ExecutionContext(device)))
-        services.queue.finish(delivery)  # type: ignore[attr-defined]
-        assert outcome is not None
-        services.queue.publish(outcome)
-        ends.append(outcome.kind)
-        controller.round()
-    return ends
 
 
 def harm(services: Services, shards: list[ShardManifest]) -> dict[str, str]:
@@ -92,7 +72,7 @@ def test_what_is_made_again_has_the_checksum_it_had(services: Services, shards: 
     (one,) = left
     assert one.what == f"{NO_MANIFEST}; its manifest may follow soon; run the command again in a minute"
     assert len(repaired) == 4
-    work_off(services)
+    Bench(services).work_off()
     for manifest in (*shards[:4], shards[5]):
         load_shard(services.store, manifest.stage, manifest.shard_id)
         assert load_manifest(services.store, manifest.stage, manifest.shard_id).sha256 == manifest.sha256
@@ -102,7 +82,7 @@ def test_what_is_made_again_has_the_checksum_it_had(services: Services, shards: 
 def test_what_comes_out_otherwise_is_not_put(services: Services, shards: list[ShardManifest]) -> None:
     remove(services.store, shards[0].key)
     repair(services, findings(services))
-    assert work_off(services, device="cuda:0") == [EventKind.CANCELLED]
+    assert Bench(services).work_off(device="cuda:0") == [EventKind.CANCELLED]
     with pytest.raises(DamagedShard):
         load_shard(services.store, shards[0].stage, shards[0].shard_id)
     assert differences(services.index, services.store) == []

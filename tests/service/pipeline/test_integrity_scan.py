@@ -103,14 +103,10 @@ def full(services: Services) -> Services:
     return services
 
 
-def keys_of_each_kind(services: Services) -> list[str]:
-    kinds = {_ID.sub("*", entry.key): entry.key for folder in FOLDERS for entry in services.store.list(folder)}
-    return sorted(kinds.values())
-
-
 def test_every_flipped_byte_is_found_and_named(full: Services) -> None:
     draw, missed, candidates = random.Random(45), [], 0
-    keys = keys_of_each_kind(full)
+    kinds = {_ID.sub("*", entry.key): entry.key for folder in FOLDERS for entry in full.store.list(folder)}
+    keys = sorted(kinds.values())
     for key in keys:
         data = full.store.get(key)
         for at in draw.sample(range(len(data)), FLIPS):

@@ -30,8 +30,9 @@ from graspd.service.pipeline.datasets.spec import DatasetRequest
 from graspd.service.pipeline.deletion import delete_asset, delete_job
 from graspd.service.queue.port import Event, EventKind
 from graspd.service.settings import Settings
-from tests.fakes import add_assets, finish, make_shard, record_of, request
+from tests.fakes import add_assets, make_shard, record_of, request
 from tests.indexes import open_services
+from tests.service.pipeline.test_deletion import finished
 
 
 @pytest.fixture
@@ -156,12 +157,6 @@ def test_a_controller_killed_between_index_and_store_is_harmless(
 
 
 ALL = (names.JOBS, names.DATASETS, names.OBJECT_SETS, names.TAGS, names.DELETIONS)
-
-
-def finished(services: Services, **changes: object) -> str:
-    job, _ = job_actions.submit(services, request(**changes))
-    finish(services, job.id)
-    return job.id
 
 
 def create(services: Services) -> object:

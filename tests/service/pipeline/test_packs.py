@@ -4,6 +4,7 @@ import hashlib
 import json
 import struct
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from itertools import accumulate
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,6 @@ from graspd.service.model.clock import timestamp
 from graspd.service.model.digests import digest_bytes, digest_json
 from graspd.service.model.errors import InputError, StoreUnavailable
 from graspd.service.model.messages import TaskMessage
-from graspd.service.model.records import Snapshot
 from graspd.service.model.states import Stage, State
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
@@ -28,13 +28,13 @@ from graspd.service.store import packs
 from graspd.service.store.integrity import read_checked
 from graspd.service.store.manifests import ShardManifest, load_manifest, load_shard, publish_shard, shard_exists
 from graspd.service.store.packs import has_packs, unpack_all
-from graspd.service.store.records import put_record
 from graspd.service.store.store import Store, open_store
 from tests.damage import flipped, overwrite
 from tests.fakes import job_record, make_shard, record_of, request, tasks_of
 from tests.service.conftest import service
 from tests.service.pipeline.test_controller import Bench
-from tests.service.pipeline.test_integrity import findings, work_off
+from tests.service.pipeline.test_integrity import findings
+from tests.service.readers.conftest import put_snapshot
 
 
 def batches(count: int, **changes: object) -> list[TaskMessage]:
@@ -121,7 +121,7 @@ def test_what_is_harmed_in_a_pack_is_made_again(services: Services) -> None:
     found = findings(services)
     assert [wrong.shard for wrong in found] == [tasks[1].output]
     assert repair(services, found) == (found, [])
-    work_off(services)
+    Bench(services).work_off()
     assert findings(services) == []
     assert is_whole(services, job)
 
@@ -136,16 +136,10 @@ def test_readers_name_the_command_and_read_places_in_packs(services: Services) -
     told = CliRunner().invoke(store_commands.app, ["store", "upgrade", "--json", "--data-dir", str(folder)])
     assert json.loads(told.stdout.splitlines()[-1]) == {"shards": 2}
     found = open_shards(services.store, job=job, cache=folder / "cache")
-    of_all = {"kind": "base", "size_bytes": 1, "count": 32, "valid": 1, "hand": "gripper", "object": "ball"}
     place = f"packs/{'a' * 32}/{'b' * 32}.pack@{{}}+100"
-    shards = [
-        of_all | {"id": file.id, "key": place.format(row), "sha256": file.sha256, "batch": row}
-        for row, file in enumerate(found)
-    ]
-    sums = {"complete": True, "grasps": 64, "valid": 2, "size_bytes": 2, "dataset_digest": "d" * 32}
-    taken = Snapshot(dataset="d", digest="c" * 32, created=timestamp(), shards=shards, **sums)
-    put_record(services.store, f"{names.DATASETS}/d/snapshots/{taken.digest}.json", taken)
-    of_snapshot = open_shards(services.store, dataset="d", snapshot=taken.digest, cache=folder / "cache")
+    packed = [replace(file, key=place.format(row)) for row, file in enumerate(found)]
+    put_snapshot(services.store, "d", packed, created=timestamp())
+    of_snapshot = open_shards(services.store, dataset="d", cache=folder / "cache")
     assert [of_snapshot.path(file) for file in of_snapshot] == [found.path(file) for file in found]
 
 

@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from graspd.service.index.changes.records import Changes
 from graspd.service.index.rebuild import differences
 from graspd.service.model.messages import FIRST_SCHEMA, Requirements, WorkerBeat, capabilities
-from graspd.service.model.planning import message_of, needed_schema, plan
+from graspd.service.model.planning import needed_schema
 from graspd.service.model.records import JobRecord
 from graspd.service.model.states import AssetKind, Priority, Stage, State
 from graspd.service.model.version import SCHEMA_OF_RANGES, STAGE_REVISIONS, TASK_SCHEMA
@@ -26,10 +26,8 @@ from graspd.service.pipeline.job_actions import Route, Routes, TaskRanges, span_
 from graspd.service.queue import entries
 from graspd.service.queue.entries import list_names, queue_name, queue_names
 from graspd.service.queue.rq_queue import RqQueue
-from graspd.service.store.library import publish_asset
-from graspd.service.store.manifests import ShardManifest, publish_shard
-from graspd.worker.stages.context import TaskContext, shard_of
-from tests.fakes import OBJECT_FILES, beat_of, fake_stages, message_for, plan_all, request, with_settings
+from graspd.service.store.manifests import ShardManifest
+from tests.fakes import OBJECT_FILES, beat_of, make_shard, message_for, plan_all, put_asset, request, with_settings
 from tests.service.pipeline.test_controller import Bench
 
 OWN = capabilities()
@@ -136,13 +134,8 @@ def here(services: Services, *workers: WorkerBeat) -> None:
 
 def measured(services: Services, seconds: float) -> None:
     """A batch took so long."""
-    job, _ = job_actions.submit(services, request(seed=99))
-    (task,) = plan(record := JobRecord.model_validate_json(services.store.get(f"jobs/{job.id}/job.json")))
-    message = message_of(record, task, attempt=1, max_attempt=1)
-    made = fake_stages()[Stage.SYNTHESIZE](message, TaskContext(services.store))
-    manifest, data = shard_of(message, made, device="cpu", seconds=seconds, worker="w")
-    publish_shard(services.store, manifest, data)
-    services.index.write.add_manifests([manifest])
+    made = make_shard(services.store, message_for(seed=99))
+    services.index.write.add_manifests([made.model_copy(update={"seconds": seconds})])
 
 
 def span(services: Services, grasps: int, priority: Priority = Priority.BULK, **changes: object) -> int:
@@ -184,8 +177,7 @@ def test_cells_of_a_dataset_share_the_workers(services: Services, cells: int, ta
     measured(services, 0.01)
     here(services, *(worker(f"w{number}") for number in range(4)))
     for number in range(1, cells):
-        asset = publish_asset(services.store, AssetKind.OBJECT, f"ball{number}", {**OBJECT_FILES, "n": bytes([number])})
-        services.index.write.add_asset(asset, {"verdict": "accept", "message": "fine"})
+        put_asset(services, AssetKind.OBJECT, f"ball{number}", {**OBJECT_FILES, "n": bytes([number])})
     objects = ("ball", *(f"ball{number}" for number in range(1, cells)))
     actions.create(services, DatasetRequest(name="d", hands=("gripper",), objects=objects, grasps=32 * 16))
     assert services.index.datasets.get("d").tasks == 16 * cells, "with a batch a task, until it is known"

@@ -22,36 +22,26 @@ from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.datasets import actions
 from graspd.service.pipeline.datasets.spec import DatasetRequest
 from graspd.service.pipeline.deletion import GarbageCollector, delete_asset, delete_dataset, delete_job
-from graspd.service.store.library import publish_asset
 from graspd.service.store.network_file import check_network
 from tests.api.factories import fail
-from tests.fakes import make_task, plan_all, record_of, request
+from tests.fakes import make_task, plan_all, put_asset, record_of, request
 from tests.networks import network_files, random_network
 
 FLOOR = {"kind": "half_space"}
 UPRIGHT = [1.0, 0, 0, 0]
 
 
-def put(services: Services, kind: AssetKind, name: str, files: dict[str, bytes], check: dict[str, Any] | None) -> str:
-    """An asset and the result of its check; its digest."""
-    asset = publish_asset(services.store, kind, name, files)
-    if check is not None:
-        services.store.put(names.asset_check(kind, asset.digest), json.dumps(check).encode())
-    services.index.write.add_asset(asset, check)
-    return asset.digest
-
-
 def add_cup(services: Services, version: int = 0, *, verdict: str | None = "accept", **facts: Any) -> str:
     files = {"asset.json": b'{"file": "a.stl"}', "a.stl": f"solid cup{version}\nendsolid\n".encode()}
     check = {"verdict": verdict, "message": "it is none", "repairs": [], "facts": facts} if verdict else None
-    return put(services, AssetKind.OBJECT, "cup", files, check)
+    return put_asset(services, AssetKind.OBJECT, "cup", files, check)
 
 
 def add_network(services: Services, version: int = 0, *, verdict: str | None = "accept") -> str:
     digest = services.index.assets.get(AssetKind.HAND, "gripper").digest
     files = network_files(random_network(hand="gripper", digest=digest, seed=version))
     check = check_network(files, "net") | {"verdict": verdict, "message": "it is none"} if verdict else None
-    return put(services, AssetKind.NETWORK, "net", files, check)
+    return put_asset(services, AssetKind.NETWORK, "net", files, check)
 
 
 @dataclass(frozen=True)

@@ -132,9 +132,8 @@ def test_a_name_with_a_private_address_is_refused_untold(monkeypatch: pytest.Mon
 
 
 def test_a_name_that_cannot_be_looked_up_tells_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        webhook_dispatcher.socket, "getaddrinfo", Mock(side_effect=OSError("resolver 10.0.0.2: NXDOMAIN"))
-    )
+    lost = Mock(side_effect=OSError("resolver 10.0.0.2: NXDOMAIN"))
+    monkeypatch.setattr(webhook_dispatcher.socket, "getaddrinfo", lost)
     answer = post("http://nothing.internal/", b"{}", {})
     assert not answer.is_final and answer.detail == "the host of the address cannot be looked up"
 

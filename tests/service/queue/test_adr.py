@@ -136,8 +136,10 @@ OVERRIDDEN |= {"reorder_queues", "subscribe"}
 
 def test_rq_is_used_as_rq() -> None:
     """Members of RQ's classes that classes of the product redefine; names with two underscores do not count."""
-    for module in _modules_with_rq():
-        import_module(module)
+    files = [file for package in PACKAGES for file in (REPOSITORY / package).rglob("*.py")]
+    for file in files:
+        if re.search(r"^(from|import) rq\b", file.read_text(), re.MULTILINE):
+            import_module("graspd." + ".".join(file.relative_to(REPOSITORY).with_suffix("").parts))
     ours = {
         found
         for base in (BaseWorker, Job, Queue, BaseRegistry, Execution, BaseDeathPenalty)
@@ -150,13 +152,6 @@ def test_rq_is_used_as_rq() -> None:
         for name in vars(found)
         if not name.startswith("__") and any(name in vars(base) for base in found.__mro__ if base not in ours)
     } == OVERRIDDEN
-
-
-def _modules_with_rq() -> list[str]:
-    files = [file for package in PACKAGES for file in sorted((REPOSITORY / package).rglob("*.py"))]
-    found = [file for file in files if re.search(r"^(from|import) rq\b", file.read_text(), re.MULTILINE)]
-    assert found
-    return ["graspd." + ".".join(file.relative_to(REPOSITORY).with_suffix("").parts) for file in found]
 
 
 def _subclasses(base: type) -> Iterator[type]:

@@ -1,6 +1,7 @@
 """The queue's contract, held against Redis and against its twin in memory."""
 
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -10,11 +11,13 @@ from rq.executions import prepare_execution
 from rq.serializers import JSONSerializer
 
 from graspd.service.model.clock import timestamp
+from graspd.service.model.errors import QueueUnavailable
 from graspd.service.model.messages import IngestMessage, TaskMessage
 from graspd.service.model.states import Priority, Stage
+from graspd.service.queue.connection import connect
 from graspd.service.queue.entries import held_key, list_key, queue_name, queue_names
 from graspd.service.queue.port import BULK_EVERY, Event, EventKind
-from graspd.service.queue.rq_queue import LEAD, RqQueue, lease_state, list_worker, renew_lease, worker_key
+from graspd.service.queue.rq_queue import EVENTS, LEAD, RqQueue, lease_state, list_worker, renew_lease, worker_key
 from graspd.worker.process.heartbeat import Heartbeat
 from graspd.worker.stages.context import StopReason
 from tests.fakes import beat_of, message_for
@@ -210,15 +213,10 @@ def test_events_come_once_in_order_and_again_if_not_acknowledged(queue: RqQueue)
     queue.acknowledge([event_id for event_id, _ in first[:1]])
     assert [event.task_id for _, event in queue.consume(limit=9, wait_s=0)] == ["c"]
     assert queue.consume(limit=9, wait_s=0) == []
-    restarted = _restarted(queue)
-    assert [event.task_id for _, event in restarted.consume(limit=9, wait_s=0)] == ["b", "c"]
-
-
-def _restarted(queue: RqQueue) -> RqQueue:
     if isinstance(queue, MemoryQueue):
         queue.restart_consumer()
-        return queue
-    return RqQueue(queue.connection)
+    restarted = queue if isinstance(queue, MemoryQueue) else RqQueue(queue.connection)
+    assert [event.task_id for _, event in restarted.consume(limit=9, wait_s=0)] == ["b", "c"]
 
 
 def test_any_number_of_readers_follow_the_stream(queue: RqQueue) -> None:
@@ -264,6 +262,17 @@ def test_a_lease_that_is_none_keeps_nobody_from_leading(rq_queue: RqQueue, forge
     forge(rq_queue.connection)
     assert not rq_queue.lead("a", 600)
     assert rq_queue.lead("a", 600)
+
+
+@pytest.mark.parametrize(
+    ("command", "ask"), [("smembers", RqQueue.waiting), ("set", lambda queue: queue.lead("a", 600))]
+)
+def test_what_redis_forbids_is_told(rq_queue: RqQueue, redis_server: str, command: str, ask: Any) -> None:
+    rights = ["+@all", f"-{command}"]
+    rq_queue.connection.acl_setuser("limited", enabled=True, nopass=True, keys=["*"], commands=rights)
+    queue = RqQueue(connect(redis_server.replace("://", "://limited:x@")))
+    with closing(queue), pytest.raises(QueueUnavailable, match="permissions"):
+        ask(queue)
 
 
 def test_sums_add_up_and_each_name_has_its_own(queue: RqQueue) -> None:
@@ -369,3 +378,15 @@ def test_unreadable_events_stay_nobodys_work(rq_queue: RqQueue) -> None:
     ((event_id, _),) = rq_queue.consume(limit=9, wait_s=0)
     rq_queue.acknowledge([event_id])
     assert rq_queue.connection.xpending("graspd:events", "keeper")["pending"] == 0
+
+
+def test_everything_in_redis_of_no_fixed_number_has_an_end(rq_queue: RqQueue) -> None:
+    rq_queue.enqueue([task()], Priority.BULK)
+    rq_queue.discard(["0" * 32])
+    rq_queue.announce("controller", 5)
+    rq_queue.lead("a", 5)
+    rq_queue.publish(Event(kind=EventKind.STARTED, at=timestamp(), task_id="a"))
+    rq_queue.publish(Event(kind=EventKind.FINISHED, at=timestamp(), task_id="a"))
+    fixed = ("rq:queue", "rq:job", "rq:unique", EVENTS, "graspd:workers", "graspd:tally")
+    without_end = [key.decode() for key in rq_queue.connection.keys("*") if rq_queue.connection.ttl(key) < 0]
+    assert [key for key in without_end if not key.startswith(fixed)] == []

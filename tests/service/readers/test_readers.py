@@ -3,6 +3,7 @@
 import hashlib
 import os
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,21 +13,18 @@ import pytest
 from obstore.store import MemoryStore
 
 from graspd.service.model.errors import DamagedShard, InputError, NotFoundError
-from graspd.service.model.names import dataset_snapshot
-from graspd.service.model.records import Snapshot
 from graspd.service.model.transforms import compose, pose_from_matrix
 from graspd.service.pipeline.backends import Services
 from graspd.service.readers import Grasps, Pictures, ShardCache, Shards, open_shards
 from graspd.service.readers.rows import RowTable
 from graspd.service.settings import Settings
 from graspd.service.store.columns import SCHEMAS
-from graspd.service.store.records import put_record
 from graspd.service.store.shards import read_shard
 from graspd.service.store.store import Store, open_store
 from tests.damage import flipped, flipped_values
 from tests.indexes import open_services
 from tests.servers import S3Server
-from tests.service.readers.conftest import GRASPS, job_in
+from tests.service.readers.conftest import GRASPS, job_in, put_snapshot
 
 
 @pytest.fixture
@@ -68,6 +66,28 @@ def test_a_condition_keeps_the_grasps_it_holds_for(shards: Shards) -> None:
         Grasps(shards, where=lambda columns: np.ones(3, bool))
 
 
+UNREADABLE: dict[str, Callable[[Shards], object]] = {
+    "a job or a dataset": lambda shards: open_shards(shards.store),
+    "no column 'grasp/colour'; docs": lambda shards: Grasps(shards, ["grasp/colour"]),
+    "on mug has no column 'grasp/approach'": lambda shards: Grasps(shards, ["grasp/approach"])[0],
+    "of mug has no column 'image/distance'": lambda shards: Pictures(shards, ["image/distance"]),
+}
+
+
+@pytest.mark.parametrize("words", UNREADABLE)
+def test_what_is_not_there_is_told_by_name(shards: Shards, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        UNREADABLE[words](shards)
+
+
+def test_pictures_of_unknown_scenes_are_to_be_rendered_again(box: Path, tmp_path: Path) -> None:
+    shutil.copytree(box, tmp_path / "set")
+    with h5py.File(tmp_path / "set" / "views.h5", "r+") as file:
+        del file.attrs["base_shard"]
+    with pytest.raises(InputError, match="graspd render"):
+        Pictures(open_shards(tmp_path / "set"))
+
+
 def test_a_picture_comes_with_its_grasps_in_the_camera_frame(folder: Path) -> None:
     shards = open_shards(folder)
     picture = next(sample for sample in Pictures(shards) if len(sample["grasp/hand_pose"]))
@@ -97,7 +117,7 @@ def test_the_newest_snapshot_of_a_dataset_is_read(services: Services, shards: Sh
     with pytest.raises(NotFoundError, match="graspd datasets snapshot kitchen"):
         open_shards(services.store, dataset="kitchen", cache=tmp_path / "cache")
     for number, some in enumerate((shards.files[:1], shards.files)):
-        _put_snapshot(services, "kitchen", Shards(some), created=f"2026-01-0{number + 1}T00:00:00Z")
+        put_snapshot(services.store, "kitchen", some, created=f"2026-01-0{number + 1}T00:00:00Z")
     assert len(open_shards(services.store, dataset="kitchen", cache=tmp_path / "cache")) == len(shards)
 
 
@@ -129,16 +149,6 @@ def test_a_full_cache_drops_what_was_unused_longest(services: Services, shards: 
     held = {path.stem for path in cache.folder.iterdir()}
     assert shards.files[-1].sha256 in held and shards.files[0].sha256 not in held
     assert sum(sizes[name] for name in held) <= cache.limit_bytes
-
-
-def _put_snapshot(services: Services, dataset: str, shards: Shards, *, created: str) -> None:
-    digest = hashlib.sha256(created.encode()).hexdigest()[:32]
-    same = ("id", "kind", "key", "sha256", "hand", "object", "batch")
-    sums = {"size_bytes": 1, "valid": 1}
-    listed = [{name: getattr(file, name) for name in same} | sums | {"count": 1} for file in shards]
-    of = {"dataset": dataset, "dataset_digest": "a" * 32, "digest": digest, "complete": True, "grasps": 1}
-    taken = Snapshot(**of, **sums, created=created, shards=listed)
-    put_record(services.store, dataset_snapshot(dataset, digest), taken)
 
 
 @pytest.mark.s3

@@ -21,15 +21,14 @@ from graspd import cli as program
 from graspd.service.cli import EngineSettings, engine_settings, load_settings, reporting_errors
 from graspd.service.model.errors import InputError, StoreUnavailable, UnavailableError
 from graspd.service.pipeline import job_actions
-from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.leading import PART
 from graspd.service.queue.rq_queue import RqQueue
 from graspd.service.run.commands import app
 from graspd.service.run.supervisor import _SETTLED, Supervisor, _explicit_settings
 from graspd.service.settings import Settings
-from graspd.service.store.store import open_store
 from tests.conftest import REPOSITORY
 from tests.fakes import request
+from tests.service.conftest import service
 
 runner = CliRunner()
 
@@ -84,13 +83,6 @@ def test_a_setting_of_0_2_is_refused_with_its_new_name(monkeypatch: pytest.Monke
     assert float(getattr(load_settings(), new.removeprefix("GRASPD_").lower())) == 1.0
 
 
-def on_disk(services: Services) -> Services:
-    store = open_store(services.settings.resolved_store_url)
-    for entry in list(services.store.list("assets")):
-        store.put(entry.key, services.store.get(entry.key))
-    return Services(services.settings, store, services.index, services.queue)
-
-
 @pytest.mark.parametrize("command", [["store", "verify"], ["index", "rebuild", "--check"], ["index", "rebuild"]])
 def test_what_reads_a_store_makes_none_where_there_is_none(tmp_path: Path, command: list[str]) -> None:
     shown = runner.invoke(program.build(), ["admin", *command, "--data-dir", str(tmp_path / "mistyped")])
@@ -99,14 +91,13 @@ def test_what_reads_a_store_makes_none_where_there_is_none(tmp_path: Path, comma
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_check_tells_differences_and_changes_nothing(services: Services) -> None:
-    services = on_disk(services)
-    job_actions.submit(services, request())
-    damaged = ["index", "rebuild", "--check", "--data-dir", str(services.settings.data_dir)]
+def test_a_check_tells_differences_and_changes_nothing(tmp_path: Path) -> None:
+    for services in service(tmp_path):
+        job_actions.submit(services, request())
+    damaged = ["index", "rebuild", "--check", "--data-dir", str(tmp_path)]
     assert runner.invoke(app, damaged).exit_code == 0
-    (services.settings.data_dir / "index.sqlite").unlink()
-    for leftover in services.settings.data_dir.glob("index.sqlite-*"):
-        leftover.unlink()
+    for file in tmp_path.glob("index.sqlite*"):
+        file.unlink()
     for _ in range(2):
         shown = runner.invoke(app, damaged)
         assert shown.exit_code == 1 and "not in the index" in shown.output
@@ -144,7 +135,7 @@ def test_a_worker_that_never_gets_ready_is_named_with_its_log(tmp_path: Path) ->
         supervisor.wait_ready()
 
 
-def test_a_wait_says_for_what_and_can_be_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_wait_says_for_what_and_can_be_stopped_or_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("graspd.service.run.supervisor._TOLD_EVERY_S", 0.0)
     idle, stop, told = (sys.executable, "-c", "import signal; signal.pause()"), threading.Event(), []
 
@@ -155,6 +146,8 @@ def test_a_wait_says_for_what_and_can_be_stopped(tmp_path: Path, monkeypatch: py
 
     with Supervisor(Settings(data_dir=tmp_path, port=0), workers=1, api=False, worker_command=idle) as supervisor:
         assert not supervisor.wait_ready(say=say, stop=stop)
+        with pytest.raises(UnavailableError, match=rf"not ready after 0 s: .*workers; see {tmp_path}/logs"):
+            supervisor.wait_ready(timeout=0)
     assert str(tmp_path / "logs") in told[-1]
 
 

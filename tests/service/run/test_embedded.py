@@ -132,6 +132,13 @@ def test_only_one_process_runs_the_redis_of_a_folder(tmp_path: Path) -> None:
     own_redis(settings).close()
 
 
+def test_a_folder_elsewhere_is_not_taken_for_the_services_own(tmp_path: Path) -> None:
+    (tmp_path / "others").mkdir()
+    (tmp_path / "redis").symlink_to(tmp_path / "others")
+    with pytest.raises(BusyError, match="belongs to another user; remove it"):
+        own_redis(Settings(data_dir=tmp_path))
+
+
 def test_a_redis_that_is_not_there_is_one_clear_line(tmp_path: Path) -> None:
     queue = RqQueue(connect(redis_url(Settings(data_dir=tmp_path)), patience=0))
     with pytest.raises(QueueUnavailable, match=r"^Redis does not answer .*graspd up.*GRASPD_REDIS_URL$"):

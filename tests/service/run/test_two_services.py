@@ -4,7 +4,6 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -13,7 +12,6 @@ from graspd.service.index.index import Index
 from graspd.service.model.errors import InputError
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.identity import identify
-from graspd.service.queue.connection import connect
 from graspd.service.queue.rq_queue import RqQueue
 from graspd.service.run.doctor.backends import index_identity
 from graspd.service.run.doctor.checks import Condition
@@ -35,15 +33,6 @@ def first(tmp_path: Path, rq_queue: RqQueue, redis_server: str) -> Iterator[Serv
     identify(made)
     yield made
     made.close()
-
-
-@pytest.fixture
-def beside(redis_server: str) -> str:
-    """URL of an empty Redis: another number of database."""
-    url = f"{redis_server}?db=1"
-    with closing(RqQueue(connect(url))) as queue:
-        queue.connection.flushdb()
-    return url
 
 
 def run(command: list[str], folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -68,10 +57,11 @@ def test_the_doctor_says_so(first: Services, redis_server: str, tmp_path: Path) 
     assert index_identity(second).condition is Condition.BAD
 
 
-def test_another_number_of_database_is_another_redis(first: Services, beside: str, tmp_path: Path) -> None:
-    settings = Settings(data_dir=tmp_path / "second", redis_url=beside)
+def test_another_number_of_database_is_another_redis(first: Services, redis_server: str, tmp_path: Path) -> None:
+    settings = Settings(data_dir=tmp_path / "second", redis_url=f"{redis_server}?db=1")
     empty_index(settings.resolved_index_url).close()
     second = Services.open(settings)
+    second.queue.connection.flushdb()
     assert identify(second) != first.queue.service()
     second.close()
 

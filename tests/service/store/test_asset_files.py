@@ -13,9 +13,10 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from graspd.service.model.errors import InputError, LimitError
+from graspd.service.model.errors import InputError, LimitError, NotFoundError
+from graspd.service.model.states import AssetKind
 from graspd.service.store import network_file
-from graspd.service.store.assets import pack, unpack
+from graspd.service.store.assets import builtin_files, pack, unpack
 from graspd.service.store.network_file import ProposalNetwork, from_bytes, to_bytes
 from graspd.service.store.object_sets import object_set, read_set
 from tests.networks import random_network
@@ -62,25 +63,11 @@ class Bomb:
         return Path.touch, (Path("a pickle ran"),)
 
 
-def _without(arrays: Arrays) -> bytes:
-    return packed({name: array for name, array in arrays.items() if name != "flow.1.b.bias"})
-
-
-def _not_finite(arrays: Arrays) -> bytes:
-    mean = arrays["mean"].copy()
-    mean[3] = np.nan
-    return packed(arrays | {"mean": mean})
-
-
 def _lying_header(arrays: Arrays) -> bytes:
     """A member whose header claims a petabyte."""
     buffer = io.BytesIO()
     np.lib.format.write_array_header_1_0(buffer, {"descr": "<f4", "fortran_order": False, "shape": (1 << 48,)})
     return _replaced(arrays, "mean.npy", buffer.getvalue())
-
-
-def _bomb_of_zeros(arrays: Arrays) -> bytes:
-    return _replaced(arrays, "mean.npy", b"\0" * (8 << 20), zipfile.ZIP_DEFLATED)
 
 
 def _replaced(arrays: Arrays, member: str, data: bytes, how: int = zipfile.ZIP_STORED) -> bytes:
@@ -91,18 +78,23 @@ def _replaced(arrays: Arrays, member: str, data: bytes, how: int = zipfile.ZIP_S
     return buffer.getvalue()
 
 
+NAN = np.float32("nan")
 HOSTILE: dict[str, tuple[Callable[[Arrays], bytes], str]] = {
     "no zip": (lambda arrays: b"PK\3\4 no archive", "no .npz"),
     "pickled text": (lambda arrays: packed(arrays | {"meta": np.array([Bomb()], object)}), "one text"),
     "pickled weights": (lambda arrays: packed(arrays | {"mean": np.array([Bomb()], object)}), "mean is object"),
     "double": (lambda arrays: packed(arrays | {"mean": arrays["mean"].astype(float)}), "mean is float64"),
     "transposed": (lambda arrays: packed(arrays | {"flow.out.weight": arrays["flow.out.weight"].T}), "flow.out.weight"),
-    "an array less": (_without, "without flow.1.b.bias"),
+    "an array less": (lambda arrays: packed({n: a for n, a in arrays.items() if n != "std"}), "without std"),
     "an array more": (lambda arrays: packed(arrays | {"extra": np.zeros(3)}), "besides extra"),
-    "not finite": (_not_finite, "mean has a number that is not finite"),
+    "not finite": (lambda arrays: packed(arrays | {"mean": np.append(arrays["mean"][1:], NAN)}), "mean .* not finite"),
     "no spread": (lambda arrays: packed(arrays | {"std": 0 * arrays["std"]}), "std must be positive"),
     "lying header": (_lying_header, "mean is float32"),
-    "zip bomb": (_bomb_of_zeros, "unpacks to 8388608 bytes"),
+    "a newer header": (lambda arrays: _replaced(arrays, "mean.npy", b"\x93NUMPY\3\0"), "of NumPy's format"),
+    "zip bomb": (
+        lambda arrays: _replaced(arrays, "mean.npy", bytes(1 << 23), zipfile.ZIP_DEFLATED),
+        "unpacks to 8388608",
+    ),
     "another schema": (lambda arrays: with_meta(arrays, schema="graspd/proposals@2"), "schema"),
     "another joint": (lambda arrays: with_meta(arrays, joint_names=["a", "b", "c"]), "sizes"),
     "a joint twice": (lambda arrays: with_meta(arrays, joint_names=["a", "a"]), "named twice"),
@@ -141,30 +133,26 @@ def test_what_no_reader_would_take_is_not_written(network: ProposalNetwork) -> N
             to_bytes(wrong)
 
 
-def names(*paths: str) -> dict[str, list[str]]:
-    return {name: sorted(files) for name, files in object_set(dict.fromkeys(paths, b"x")).items()}
+EGAD = ["egad/A0.obj", "egad/B3.obj", "egad/readme.txt"]
+YCB = [f"ycb/a/google_16k/{name}" for name in ("nontextured.stl", "textured.obj")]
+YCB += [f"ycb/b/google_16k/{name}" for name in ("textured.obj", "textured.mtl")]
+DESCRIBED = ["a/clean.stl", "a/asset.json", "b/clean.stl"]
 
 
-def test_a_flat_folder_gives_one_object_a_mesh() -> None:
-    assert names("egad/A0.obj", "egad/B3.obj", "egad/readme.txt") == {"A0": ["A0.obj"], "B3": ["B3.obj"]}
+@pytest.mark.parametrize(
+    ("paths", "objects"),
+    [
+        (EGAD, {"A0": ["A0.obj"], "B3": ["B3.obj"]}),
+        (YCB, {"a": ["nontextured.stl"], "b": ["textured.obj"]}),
+        (DESCRIBED, {"a": ["asset.json", "clean.stl"], "b": ["clean.stl"]}),
+        (["x/my mug!.stl", "x/my_mug_.stl"], {"my_mug_": ["my mug!.stl"], "my_mug_-2": ["my_mug_.stl"]}),
+    ],
+)
+def test_a_folder_of_meshes_is_a_set_of_objects(paths: list[str], objects: dict[str, list[str]]) -> None:
+    assert {name: sorted(files) for name, files in object_set(dict.fromkeys(paths, b"x")).items()} == objects
 
 
-def test_a_folder_an_object_takes_the_best_mesh_of_each() -> None:
-    found = names(
-        "ycb/003_cracker_box/google_16k/nontextured.stl",
-        "ycb/003_cracker_box/google_16k/textured.obj",
-        "ycb/025_mug/google_16k/textured.obj",
-        "ycb/025_mug/google_16k/textured.mtl",
-    )
-    assert found == {"003_cracker_box": ["nontextured.stl"], "025_mug": ["textured.obj"]}
-
-
-def test_asset_json_beside_a_mesh_goes_with_it() -> None:
-    assert names("a/clean.stl", "a/asset.json", "b/clean.stl") == {"a": ["asset.json", "clean.stl"], "b": ["clean.stl"]}
-
-
-def test_names_are_made_fit_for_the_service_and_stay_apart() -> None:
-    assert set(names("x/my mug!.stl", "x/my_mug_.stl")) == {"my_mug_", "my_mug_-2"}
+def test_a_folder_without_a_mesh_is_no_set() -> None:
     with pytest.raises(InputError, match="no mesh"):
         object_set({"a.txt": b""})
 
@@ -182,6 +170,11 @@ def test_a_link_out_of_the_folder_is_left_alone_and_too_large_a_set_refused(tmp_
     assert list(read_set(tmp_path / "set", limit_bytes=100)) == ["a.stl"]
     with pytest.raises(LimitError):
         read_set(tmp_path / "set", limit_bytes=99)
+
+
+def test_a_builtin_that_is_not_there_lists_those_that_are() -> None:
+    with pytest.raises(NotFoundError, match="allegro"):
+        builtin_files(AssetKind.HAND, "nothing")
 
 
 def test_a_machine_without_memory_damages_no_archive(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -85,7 +85,7 @@ def test_an_unfinished_write_is_never_seen(tmp_path: Path) -> None:
     assert not store.exists("shards/base/b.h5")
 
 
-def test_a_folder_that_cannot_be_made_or_vanishes_is_one_clear_line(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_used_is_one_clear_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     store = open_store((tmp_path / "store").as_uri())
     (tmp_path / "store").rmdir()
     (tmp_path / "store").write_text("in the way")
@@ -95,6 +95,9 @@ def test_a_folder_that_cannot_be_made_or_vanishes_is_one_clear_line(tmp_path: Pa
         assert "\n" not in str(found.value)
     with pytest.raises(StoreUnavailable, match=r"store folder .*store/inner cannot be written: Not a directory$"):
         open_store((tmp_path / "store" / "inner").as_uri())
+    monkeypatch.setattr(os, "access", lambda *_: False)  # root may write everywhere
+    with pytest.raises(StoreUnavailable, match=r"cannot be written: Permission denied$"):
+        open_store(tmp_path.as_uri())
 
 
 @pytest.mark.parametrize("url", ["ftp://x", "file://host/path", "nothing", "file:relative"])

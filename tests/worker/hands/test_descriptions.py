@@ -15,6 +15,7 @@ from graspd.client.add_commands import upload_of
 from graspd.commands.hands import report_hand
 from graspd.service.model.errors import HandError, InputError
 from graspd.service.model.states import AssetKind
+from graspd.service.store.hand_files import main_of
 from graspd.service.store.library import publish_asset
 from graspd.service.store.store import open_store
 from graspd.worker.hands.check import check_hand
@@ -230,6 +231,7 @@ def test_a_urdf_is_read_as_programs_write_it(written: str) -> None:
         (claw().replace('name="test"', 'name="test" name="b"').encode(), "duplicate attribute"),
         (b"<sdf/>", "the XML root is <sdf>, but a URDF begins with <robot>"),
         (b'<!DOCTYPE robot [<!ENTITY a "b">]><robot name="&a;"/>'.decode().encode("utf-16"), "entities are refused"),
+        (claw("https://any/pad.stl").encode(), "put it beside the URDF"),
     ],
 )
 def test_a_urdf_that_is_none_is_told_why(data: bytes, told: str) -> None:
@@ -418,6 +420,13 @@ def test_of_several_descriptions_one_is_named(tmp_path: Path) -> None:
         options = f'{{"file": "{said}"}}'
         files = files_of_upload(AssetKind.HAND, "h.zip", packed, limit_bytes=1 << 20, options=options)
         assert b'"urdf/right.urdf"' in files["asset.json"]
+    with pytest.raises(InputError, match=r"2 files called 'h\.urdf'.*name one by its path"):
+        main_of(dict.fromkeys(("old/h.urdf", "new/h.urdf"), b"<robot/>"), "h.urdf")
+
+
+def test_a_folder_of_too_many_files_is_no_hand(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("graspd.service.store.hand_files.MAX_FILES", 1)
+    assert "more than 1 files; give the folder of one hand" in report_hand(str(checkout))["message"]
 
 
 def test_what_a_file_prints_without_end_is_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -43,6 +43,7 @@ from graspd.worker.stages.context import StopReason, TaskContext
 from graspd.worker.stages.hand_self_test import SelfTest, fitting_width, plain_objects, self_test, self_test_facts
 from graspd.worker.validation.payload import Limit
 from tests.api.factories import zipped
+from tests.damage import flipped
 from tests.worker.hands.urdfs import OPENING, gripper, gripper_urdf, joint, link, robot
 from tests.worker.objects.shapes import sphere, stl
 
@@ -235,26 +236,11 @@ def zip_bomb() -> bytes:
     return zipped({f"{i}.stl": bytes(DOOR_BYTES) for i in range(9)})
 
 
-def symlink() -> bytes:
-    buffer = io.BytesIO()
+def archive_of(data: bytes, *, mode: int = 0o100644, how: int = zipfile.ZIP_DEFLATED) -> bytes:
+    buffer, entry = io.BytesIO(), zipfile.ZipInfo("ball.stl")
+    entry.external_attr = mode << 16
     with zipfile.ZipFile(buffer, "w") as archive:
-        entry = zipfile.ZipInfo("mesh.stl")
-        entry.external_attr = 0o120777 << 16
-        archive.writestr(entry, "/etc/passwd")
-    return buffer.getvalue()
-
-
-def damaged_zip() -> bytes:
-    data = bytearray(zipped({"ball.stl": BALL["m.stl"]}))
-    data[200:260] = bytes(60)
-    return bytes(data)
-
-
-def unusual_zip() -> bytes:
-    """LZMA's header may ask for a dictionary of 4 GiB."""
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_LZMA) as archive:
-        archive.writestr("ball.stl", BALL["m.stl"])
+        archive.writestr(entry, data, how)
     return buffer.getvalue()
 
 
@@ -285,12 +271,14 @@ def test_an_attack_is_refused_and_the_worker_does_the_next_task(filename: str, d
         (lambda: zipped({"/tmp/slip.stl": BALL["m.stl"]}), "leaves its folder"),
         (lambda: zipped({"inner.zip": zipped({"innermost.zip": zip_bomb()})}), "holds no object file"),
         (zip_bomb, "unpacks to more"),
-        (symlink, "symbolic link"),
+        (lambda: archive_of(b"/etc/passwd", mode=0o120777), "symbolic link"),
         (lambda: zipped({f"{i}.obj": b"v" for i in range(3000)}), "3000 files"),
-        (damaged_zip, "damaged"),
-        (unusual_zip, "unusual"),
+        (lambda: flipped(archive_of(BALL["m.stl"]), 200), "damaged"),
+        # LZMA's header may ask for a dictionary of 4 GiB.
+        (lambda: archive_of(BALL["m.stl"], how=zipfile.ZIP_LZMA), "unusual"),
+        (lambda: archive_of(b"").replace(b"\x14\3\x14\0\0", b"\x14\3\x14\0\1"), "without a password"),
     ],
-    ids=["slip", "absolute", "nested", "bomb", "link", "many", "damaged", "lzma"],
+    ids=["slip", "absolute", "nested", "bomb", "link", "many", "damaged", "lzma", "locked"],
 )
 def test_an_archive_that_attacks_is_refused_at_the_door(archive: Callable[[], bytes], says: str) -> None:
     data, start = archive(), computed()
@@ -402,10 +390,8 @@ def test_a_busy_machine_leaves_nothing_out(monkeypatch: pytest.MonkeyPatch) -> N
 def test_a_servo_that_is_stiff_for_its_limit_gives_little() -> None:
     """0.1 N m at 20 N m/rad are 5 mrad, and the pad lies 50 to 100 mm from its joint."""
     hand = three_fingers(effort=0.1, stiffness=20.0)
-    assert (
-        0.005 * 0.05 < hand_self_test._drive_compliance(hand) < 0.005 * 0.1
-        and hand_self_test._drive_compliance(gripper()) == np.inf
-    )
+    assert 0.005 * 0.05 < hand_self_test._drive_compliance(hand) < 0.005 * 0.1
+    assert hand_self_test._drive_compliance(gripper()) == np.inf
 
 
 @pytest.mark.parametrize(

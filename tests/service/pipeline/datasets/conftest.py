@@ -14,16 +14,16 @@ from tests.service.pipeline.datasets.makers import add_asset
 
 @pytest.fixture
 def either(index_url: str, tmp_path: Path) -> Iterator[Services]:
-    yield from _service(tmp_path, index_url)
+    yield from _service(tmp_path, index_url=SecretStr(index_url))
 
 
 @pytest.fixture
 def services(tmp_path: Path) -> Iterator[Services]:
-    yield from _service(tmp_path, f"sqlite:///{tmp_path / 'index.sqlite'}")
+    yield from _service(tmp_path)
 
 
-def _service(folder: Path, url: str) -> Iterator[Services]:
-    for made in service(folder, open_store("memory://"), index_url=SecretStr(url)):
+def _service(folder: Path, **said: SecretStr) -> Iterator[Services]:
+    for made in service(folder, open_store("memory://"), **said):
         for kind, name in (("hand", "claw"), ("object", "cube"), ("object", "cone")):
             add_asset(made, kind, name)
         yield made

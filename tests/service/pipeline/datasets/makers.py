@@ -1,28 +1,21 @@
 """Hands and objects without content, datasets on them, and their tasks done or failed on the spot."""
 
-import json
 from typing import Any
 
 from graspd.service.index.views import CellView
-from graspd.service.model import names
 from graspd.service.model.planning import plan
 from graspd.service.model.states import AssetKind, Stage
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.datasets import actions
 from graspd.service.pipeline.datasets.spec import DatasetRequest
-from graspd.service.store.library import publish_asset
-from tests.fakes import fail_task, finish, plan_all, record_of
+from tests.fakes import ACCEPTED, fail_task, finish, plan_all, put_asset, record_of
 
 
 def add_asset(services: Services, kind: str, name: str, *, content: str = "", verdict: str | None = "accept") -> str:
     """A hand or object; returns its digest."""
     files = {"asset.json": b'{"file": "it"}', "it": f"{name} {content}".encode()}
-    asset = publish_asset(services.store, AssetKind(kind), name, files)
-    found = {"verdict": verdict, "message": "as it is"} if verdict else None
-    if found:
-        services.store.put(names.asset_check(AssetKind(kind), asset.digest), json.dumps(found).encode())
-    services.index.write.add_asset(asset, found)
-    return asset.digest
+    found = ACCEPTED | {"verdict": verdict, "message": "as it is"} if verdict else None
+    return put_asset(services, AssetKind(kind), name, files, found)
 
 
 def wanted(name: str = "grasps", **changes: Any) -> DatasetRequest:

@@ -118,14 +118,11 @@ def test_an_interval_holds_the_estimate_and_shrinks(services: Services) -> None:
 
 
 def test_batches_that_differ_widen_the_interval() -> None:
-    even, uneven = (machine_of([batch_of(one) for one in times]) for times in ((5.0, 5.0, 5.0), (1.0, 5.0, 25.0)))
+    of, sizes = ("claw", "cube", "cpu", JobRequest(hand="claw", object="cube")), (32, 32, 32, 1000)
+    both = ([BatchCost(*of, one, *sizes) for one in times] for times in ((5.0, 5.0, 5.0), (1.0, 5.0, 25.0)))
+    even, uneven = map(machine_of, both)
     assert even.factor == uneven.factor
     assert uneven.stored_spread[0] < even.stored_spread[0] < even.stored_spread[1] < uneven.stored_spread[1]
-
-
-def batch_of(seconds: float) -> BatchCost:
-    options = JobRequest(hand="claw", object="cube")
-    return BatchCost("claw", "cube", "cpu", options, seconds, 32, 32, 32, 1000)
 
 
 @pytest.mark.parametrize(

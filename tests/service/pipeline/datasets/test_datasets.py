@@ -14,7 +14,8 @@ from graspd.service.index.rebuild import differences, rebuild
 from graspd.service.model import digests, errors, names
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.planning import OUTCOMES
-from graspd.service.model.records import DatasetRecord, Snapshot, SnapshotShard, request_of
+from graspd.service.model.projects import ProjectScope
+from graspd.service.model.records import DatasetRecord, Snapshot, SnapshotShard, object_set_of, request_of
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.states import AssetKind, Priority, State
 from graspd.service.pipeline import job_actions
@@ -25,7 +26,7 @@ from graspd.service.pipeline.datasets.cost import estimate
 from graspd.service.pipeline.datasets.export import Fetch, export_shards, path_of
 from graspd.service.pipeline.datasets.spec import DatasetRequest
 from graspd.service.pipeline.fidelity_choice import Resolver
-from graspd.service.store.records import charts_of, job_events, load_dataset, publish
+from graspd.service.store.records import charts_of, job_events, load_dataset, publish, put_record
 from graspd.service.store.store import open_store
 from tests.fakes import finish, plan_all, record_of
 from tests.service.pipeline.datasets.makers import add_asset, cells_of, done, fail, jobs_of, wanted
@@ -228,6 +229,13 @@ def test_a_set_has_versions_and_the_newest_counts(either: Services) -> None:
         actions.add_object_set(either, "round", ["moon"])
     with pytest.raises(errors.InputError, match="holds no object"):
         actions.add_object_set(either, "none", [])
+
+
+def test_a_set_that_broke_off_keeps_its_name_in_its_project(services: Services) -> None:
+    left = object_set_of("round", ["ball"], project="blue")
+    put_record(services.store, names.object_set("round", left.digest), left)
+    with pytest.raises(errors.ConflictError, match="take another name"):
+        actions.add_object_set(services, "round", ["ball"], scope=ProjectScope("", everything=False))
 
 
 def test_the_same_shards_are_the_same_snapshot(services: Services) -> None:

@@ -53,11 +53,6 @@ def test_an_index_that_is_what_the_store_says_is_good(kept: Services, look: Look
     assert backends.index(kept.settings).condition is Condition.GOOD
 
 
-def change_row(services: Services) -> None:
-    with services.index.database.writing() as connection:
-        connection.exec_driver_sql("UPDATE shards SET valid = valid + 1")
-
-
 def remove_row(services: Services) -> None:
     with services.index.database.writing() as connection:
         connection.exec_driver_sql(f"DELETE FROM shards WHERE id = '{shard_of(services).stem}'")
@@ -75,7 +70,8 @@ def test_a_manifest_or_row_that_is_gone_is_bad(kept: Services, look: Look, harm:
 
 
 def test_a_row_that_differs_is_bad(kept: Services) -> None:
-    change_row(kept)
+    with kept.index.database.writing() as connection:
+        connection.exec_driver_sql("UPDATE shards SET valid = valid + 1")
     found = backends.index_is_store(kept.settings, settles_s=0.0)
     assert not found.ok and shard_of(kept).stem in found.message and "in the store " in found.message
 
@@ -103,16 +99,20 @@ def test_where_there_is_no_index_none_is_made(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_damaged_file_is_bad_and_left_where_it_is(kept: Services) -> None:
+@pytest.mark.parametrize(("at", "harm"), [(0, b"no database" * 1000), (36, b"\0\0\0\7")], ids=["all", "free pages"])
+def test_a_damaged_file_is_bad_and_left_where_it_is(kept: Services, at: int, harm: bytes) -> None:
     kept.index.close()
     file = kept.settings.data_dir / "index.sqlite"
     for beside in kept.settings.data_dir.glob("index.sqlite-*"):
         beside.unlink()
-    file.write_bytes(b"no database" * 1000)
+    with file.open("r+b") as opened:
+        opened.seek(at)
+        opened.write(harm)
+    damaged = file.read_bytes()
     found = backends.index(kept.settings)
     assert not found.ok and "graspd admin index rebuild" in found.fix
     assert backends.index_is_store(kept.settings).condition is Condition.SKIPPED
-    assert file.read_bytes() == b"no database" * 1000
+    assert file.read_bytes() == damaged
 
 
 @pytest.mark.parametrize("revision", [f"{int(REVISION) - 1:04}", "9999"])
