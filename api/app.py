@@ -87,7 +87,7 @@ def create_app(settings: Settings, services: Services | None = None) -> FastAPI:
     app.state.metrics = Metrics()
     app.state.uploads, app.state.forms = RequestLimiter(UPLOADS), RequestLimiter(FORMS)
     app.state.exports = RequestLimiter(EXPORTS)
-    problems.install(app, problem_page)
+    problems.install_handlers(app, problem_page)
     pages.install(app, opened)
     for router in (*_ROUTERS, *map(asset_router, AssetKind), *datasets.routers, *pages.routers):
         # Adds the routes built at import. `include_router` would rebuild them at the first request. It would also
@@ -131,8 +131,8 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
             for method, operation in operations.items():
                 answers = operation.setdefault("responses", {})
                 if "application/json" in answers.get("422", {}).get("content", {}):
-                    answers["422"] = problems.responses(422)[422]
-                for status, answer in problems.responses(*_middleware_statuses(path, method)).items():
+                    answers["422"] = problems.problem_responses(422)[422]
+                for status, answer in problems.problem_responses(*_middleware_statuses(path, method)).items():
                     answers.setdefault(str(status), answer)
         if app.state.settings.api_root_path:
             document["servers"] = [{"url": app.state.settings.api_root_path}]

@@ -102,7 +102,7 @@ def problem_response(
 def describe(error: Exception) -> tuple[str, str, int, str]:
     """Return (slug, title, status, detail) of an exception; unexpected errors reveal no internals."""
     if isinstance(error, GraspdError):
-        return error.slug, error.title, error.status, plain(str(error)) or error.title
+        return error.slug, error.title, error.status, replace_surrogates(str(error)) or error.title
     if _is_full(error) or _is_full(error.__cause__):
         return StoreUnavailable.slug, StoreUnavailable.title, StoreUnavailable.status, _FULL_SAID
     if isinstance(error, ApiError):
@@ -120,7 +120,7 @@ def _is_full(error: BaseException | None) -> bool:
     return isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
 
 
-def plain(text: str) -> str:
+def replace_surrogates(text: str) -> str:
     """Replace lone surrogates, which JSON may contain but UTF-8 cannot encode."""
     return text.encode(errors="replace").decode()
 
@@ -174,15 +174,15 @@ def _field_error(entry: dict[str, Any]) -> FieldError:
         message = str(entry.get("ctx", {}).get("error", message))
         tokens = []
     pointer = "#/" + "/".join(tokens) if place == "body" else ".".join(tokens)
-    where = plain(pointer) if tokens else "#"
-    return FieldError(pointer=where[:_LONGEST_POINTER], detail=plain(message), type=str(entry["type"]))
+    where = replace_surrogates(pointer) if tokens else "#"
+    return FieldError(pointer=where[:_LONGEST_POINTER], detail=replace_surrogates(message), type=str(entry["type"]))
 
 
 def request_id_of(request: Request) -> str | None:
     return request.scope.get("state", {}).get("request_id")
 
 
-def install(app: FastAPI, page: Callable[[Request, dict[str, Any]], Response]) -> None:
+def install_handlers(app: FastAPI, page: Callable[[Request, dict[str, Any]], Response]) -> None:
     """Convert exceptions to problem documents; at dashboard addresses, browsers get a `page` instead."""
 
     def answer_any(request: Request, error: Exception) -> Response:
@@ -206,7 +206,9 @@ def install(app: FastAPI, page: Callable[[Request, dict[str, Any]], Response]) -
     app.add_exception_handler(RequestValidationError, bad_request)
 
 
-def responses(*statuses: int, others: dict[int | str, dict[str, Any]] | None = None) -> dict[int | str, dict[str, Any]]:
+def problem_responses(
+    *statuses: int, others: dict[int | str, dict[str, Any]] | None = None
+) -> dict[int | str, dict[str, Any]]:
     """Return OpenAPI entries of a route: `others`, and a problem document for each status."""
     return (others or {}) | {
         status: {

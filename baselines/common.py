@@ -86,7 +86,7 @@ SAMPLES: Final = 1200
 STEP: Final = 1e-4
 
 
-def inside_points(hand: HandModel, *, each: int, on_palm: int) -> SurfacePoints:
+def inner_side_points(hand: HandModel, *, each: int, on_palm: int) -> SurfacePoints:
     """Spread points evenly on the inner side: at most `each` per closing link, `on_palm` on the palm."""
     points = sample_surface(hand, SAMPLES)
     inside = _inside(hand, points)

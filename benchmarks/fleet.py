@@ -138,7 +138,7 @@ def machine(*, sqlite: bool, s3: bool) -> Iterator[Machine]:
         _wait(lambda: _answers(services), "Redis answers")
         add_assets(services)
         pids["controller"] = _started(stack, [sys.executable, "-m", "graspd", "controller"], environment(settings))
-        _wait(lambda: services.queue.announced(PART), "a controller works")
+        _wait(lambda: services.queue.is_announced(PART), "a controller works")
         yield Machine(settings, services, pids | {"redis": redis})
 
 
@@ -211,7 +211,7 @@ def _looks(at: Machine, seconds: float) -> tuple[list[float], list[float]]:
 
 
 def _finished(services: Services) -> int:
-    with services.index.database.reading() as connection:
+    with services.index.database.read_transaction() as connection:
         done = select(func.count()).select_from(tasks).where(tasks.c.state == State.SUCCEEDED.value)
         return int(connection.scalar(done) or 0)
 

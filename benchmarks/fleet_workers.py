@@ -157,7 +157,7 @@ class Fleet:
         put_event(pipe, event)
 
     def _publish(self, message: dict[str, Any]) -> None:
-        self._store.put(names.shard_manifest(Stage.SYNTHESIZE, message["output"]), self._manifest(message).encode())
+        self._store.put(names.shard_manifest_key(Stage.SYNTHESIZE, message["output"]), self._manifest(message).encode())
 
     def _manifest(self, message: dict[str, Any]) -> str:
         if not self._template:

@@ -23,7 +23,7 @@ from pathlib import Path
 
 import warp as wp
 
-from graspd.worker.engines.backend import ARCHITECTURES, modules
+from graspd.worker.engines.backend import ARCHITECTURES, kernel_modules
 
 STACK_BYTES = 512
 HOT_REGISTERS = 128
@@ -118,7 +118,7 @@ def main() -> None:
         sys.exit("gpu_check needs ptxas: pip install 'graspd[gpu-check]'")
     found: list[Kernel] = []
     for arch in given.arch or ARCHITECTURES:
-        names = modules()
+        names = kernel_modules()
         # Warp's code generation holds Python's lock, but the assembler is a separate process.
         with ThreadPoolExecutor(2) as pool:
             for part in pool.map(lambda name, arch=arch: kernels(name, arch, assembler), names):

@@ -26,8 +26,8 @@ from graspd.service.index.tables import attempts, grasps, jobs, metadata, shards
 from graspd.service.model import names
 from graspd.service.model.digests import digest_json, job_id
 from graspd.service.model.domain import JobRequest
-from graspd.service.model.metrics import IndexLevel, indexed
-from graspd.service.model.planning import PlannedTask, plan
+from graspd.service.model.metrics import IndexLevel, indexed_metrics
+from graspd.service.model.planning import PlannedTask, plan_tasks
 from graspd.service.model.records import AttemptRecord, JobRecord
 from graspd.service.model.states import AssetKind, Priority, Stage, State
 from graspd.service.model.version import PACKAGE_VERSION, STAGE_REVISIONS
@@ -40,7 +40,7 @@ _CHUNK: Final = 20_000
 #: Number of jobs per hundred in each state; running jobs are half done.
 _MIX: Final = {State.SUCCEEDED: 88, State.RUNNING: 4, State.QUEUED: 3, State.FAILED: 3, State.CANCELLED: 2}
 #: Metrics of every grasp.
-_NAMES: Final = tuple(metric.name for metric in indexed(IndexLevel.SORTED) if not metric.optional)
+_NAMES: Final = tuple(metric.name for metric in indexed_metrics(IndexLevel.SORTED) if not metric.optional)
 _SCALES: Final = dict(zip(_NAMES, (0.25, 0.8, 9.0, 0.3, 0.8, 0.1, 0.05), strict=True))
 
 
@@ -53,9 +53,9 @@ def fill(index: Index, store: Store, *, grasps: int = 1_000_000, jobs: int = 100
     for asset in publish_builtins(store):
         index.write.add_asset(asset, {"verdict": "accept", "message": "", "repairs": [], "facts": {}})
     maker = _Maker(index, grasps // jobs, jobs, np.random.default_rng(seed))
-    with index.database.writing() as connection:
+    with index.database.write_transaction() as connection:
         maker.insert(connection)
-    with index.database.reading() as connection:
+    with index.database.read_transaction() as connection:
         if connection.dialect.name == "postgresql":  # it would otherwise vacuum later
             own = ", ".join(metadata.tables)  # only the tables of the index
             connection.execution_options(isolation_level="AUTOCOMMIT").exec_driver_sql(f"VACUUM ANALYZE {own}")
@@ -81,7 +81,10 @@ class _Maker:
         failed = [record for record, state in records if state is State.FAILED]
         self._insert(connection, attempts, (self._attempt(record) for record in failed))
         made = [
-            (record, task) for record, state in records for task in plan(record) if task.batch < _done(record, state)
+            (record, task)
+            for record, state in records
+            for task in plan_tasks(record)
+            if task.batch < _done(record, state)
         ]
         self._insert(connection, shards, (self._shard(record, task) for record, task in made))
         base = [(record, task) for record, task in made if task.stage is Stage.SYNTHESIZE]
@@ -131,7 +134,7 @@ class _Maker:
 
     def _attempt(self, record: JobRecord) -> dict[str, Any]:
         done = _done(record, State.FAILED)
-        task = next(task for task in plan(record) if task.batch == done)
+        task = next(task for task in plan_tasks(record) if task.batch == done)
         attempt = AttemptRecord(
             task_id=task.id,
             job_id=record.id,
@@ -152,7 +155,7 @@ class _Maker:
             shard_id=task.output,
             stage=task.stage,
             kind=kind,
-            key=names.shard_file(task.stage, task.output),
+            key=names.shard_file_key(task.stage, task.output),
             sha256=digest_json(task.output) * 2,
             size_bytes=40_000,
             counts={axis: task.count},

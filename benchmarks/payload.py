@@ -25,7 +25,7 @@ from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.model.scene_spec import parse_scene
 from graspd.worker.control.postures import squeeze
 from graspd.worker.generation import ValidatedBatch, validated_grasps
-from graspd.worker.grasps import GraspSet, joined
+from graspd.worker.grasps import GraspSet, join_grasp_sets
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
@@ -70,7 +70,7 @@ class WholeLifts(LiftPayload):
             self._weigh(mass)
             self._restore()
             self._goal = np.zeros(3)
-            self.data.xfrc_applied[self.scene.object_body, :3] = -self.scene.push * self._up
+            self.data.xfrc_applied[self.scene.object_body, :3] = -self.scene.push_force * self._up
             self._rise(grasps, row)
             rollout = Rollout()
             return self._validate(rollout) is Outcome.HELD and self._hold(rollout) is Outcome.HELD
@@ -161,7 +161,7 @@ def of_pair(given: Any, hand: HandModel, name: str, mass: float) -> tuple[Floats
 def squeezed(hand: HandModel, obj: ObjectModel, grasps: GraspSet) -> GraspSet:
     """Return the grasps unchanged, then with the squeezes of `FORCES_N`."""
     stronger = [squeeze(hand, obj, grasps.grasp, total_normal_force=force) for force in FORCES_N]
-    return joined([grasps, *(replace(grasps, squeeze=one) for one in stronger)])
+    return join_grasp_sets([grasps, *(replace(grasps, squeeze=one) for one in stronger)])
 
 
 def every(grasps: GraspSet) -> NDArray[np.intp]:

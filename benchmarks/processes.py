@@ -26,7 +26,7 @@ import numpy as np
 
 from graspd.service.model.domain import BATCH_SIZE
 from graspd.service.model.fidelity import FIDELITIES
-from graspd.worker.grasps import GraspSet, joined
+from graspd.worker.grasps import GraspSet, join_grasp_sets
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import ExecutionContext, PlanRequest, synthesize
@@ -80,7 +80,7 @@ class Pair:
         self.pieces = decompose(self.obj)
         batches = range(count // BATCH_SIZE)
         made = [synthesize(self.hand, self.obj, PlanRequest(BATCH_SIZE, fidelity, 19, batch)) for batch in batches]
-        self.grasps: GraspSet = joined(made)
+        self.grasps: GraspSet = join_grasp_sets(made)
 
     def validated(self, run: ExecutionContext, grasps: GraspSet) -> dict[str, Any]:
         found = validate(self.hand, self.obj, grasps, pieces=self.pieces, run=run)

@@ -22,7 +22,7 @@ from graspd.worker.quality.probe import HAND_POINTS, OBJECT_POINTS, probe_of
 from graspd.worker.quality.table import measure
 from graspd.worker.validation.decomposition import decompose
 from graspd.worker.validation.displacement import simulated_displacement_cm
-from graspd.worker.validation.robust import reaches, robust
+from graspd.worker.validation.robust import reaches_share, validate_robustness
 
 FRICTION, THRESHOLD_M, TOP, CORES = 1.0, 0.005, 10, 2
 #: Share of perturbed models that a robust grasp must hold in.
@@ -67,7 +67,7 @@ def metrics(cell: Cell) -> dict[str, Any]:
 def in_models(cell: Cell) -> dict[str, Any]:
     """Return, for each grasp held at level standard, the share of perturbed models in which it holds."""
     held = np.array(cell.verdicts("standard", False)["success"])
-    found = robust(
+    found = validate_robustness(
         cell.hand, cell.obj, cell.grasps, held=held, models=ROBUST_MODELS, seed=SEED, pieces=decompose(cell.obj)
     )
     return {"models": ROBUST_MODELS, "shares": found.share[held == 1].tolist(), "seconds": found.seconds}
@@ -87,7 +87,7 @@ def row(cell: Cell) -> dict[str, Any]:
         "gsr_hard": float(hard.mean()),
         "robust": float(shares.mean()) if len(shares) else None,
         "robust_n": len(shares),
-        "robust_many": int(reaches(shares, SHARE).sum()),
+        "robust_many": int(reaches_share(shares, SHARE).sum()),
         "osr": float(dexgraspbench.any()),
         "osr_hard": float(hard.any()),
         "held": int(dexgraspbench.sum()),

@@ -24,8 +24,8 @@ from graspd.worker.quality.intervals import wilson
 from graspd.worker.validation.decomposition import decompose
 from graspd.worker.validation.model import MujocoOptions
 from graspd.worker.validation.refit import fits_of
-from graspd.worker.validation.robust import reaches, robust
-from graspd.worker.validation.variant import NOMINAL, SHAPES, Models, Variant, axes_of, couplings_of, draw
+from graspd.worker.validation.robust import reaches_share, validate_robustness
+from graspd.worker.validation.variant import NOMINAL, SHAPES, Models, Variant, axes_of, couplings_of, draw_variant
 
 OBJECTS = ["003_cracker_box", "005_tomato_soup_can", "011_banana", "025_mug"]
 #: Seed of the random models; jobs with this seed have other models.
@@ -55,8 +55,8 @@ def kinds(cell: Cell, draws: int) -> dict[str, list[Callable[[np.random.Generato
         found[f"{AXIS_MEANINGS[Axis.COUPLINGS]}: {coupling}"] = [lambda _, c=coupling: Variant(coupling=c)]  # type: ignore[misc]
     for axis in axes_of(hand):
         if axis not in (Axis.SHAPES, Axis.COUPLINGS):
-            found[AXIS_MEANINGS[axis]] = [lambda rng, a=axis: draw(a, hand, rng)] * draws  # type: ignore[misc]
-    found[ALL] = [lambda rng: together(draw(axis, hand, rng) for axis in axes_of(hand))] * draws
+            found[AXIS_MEANINGS[axis]] = [lambda rng, a=axis: draw_variant(a, hand, rng)] * draws  # type: ignore[misc]
+    found[ALL] = [lambda rng: together(draw_variant(axis, hand, rng) for axis in axes_of(hand))] * draws
     return found
 
 
@@ -76,7 +76,7 @@ def study(cell: Cell, draws: int) -> dict[str, Any]:
     jobs: dict[str, Any] = {}
     for wanted in (0.0, *SHARES):
         began = time.process_time()
-        found = robust(
+        found = validate_robustness(
             cell.hand,
             cell.obj,
             cell.grasps,
@@ -109,7 +109,7 @@ def summed(hand: str, found: dict[str, dict[str, Any]]) -> dict[str, Any]:
     shares = np.concatenate([np.array(cell["shares"]) for cell in every])
     weakest = Counter(AXIS_MEANINGS[Axis(one)] for cell in every for one in cell["weakest"] if one)
     candidates = len(shares)
-    reached = {f"{wanted:g}": int(reaches(shares, wanted).sum()) for wanted in SHARES}
+    reached = {f"{wanted:g}": int(reaches_share(shares, wanted).sum()) for wanted in SHARES}
     return {
         "hand": hand,
         "candidates": sum(cell["candidates"] for cell in every),

@@ -67,14 +67,14 @@ def poses_of(obj: ObjectModel, variants: int) -> list[str]:
     """Return the table cells of each resting face, the most frequent face first."""
     faces = resting_faces(obj)
     table = simulate._build(obj.centred)
-    with patch.object(RestingFaces, "topples", lambda self, face: False):
+    with patch.object(RestingFaces, "can_topple", lambda self, face: False):
         found = np.array([simulate._redo_until_rest(table, (SEED, k)).face for k in range(DROPS)])
-    steady, cells = not all(faces.rolls(int(face)) for face in found), []
+    steady, cells = not all(faces.can_roll(int(face)) for face in found), []
     for face, count in sorted(zip(*np.unique(found, return_counts=True), strict=True), key=lambda one: -one[1]):
         turn, _ = faces.looseness(int(face))
         pose = lay_flat(faces, int(face), np.array([0.0, 0, 0, 1, 0, 0, 0]))
         angles = np.degrees(turns(obj, pose, variants))
-        word = "topples" if faces.topples(int(face)) else "rolls" if steady and faces.rolls(int(face)) else "kept"
+        word = "topples" if faces.can_topple(int(face)) else "rolls" if steady and faces.can_roll(int(face)) else "kept"
         cells.append(f"{count} | {np.degrees(turn):.0f} | {word} | {angles[0]:.1f} | {angles[1:].max():.1f}")
     return cells
 

@@ -91,8 +91,8 @@ def write(
         poses = np.asarray(placed.object_pose, float)
         scenes = {k: (poses[k], write_table(name, poses[k], k, folder)) for k in sorted(set(number[list(rows)]))}
     paths: list[Path] = []
-    for mapping in models_of(hand, folder):
-        out = folder / "output" / f"{experiment(placed)}_{mapping.config}"
+    for mapping in write_models(hand, folder):
+        out = folder / "output" / f"{experiment_name(placed)}_{mapping.config}"
         mapping.write(out)
         written = [out / GRASPS / name / f"{SCALE}_pose{number[row]:03}" / f"{row}.npy" for row in rows]
         for row, file in zip(rows, written, strict=True):
@@ -103,7 +103,7 @@ def write(
                 "obj_pose": pose.copy(),
                 "scene_path": path.as_posix(),
             }
-            record |= postures(mapping, hand, grasps, row, None if placed is None else pose)
+            record |= qpos_fields(mapping, hand, grasps, row, None if placed is None else pose)
             if placed is not None:
                 record |= tabletop_fields(mapping, hand, grasps, row, pose)
             save_record(file, record)
@@ -111,7 +111,7 @@ def write(
     return paths
 
 
-def models_of(hand: HandModel, folder: Path) -> list[HandMapping]:
+def write_models(hand: HandModel, folder: Path) -> list[HandMapping]:
     """Write a model of the hand below `folder`; return mappings to it and to the benchmark's own, if any."""
     config = f"{NAME}_{plain_name(hand.name)}"
     model = write_hand(hand, config, folder)
@@ -123,12 +123,12 @@ def models_of(hand: HandModel, folder: Path) -> list[HandMapping]:
     return [ours, *filter(None, [benchmark_mapping(hand)])]
 
 
-def experiment(placed: PlacedGrasps | None) -> str:
+def experiment_name(placed: PlacedGrasps | None) -> str:
     """Return the name of an experiment: free grasps and grasps on tables are separate."""
     return NAME if placed is None else f"{NAME}_{TABLETOP}"
 
 
-def postures(mapping: HandMapping, hand: HandModel, grasps: GraspSet, row: int, pose: Floats | None) -> Row:
+def qpos_fields(mapping: HandMapping, hand: HandModel, grasps: GraspSet, row: int, pose: Floats | None) -> Row:
     """Return the `..._qpos` of a grasp whose object is at the origin, or at `pose` (7,) on a table."""
     record: Row = {}
     for name in POSTURES:

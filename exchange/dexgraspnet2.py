@@ -51,7 +51,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-from graspd.exchange.imported import ImportedGrasps, add_postures, joints_by_name, scaled_object, verdicts
+from graspd.exchange.imported import ImportedGrasps, add_postures, joints_by_name, parse_verdicts, scaled_object
 from graspd.exchange.plan import ExportPart, ExportSummary, PictureReference, by_scene, plain_name
 from graspd.service.model.base import error_text
 from graspd.service.model.errors import InputError
@@ -115,7 +115,7 @@ class SceneGraspness:
     @classmethod
     def of(cls, hand: HandModel, grasps: Posture, samples: Floats) -> SceneGraspness:
         """Compute the graspness from K grasps in the object's frame; without grasps all values are 0."""
-        pointed = pointed_at(*lines_of_sight(hand, grasps), samples)
+        pointed = aim_points(*lines_of_sight(hand, grasps), samples)
         return cls(samples, pointed, sum_graspness(samples, pointed))
 
     def of_view(
@@ -125,8 +125,8 @@ class SceneGraspness:
         `depth` (H, W) [m] is 0 without a surface. `labels` (H, W) are 0 for background and 1 for the object of the
         grasps; at least one label is not 0. `intrinsics` are (3, 3) [px]. `camera` (4, 4) and `object_pose` (7,) are in
         the table's frame. Points are in pixel order."""
-        cloud = back_projected(depth, intrinsics)
-        inside = in_workspace(cloud, depth, labels, camera)
+        cloud = back_project(depth, intrinsics)
+        inside = workspace_mask(cloud, depth, labels, camera)
         found = np.zeros(np.count_nonzero(inside), np.float32)
         mine = labels[inside] == 1
         points = apply(invert(object_pose), cloud[inside][mine])
@@ -158,7 +158,7 @@ def _fingertips(hand: HandModel, grasps: Posture) -> Floats:
     return apply(body_poses(hand, grasps.hand_pose, grasps.joint_positions)[:, list(hand.fingertips)], pads)
 
 
-def pointed_at(palm: Floats, line: Floats, samples: Floats) -> NDArray[np.intp]:
+def aim_points(palm: Floats, line: Floats, samples: Floats) -> NDArray[np.intp]:
     """Return indices (K,) of aim points in `samples` (S, 3), seen from `palm` along `line` (K, 3) [m]."""
     found = np.empty(len(palm), np.intp)
     for first in range(0, len(palm), _AT_ONCE):
@@ -183,7 +183,7 @@ def sum_graspness(samples: Floats, pointed: NDArray[np.intp]) -> Floats:
     return np.asarray(10.0 ** (-FALL_PER_M * cdist(samples, samples[some])) @ count[some], float)
 
 
-def back_projected(depth: Floats, intrinsics: Floats) -> Floats:
+def back_project(depth: Floats, intrinsics: Floats) -> Floats:
     """Return the points (H, W, 3) of a picture in the camera's frame [m], bit for bit as in the loader."""
     u, v = np.meshgrid(np.arange(depth.shape[1]), np.arange(depth.shape[0]))
     x = (u - intrinsics[0, 2]) * depth / intrinsics[0, 0]
@@ -191,7 +191,7 @@ def back_projected(depth: Floats, intrinsics: Floats) -> Floats:
     return np.stack([x, y, depth], axis=-1)
 
 
-def in_workspace(cloud: Floats, depth: Floats, labels: NDArray[np.uint8], camera: Floats) -> NDArray[np.bool_]:
+def workspace_mask(cloud: Floats, depth: Floats, labels: NDArray[np.uint8], camera: Floats) -> NDArray[np.bool_]:
     """Return a mask (H, W) of pixels whose points (H, W, 3) the loader keeps.
     Such pixels have a depth, and their points are near the box around all labelled points, in the table's frame. As in
     the loader, labelled pixels without depth extend the box to the camera."""
@@ -367,7 +367,7 @@ def read(path: Path, *, hand: str, obj: str, number: int = 0) -> list[ImportedGr
     if grasps is None:
         grasps = add_postures(model, thing, grasp)
     success = found.get("success")
-    published = None if success is None or np.size(success) != count else verdicts(success)
+    published = None if success is None or np.size(success) != count else parse_verdicts(success)
     return [ImportedGrasps(model, thing, grasps, path.stem, published=published)]
 
 

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from graspd.exchange.bench_hand import COLLECTED, HandMapping
 from graspd.exchange.bench_scene import SET, TABLETOP, check_table, save_record, write_object, write_table
-from graspd.exchange.dexgraspbench import POSTURES, experiment, models_of, postures
+from graspd.exchange.dexgraspbench import POSTURES, experiment_name, qpos_fields, write_models
 from graspd.exchange.plan import ExportPart, ExportSummary, PictureReference, pictures_without_pixels
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, invert
@@ -129,8 +129,8 @@ def _write_group(
         # No type has objects in both splits, so all grasps get one type.
         parts, listed = [(lot, scene, 0, rows) for lot, scene, rows in _untyped(parts)], [0]
     done.counts["grasps"] += sum(len(rows) for *_, rows in parts)
-    for mapping in models_of(lots[0].hand, folder):
-        name = f"{experiment(lots[0].placed)}_{mapping.config}"
+    for mapping in write_models(lots[0].hand, folder):
+        name = f"{experiment_name(lots[0].placed)}_{mapping.config}"
         top = folder / "assets" / "grasp" / name
         mapping.write(top)
         for lot, scene, kind, rows in parts:
@@ -173,7 +173,7 @@ def _record(mapping: HandMapping, lot: ExportPart, rows: NDArray[np.intp], scene
     grasps: GraspSet = lot.grasps
     record: dict[str, Any] = {"scene_path": scene.as_posix(), "scene_scale": np.ones(len(rows))}
     poses = [None if lot.placed is None else np.asarray(lot.placed.object_pose[lot.placed.index[row]]) for row in rows]
-    each = [postures(mapping, lot.hand, grasps, int(row), pose) for row, pose in zip(rows, poses, strict=True)]
+    each = [qpos_fields(mapping, lot.hand, grasps, int(row), pose) for row, pose in zip(rows, poses, strict=True)]
     record |= {f"{name}_qpos": np.array([one[f"{name}_qpos"] for one in each]) for name in POSTURES}
     # DexLearn ignores this pose; it is needed to import the grasps unchanged.
     record["obj_pose"] = np.array([IDENTITY_POSE if pose is None else pose for pose in poses])

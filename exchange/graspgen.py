@@ -100,7 +100,7 @@ def _write_hand(hand: HandModel, lots: list[ExportPart], folder: Path, out: set[
     for split, some in (("train", set(uuids) - out), ("valid", set(uuids) & out if out else set(uuids))):
         (folder / "splits" / name / f"{split}.txt").write_text("".join(f"{uuid}\n" for uuid in sorted(some)))
     (folder / "grippers").mkdir(exist_ok=True)
-    text = "".join(f"{key}: {json.dumps(value)}\n" for key, value in convention(hand).items())
+    text = "".join(f"{key}: {json.dumps(value)}\n" for key, value in gripper_convention(hand).items())
     (folder / "grippers" / f"{name}.yaml").write_text(text)
     good = {uuid: sum(record["grasps"]["object_in_gripper"]) for uuid, record in records.items()}
     done.counts["grasps"] += sum(len(record["grasps"]["transforms"]) for record in records.values())
@@ -117,7 +117,7 @@ def _record(hand: HandModel, lots: list[ExportPart]) -> dict[str, Any]:
         some: list[Posture] = [getattr(lot.grasps, name).take(lot.rows) for lot in lots]
         parts[f"{name}_pose"] = np.concatenate([part.hand_pose for part in some])
         parts[f"{name}_joints"] = np.concatenate([part.joint_positions for part in some])
-    held = np.concatenate([validity.valid(lot.shard.arrays)[lot.rows] for lot in lots])
+    held = np.concatenate([validity.valid_mask(lot.shard.arrays)[lot.rows] for lot in lots])
     grasps = {"transforms": pose_to_matrix(parts["grasp_pose"]).tolist(), "object_in_gripper": held.tolist()}
     return {
         "object": {"file": f"{uuid_of(lots[0])}.obj", "scale": 1.0},
@@ -126,7 +126,7 @@ def _record(hand: HandModel, lots: list[ExportPart]) -> dict[str, Any]:
     }
 
 
-def convention(hand: HandModel) -> dict[str, Any]:
+def gripper_convention(hand: HandModel) -> dict[str, Any]:
     """Return values of a gripper's YAML file: opening [m], reach along the approach [m], and frame.
     GraspGen's frame is given by its pose [[x, y, z], [x, y, z, w]] in the base link's frame. For a hand
     without jaws, x is the direction across the approach with the largest distance of open fingertips."""
@@ -172,7 +172,7 @@ def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[Impo
         raise InputError(f"{file} has an object of scale {scale:g}")
     model, thing = hand_from_path(hand), scaled_object(obj, scale)
     pose = pose_from_matrix(matrices)
-    made = _grasps(file, model, record, pose) or add_postures(model, thing, closed_at(model, thing, pose))
+    made = _grasps(file, model, record, pose) or add_postures(model, thing, close_hands_at(model, thing, pose))
     name = object_name or Path(str(record["object"].get("file", ""))).stem or thing.name
     return [ImportedGrasps(model, thing, made, name, scale, held.astype(np.int8))]
 
@@ -238,7 +238,7 @@ def _json(path: Path, value: Any) -> None:
     path.write_text(json.dumps(value, indent=1) + "\n")
 
 
-def closed_at(hand: HandModel, obj: ObjectModel, hand_pose: NDArray[np.float64]) -> Posture:
+def close_hands_at(hand: HandModel, obj: ObjectModel, hand_pose: NDArray[np.float64]) -> Posture:
     """Return hands at poses (N, 7) in the object frame, closed from the preshape to contact or limits."""
     pair = load_pair(hand, obj, "cpu", kernels)
     joints = np.zeros((len(hand_pose), len(hand.joint_names)))

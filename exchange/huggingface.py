@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from graspd.exchange.bench_scene import tables_at
-from graspd.exchange.imported import ImportedGrasps, joints_by_name, scaled_object, verdicts
+from graspd.exchange.imported import ImportedGrasps, joints_by_name, parse_verdicts, scaled_object
 from graspd.exchange.plan import ExportPart, ExportSummary
 from graspd.service import parquet
 from graspd.service.model.errors import InputError
@@ -233,7 +233,7 @@ def _set(
             pose = np.array([columns[f"{what}_pose"][k] for k in rows], float).reshape(len(rows), 7)
             values = np.array([columns[f"{what}_joints"][k] for k in rows], float)
             parts[what] = Posture(pose, joints_by_name(model, order, values, what=str(path)))
-        verdict = verdicts([columns["verdict"][k] for k in rows]) if "verdict" in columns else None
+        verdict = parse_verdicts([columns["verdict"][k] for k in rows]) if "verdict" in columns else None
         place = np.array([columns["object_pose"][k] for k in rows], float) if on_table else None
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise InputError(f"{path} is no table of grasps: {error}") from None

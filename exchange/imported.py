@@ -55,7 +55,7 @@ def add_postures(hand: HandModel, obj: ObjectModel, grasp: Posture) -> GraspSet:
     return GraspSet(grasp, pregrasp(hand, obj, grasp), squeeze(hand, obj, grasp), np.full(len(grasp), np.nan))
 
 
-def verdicts(values: Sequence[Any] | NDArray[Any]) -> NDArray[np.int8]:
+def parse_verdicts(values: Sequence[Any] | NDArray[Any]) -> NDArray[np.int8]:
     """Return (N,) verdicts of a file: 1 held, 0 dropped, -1 unknown."""
     return np.array([int(value) if value in (0, 1) else -1 for value in np.ravel(values).tolist()], np.int8)
 

@@ -51,18 +51,18 @@ class Case:
         )
 
 
-def expand(path: Path) -> list[Path]:
+def expand_path(path: Path) -> list[Path]:
     """Return a path itself, or the base shards and reference grasps of a folder without `.npy` files."""
     if not path.is_dir() or any(path.rglob("*.npy")):
         return [path]
-    shards = (file for file in path.rglob("*.h5") if not _of_scenes(file))
+    shards = (file for file in path.rglob("*.h5") if not _is_scene_file(file))
     found = sorted([*shards, *(file for file in path.rglob("*.json") if file.name not in BESIDE_SHARDS)])
     if not found:
         raise InputError(f"{path} has no shards (.h5), reference grasps (.json) or DexGraspBench files (.npy)")
     return found
 
 
-def _of_scenes(path: Path) -> bool:
+def _is_scene_file(path: Path) -> bool:
     """Check whether a file is a scene or views shard, which has no grasps of its own."""
     with open_shard(path) as file:
         return kind_of(file, str(path)) != "base"

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from graspd.exchange.bench_scene import tables_at
 from graspd.exchange.huggingface import png
-from graspd.exchange.imported import ImportedGrasps, joints_by_name, scaled_object, verdicts
+from graspd.exchange.imported import ImportedGrasps, joints_by_name, parse_verdicts, scaled_object
 from graspd.exchange.plan import ExportPart, ExportSummary, PictureReference, by_scene
 from graspd.service import parquet
 from graspd.service.model.base import error_text
@@ -84,8 +84,8 @@ def write(lots: Sequence[ExportPart], pictures: Pictures, folder: Path, out: fro
     tasks = {name: k for k, name in enumerate(dict.fromkeys(lot.name for lot, _, _ in episodes))}
     writer = _Writer(folder, ways[0], pictures, tasks)
     for first in range(0, len(episodes), _EPISODES):
-        writer.file(episodes[first : first + _EPISODES])
-    writer.meta(sum(lot.name not in out for lot, _, _ in episodes))
+        writer.write_file(episodes[first : first + _EPISODES])
+    writer.write_meta(sum(lot.name not in out for lot, _, _ in episodes))
     done = ExportSummary({"grasps": len(episodes), "frames": writer.frames, "files": -(-len(episodes) // _EPISODES)})
     if left := sum(len(lot.rows) for lot in lots) - len(episodes):
         done.notes.append(f"{left} grasps are left out: they are free, or no picture shows their scene")
@@ -116,7 +116,7 @@ class _Writer:
         self._size: tuple[int, ...] = ()
         self._values: dict[str, list[NDArray[Any]]] = {}
 
-    def file(self, episodes: Sequence[tuple[ExportPart, int, PictureReference]]) -> None:
+    def write_file(self, episodes: Sequence[tuple[ExportPart, int, PictureReference]]) -> None:
         """Write a file with one row group per episode."""
         number = len(self.episodes) // _EPISODES
         width = 7 + len(self.hand.joint_names)
@@ -172,7 +172,7 @@ class _Writer:
             rows.append(moving | still | {name: values[k].item() for name, values in numbers.items()})
         return rows
 
-    def meta(self, train: int) -> None:
+    def write_meta(self, train: int) -> None:
         meta, total = self.folder / "meta", len(self.episodes)
         meta.mkdir(parents=True)
         splits = {"train": f"0:{train}"} | ({"test": f"{train}:{total}"} if train < total else {})
@@ -316,4 +316,4 @@ def _verdicts(path: Path, episodes: list[int]) -> NDArray[np.int8] | None:
         columns = parquet.read(file, (EPISODE, VERDICT))
         if VERDICT in columns and EPISODE in columns:
             found |= dict(zip(columns[EPISODE], columns[VERDICT], strict=True))
-    return verdicts([found.get(number) for number in episodes]) if found else None
+    return parse_verdicts([found.get(number) for number in episodes]) if found else None

@@ -45,7 +45,7 @@ class ExportPart:
         return hashlib.sha256(self.id.encode()).hexdigest()[:8]
 
 
-def held_out(kinds: Mapping[str, str], share: float) -> frozenset[str]:
+def held_out_objects(kinds: Mapping[str, str], share: float) -> frozenset[str]:
     """Return the objects of a share of the families; a hash selects these families.
     At least one family is chosen and one is not; a single family is not chosen."""
     order = sorted(set(kinds.values()), key=lambda kind: hashlib.sha256(kind.encode()).digest())

@@ -28,7 +28,14 @@ from typing import Any, Final
 import numpy as np
 from pydantic_core import from_json
 
-from graspd.exchange.imported import ImportedGrasps, add_postures, joints_by_name, load_npy, scaled_object, verdicts
+from graspd.exchange.imported import (
+    ImportedGrasps,
+    add_postures,
+    joints_by_name,
+    load_npy,
+    parse_verdicts,
+    scaled_object,
+)
 from graspd.service.model.base import error_text
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import (
@@ -196,7 +203,7 @@ def read_reference(path: Path, *, hand: str | None = None, obj: str | None = Non
         joints = joints_by_name(model, stored["hand"]["joint_names"], values, what=str(path))
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise InputError(f"{path} is no file of reference grasps: {error!r}") from None
-    published = verdicts([row.get("pick_success_published") for row in rows])
+    published = parse_verdicts([row.get("pick_success_published") for row in rows])
     grasps = add_postures(model, thing, Posture(pose, joints))
     return [ImportedGrasps(model, thing, grasps, str(stored["object"]), published=published)]
 

@@ -24,13 +24,13 @@ from graspd.exchange.robots.execution import (
     time_motions,
     tool_frame,
 )
-from graspd.exchange.robots.reach import Description, ReachSearch, describe, read_arm
+from graspd.exchange.robots.reach import Description, ReachSearch, read_arm, read_description
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import IDENTITY_POSE
 from graspd.service.store.shards import Shard, read_shard
 from graspd.worker.files.provenance import hand_files_of_shard
 from graspd.worker.files.subsets import select_grasps
-from graspd.worker.rendering.sheets import best as best_of
+from graspd.worker.rendering.sheets import best_rows as best_of
 from graspd.worker.rendering.sheets import metric_at_threshold
 from graspd.worker.validation.decomposition import decompose
 
@@ -65,7 +65,7 @@ def export_grasps(source: Path, format_: str, wishes: RobotExportOptions, folder
         raise InputError("an arm needs the link that the hand is mounted on: --mount LINK")
     shard = read_shard(source, kind="base")
     files = hand_files_of_shard(shard, wishes.hand)
-    description = describe(files.files, files.options)
+    description = read_description(files.files, files.options)
     written = ExportSummary({})
     found = _plan_executions(source, shard, description, wishes, written)
     limits = hand_limits(found.hand)

@@ -18,7 +18,7 @@ from graspd.service.store.shards import json_attribute, write_shard
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.files.provenance import base_attributes
 from graspd.worker.generation import score_grasps
-from graspd.worker.objects.options import for_request
+from graspd.worker.objects.options import apply_request
 from graspd.worker.objects.prepare import files_from_path
 
 
@@ -45,7 +45,7 @@ def write_scored(
     except ValueError:
         raise InputError(f"unknown level {validation!r}; choose dexgraspbench, standard, fast or none") from None
     scenes = None if found.placed is None else found.placed.everywhere
-    obj = for_request(found.obj, request)
+    obj = apply_request(found.obj, request)
     made = score_grasps(found.hand, obj, found.grasps, request, scenes=scenes, run=run)
     folder.mkdir(parents=True, exist_ok=True)
     mesh = mesh_file(found.obj, folder / f"{name}-{found.scale:g}.obj")

@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from graspd.exchange.inputs import load_case
-from graspd.exchange.plan import ExportPart, ExportSummary, held_out, plain_name
+from graspd.exchange.plan import ExportPart, ExportSummary, held_out_objects, plain_name
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import Floats
 from graspd.service.readers import Pictures, Shards, open_shards
@@ -46,7 +46,7 @@ def export_training(source: Path, format_: str, wishes: TrainingExportOptions, f
         raise InputError(f"--held-out is {wishes.held_out:g}; give a share of the objects between 0 and 1")
     shards = open_shards(source)
     lots = _export_parts(shards, format_, wishes)
-    out = held_out(object_families({lot.name: lot.obj for lot in lots}), wishes.held_out)
+    out = held_out_objects(object_families({lot.name: lot.obj for lot in lots}), wishes.held_out)
     from graspd.exchange import dexgraspnet2, dexlearn, graspgen, huggingface, lerobot
 
     if format_ == "graspgen":
@@ -87,7 +87,7 @@ def _exported_rows(shard: Shard, format_: str, wishes: TrainingExportOptions) ->
     """Return a mask (N,) of exported grasps. GraspGen's format has labels, so it gets failed grasps too."""
     if format_ != "graspgen":
         return select_grasps(shard, unvalidated=wishes.unvalidated, every=wishes.every)[0]
-    validated = validity.validated(shard.arrays)
+    validated = validity.validated_mask(shard.arrays)
     if wishes.unvalidated or not validated.any():
         raise InputError(f"{format_} needs a verdict on each grasp: make grasps without --validation none")
     return validated

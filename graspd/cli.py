@@ -173,7 +173,7 @@ def missing_extra(module: str) -> str | None:
     return extra if needed and find_spec(needed) is None else None
 
 
-def build() -> typer.Typer:
+def build_app() -> typer.Typer:
     app = typer.Typer(
         cls=LazyGroup,
         help="Make datasets of stable, contact-rich multi-finger grasps by differentiable simulation.",
@@ -206,4 +206,4 @@ def main() -> None:
     # Without this setting pydantic searches all installed packages for plugins. To enable plugins, set the variable to
     # "".
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
-    run_command_line(build())
+    run_command_line(build_app())

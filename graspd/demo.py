@@ -14,7 +14,7 @@ from graspd.api.formatting import count, duration
 from graspd.api.models import JobDetail
 from graspd.client.client import Client
 from graspd.client.reports import JobDisplay, job_summary, mean_metrics, yield_of
-from graspd.service.cli import CommandGroup, JsonFlag, emit, load_settings, plain_console, write_output
+from graspd.service.cli import CommandGroup, JsonFlag, load_settings, plain_console, print_json, write_output
 from graspd.service.command_options import parsed_options
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.errors import TaskError
@@ -58,7 +58,7 @@ def demo(
             job, files = run(client, request, out, console)
     results = write_pages(out, job, files)
     if json:
-        emit(job_summary(job) | results)
+        print_json(job_summary(job) | results)
     else:
         print_results(console, job, results)
 
@@ -115,19 +115,19 @@ def draw_grasps(job: JobDetail, base: Shard) -> bytes:
     from graspd.worker.hands.load import load_hand
     from graspd.worker.objects.prepare import load_object
     from graspd.worker.rendering.pictures import grasp_pictures
-    from graspd.worker.rendering.sheets import best, contact_sheet, figures
+    from graspd.worker.rendering.sheets import best_rows, caption_entries, contact_sheet
 
-    backend.start()
+    backend.start_warp()
     hand = load_hand(builtin_files(AssetKind.HAND, job.hand), name=job.hand, digest=job.hand_digest)
     files, error_m = builtin_files(AssetKind.OBJECT, job.object), job.request.knobs.face_error_m
     obj = load_object(files, name=job.object, digest=job.object_digest, face_error_m=error_m)
-    rows = best(base.arrays, _SHOWN_GRASPS, validity.valid(base.arrays))
+    rows = best_rows(base.arrays, _SHOWN_GRASPS, validity.valid_mask(base.arrays))
     poses, joints = (np.asarray(base[f"grasp/{name}"], float)[rows] for name in ("hand_pose", "joint_positions"))
     pictures = grasp_pictures(hand, obj, poses, joints, samples=_SAMPLES)[:, 0]
     # The font of the sheet has neither Greek letters nor a multiplication sign.
     title = f"{job.hand} on {job.object}"
     subtitle = f"the best {len(rows)} of {job.grasps} valid grasps by epsilon, of {job.candidates} candidates"
-    return contact_sheet(pictures, figures(base.arrays, rows), title=title, subtitle=subtitle)
+    return contact_sheet(pictures, caption_entries(base.arrays, rows), title=title, subtitle=subtitle)
 
 
 def html_page(job: JobDetail, pictures: list[Path], shards: list[Path], out: Path) -> str:

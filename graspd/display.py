@@ -75,10 +75,10 @@ def html_of(grasps: Grasps) -> str:
 def viewer_of(grasps: Grasps, *, host: str, port: int) -> Viewer:
     try:
         from graspd.worker.files.provenance import hand_of_shard, neighbours_of_shard, object_of_shard
-        from graspd.worker.viewing import Viewer, ViewerContent, missing
+        from graspd.worker.viewing import Viewer, ViewerContent, missing_viewer_text
     except ModuleNotFoundError as error:
         raise ImportError(f"view needs {error.name}; run pip install 'graspd[worker,view]'") from error
-    if said := missing():
+    if said := missing_viewer_text():
         raise InputError(said)
     shard = grasps.shard()
     hand, obj = hand_of_shard(shard, None), object_of_shard(shard, None)

@@ -14,7 +14,7 @@ from typing import Annotated, Final
 import typer
 
 from graspd.cli import missing_extra
-from graspd.service.cli import CommandGroup, JsonFlag, emit, load_settings
+from graspd.service.cli import CommandGroup, JsonFlag, load_settings, print_json
 from graspd.service.model.errors import InputError
 from graspd.service.run.doctor import backends, fleet, machine
 from graspd.service.run.doctor.checks import THREADS, Check, Condition, Finding, run_checks, skipped
@@ -52,7 +52,7 @@ def doctor(
     is_well = counts[Condition.BAD] == 0
     if json:
         told = [{"name": one.name, **dataclasses.asdict(one), "ok": one.ok} for one in found]
-        emit({"ok": is_well, "checks": told, **{condition.value: number for condition, number in counts.items()}})
+        print_json({"ok": is_well, "checks": told, **{condition.value: number for condition, number in counts.items()}})
     else:
         typer.echo(", ".join(f"{number} {condition.value}" for condition, number in counts.items() if number), err=True)
     _exit(0 if is_well else 1)
@@ -73,9 +73,9 @@ def all_checks(settings: Settings, *, full: bool = False) -> list[Check]:
     if missing_extra("graspd.api"):
         checks.append(_missing_extra("keys", "api"))
     else:
-        from graspd.api.access.doctor import keys
+        from graspd.api.access.doctor import check_keys
 
-        checks.append(Check("keys", partial(keys, settings)))
+        checks.append(Check("keys", partial(check_keys, settings)))
     if missing_extra("graspd.commands"):
         return [*checks, _missing_extra("gpu", "worker"), _missing_extra("kernels", "worker")]
     from graspd.commands.doctor import checks_of as of_worker
@@ -112,18 +112,18 @@ def checks_of(settings: Settings, *, full: bool = False) -> list[Check]:
     """Return the checks without engine and API; with `full`, all index rows are compared with the store."""
     full_s = _FULL_S if full else 120.0
     return [
-        Check("disk", partial(machine.disk, settings)),
-        Check("data-folder", partial(machine.data_folder, settings)),
-        Check("limits", machine.limits),
-        Check("redis", partial(backends.redis, settings)),
-        Check("redis-persistence", partial(backends.persistence, settings)),
-        Check("store", partial(backends.store, settings), limit_s=120.0),
-        Check("index", partial(backends.index, settings)),
-        Check("identity", partial(backends.index_identity, settings)),
-        Check("index-is-store", partial(backends.index_is_store, settings, full=full), limit_s=full_s),
-        Check("damage", partial(backends.store_damage, settings)),
-        Check("clocks", partial(fleet.clocks, settings), limit_s=120.0),
-        Check("controller", partial(fleet.controller, settings)),
-        Check("workers", partial(fleet.workers, settings)),
-        Check("port", partial(fleet.port, settings)),
+        Check("disk", partial(machine.check_disk, settings)),
+        Check("data-folder", partial(machine.check_data_folder, settings)),
+        Check("limits", machine.check_limits),
+        Check("redis", partial(backends.check_redis, settings)),
+        Check("redis-persistence", partial(backends.check_persistence, settings)),
+        Check("store", partial(backends.check_configured_store, settings), limit_s=120.0),
+        Check("index", partial(backends.check_index, settings)),
+        Check("identity", partial(backends.check_index_identity, settings)),
+        Check("index-is-store", partial(backends.compare_index_with_store, settings, full=full), limit_s=full_s),
+        Check("damage", partial(backends.check_store_damage, settings)),
+        Check("clocks", partial(fleet.check_clocks, settings), limit_s=120.0),
+        Check("controller", partial(fleet.check_controller, settings)),
+        Check("workers", partial(fleet.check_workers, settings)),
+        Check("port", partial(fleet.check_port, settings)),
     ]

@@ -193,12 +193,12 @@ class Grasps:
     @property
     def is_valid(self) -> NDArray[np.bool_]:
         """(N,) whether each grasp is feasible and held in validation; in a scene, lifted."""
-        return validity.valid(self._columns)
+        return validity.valid_mask(self._columns)
 
     @property
     def is_feasible(self) -> NDArray[np.bool_]:
         """(N,) whether each grasp is within the limits of penetration and contact."""
-        return validity.feasible(self._columns)
+        return validity.feasible_mask(self._columns)
 
     @property
     def metrics(self) -> list[str]:

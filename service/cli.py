@@ -168,14 +168,14 @@ def plain_table(*headings: str, whole: Collection[str] = ()) -> Table:
     return table
 
 
-def emit(value: BaseModel | dict[str, Any]) -> None:
+def print_json(value: BaseModel | dict[str, Any]) -> None:
     plain = value.model_dump(mode="json") if isinstance(value, BaseModel) else value
     typer.echo(json.dumps(plain, allow_nan=False, default=str))
 
 
-def report(value: BaseModel | dict[str, Any], text: str, *, json: bool) -> None:
+def print_result(value: BaseModel | dict[str, Any], text: str, *, json: bool) -> None:
     if json:
-        emit(value)
+        print_json(value)
     else:
         typer.echo(text)
 

@@ -55,7 +55,7 @@ def parsed_options(model: type[ModelT], values: dict[str, Any]) -> ModelT:
     return validate(model, values, names={**names, "name": "NAME", **options})
 
 
-def pairs(texts: Iterable[str]) -> dict[str, str | int | float]:
+def parse_pairs(texts: Iterable[str]) -> dict[str, str | int | float]:
     """Parse `name=value` of each `--option`; numeric values become numbers, as in a request's JSON."""
     split = [text.partition("=") for text in texts]
     for name, equals, value in split:

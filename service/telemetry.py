@@ -28,7 +28,7 @@ _TALKATIVE: Final = ("rq.worker", "rq.job", "rq.queue", "httpx")
 
 
 @contextmanager
-def bind(**subjects: Any) -> Iterator[None]:
+def bind_subjects(**subjects: Any) -> Iterator[None]:
     """Add non-empty subjects to log lines of a `with` block; threads started in it do not inherit them."""
     token = _bound.set({**_bound.get(), **{name: value for name, value in subjects.items() if value}})
     try:
@@ -37,7 +37,7 @@ def bind(**subjects: Any) -> Iterator[None]:
         _bound.reset(token)
 
 
-def bound(subject: str) -> str:
+def bound_subject(subject: str) -> str:
     return str(_bound.get().get(subject, ""))
 
 

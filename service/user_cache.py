@@ -23,7 +23,7 @@ _DIGEST_BYTES: Final = 32
 _LIMIT_BYTES: Final = 2 << 30
 
 
-def folder(name: str) -> Path:
+def cache_folder(name: str) -> Path:
     """Return the folder of one kind of entries, in `$XDG_CACHE_HOME/graspd`, else a private temporary one."""
     return _root(os.environ.get("XDG_CACHE_HOME", ""), os.environ.get("HOME", ""), tempfile.gettempdir()) / name
 

@@ -32,7 +32,7 @@ from graspd.worker.validation.key import Level
 from graspd.worker.validation.lift import LiftOutcome
 from graspd.worker.validation.lifting import LiftLevel, LiftVerdicts, validate_lifts
 from graspd.worker.validation.protocol import Outcome
-from graspd.worker.validation.robust import Robustness, robust
+from graspd.worker.validation.robust import Robustness, validate_robustness
 from graspd.worker.validation.validator import Verdicts, validate
 
 Protocol = Literal["dexgraspbench", "displacement", "lift"]
@@ -132,7 +132,7 @@ def _model_results(
     case: Case, grasps: GraspSet, row: dict[str, Any], models: int, tell: Callable[[Robustness], None], **given: Any
 ) -> dict[str, Any]:
     """Return results of models around the nominal one; add each grasp's share to its verdict."""
-    found = robust(case.hand, case.obj, grasps, models=models, seed=MODELS_SEED, **given)
+    found = validate_robustness(case.hand, case.obj, grasps, models=models, seed=MODELS_SEED, **given)
     tell(found)
     return _in_models(found, row.get("verdicts", []))
 

@@ -21,7 +21,7 @@ from graspd.service.model import names
 from graspd.service.model.clock import timestamp
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.messages import TaskMessage, WorkerBeat
-from graspd.service.model.planning import PlannedTask, message_of, plan
+from graspd.service.model.planning import PlannedTask, message_of, plan_tasks
 from graspd.service.model.records import AttemptRecord, JobRecord
 from graspd.service.model.states import AssetKind, Priority, Stage
 from graspd.service.pipeline.backends import Services
@@ -36,7 +36,7 @@ from graspd.worker.process.fitness import Check
 from graspd.worker.process.link import Link, Setup, StartEngine, start_engine
 from graspd.worker.process.selfcheck import EngineError
 from graspd.worker.stages.context import Output, StageFunction, TaskContext, shard_of
-from graspd.worker.stages.ranges import base_rows, batches_of, joined
+from graspd.worker.stages.ranges import base_rows, join_outputs, split_into_batches
 
 HAND_FILES = {"asset.json": b'{"file": "hand.urdf"}', "hand.urdf": b"<robot name='fake'/>"}
 OBJECT_FILES = {"asset.json": b'{"file": "ball.stl"}', "ball.stl": b"solid ball\nendsolid ball\n"}
@@ -47,7 +47,7 @@ _POSE = np.array([[0.0, 0, 0, 1, 0, 0, 0]])
 def fake_synthesize(message: TaskMessage, context: TaskContext) -> Output:
     """A base shard whose numbers follow from seed and batch, as real ones do."""
     _pretend_to_work(context)
-    return joined(message, [_batch_of_grasps(batch, context) for batch in batches_of(message)])
+    return join_outputs(message, [_batch_of_grasps(batch, context) for batch in split_into_batches(message)])
 
 
 def _batch_of_grasps(message: TaskMessage, context: TaskContext) -> Output:
@@ -72,18 +72,18 @@ def _batch_of_grasps(message: TaskMessage, context: TaskContext) -> Output:
         "quality/success": valid,
     }
     if message.request.in_scene:
-        assert context.store.exists(names.shard_manifest(Stage.SCENE, message.inputs[0]))
+        assert context.store.exists(names.shard_manifest_key(Stage.SCENE, message.inputs[0]))
         quality |= {"quality/clearance_m": rng.random(n), "quality/lift_hard": valid}
     return Output({**postures, **quality}, {"joint_names": ["a", "b"]})
 
 
 def fake_scene(message: TaskMessage, context: TaskContext) -> Output:
     _pretend_to_work(context)
-    parts = batches_of(message)
+    parts = split_into_batches(message)
     if message.request.in_scene:
-        return joined(message, [_scenes_of_batch(part) for part in parts])
+        return join_outputs(message, [_scenes_of_batch(part) for part in parts])
     rows = base_rows(load_shard(context.store, Stage.SYNTHESIZE, message.inputs[0]), message)
-    return joined(message, [_scenes_of_batch(part) for part in parts], base_rows=rows)
+    return join_outputs(message, [_scenes_of_batch(part) for part in parts], base_rows=rows)
 
 
 def _scenes_of_batch(message: TaskMessage) -> Output:
@@ -111,7 +111,7 @@ def put_asset(services: Services, kind: AssetKind, name: str, files: Mapping[str
     """A hand, an object or a network, and what its check found; its digest."""
     asset = publish_asset(services.store, kind, name, files)
     if check is not None:
-        put_document(services.store, names.asset_check(kind, asset.digest), check)
+        put_document(services.store, names.asset_check_key(kind, asset.digest), check)
     services.index.write.add_asset(asset, check)
     return asset.digest
 
@@ -126,7 +126,7 @@ def with_settings(services: Services, **changes: Any) -> Services:
 
 
 def record_of(services: Services, job: str) -> JobRecord:
-    return read_record(JobRecord, services.store, names.job_record(job))
+    return read_record(JobRecord, services.store, names.job_record_key(job))
 
 
 def make_task(services: Services, job: JobRecord, task: PlannedTask, **info: Any) -> ShardManifest:
@@ -137,7 +137,7 @@ def make_task(services: Services, job: JobRecord, task: PlannedTask, **info: Any
 
 
 def finish(services: Services, job: str, *, batches: float = math.inf, stage: Stage | None = None, **info: Any) -> None:
-    for task in plan(record := record_of(services, job)):
+    for task in plan_tasks(record := record_of(services, job)):
         if task.batch < batches and stage in (None, task.stage):
             make_task(services, record, task, **info)
 
@@ -148,7 +148,7 @@ def plan_all(services: Services) -> None:
 
 
 def tasks_of(job: JobRecord) -> list[TaskMessage]:
-    tasks = [task for task in plan(job) if task.stage is Stage.SYNTHESIZE]
+    tasks = [task for task in plan_tasks(job) if task.stage is Stage.SYNTHESIZE]
     return [message_of(job, task, attempt=1, max_attempt=3) for task in tasks]
 
 
@@ -156,7 +156,7 @@ def fail_task(services: Services, job: str, task: PlannedTask | TaskView, number
     """A failed attempt at a task, the last one, in store and index; its key."""
     fields = {"kind": "ValueError", "reason": "it broke", "worker": "w", "ended": timestamp(), "last": True, **changes}
     attempt = AttemptRecord(task_id=task.id, job_id=job, stage=task.stage, number=number, **fields)
-    put_record(services.store, key := names.attempt(task.id, number), attempt)
+    put_record(services.store, key := names.attempt_key(task.id, number), attempt)
     services.index.write.add_attempt(attempt)
     return key
 
@@ -179,7 +179,7 @@ def job_record(wanted: JobRequest, job: str = "c" * 32) -> JobRecord:
 
 def message_for(stage: Stage = Stage.SYNTHESIZE, *, attempt: int = 1, **changes: Any) -> TaskMessage:
     job = job_record(request(**changes))
-    task = next(task for task in plan(job) if task.stage is stage)
+    task = next(task for task in plan_tasks(job) if task.stage is stage)
     return message_of(job, task, attempt=attempt, max_attempt=3)
 
 

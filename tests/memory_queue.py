@@ -108,7 +108,7 @@ class MemoryQueue(RqQueue):
     def announce(self, part: str, seconds: float) -> None:
         self._announced[part] = self.clock() + seconds
 
-    def announced(self, part: str) -> bool:
+    def is_announced(self, part: str) -> bool:
         return self._announced.get(part, 0.0) > self.clock()
 
     def service(self) -> str | None:
@@ -118,7 +118,7 @@ class MemoryQueue(RqQueue):
         if instead or self._service is None:
             self._service = identity
 
-    def lead(self, holder: str, seconds: float) -> bool:
+    def renew_leadership(self, holder: str, seconds: float) -> bool:
         with self._changed:
             now = self.clock()
             if self._lease[0] != holder and self._lease[1] > now:
@@ -131,7 +131,7 @@ class MemoryQueue(RqQueue):
             if self._lease[0] == holder:
                 self._lease = ("", 0.0)
 
-    def now(self, *, lease_s: float) -> QueueStatus:
+    def status(self, *, lease_s: float) -> QueueStatus:
         running = Counter((Priority.BULK, held.message.stage) for held in self._held.values())
         pulses = {name: (beat, 0.0) for name, beat in self._workers.items()}
         return QueueStatus(depth=self.depths(), running=running, workers=pulses)
@@ -140,7 +140,7 @@ class MemoryQueue(RqQueue):
         for name, amount in amounts.items():
             self._sums[name] = self._sums.get(name, 0.0) + amount
 
-    def counted(self) -> dict[str, float]:
+    def counter_sums(self) -> dict[str, float]:
         return dict(self._sums)
 
     def tidy(self) -> None:

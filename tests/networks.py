@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from graspd.service.store.network_file import NETWORK_FILE, ProposalNetwork, numbers, to_bytes, weight_shapes
+from graspd.service.store.network_file import NETWORK_FILE, ProposalNetwork, row_size, to_bytes, weight_shapes
 
 DIGEST = "0" * 32
 #: A small job that sets out from a network, but for its options.
@@ -27,7 +27,7 @@ def random_network(
     for name, shape in weight_shapes(len(joint_names)).items():
         bound = shape[1] ** -0.5 if len(shape) == 2 else bound
         weights[name] = rng.uniform(-bound, bound, shape).astype(np.float32)
-    count = numbers(len(joint_names))
+    count = row_size(len(joint_names))
     mean = rng.normal(0, 0.1, count).astype(np.float32)
     std = rng.uniform(0.05, 0.2, count).astype(np.float32)
     return ProposalNetwork(hand, digest, tuple(joint_names), weights, mean, std, points, steps, about="drawn by chance")

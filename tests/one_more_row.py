@@ -45,14 +45,14 @@ def of_option(folder: Path) -> dict[str, Any]:
 
     import graspd
     from graspd.api.app import create_app
-    from graspd.cli import build
+    from graspd.cli import build_app
     from graspd.service.docs import keywords_stub, options_table
     from graspd.service.settings import Settings
     from tests.api.conftest import BASE_URL
     from tests.indexes import open_services
 
     def command(*words: str) -> str:
-        return CliRunner().invoke(build(), [*words], env={"COLUMNS": "200"}).output
+        return CliRunner().invoke(build_app(), [*words], env={"COLUMNS": "200"}).output
 
     calls, pair = (graspd.synthesize, graspd.Client.submit), ("--hand", "barrett", "--object", "block")
     services = open_services(Settings(data_dir=folder))

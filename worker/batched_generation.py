@@ -18,7 +18,7 @@ from graspd.service.model.errors import InputError, TaskCancelled
 from graspd.worker.engines.devices import check_device, exclusive
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext, ProgressShares
 from graspd.worker.generation import PARTS, Batch, Known, Scoring, ValidatedBatch, require_graspable, validated_grasps
-from graspd.worker.grasps import GraspSet, joined
+from graspd.worker.grasps import GraspSet, join_grasp_sets
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners import BatchRequest, NoStartFound, synthesize_batches
@@ -59,7 +59,7 @@ def validated_batches(
     found: dict[int, ValidatedBatch | None] = {}
     refused: list[Exception] = []
     try:
-        with closing(job.one_by_one() if join == 1 or len(sizes) == 1 else job.in_waves(join)) as batches:
+        with closing(job.make_one_by_one() if join == 1 or len(sizes) == 1 else job.make_in_waves(join)) as batches:
             for number, one in batches:
                 if isinstance(one, ValidatedBatch):
                     if checked is not None:
@@ -97,7 +97,7 @@ class _Job:
     run: ExecutionContext
     partial: bool
 
-    def one_by_one(self) -> Generator[Made]:
+    def make_one_by_one(self) -> Generator[Made]:
         """Make one batch after the other."""
         shares = ProgressShares(self.sizes, self.run.progress)
         for k, (count, scenes) in enumerate(zip(self.sizes, self.scenes, strict=True)):
@@ -111,7 +111,7 @@ class _Job:
                 yield number, made
                 own.progress(1.0, 1.0, "done")
 
-    def in_waves(self, join: int) -> Generator[Made]:
+    def make_in_waves(self, join: int) -> Generator[Made]:
         """Plan candidates of `join` batches in one launch, while the previous wave is validated and measured."""
         require_graspable(self.hand, self.obj)
         stop, shares = threading.Event(), ProgressShares(self.sizes, self.run.progress)
@@ -132,9 +132,9 @@ class _Job:
             ahead: Future[_Wave] | None = None
             try:
                 while (wave := _next_wave(waiting, fresh, join * BATCH_SIZE)) or ahead is not None:
-                    planned, ahead = ahead, device.submit(_planned, scoring, wave) if wave else None
+                    planned, ahead = ahead, device.submit(_plan_wave, scoring, wave) if wave else None
                     going |= {batch.number: batch for batch in wave}
-                    for batch, error in _scored(scoring, planned.result()) if planned is not None else ():
+                    for batch, error in _score_wave(scoring, planned.result()) if planned is not None else ():
                         if error is None and batch.needed is not None:
                             waiting.append(batch)
                             continue
@@ -175,7 +175,7 @@ def _next_wave(waiting: deque[Batch], fresh: Iterator[Batch], most: int) -> list
     return found
 
 
-def _planned(scoring: Scoring, batches: Sequence[Batch]) -> _Wave:
+def _plan_wave(scoring: Scoring, batches: Sequence[Batch]) -> _Wave:
     """Plan the next candidates of the batches, in the single thread that owns the device."""
     known: Known = {}
     rollout, request, asked = scoring.rollout(known), scoring.request, list[BatchRequest]()
@@ -192,15 +192,15 @@ def _planned(scoring: Scoring, batches: Sequence[Batch]) -> _Wave:
                 raise grasps
             told.append(batch.grasps_to_store(one.wanted, grasps) if isinstance(grasps, GraspSet) else grasps)
         good = [grasps for grasps in told if isinstance(grasps, GraspSet)]
-        whole = joined(good) if good else None
-        return _Wave(batches, told, whole, known, scoring.prefiltered(whole) if whole is not None else None)
+        whole = join_grasp_sets(good) if good else None
+        return _Wave(batches, told, whole, known, scoring.run_prefilter(whole) if whole is not None else None)
 
 
-def _scored(scoring: Scoring, wave: _Wave) -> Iterator[tuple[Batch, Exception | None]]:
+def _score_wave(scoring: Scoring, wave: _Wave) -> Iterator[tuple[Batch, Exception | None]]:
     """Validate and measure a wave at once; yield each batch with its planning error or None."""
     parts: Iterator[Round] = iter(())
     if wave.whole is not None:
-        scored = scoring.evaluate(wave.whole, scoring.run.quiet(), wave.known, wave.prefilter)
+        scored = scoring.evaluate(wave.whole, scoring.run.without_progress(), wave.known, wave.prefilter)
         parts = iter(scored.split([len(made) for made in wave.made if isinstance(made, GraspSet)]))
     for batch, made in zip(wave.batches, wave.made, strict=True):
         if isinstance(made, Exception):

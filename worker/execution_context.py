@@ -66,7 +66,7 @@ class ExecutionContext:
 
         return replace(self, progress=tell)
 
-    def quiet(self) -> ExecutionContext:
+    def without_progress(self) -> ExecutionContext:
         return replace(self, progress=DEFAULT_CONTEXT.progress)
 
     def check(self, what: str) -> None:

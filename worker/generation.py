@@ -23,16 +23,16 @@ from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import TaskCancelled
 from graspd.service.model.planning import sum_outcomes
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext, parallel_map
-from graspd.worker.grasps import GraspSet, joined, joined_columns
+from graspd.worker.grasps import GraspSet, join_columns, join_grasp_sets
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.pinch_postures import require_opposing
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners import NoStartFound, PlanRequest, Rollout, fitting_pairs, method, synthesize
 from graspd.worker.planners.fast_graspd.antipodal_starts import narrow_reason
-from graspd.worker.quality.diversity import POINTS, distinct, hand_points
-from graspd.worker.quality.gate import GATES, failed_gate, passes
+from graspd.worker.quality.diversity import POINTS, distinct_mask, hand_points
+from graspd.worker.quality.gate import GATES, failed_gate, passes_gate
 from graspd.worker.quality.table import measure
-from graspd.worker.rounds import ROUND_STRIDE, Arrays, Round, expected_need, next_round, parts_of, select_rows
+from graspd.worker.rounds import ROUND_STRIDE, Arrays, Round, expected_need, next_round, select_rows, split_rows
 from graspd.worker.scenes.rollout import lift_level, outcomes_in_scenes, rollout_on, scene_verdicts
 from graspd.worker.simulation.environment import PlacedGrasps, Scenes
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
@@ -43,8 +43,8 @@ from graspd.worker.validation.lifting import lift_key, validate_lifts
 from graspd.worker.validation.payload import ENOUGH, Limit, limit_of, payloads, shake_margins
 from graspd.worker.validation.prefilter.prefilter import PrefilterVerdicts, prefilter_key_terms
 from graspd.worker.validation.protocol import DIRECTIONS, Outcome
-from graspd.worker.validation.robust import reaches, robust
-from graspd.worker.validation.validator import prefiltered, validate
+from graspd.worker.validation.robust import reaches_share, validate_robustness
+from graspd.worker.validation.validator import prefilter_grasps, validate
 
 #: Reasons to reject a grasp. diverged: its numbers are not finite. blocked: an obstacle of its scene is in the way.
 #: dropped: the validator did not hold it. gate: it fails the geometric gate. not_robust: it holds in too few models.
@@ -196,13 +196,13 @@ class Scoring(AbstractContextManager["Scoring"]):
     def _level(self) -> Any:
         return self.request.validation
 
-    def prefiltered(self, planned: GraspSet) -> PrefilterVerdicts | None:
+    def run_prefilter(self, planned: GraspSet) -> PrefilterVerdicts | None:
         """Return the GPU prefilter's verdicts on the finite grasps; None if the prefilter is not used."""
         if self.pieces is None or self.scenes is not None or not prefilter_key_terms(self.hand, self._level, self.run):
             return None
-        finite = planned.take(np.flatnonzero(planned.finite))
-        return prefiltered(
-            self.hand, self.obj, finite, level=self._level, pieces=self.pieces.result(), run=self.run.quiet()
+        finite = planned.take(np.flatnonzero(planned.is_finite))
+        return prefilter_grasps(
+            self.hand, self.obj, finite, level=self._level, pieces=self.pieces.result(), run=self.run.without_progress()
         )
 
     def evaluate(
@@ -215,7 +215,7 @@ class Scoring(AbstractContextManager["Scoring"]):
         """Validate and measure grasps, and select the wanted ones, near-duplicates included.
         Grasps with numbers that are not finite are rejected. `known` has verdicts on candidates, `prefilter` has
         verdicts of the GPU prefilter."""
-        fates = np.where(planned.finite, "kept", "diverged").astype(object)
+        fates = np.where(planned.is_finite, "kept", "diverged").astype(object)
         seconds = {"planner": 0.0, "validation": 0.0, "quality": 0.0}
         finite = np.flatnonzero(fates == "kept")
         planned = planned.take(finite)
@@ -235,12 +235,14 @@ class Scoring(AbstractContextManager["Scoring"]):
         with _timed(seconds, "quality"):
             friction = self.request.friction
             columns |= measure(self.hand, self.obj, grasps, friction=friction, run=run.part(*PARTS[1:]))
-        columns["quality/feasible"] = passes(columns)
+        columns["quality/feasible"] = passes_gate(columns)
         feasible = columns["quality/feasible"] == 1
         held = columns.get("quality/success", np.zeros(len(rows), np.int8)) == 1
         columns["quality/valid"] = (feasible & held).astype(np.uint8)
         with _timed(seconds, "validation"):
-            columns |= self._further_tests(grasps, held if every else feasible & held, feasible & held, run.quiet())
+            columns |= self._further_tests(
+                grasps, held if every else feasible & held, feasible & held, run.without_progress()
+            )
         if not every:
             wanted = feasible if self.pieces is None else feasible & held
             lost = np.setdiff1d(np.arange(size), rows)
@@ -248,7 +250,7 @@ class Scoring(AbstractContextManager["Scoring"]):
             fates[finite[lost]] = why[lost]
             fates[finite[rows[~wanted]]] = [f"gate_{name}" for name in np.asarray(failed_gate(columns))[~wanted]]
             if self.request.robust:
-                enough = reaches(columns["quality/robust_share"], self.request.robust)
+                enough = reaches_share(columns["quality/robust_share"], self.request.robust)
                 fates[finite[rows[wanted & ~enough]]] = "not_robust"
                 wanted &= enough
             if least := self.request.min_payload:
@@ -294,7 +296,7 @@ class Scoring(AbstractContextManager["Scoring"]):
         common: dict[str, Any] = {"pieces": self.pieces.result(), "run": run}
         placed = self.placed(grasps)
         if request.models:
-            columns |= robust(
+            columns |= validate_robustness(
                 self.hand,
                 self.obj,
                 grasps,
@@ -378,7 +380,7 @@ class Batch:
                 yield RoundRequest(number, range(first, first + share), self.candidates - first, (done, hoped))
                 first += share
                 valid = sum(len(one.grasps) for one in self.rounds)
-            if not valid and self._is_unreachable():
+            if not valid and self._has_unreachable_payload():
                 return
             number += 1
 
@@ -389,25 +391,29 @@ class Batch:
             self.seconds[name] += made.seconds[name]
         if self.request.want != "candidates":
             points = np.concatenate([self._kept, hand_points(self.scoring.hand, made.grasps.grasp)])
-            kept = distinct(points, self.request.min_distance, given=len(self._kept))
+            kept = distinct_mask(points, self.request.min_distance, given=len(self._kept))
             wanted, self._kept = kept[len(self._kept) :], points[kept]
             made.fates[made.rows[~wanted]] = "alike"
             made.grasps, made.columns = select_rows(made.grasps, made.columns, np.flatnonzero(wanted))
         self.rounds.append(made)
         self.needed = next(self._needs, None)
 
-    def _is_unreachable(self) -> bool:
+    def _has_unreachable_payload(self) -> bool:
         """Check whether the latest grasps show that the hand lifts far less than the wanted payload."""
         scoring = self.scoring
         if scoring.pieces is None or (self.limit is not None and self.limit.grasps >= ENOUGH):
             return False
-        planned = joined([grasps for one in self.rounds for grasps in one.planned])
+        planned = join_grasp_sets([grasps for one in self.rounds for grasps in one.planned])
         latest = max(ENOUGH, sum(map(len, self.rounds[-1].planned)))
         planned = planned.take(slice(max(0, len(planned) - latest), None))
         hand, obj, placed = scoring.hand, scoring.obj, scoring.placed(planned)
-        pieces, run, wanted = scoring.pieces.result(), scoring.run.quiet(), max(obj.mass, self.request.min_payload)
+        pieces, run, wanted = (
+            scoring.pieces.result(),
+            scoring.run.without_progress(),
+            max(obj.mass, self.request.min_payload),
+        )
         self.limit = limit_of(hand, obj, planned, wanted=wanted, pieces=pieces, placed=placed, run=run)
-        return self.limit is not None and self.limit.is_unreachable
+        return self.limit is not None and self.limit.is_far_exceeded
 
     @property
     def _is_divisible(self) -> bool:
@@ -419,7 +425,7 @@ class Batch:
         known: Known = {}
         run = self.run.part(*asked.progress)
         rollout = self.scoring.rollout(known)  # one for all parts
-        parts = parts_of(asked.rows, run.cores if self._is_divisible and run.pool is None else 1)
+        parts = split_rows(asked.rows, run.cores if self._is_divisible and run.pool is None else 1)
 
         def planned(part: range, own: ExecutionContext, others: bool) -> Round:
             wanted = self.plan_request(replace(asked, rows=part), rollout, others_have_place=others)
@@ -440,7 +446,7 @@ class Batch:
         if len(refused := [one for one in found if isinstance(one, NoStartFound)]) == len(found):
             raise self.explain_refusal(refused[0])
         made = [
-            planned(part, run.quiet(), True) if isinstance(one, NoStartFound) else one
+            planned(part, run.without_progress(), True) if isinstance(one, NoStartFound) else one
             for part, one in zip(parts, found, strict=True)
         ]
         whole = Round.joined(made)
@@ -480,8 +486,8 @@ class Batch:
     def finish(self) -> ValidatedBatch:
         """Join the rounds to one batch of at most `count` grasps, with rechecks."""
         scoring, rounds, count = self.scoring, self.rounds, self.count
-        grasps = joined([part.grasps for part in rounds])
-        columns = joined_columns([part.columns for part in rounds])
+        grasps = join_grasp_sets([part.grasps for part in rounds])
+        columns = join_columns([part.columns for part in rounds])
         fates = np.concatenate([part.fates for part in rounds])
         # The last round may find more grasps than needed. Only candidates up to the last selected grasp count; with the
         # others the share of valid ones would be too low.
@@ -556,14 +562,14 @@ class Batch:
         valid = np.flatnonzero(first.columns["quality/valid"])
         if self.request.want != "candidates":
             points = hand_points(self.scoring.hand, first.grasps.grasp.take(valid))
-            valid = valid[distinct(points, self.request.min_distance)]
+            valid = valid[distinct_mask(points, self.request.min_distance)]
         if len(valid) >= count:
             self._rechecks = self.scoring.beside.submit(self._recheck, first.grasps.take(valid[:count]))
 
     def _recheck(self, grasps: GraspSet) -> NDArray[np.int8]:
         scoring = self.scoring
         assert scoring.pieces is not None
-        run, pieces = scoring.run.quiet(), scoring.pieces.result()
+        run, pieces = scoring.run.without_progress(), scoring.pieces.result()
         if (placed := scoring.placed(grasps)) is None:
             return validate(scoring.hand, scoring.obj, grasps, level="dexgraspbench", pieces=pieces, run=run).success
         return validate_lifts(

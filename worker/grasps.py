@@ -25,14 +25,14 @@ _ARRAYS: Final = ("approach", "coming", "scene", "wrist")
 GRID_M: Final = 2.0**-30
 
 
-def on_grid(positions: ArrayLike) -> Floats:
+def round_to_grid(positions: ArrayLike) -> Floats:
     return np.rint(np.asarray(positions, float) / GRID_M) * GRID_M
 
 
-def moved(pose: ArrayLike, by: ArrayLike) -> Floats:
+def move_poses(pose: ArrayLike, by: ArrayLike) -> Floats:
     """Move poses (..., 7) by a vector (3,) in their parent's frame, and round positions to the grid."""
     pose = np.array(pose, float)
-    pose[..., :3] = on_grid(pose[..., :3] + np.asarray(by, float))
+    pose[..., :3] = round_to_grid(pose[..., :3] + np.asarray(by, float))
     return pose
 
 
@@ -52,7 +52,7 @@ class Posture:
         return Posture(np.asarray(self.hand_pose, float)[rows], np.asarray(self.joint_positions, float)[rows])
 
     def moved(self, by: ArrayLike) -> Posture:
-        return Posture(moved(self.hand_pose, by), self.joint_positions)
+        return Posture(move_poses(self.hand_pose, by), self.joint_positions)
 
     @classmethod
     def from_columns(cls, columns: Columns, name: str = "grasp") -> Posture:
@@ -91,7 +91,7 @@ class GraspSet:
         return len(self.grasp)
 
     @property
-    def finite(self) -> NDArray[np.bool_]:
+    def is_finite(self) -> NDArray[np.bool_]:
         """(N,) whether all numbers of a grasp's postures are finite."""
         parts = (self.grasp, self.pregrasp, self.squeeze)
         rows = np.concatenate([array for part in parts for array in (part.hand_pose, part.joint_positions)], axis=1)
@@ -108,7 +108,7 @@ class GraspSet:
     def moved(self, by: ArrayLike) -> GraspSet:
         """Return the grasps and trajectories moved by a vector (3,) [m], to a frame with another origin."""
         postures = {name: getattr(self, name).moved(by) for name in _POSTURES}
-        approach = None if self.approach is None else moved(self.approach, by)
+        approach = None if self.approach is None else move_poses(self.approach, by)
         return replace(self, **postures, approach=approach, lift=None if self.lift is None else self.lift.moved(by))
 
     def to_columns(self) -> dict[str, NDArray[Any]]:
@@ -143,17 +143,17 @@ class GraspSet:
         return found
 
 
-def joined(sets: Sequence[GraspSet]) -> GraspSet:
+def join_grasp_sets(sets: Sequence[GraspSet]) -> GraspSet:
     """Join several sets of one hand on one object; the first set provides the info."""
     whole: dict[str, Any] = {"seconds": sum(one.seconds for one in sets), "info": dict(sets[0].info)}
     for name in (*_POSTURES, "lift", "stability_loss", *_ARRAYS):
         parts = [getattr(one, name) for one in sets]
         if all(part is not None for part in parts):
-            whole[name] = _joined(parts) if isinstance(parts[0], Posture) else np.concatenate(parts)
+            whole[name] = _join_postures(parts) if isinstance(parts[0], Posture) else np.concatenate(parts)
     return GraspSet(**whole)
 
 
-def joined_columns(parts: Sequence[Columns]) -> dict[str, NDArray[Any]]:
+def join_columns(parts: Sequence[Columns]) -> dict[str, NDArray[Any]]:
     """Join base columns of several sets; all sets have the same thresholds."""
     return {
         path: parts[0][path] if path == THRESHOLDS else np.concatenate([part[path] for part in parts])
@@ -161,7 +161,7 @@ def joined_columns(parts: Sequence[Columns]) -> dict[str, NDArray[Any]]:
     }
 
 
-def _joined(parts: Sequence[Posture]) -> Posture:
+def _join_postures(parts: Sequence[Posture]) -> Posture:
     return Posture(
         np.concatenate([part.hand_pose for part in parts]), np.concatenate([part.joint_positions for part in parts])
     )

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspd.service.model.domain import BATCH_SIZE
-from graspd.worker.grasps import THRESHOLDS, GraspSet, joined, joined_columns
+from graspd.worker.grasps import THRESHOLDS, GraspSet, join_columns, join_grasp_sets
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -46,8 +46,8 @@ class Round:
         firsts = accumulate((len(part.fates) for part in parts), initial=0)
         seconds = {name: sum(part.seconds[name] for part in parts) for name in parts[0].seconds}
         return cls(
-            joined([part.grasps for part in parts]),
-            joined_columns([part.columns for part in parts]),
+            join_grasp_sets([part.grasps for part in parts]),
+            join_columns([part.columns for part in parts]),
             np.concatenate([part.rows + first for part, first in zip(parts, firsts, strict=False)]),
             np.concatenate([part.fates for part in parts]),
             in_scene,
@@ -86,7 +86,7 @@ def expected_need(wanted: int, valid: int, candidates: int) -> int:
     return math.ceil(1.1 * (wanted - valid) / max(valid / candidates, _LEAST_RATE))
 
 
-def parts_of(rows: range, cores: int) -> list[range]:
+def split_rows(rows: range, cores: int) -> list[range]:
     """Split rows into contiguous, nearly equal parts: up to one per core, of `SMALLEST_PART` rows or more."""
     bounds = np.linspace(rows.start, rows.stop, max(1, min(cores, len(rows) // SMALLEST_PART)) + 1).astype(int)
     return [range(int(low), int(high)) for low, high in pairwise(bounds)]

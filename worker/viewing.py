@@ -16,7 +16,14 @@ from numpy.typing import NDArray
 from graspd.service.model.errors import InputError
 from graspd.service.model.scene_spec import Box, SceneSpec, supports_in
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, quat_rotate
-from graspd.service.readers.trajectories import Waypoint, point_at, scene_spec_of, slider_axis, trajectory_of, wrists_of
+from graspd.service.readers.trajectories import (
+    Waypoint,
+    point_at,
+    scene_spec_of,
+    slider_positions,
+    trajectory_of,
+    wrists_of,
+)
 from graspd.service.store.shards import Shard
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
@@ -125,7 +132,7 @@ _EYE_M: Final = 0.7
 _STEP: Final = np.pi / 8
 
 
-def missing() -> str:
+def missing_viewer_text() -> str:
     """Return instructions to install the viewer; empty if nothing is missing."""
     try:
         import viser  # noqa: F401
@@ -229,7 +236,7 @@ class Viewer:
         self._title = gui.add_markdown("")
         turn = gui.add_button_group("grasp", ("previous", "next"))
         choice = gui.add_dropdown("show", self.filters, initial_value=self.filters[0])
-        places = slider_axis(self._way)
+        places = slider_positions(self._way)
         marks = tuple((float(place), point.name) for place, point in zip(places, self._way, strict=True) if point.name)
         start = next(place for place, name in marks if name == "grasp")
         self.slider = gui.add_slider("trajectory", 0.0, float(places[-1]), 0.01, start, marks=marks)
@@ -321,7 +328,7 @@ def _figures(shard: Shard, row: int) -> str:
 
 
 def _motion_label(way: Any, place: float) -> str:
-    places = slider_axis(way)
+    places = slider_positions(way)
     names = [(float(at), point.name) for at, point in zip(places, way, strict=True) if point.name]
     near = next((name for at, name in names if abs(at - place) < 0.02), "")
     if near:

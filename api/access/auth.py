@@ -85,7 +85,7 @@ def may_change(owner: str, project: str = "") -> bool:
     return key.scope.includes(Scope.SUBMIT) and is_theirs
 
 
-def must_own(owner: str, what: str, project: str = "") -> None:
+def require_ownership(owner: str, what: str, project: str = "") -> None:
     """Raise ForeignResource unless the key may change `what`, such as `job 1a2b`."""
     if not may_change(owner, project):
         key = caller.get()

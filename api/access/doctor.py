@@ -17,7 +17,7 @@ _SOON: Final = timedelta(days=7)
 _ADD: Final = "graspd keys add admin --scope admin"
 
 
-def keys(settings: Settings) -> Finding:
+def check_keys(settings: Settings) -> Finding:
     path = settings.resolved_keys_file
     try:
         found = KeyFile(path).list()

@@ -119,11 +119,11 @@ class _Holder:
     counts_jobs: bool
 
     @property
-    def held(self) -> str:
+    def held_key(self) -> str:
         return f"graspd:quota:{self.name}:held"
 
     @property
-    def day(self) -> str:
+    def day_key(self) -> str:
         return f"graspd:quota:{self.name}:{datetime.now(UTC):%Y-%m-%d}"
 
     def refusal(self, met: str, amount: int) -> QuotaError:
@@ -141,7 +141,7 @@ class _Holder:
 
 
 class Quotas:
-    """Counters of keys and projects; `unfinished` returns the ids, of those given, that have not ended."""
+    """Counters of keys and projects; `select_unfinished` returns the ids, of those given, that have not ended."""
 
     def __init__(
         self,
@@ -208,14 +208,14 @@ class Quotas:
         finally:
             with self._log_outage(holder):
                 if claim.counts or met == "known":
-                    self._connection.eval(_SETTLE, 1, holder.held, job, grasps, number)
+                    self._connection.eval(_SETTLE, 1, holder.held_key, job, grasps, number)
                 else:
-                    self._connection.eval(_UNDO, 1, holder.held, job, number)
+                    self._connection.eval(_UNDO, 1, holder.held_key, job, number)
                 # If two claims are for one job, only the claim that created it counts as a job of today.
                 if today and met == "shared" and claim.counts:
-                    self._connection.incrby(holder.day, today)
+                    self._connection.incrby(holder.day_key, today)
                 if today and met == "" and not claim.counts:
-                    self._connection.decrby(holder.day, today)
+                    self._connection.decrby(holder.day_key, today)
 
     def _claim(self, holder: _Holder, job: str, grasps: int, number: str, today: int) -> str:
         """Return `shared` (another claim is pending), `known`, `unknown` (no Redis), or empty (new job)."""
@@ -233,17 +233,17 @@ class Quotas:
         about = (job, grasps, *limits, _KEPT_S, today, number, _PENDING_S)
         met, amount = b"unknown", b"0"
         with self._log_outage(holder):
-            met, amount = self._connection.eval(_CLAIM, 2, holder.held, holder.day, *about)
+            met, amount = self._connection.eval(_CLAIM, 2, holder.held_key, holder.day_key, *about)
         return met.decode(), int(amount)
 
     def _drop_ended(self, holder: _Holder) -> None:
         """Drop ended jobs, but neither jobs whose submission is pending nor jobs claimed again meanwhile."""
-        found = [word.decode(errors="replace") for word in self._connection.eval(_ENTERED, 1, holder.held)]
+        found = [word.decode(errors="replace") for word in self._connection.eval(_ENTERED, 1, holder.held_key)]
         entries = dict(zip(found[::2], found[1::2], strict=True))
         ended = sorted(entries.keys() - set(self._unfinished(list(entries))))
         for start in range(0, len(ended), _AT_ONCE):
             some = [word for job in ended[start : start + _AT_ONCE] for word in (job, entries[job])]
-            self._connection.eval(_DROP, 1, holder.held, *some)
+            self._connection.eval(_DROP, 1, holder.held_key, *some)
 
     @contextmanager
     def _log_outage(self, holder: _Holder) -> Iterator[None]:
@@ -262,7 +262,7 @@ def _until_midnight() -> int:
 DATASET_PREFIX: Final = "dataset:"
 
 
-def unfinished(index: Index, ids: Collection[str]) -> set[str]:
+def select_unfinished(index: Index, ids: Collection[str]) -> set[str]:
     """Return those of the given jobs and datasets (`dataset:NAME`) that have not ended."""
     names = {one.removeprefix(DATASET_PREFIX) for one in ids if one.startswith(DATASET_PREFIX)}
     found = index.jobs.unfinished([one for one in ids if not one.startswith(DATASET_PREFIX)])

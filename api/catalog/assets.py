@@ -9,7 +9,7 @@ from collections.abc import Mapping, MutableMapping
 from dataclasses import replace
 from typing import Final
 
-from graspd.api.access.auth import caller_id, must_own, project_scope
+from graspd.api.access.auth import caller_id, project_scope, require_ownership
 from graspd.service.index.views import AssetView, Page
 from graspd.service.model import names
 from graspd.service.model.digests import digest_files
@@ -18,10 +18,17 @@ from graspd.service.model.names import MOST, shorten
 from graspd.service.model.projects import EVERYTHING, ProjectScope, project_mark
 from graspd.service.model.states import AssetKind
 from graspd.service.pipeline import deletion
-from graspd.service.pipeline.backends import Services, recording
+from graspd.service.pipeline.backends import Services, record_transaction
 from graspd.service.store import library
 from graspd.service.store.assets import ZipFiles, asset_json
-from graspd.service.store.descriptions import MAX_BYTES, HandCorrections, HandFacts, corrected, facts_of, json_object
+from graspd.service.store.descriptions import (
+    MAX_BYTES,
+    HandCorrections,
+    HandFacts,
+    apply_corrections,
+    facts_of,
+    json_object,
+)
 from graspd.service.store.integrity import get_sealed, put_document
 from graspd.service.store.network_file import network_report
 
@@ -50,7 +57,7 @@ class Assets:
 
     def model(self, asset: AssetView) -> bytes:
         """Return the prepared hand or object as binary glTF; NotFoundError before its check."""
-        return get_sealed(self._services.store, names.asset_model(asset.kind, asset.digest))
+        return get_sealed(self._services.store, names.asset_model_key(asset.kind, asset.digest))
 
     def add(
         self,
@@ -83,9 +90,9 @@ class Assets:
         asset = library.store_files(store, kind, name, files, said=said)
         if found is not None:
             # The check is stored first, because jobs can use the network once it is recorded.
-            put_document(store, names.asset_check(kind, asset.digest), found)
+            put_document(store, names.asset_check_key(kind, asset.digest), found)
         # With two simultaneous uploads under one name, the later one must find the record of the earlier one.
-        with recording(self._services) as (connection, put):
+        with record_transaction(self._services) as (connection, put):
             self._check_name(kind, name, asset.digest)
             asset = library.record_asset(store, asset, put)
             index.write.add_asset(asset, library.load_check(store, kind, asset.digest), within=connection)
@@ -99,12 +106,12 @@ class Assets:
         """Create a hand from the same files with corrected facts; the default name adds a number."""
         hand = self.one(AssetKind.HAND, name)
         facts = self.hand_facts(hand)
-        archive = self._services.store.get(names.asset_files(AssetKind.HAND, hand.digest))
+        archive = self._services.store.get(names.asset_files_key(AssetKind.HAND, hand.digest))
         files = ZipFiles(io.BytesIO(archive), limit_bytes=library.UNPACKED_LIMIT_BYTES)
         if digest_files(AssetKind.HAND, files) != hand.digest:
             raise DamagedError(f"the files of the hand {hand.name!r} in the store are damaged; upload it again")
         said = json_object(asset_json(files), "asset.json")
-        text = json.dumps(corrected(said, facts, corrections)).encode()
+        text = json.dumps(apply_corrections(said, facts, corrections)).encode()
         if len(text) > MAX_BYTES:
             raise LimitError(f"the corrected asset.json exceeds {MAX_BYTES} bytes; give fewer corrections")
         files["asset.json"] = text
@@ -127,7 +134,7 @@ class Assets:
     def delete(self, kind: AssetKind, name: str) -> None:
         asset = self.one(kind, name)
         if not asset.builtin:
-            must_own(asset.owner, f"{kind.value} {name!r}", asset.project)
+            require_ownership(asset.owner, f"{kind.value} {name!r}", asset.project)
         deletion.delete_asset(self._services, kind, asset.digest, owner=caller_id(), scope=project_scope())
         log.info("%s %s deleted", kind, asset.name)
 

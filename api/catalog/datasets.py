@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Final
 
-from graspd.api.access.auth import caller, caller_id, must_own, project_scope
+from graspd.api.access.auth import caller, caller_id, project_scope, require_ownership
 from graspd.api.access.quotas import DATASET_PREFIX, Quotas
 from graspd.api.catalog.grasps import MEAN_METRICS
 from graspd.service.index.queries.grasps import GraspFilter, Metric
@@ -91,7 +91,7 @@ class Datasets:
     def take_snapshot(self, name: str) -> tuple[Snapshot, bool]:
         """Record the dataset's present shards; return the snapshot and whether it is new."""
         self.one(name)
-        return actions.snapshot(self._services, name)
+        return actions.take_snapshot(self._services, name)
 
     def snapshots(self, name: str, *, limit: int = 50, cursor: str | None = None) -> Page[SnapshotView]:
         return self._services.index.datasets.snapshots(name, limit=limit, cursor=cursor, scope=project_scope())
@@ -108,7 +108,7 @@ class Datasets:
             objects,
             owner=caller_id(),
             scope=project_scope(),
-            may_follow=lambda owner, project: must_own(owner, f"the set {name!r}", project),
+            may_follow=lambda owner, project: require_ownership(owner, f"the set {name!r}", project),
         )
 
     def object_sets(self) -> list[ObjectSetView]:
@@ -122,7 +122,7 @@ class Datasets:
         filters = [
             GraspFilter(dataset=each.name, valid=True if each.options.standing == "valid" else None) for each in both
         ]
-        metrics = self._services.index.statistics.side_by_side(filters, MEAN_METRICS)
+        metrics = self._services.index.statistics.compare_distributions(filters, MEAN_METRICS)
         few = max(each.cells for each in both) <= MOST_CELLS
         return Comparison(*both, list(_settings(*both)), self._pairs(one, other) if few else [], metrics)
 
@@ -133,7 +133,7 @@ class Datasets:
 
     def _owned(self, name: str) -> DatasetView:
         dataset = self.one(name)
-        must_own(dataset.owner, f"dataset {name!r}", dataset.project)
+        require_ownership(dataset.owner, f"dataset {name!r}", dataset.project)
         return dataset
 
 

@@ -13,7 +13,7 @@ from anyio.to_thread import run_sync
 from fastapi import Request
 from fastapi.sse import ServerSentEvent
 
-from graspd.api.access.auth import caller, caller_id, is_still_authorized, may_change, must_own, project_scope
+from graspd.api.access.auth import caller, caller_id, is_still_authorized, may_change, project_scope, require_ownership
 from graspd.api.access.keys import Scope
 from graspd.api.catalog.jobs import Jobs
 from graspd.api.catalog.overview import Overview
@@ -24,7 +24,7 @@ from graspd.service.model.digests import digest_json
 from graspd.service.model.errors import ConflictError, LimitError, UnavailableError
 from graspd.service.model.projects import ProjectScope
 from graspd.service.model.webhooks import MOST_HOOKS, End, Webhook, check_url, secret_of
-from graspd.service.pipeline.backends import Services, recording
+from graspd.service.pipeline.backends import Services, record_transaction
 
 log = logging.getLogger(__name__)
 POLL_S: Final = 0.5
@@ -37,7 +37,7 @@ async def job_events(jobs: Jobs, job_id: str, request: Request) -> AsyncIterator
     last = ""
     while not await request.is_disconnected() and is_still_authorized(request, Scope.READ):
         try:
-            job = await run_sync(jobs.moving, job_id)
+            job = await run_sync(jobs.get_progress, job_id)
         except UnavailableError as error:
             yield ServerSentEvent(event="unavailable", data={"detail": str(error)}, retry=RETRY_MS)
             await asyncio.sleep(RETRY_MS / 1000)
@@ -103,18 +103,18 @@ class Webhooks:
             owner=caller_id(),
             project=project,
         )
-        with recording(self._services) as (connection, put):
-            if len(self._services.index.outbox.hooks(scope=ProjectScope(project, everything=False))) >= MOST_HOOKS:
+        with record_transaction(self._services) as (connection, put):
+            if len(self._services.index.outbox.webhooks(scope=ProjectScope(project, everything=False))) >= MOST_HOOKS:
                 raise LimitError(f"there are {MOST_HOOKS} webhooks already, the maximum; delete one")
-            put(names.webhook(hook.id), hook)
+            put(names.webhook_key(hook.id), hook)
             self._services.index.outbox.add(hook, within=connection)
         key = caller.get()
         log.info("webhook %s made by %s", hook.id, key.name if key else "this machine")
-        return self._services.index.outbox.hook(hook.id), secret_of(master.get_secret_value(), hook.id)
+        return self._services.index.outbox.webhook(hook.id), secret_of(master.get_secret_value(), hook.id)
 
     def all(self) -> list[WebhookView]:
         """Return webhooks that the caller may change; addresses of other webhooks may contain credentials."""
-        hooks = self._services.index.outbox.hooks(scope=project_scope())
+        hooks = self._services.index.outbox.webhooks(scope=project_scope())
         return [hook for hook in hooks if may_change(hook.owner, hook.project)]
 
     def log(self, webhook: str, *, limit: int = 50) -> list[DeliveryView]:
@@ -123,11 +123,11 @@ class Webhooks:
     def delete(self, webhook: str) -> None:
         hook = self._owned(webhook)
         # Delete the record first: an interrupted deletion then leaves only a row that a rebuild drops.
-        self._services.store.delete(names.webhook(hook.id))
+        self._services.store.delete(names.webhook_key(hook.id))
         self._services.index.outbox.remove(hook.id)
         log.info("webhook %s deleted", hook.id)
 
     def _owned(self, webhook: str) -> WebhookView:
-        hook = self._services.index.outbox.hook(webhook, scope=project_scope())
-        must_own(hook.owner, f"webhook {webhook}", hook.project)
+        hook = self._services.index.outbox.webhook(webhook, scope=project_scope())
+        require_ownership(hook.owner, f"webhook {webhook}", hook.project)
         return hook

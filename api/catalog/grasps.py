@@ -24,12 +24,12 @@ from graspd.service.model.metrics import (
     IndexLevel,
     entropy_bits,
     evenness,
-    indexed,
+    indexed_metrics,
 )
 from graspd.service.model.records import MOST_TAGGED, Grasp
 from graspd.service.model.scene_spec import supports_in
 from graspd.service.pipeline.backends import Services
-from graspd.service.readers.trajectories import scene_spec_of, slider_axis, trajectory_of
+from graspd.service.readers.trajectories import scene_spec_of, slider_positions, trajectory_of
 from graspd.service.store.columns import LIFT_OUTCOMES, PUSH_OUTCOMES
 from graspd.service.store.integrity import read_checked
 from graspd.service.store.shards import Shard, read_shard
@@ -39,7 +39,7 @@ _KEPT_STATISTICS: Final = 256
 _KEPT_SHARDS: Final = 64
 _BINS: Final = 20
 _SHARED: Final = GraspFilter.model_fields.keys() & models.GraspQuery.model_fields.keys()
-MEAN_METRICS: Final[tuple[Metric, ...]] = tuple(metric.name for metric in indexed(IndexLevel.OFFERED))
+MEAN_METRICS: Final[tuple[Metric, ...]] = tuple(metric.name for metric in indexed_metrics(IndexLevel.OFFERED))
 
 
 class Grasps:
@@ -62,9 +62,9 @@ class Grasps:
             raise LimitError(f"more than {MOST_TAGGED} grasps pass this filter, the maximum of a selection; narrow it")
         return found
 
-    def listed(self, places: Sequence[Grasp]) -> Iterator[GraspView]:
+    def get_many(self, places: Sequence[Grasp]) -> Iterator[GraspView]:
         """Yield grasps by identifier; all must be visible to the caller, and deleted grasps are omitted."""
-        return self._index.grasps.listed(places)
+        return self._index.grasps.get_many(places)
 
     def _filter(self, query: models.GraspQuery) -> GraspFilter:
         seen = project_scope()
@@ -72,7 +72,7 @@ class Grasps:
             self._index.datasets.get(query.dataset, scope=seen)
         found = query.model_dump(include=_SHARED) | {
             "project": None if seen.everything else seen.project,
-            "tag": query.tag and self._index.tags.named(query.tag, scope=seen),
+            "tag": query.tag and self._index.tags.id_of(query.tag, scope=seen),
             "at_least": _bounds(query, "min"),
             "at_most": _bounds(query, "max"),
         }
@@ -209,7 +209,7 @@ def _trajectory(file: Shard, row: int) -> list[models.Waypoint]:
             joint_positions=point.joint_positions.tolist(),
             carried=point.carried.tolist(),
         )
-        for point, place in zip(points, slider_axis(points).tolist(), strict=True)
+        for point, place in zip(points, slider_positions(points).tolist(), strict=True)
     ]
 
 

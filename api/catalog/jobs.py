@@ -10,7 +10,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import Final, Literal
 
-from graspd.api.access.auth import caller, caller_id, must_own, project_scope
+from graspd.api.access.auth import caller, caller_id, project_scope, require_ownership
 from graspd.api.access.quotas import Idempotency, Quotas
 from graspd.api.catalog.grasps import MEAN_METRICS, Grasps
 from graspd.api.models import Job, JobDetail, MeanMetrics, Shard, StageStatus, stage_state
@@ -20,7 +20,7 @@ from graspd.service.model.states import Stage, State
 from graspd.service.pipeline import deletion, job_actions
 from graspd.service.pipeline.backends import Services
 from graspd.service.store.integrity import CheckedObjects
-from graspd.service.telemetry import bind
+from graspd.service.telemetry import bind_subjects
 
 log = logging.getLogger(__name__)
 _PAGE: Final = 200
@@ -52,13 +52,13 @@ class Shards:
     def one(self, shard_id: str) -> Shard:
         return _shard(self._services.index.shards.get(shard_id, scope=project_scope()))
 
-    def intact(self, shard_id: str) -> Shard:
+    def get_intact(self, shard_id: str) -> Shard:
         """Return a shard whose file matches its checksum; a file is read again only after a change."""
         shard = self.one(shard_id)
         self._checked.check(shard.key, shard.sha256)
         return shard
 
-    def address(self, shard: Shard) -> str | None:
+    def signed_url(self, shard: Shard) -> str | None:
         """Return the address at which the store serves the file to GET; None if only the API serves it."""
         return self._services.store.sign(shard.key)
 
@@ -101,8 +101,8 @@ class Jobs:
             bound = self._idempotency.claim(key.name if key else "", idempotency_key, request)
         with bound:
             record = job_actions.prepare(self._services, request, owner=caller_id(), scope=project_scope())
-            with bind(job=record.id), self._quotas.claim(key, record.id, record.request.grasps) as claim:
-                job, is_new = job_actions.enter(self._services, record)
+            with bind_subjects(job=record.id), self._quotas.claim(key, record.id, record.request.grasps) as claim:
+                job, is_new = job_actions.enter_job(self._services, record)
                 claim.counts = is_new
                 log.info("job submitted" if is_new else "job existed already")
         # The identical job may have been requested with a named fidelity. A request with a target still gets the
@@ -111,21 +111,21 @@ class Jobs:
 
     def cancel(self, job_id: str) -> JobDetail:
         self._owned(job_id)
-        with bind(job=job_id):
+        with bind_subjects(job=job_id):
             job = job_actions.cancel(self._services, job_id)
             log.info("job cancelled")
         return self._detail(job)
 
     def retry(self, job_id: str) -> JobDetail:
         grasps = self._owned(job_id).request.grasps
-        with bind(job=job_id), self._quotas.claim(caller.get(), job_id, grasps, is_new=False):
+        with bind_subjects(job=job_id), self._quotas.claim(caller.get(), job_id, grasps, is_new=False):
             job = job_actions.retry(self._services, job_id)
             log.info("job retried")
         return self._detail(job)
 
     def delete(self, job_id: str) -> None:
         self._owned(job_id)
-        with bind(job=job_id):
+        with bind_subjects(job=job_id):
             deletion.delete_job(self._services, job_id, owner=caller_id())
             log.info("job deleted")
 
@@ -147,13 +147,13 @@ class Jobs:
     def one(self, job_id: str) -> JobDetail:
         return self._detail(self._services.index.jobs.get(job_id, scope=project_scope()))
 
-    def moving(self, job_id: str) -> Job:
+    def get_progress(self, job_id: str) -> Job:
         """Return a job with only the progress of its stages, for event streams."""
         return self._job(self._services.index.jobs.get(job_id, scope=project_scope()), self._running(job_id))
 
     def _owned(self, job_id: str) -> JobView:
         job = self._services.index.jobs.get(job_id, scope=project_scope())
-        must_own(job.owner, f"job {job_id}", job.project)
+        require_ownership(job.owner, f"job {job_id}", job.project)
         return job
 
     def _detail(self, job: JobView) -> JobDetail:

@@ -14,7 +14,7 @@ from typing import Final
 
 from pydantic import Field
 
-from graspd.api.access.auth import caller, must_own, project_scope
+from graspd.api.access.auth import caller, project_scope, require_ownership
 from graspd.api.access.keys import KeyFile, ProjectLimits
 from graspd.api.catalog.jobs import Jobs
 from graspd.api.metrics import Snapshot
@@ -65,7 +65,7 @@ class Overview:
         doing = self._services.index.feed.outputs([worker.task_id for worker in known if worker.task_id])
         seen = self._tasks_in_scope(worker.task_id for worker in known if worker.task_id)
         try:
-            pulses = self._queue_now().workers
+            pulses = self._queue_status().workers
         except UnavailableError:
             pulses = {}
         return [
@@ -109,7 +109,7 @@ class Overview:
         """Return the number of damaged or missing stored objects, and the first ones; none in a limited scope."""
         if not project_scope().everything:
             return 0, []
-        return self._services.index.damage.known(limit=_DAMAGE_SHOWN)
+        return self._services.index.damage.summary(limit=_DAMAGE_SHOWN)
 
     def snapshot(self) -> Snapshot:
         found = Snapshot()
@@ -117,8 +117,8 @@ class Overview:
         found.add_parts({name: None if ms is None else ms / 1000 for name, ms in latencies.items()})
         with contextlib.suppress(UnavailableError):
             queue = self._services.queue
-            found.add_queue(self._queue_now(), is_kept=queue.announced(PART))
-            found.add_sums(queue.counted())
+            found.add_queue(self._queue_status(), is_kept=queue.is_announced(PART))
+            found.add_sums(queue.counter_sums())
         with contextlib.suppress(UnavailableError):
             found.add_index(read_index(self._services.index.database))
         return found
@@ -144,9 +144,9 @@ class Overview:
         wanted, scope = set(tasks), project_scope()
         return wanted if scope.everything else wanted - self._services.index.jobs.out_of_scope(wanted, scope)
 
-    def _queue_now(self) -> QueueStatus:
+    def _queue_status(self) -> QueueStatus:
         # A worker's registration expires in whole seconds: see `worker.process.heartbeat`.
-        return self._services.queue.now(lease_s=max(2, round(self._services.settings.lease_s)))
+        return self._services.queue.status(lease_s=max(2, round(self._services.settings.lease_s)))
 
 
 KEPT_S: Final = 2.0
@@ -216,7 +216,7 @@ class Probes:
     def _controller_and_workers(self) -> tuple[bool, int]:
         try:
             fit = [beat for beat in self._services.queue.workers() if beat.state != "quarantined"]
-            return self._services.queue.announced(PART), len(fit)
+            return self._services.queue.is_announced(PART), len(fit)
         except UnavailableError:
             return False, 0
 
@@ -271,7 +271,7 @@ class Usage:
     def limits(self) -> dict[str, ProjectLimits]:
         if caller.get() is None:
             return {}
-        return {name: limits for name, limits in self._keys.projects().items() if project_scope().sees(name)}
+        return {name: limits for name, limits in self._keys.projects().items() if project_scope().can_see(name)}
 
 
 def as_csv(days: list[UsageDay]) -> str:
@@ -305,7 +305,7 @@ class Deletions:
 
     def restore(self, what: What, name: str) -> DeletionView:
         def permit(one: Deletion) -> None:
-            must_own(one.submitter, f"{what} {name!r}", one.project)
+            require_ownership(one.submitter, f"{what} {name!r}", one.project)
 
         found = deletion.restore(self._services, what, name, permit=permit, among=_is_in_scope)
         log.info("%s %s restored", what, found.name or found.id)
@@ -319,4 +319,4 @@ class Deletions:
 
 
 def _is_in_scope(one: Deletion) -> bool:
-    return project_scope().sees(one.project)
+    return project_scope().can_see(one.project)

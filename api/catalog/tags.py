@@ -15,17 +15,17 @@ from typing import IO, Any, Final, Literal
 
 import numpy as np
 
-from graspd.api.access.auth import caller_id, may_change, must_own, project_scope
+from graspd.api.access.auth import caller_id, may_change, project_scope, require_ownership
 from graspd.api.catalog.grasps import Grasps
 from graspd.api.models import Selection, TagChange
 from graspd.service.index.views import GraspView, TagView
 from graspd.service.model.errors import InputError, LimitError, NotFoundError
 from graspd.service.model.projects import ProjectScope
-from graspd.service.model.records import MOST_TAGS, Grasp, Tag, by_shard, tag_id
+from graspd.service.model.records import MOST_TAGS, Grasp, Tag, rows_by_shard, tag_id
 from graspd.service.pipeline import tagging
 from graspd.service.pipeline.backends import Services
 from graspd.service.store.integrity import read_checked
-from graspd.service.store.shards import part_of_shard, place_of, read_shard
+from graspd.service.store.shards import part_of_shard, read_shard, relative_path_of
 
 log = logging.getLogger(__name__)
 
@@ -41,7 +41,7 @@ class Tags:
         return self._services.index.tags.all(scope=project_scope())
 
     def one(self, name: str) -> TagView:
-        wanted = self._services.index.tags.named(name, scope=project_scope())
+        wanted = self._services.index.tags.id_of(name, scope=project_scope())
         return next(tag for tag in self.all() if tag.id == wanted)
 
     def of(self, grasps: Collection[Grasp]) -> dict[Grasp, list[str]]:
@@ -53,7 +53,7 @@ class Tags:
         if selection.filter is not None:
             return self._grasps.members(selection.filter)
         named = sorted({(grasp.shard_id, grasp.row) for grasp in selection.grasps or ()})
-        there = self._services.index.tags.there(named, scope=project_scope())
+        there = self._services.index.tags.existing_grasps(named, scope=project_scope())
         for shard, row in named:
             if (shard, row) not in there:
                 raise NotFoundError(f"there is no grasp {row} in shard {shard!r}")
@@ -73,13 +73,13 @@ class Tags:
         log.info("tag %s given to %d grasps", name, changed)
         return TagChange(tag=self.one(tag_id(name, project)), changed=changed)
 
-    def take_off(self, name: str, selection: Selection) -> TagChange:
-        tag = self._services.index.tags.named(name, scope=project_scope())
+    def untag(self, name: str, selection: Selection) -> TagChange:
+        tag = self._services.index.tags.id_of(name, scope=project_scope())
         changed = tagging.untag_grasps(self._services, tag, self.chosen(selection), permit=_permit)
         return TagChange(tag=self.one(tag), changed=changed)
 
     def remove(self, name: str) -> None:
-        tag = self._services.index.tags.named(name, scope=project_scope())
+        tag = self._services.index.tags.id_of(name, scope=project_scope())
         tagging.delete_tag(self._services, tag, permit=_permit, owner=caller_id())
         log.info("tag %s removed", name)
 
@@ -91,7 +91,7 @@ class Tags:
 
 def _permit(tag: Tag | None) -> None:
     if tag is not None:
-        must_own(tag.owner, f"the tag {tag.name!r}", tag.project)
+        require_ownership(tag.owner, f"the tag {tag.name!r}", tag.project)
 
 
 Format = Literal["csv", "json", "zip"]
@@ -110,7 +110,7 @@ class GraspExports:
         self._grasps = grasps
         self._tags = tags
 
-    def made(self, places: Sequence[Grasp], format: Format, said: Mapping[str, Any]) -> tuple[int, Iterator[bytes]]:
+    def export(self, places: Sequence[Grasp], format: Format, said: Mapping[str, Any]) -> tuple[int, Iterator[bytes]]:
         """Write grasps that are in scope, and their selection `said`, to a file; return its size and bytes."""
         file = TemporaryFile()  # noqa: SIM115 (it is closed once it is sent)
         try:
@@ -124,7 +124,7 @@ class GraspExports:
 
     def _rows(self, places: Sequence[Grasp]) -> Iterator[dict[str, Any]]:
         tags = self._tags.of(places)
-        for grasp in self._grasps.listed(places):
+        for grasp in self._grasps.get_many(places):
             yield grasp.model_dump(mode="json") | {"tags": tags.get((grasp.shard_id, grasp.row), [])}
 
     def _csv(self, file: IO[bytes], places: Sequence[Grasp], _: Mapping[str, Any]) -> None:
@@ -143,7 +143,7 @@ class GraspExports:
         file.write(b"\n]}\n")
 
     def _zip(self, file: IO[bytes], places: Sequence[Grasp], said: Mapping[str, Any]) -> None:
-        shards = by_shard(places)
+        shards = rows_by_shard(places)
         if not shards:
             raise InputError("the selection contains no grasp; change it")
         if len(shards) > MOST_SHARDS:
@@ -161,7 +161,7 @@ class GraspExports:
                 mask = np.zeros(known.count, bool)
                 mask[list(rows)] = True
                 looked_at += len(mask)
-                names.append(place_of(shard, names))
+                names.append(relative_path_of(shard, names))
                 # ZipInfo has a fixed date, so that the same grasps give an identical file.
                 packed.writestr(zipfile.ZipInfo(str(names[-1])), part_of_shard(shard, mask))
             told = {**said, "looked_at": looked_at, "kept": len(set(places)), "shards": [str(name) for name in names]}

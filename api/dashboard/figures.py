@@ -14,7 +14,7 @@ from graspd.service.index.views import CellView, DatasetView, MatrixCell
 from graspd.service.model import studies
 from graspd.service.model.errors import DamagedError
 from graspd.service.model.states import State
-from graspd.service.store.records import STABILITY, latest
+from graspd.service.store.records import STABILITY, latest_record
 from graspd.service.store.store import Store
 
 WIDTH: Final = 600.0
@@ -42,7 +42,7 @@ class Bar:
     href: str
 
 
-def minutes(values: Sequence[int], start: float) -> Plot:
+def minute_plot(values: Sequence[int], start: float) -> Plot:
     """Draw bars of the grasps made in each minute from `start` [s since 1970]."""
     top = max([*values, 1])
     width = WIDTH / max(len(values), 1)
@@ -131,7 +131,7 @@ class Grid:
     hidden: int = 0
 
 
-def of_dataset(dataset: DatasetView, cells: Sequence[CellView]) -> Grid:
+def dataset_grid(dataset: DatasetView, cells: Sequence[CellView]) -> Grid:
     found = {
         (cell.hand, cell.object): Tile(
             hand=cell.hand,
@@ -152,7 +152,7 @@ def of_dataset(dataset: DatasetView, cells: Sequence[CellView]) -> Grid:
     return _grid(dataset.hands, dataset.objects, found)
 
 
-def of_service(cells: Iterable[MatrixCell], hands: Sequence[str], objects: Sequence[str]) -> Grid:
+def service_grid(cells: Iterable[MatrixCell], hands: Sequence[str], objects: Sequence[str]) -> Grid:
     found = {
         (cell.hand, cell.object): Tile(
             hand=cell.hand,
@@ -235,19 +235,19 @@ class MapDrawing:
     reached: list[Share]
 
 
-def load(store: Store) -> studies.Stability | None:
+def load_stability(store: Store) -> studies.Stability | None:
     try:
-        found = latest(store, STABILITY)
+        found = latest_record(store, STABILITY)
         return None if found is None else studies.from_json(found)
     except (ValueError, DamagedError):
         return None
 
 
-def draw(one: studies.StabilityMap) -> MapDrawing:
+def draw_map(one: studies.StabilityMap) -> MapDrawing:
     return MapDrawing(
         map=one,
         panels=[_panel(one, name) for name in one.panels],
-        counts={outcome: number for outcome, number in studies.counts(one.cells).items() if number},
+        counts={outcome: number for outcome, number in studies.count_outcomes(one.cells).items() if number},
         reached=_shares(one.reached()),
     )
 
@@ -259,15 +259,15 @@ def _panel(one: studies.StabilityMap, name: str) -> Panel:
     line = one.lines.get(name, [])
     if any(isinstance(x, str) for x in xs):
         # Texts fit better before a row than below a narrow column.
-        rows = [(studies.tick(x), [squares.get((x, y)) for y in ys]) for x in xs]
-        return Panel(name, one.y, one.x, [studies.tick(y) for y in ys], rows, "")
+        rows = [(studies.format_tick(x), [squares.get((x, y)) for y in ys]) for x in xs]
+        return Panel(name, one.y, one.x, [studies.format_tick(y) for y in ys], rows, "")
     upward = ys if all(isinstance(y, str) for y in ys) else ys[::-1]
-    rows = [(studies.tick(y), [squares.get((x, y)) for x in xs]) for y in upward]
+    rows = [(studies.format_tick(y), [squares.get((x, y)) for x in xs]) for y in upward]
     points = " ".join(
-        f"{PITCH[0] * (studies.between(xs, x) + 0.5):.1f},{PITCH[1] * (len(ys) - 0.5 - studies.between(ys, y)):.1f}"
-        for x, y in line
+        f"{PITCH[0] * (at_x + 0.5):.1f},{PITCH[1] * (len(ys) - 0.5 - at_y):.1f}"
+        for at_x, at_y in ((studies.tick_position(xs, x), studies.tick_position(ys, y)) for x, y in line)
     )
-    return Panel(name, one.x, one.y, [studies.tick(x) for x in xs], rows, points)
+    return Panel(name, one.x, one.y, [studies.format_tick(x) for x in xs], rows, points)
 
 
 def _square(one: studies.StabilityMap, cell: studies.MapCell, *, ringed: bool) -> CellSquare:
@@ -275,13 +275,13 @@ def _square(one: studies.StabilityMap, cell: studies.MapCell, *, ringed: bool) -
     return CellSquare(
         outcome=cell.outcome,
         text=cell.text,
-        said=f"{one.x} {studies.tick(cell.x)}, {one.y} {studies.tick(cell.y)}: {cell.outcome}; {value}",
+        said=f"{one.x} {studies.format_tick(cell.x)}, {one.y} {studies.format_tick(cell.y)}: {cell.outcome}; {value}",
         ringed=ringed,
     )
 
 
 def _shares(cells: Sequence[studies.MapCell]) -> list[Share]:
-    found = studies.counts(cells)
+    found = studies.count_outcomes(cells)
     shares, x = [], 0.0
     for outcome in studies.OUTCOMES:
         if found[outcome]:

@@ -19,17 +19,19 @@ from graspd.api.dashboard.forms import fields_of, first_message
 from graspd.api.dashboard.rendering import base_url, render
 from graspd.api.models import GraspName, GraspQuery, Selection
 from graspd.api.routes.dependencies import READ, SUBMIT, AssetsOf, ExportsOf, GraspsOf, ShardsOf, TagsOf, next_address
-from graspd.api.routes.grasps import exported
+from graspd.api.routes.grasps import export_response
 from graspd.service.index.views import GraspView, TagView
 from graspd.service.model.base import TagName
 from graspd.service.model.errors import InputError
-from graspd.service.model.metrics import AXIS_MEANINGS, GRASP_METRICS, GraspType, IndexLevel, indexed
+from graspd.service.model.metrics import AXIS_MEANINGS, GRASP_METRICS, GraspType, IndexLevel, indexed_metrics
 from graspd.service.model.states import AssetKind
 
 PAGE_SIZES: Final = {"cards": 24, "table": 50}
-COLUMNS: Final = tuple((metric.name, metric.column_title, metric.unit) for metric in indexed(IndexLevel.OFFERED))
+COLUMNS: Final = tuple(
+    (metric.name, metric.column_title, metric.unit) for metric in indexed_metrics(IndexLevel.OFFERED)
+)
 #: Metrics for which less is better: the first click sorts in ascending order.
-_LESS_IS_BETTER: Final = frozenset(metric.name for metric in indexed() if metric.less_is_better)
+_LESS_IS_BETTER: Final = frozenset(metric.name for metric in indexed_metrics() if metric.less_is_better)
 _BESIDE_VERDICT: Final = frozenset({"contact_links", "robustness", "robust_share", "grasp_type", "approach_cell"})
 
 #: Description of each axis along which models differ from the nominal one.
@@ -78,7 +80,7 @@ def grasps_page(
         models=shards.assets_of({grasp.shard_id for grasp in rows}) if view == "cards" else {},
         columns=COLUMNS,
         weakest=list(_WEAKEST.items()),
-        limits={metric.name: metric.limits for metric in indexed(IndexLevel.OFFERED)},
+        limits={metric.name: metric.limits for metric in indexed_metrics(IndexLevel.OFFERED)},
         sort=query.sort,
         sorts=[("" if key == GraspQuery().sort else key, label) for key, label, _ in COLUMNS],
         descending=query.order == "desc",
@@ -109,7 +111,7 @@ def grasp_page(
         job=shards.job_of(shard_id),
         metrics=[
             (metric.title, getattr(grasp, metric.name), metric.unit)
-            for metric in indexed()
+            for metric in indexed_metrics()
             if metric.name not in _BESIDE_VERDICT
         ],
         type=GraspType(int(grasp.grasp_type or 0)),
@@ -170,7 +172,7 @@ def untag(tags: TagsOf, fields: Fields) -> RedirectResponse:
 @router.post("/grasps/export", dependencies=READ)
 async def export(request: Request, tags: TagsOf, exports: ExportsOf, fields: Fields) -> StreamingResponse:
     wanted = _validate(_FORMAT, fields.get("format") or "zip", "format")
-    return await exported(request, tags, exports, _selection(fields), wanted)
+    return await export_response(request, tags, exports, _selection(fields), wanted)
 
 
 def action_summary(given: dict[str, str]) -> str:
@@ -188,7 +190,7 @@ def action_summary(given: dict[str, str]) -> str:
 def _tag(tags: Tags, fields: FormData, *, on: bool) -> RedirectResponse:
     name = _validate(_NAME, fields.get("tag"), "tag")
     selection = _selection(fields)
-    change = tags.give(name, selection) if on else tags.take_off(name, selection)
+    change = tags.give(name, selection) if on else tags.untag(name, selection)
     said = {"did": "tagged" if on else "untagged", "done": change.changed, "named": name}
     here = str(fields.get("here", ""))
     here = here if _PAGES.fullmatch(here) else "/grasps"

@@ -72,7 +72,7 @@ def home(
         chosen=chosen or "",
         stats=overview.stats(),
         minutes=minutes,
-        pace=figures.minutes(minutes, start),
+        pace=figures.minute_plot(minutes, start),
         jobs=jobs.page(state=chosen, limit=PAGE_SIZE, cursor=cursor),
         stages=stage_depths(overview),
         workers=[worker for worker in overview.workers() if is_recent(worker)],
@@ -104,9 +104,9 @@ def workers_page(request: Request, overview: OverviewOf) -> HTMLResponse:
 def chart_page(
     request: Request, store: StoreOf, y: str = "gsr", lifts: str = "lift", hand: str = "", object: str = ""
 ) -> HTMLResponse:
-    measured = tradeoff.load(store)
+    measured = tradeoff.load_charts(store)
     axis = {False: y if y in tradeoff.FREE else "gsr", True: lifts if lifts in tradeoff.IN_SCENES else "lift"}
-    drawn = [tradeoff.draw(one, axis=axis[one.scene is not None], hand=hand, object=object) for one in measured]
+    drawn = [tradeoff.draw_chart(one, axis=axis[one.scene is not None], hand=hand, object=object) for one in measured]
     return render(
         request,
         "chart.html",
@@ -131,14 +131,14 @@ def chart_page(
 
 @router.get("/stability", dependencies=READ)
 def stability_page(request: Request, store: StoreOf) -> HTMLResponse:
-    measured = figures.load(store)
+    measured = figures.load_stability(store)
     return render(
         request,
         "stability.html",
         page="/stability",
         poll_s=_STUDY_S,
         measured=measured,
-        maps=[figures.draw(one) for one in measured.maps] if measured else [],
+        maps=[figures.draw_map(one) for one in measured.maps] if measured else [],
     )
 
 

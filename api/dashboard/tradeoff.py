@@ -15,7 +15,7 @@ from pydantic import BaseModel
 from graspd.service.model.errors import DamagedError
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.studies import FILTERED, pareto
-from graspd.service.store.records import CHARTS, latest, scene_kinds
+from graspd.service.store.records import CHARTS, latest_record, scene_kinds
 from graspd.service.store.store import Store
 
 WIDTH: Final = 860
@@ -156,19 +156,19 @@ class Drawing:
     """Methods and fidelities without a grasp, which have no speed."""
 
 
-def load(store: Store) -> list[Measured]:
+def load_charts(store: Store) -> list[Measured]:
     """Load the last published charts, free objects first; unreadable ones are omitted."""
     found = []
     for kind in (CHARTS, *scene_kinds(store)):
         try:
-            content = latest(store, kind)
+            content = latest_record(store, kind)
             found += [] if content is None else [Measured.model_validate(content)]
         except (ValueError, DamagedError):
             continue
     return found
 
 
-def draw(measured: Measured, *, axis: str, hand: str = "", object: str = "") -> Drawing:
+def draw_chart(measured: Measured, *, axis: str, hand: str = "", object: str = "") -> Drawing:
     """Draw every method and fidelity over the runs of a hand and an object; an empty name means all."""
     shown = measured.axes[axis]
     chosen = [run for run in measured.runs if hand in ("", run.hand) and object in ("", run.object)]

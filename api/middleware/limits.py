@@ -29,7 +29,7 @@ from graspd.api.middleware.request_context import SAFE_METHODS, HttpMiddleware
 from graspd.api.problems import ApiError, error_response
 from graspd.service.model.errors import LimitError
 from graspd.service.settings import Settings
-from graspd.service.telemetry import bind
+from graspd.service.telemetry import bind_subjects
 
 #: Paths without limits: they are cheap, and browsers and monitoring poll them often.
 _FREE: Final = ("/static/", "/healthz", "/readyz")
@@ -55,7 +55,7 @@ class RateLimit(HttpMiddleware):
         key = scope.setdefault("state", {})["key"] = None if is_open else identify(scope, self.keys, self.proxy)
         token = present_caller.set(key)
         try:
-            with bind(key=key.name if key else ""):
+            with bind_subjects(key=key.name if key else ""):
                 if is_open or scope["path"].startswith(_FREE):
                     await self.app(scope, receive, send)
                 else:

@@ -21,7 +21,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from graspd.api.metrics import Metrics
 from graspd.api.problems import ApiError, error_response
 from graspd.service.model.errors import GraspdError
-from graspd.service.telemetry import bind
+from graspd.service.telemetry import bind_subjects
 
 _access = logging.getLogger("graspd.access")
 _log = logging.getLogger("graspd.api")
@@ -68,7 +68,7 @@ class RequestContext(HttpMiddleware):
         given = Headers(scope=scope).get("x-request-id", "")
         request_id = given if _REQUEST_ID.fullmatch(given) else uuid.uuid4().hex[:16]
         scope.setdefault("state", {})["request_id"] = request_id
-        with bind(request=request_id):
+        with bind_subjects(request=request_id):
             await self._answer(scope, receive, send, request_id)
 
     async def _answer(self, scope: Scope, receive: Receive, send: Send, request_id: str) -> None:

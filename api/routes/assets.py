@@ -14,7 +14,7 @@ from pydantic import Field
 from starlette.datastructures import UploadFile as AnyUpload
 
 from graspd.api.catalog.assets import Assets
-from graspd.api.problems import responses
+from graspd.api.problems import problem_responses
 from graspd.api.routes.dependencies import (
     READ,
     SUBMIT,
@@ -63,7 +63,7 @@ def asset_router(kind: AssetKind) -> APIRouter:
         page = assets.page(kind, limit=limit, cursor=cursor, refused=refused)
         return Paging(request, response, limit, cursor).linked(page)
 
-    @router.get("/{name}", dependencies=READ, responses=responses(404), name=f"get_{kind}")
+    @router.get("/{name}", dependencies=READ, responses=problem_responses(404), name=f"get_{kind}")
     def get_asset(name: str, assets: AssetsOf) -> AssetView:
         """Return an asset with the findings of its check."""
         return assets.one(kind, name)
@@ -75,7 +75,7 @@ def asset_router(kind: AssetKind) -> APIRouter:
         "",
         status_code=201 if kind is AssetKind.NETWORK else 202,
         dependencies=SUBMIT,
-        responses=responses(400, 409),
+        responses=problem_responses(400, 409),
         name=f"add_{kind}",
         description=_ADDED[kind],
     )
@@ -109,7 +109,7 @@ def asset_router(kind: AssetKind) -> APIRouter:
         return asset
 
     @router.delete(
-        "/{name}", status_code=204, dependencies=SUBMIT, responses=responses(404, 409), name=f"delete_{kind}"
+        "/{name}", status_code=204, dependencies=SUBMIT, responses=problem_responses(404, 409), name=f"delete_{kind}"
     )
     def delete_asset(name: str, assets: AssetsOf) -> None:
         """Delete an asset; refused while a job, dataset or set of objects needs it. `name` may be a digest."""
@@ -123,7 +123,7 @@ def _add_model_route(router: APIRouter, kind: AssetKind) -> None:
         "/{name}/model",
         dependencies=READ,
         response_class=Response,
-        responses=responses(
+        responses=problem_responses(
             404,
             others={
                 200: {"content": {_GLB: {}}, "description": "Binary glTF"},
@@ -190,7 +190,9 @@ class CorrectionRequest(HandCorrections):
     name: Name | None = Field(None, description="name of the corrected hand; default: the hand's name with a number")
 
 
-@correction_router.post("/{name}/corrections", status_code=202, dependencies=SUBMIT, responses=responses(400, 404, 409))
+@correction_router.post(
+    "/{name}/corrections", status_code=202, dependencies=SUBMIT, responses=problem_responses(400, 404, 409)
+)
 async def correct_hand(
     name: str, body: CorrectionRequest, request: Request, response: Response, assets: AssetsOf
 ) -> AssetView:

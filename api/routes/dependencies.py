@@ -15,7 +15,7 @@ from starlette.datastructures import Headers
 
 from graspd.api.access.auth import authorize
 from graspd.api.access.keys import Scope
-from graspd.api.access.quotas import Idempotency, Quotas, unfinished
+from graspd.api.access.quotas import Idempotency, Quotas, select_unfinished
 from graspd.api.catalog.assets import Assets
 from graspd.api.catalog.datasets import Datasets
 from graspd.api.catalog.events import Webhooks
@@ -39,7 +39,7 @@ def provide(app: FastAPI, services: Services) -> None:
     quotas = Quotas(
         services.settings,
         redis,
-        lambda ids: unfinished(services.index, ids),
+        lambda ids: select_unfinished(services.index, ids),
         limits_of=state.keys.limits_of,
         gpu_seconds=services.index.usage.gpu_seconds,
     )

@@ -17,14 +17,14 @@ from graspd.api.models import (
     TagChange,
     TagRequest,
 )
-from graspd.api.problems import responses
+from graspd.api.problems import problem_responses
 from graspd.api.routes.dependencies import READ, SUBMIT, ExportsOf, GraspsOf, Paging, TagsOf
 from graspd.service.index.views import GraspView, Page, TagView
 
 router = APIRouter(prefix="/v1/grasps", tags=["grasps"])
 
 
-@router.get("/{shard_id}/{row}", dependencies=READ, responses=responses(404))
+@router.get("/{shard_id}/{row}", dependencies=READ, responses=problem_responses(404))
 def get_grasp(shard_id: str, row: int, response: Response, grasps: GraspsOf) -> GraspDetail:
     """Return one grasp with its postures, and its metrics at every contact threshold."""
     response.headers["Cache-Control"] = "private, max-age=86400"
@@ -35,7 +35,7 @@ def get_grasp(shard_id: str, row: int, response: Response, grasps: GraspsOf) -> 
     "/export",
     dependencies=READ,
     response_class=StreamingResponse,
-    responses=responses(
+    responses=problem_responses(
         404,
         413,
         500,
@@ -47,14 +47,14 @@ async def export_grasps(
 ) -> StreamingResponse:
     """Export all grasps that pass every filter: rows as CSV or JSON, or base shards in a ZIP."""
     chosen = GraspQuery.model_validate(query.model_dump(exclude={"format"}))
-    return await exported(request, tags, exports, Selection(filter=chosen), query.format)
+    return await export_response(request, tags, exports, Selection(filter=chosen), query.format)
 
 
-async def exported(
+async def export_response(
     request: Request, tags: Tags, exports: GraspExports, selection: Selection, format: Format
 ) -> StreamingResponse:
     said = selection.model_dump(mode="json", exclude_none=True)
-    size, chunks = await request.app.state.exports.run(lambda: exports.made(tags.chosen(selection), format, said))
+    size, chunks = await request.app.state.exports.run(lambda: exports.export(tags.chosen(selection), format, said))
     headers = {
         "Content-Length": str(size),
         "Content-Disposition": f'attachment; filename="grasps.{format}"',
@@ -63,7 +63,7 @@ async def exported(
     return StreamingResponse(chunks, media_type=MEDIA_TYPES[format], headers=headers)
 
 
-@router.get("", dependencies=READ, responses=responses(404))
+@router.get("", dependencies=READ, responses=problem_responses(404))
 def list_grasps(
     request: Request, response: Response, grasps: GraspsOf, query: Annotated[GraspPageQuery, Query()]
 ) -> Page[GraspView]:
@@ -83,25 +83,25 @@ def list_tags(tags: TagsOf) -> list[TagView]:
     return tags.all()
 
 
-@tag_router.post("", dependencies=SUBMIT, responses=responses(400, 404, 409))
+@tag_router.post("", dependencies=SUBMIT, responses=problem_responses(400, 404, 409))
 def give_tag(body: TagRequest, tags: TagsOf) -> TagChange:
     """Give a tag to listed or filtered grasps; create the tag if it is new."""
     return tags.give(body.name, body)
 
 
-@tag_router.get("/{name}", dependencies=READ, responses=responses(404))
+@tag_router.get("/{name}", dependencies=READ, responses=problem_responses(404))
 def get_tag(name: TagName, tags: TagsOf) -> TagView:
     """Return a tag; `GET /v1/grasps?tag=NAME` lists its grasps."""
     return tags.one(name)
 
 
-@tag_router.post("/{name}/remove", dependencies=SUBMIT, responses=responses(400, 404, 409))
+@tag_router.post("/{name}/remove", dependencies=SUBMIT, responses=problem_responses(400, 404, 409))
 def take_tag_off(name: TagName, body: Selection, tags: TagsOf) -> TagChange:
     """Remove a tag from listed or filtered grasps."""
-    return tags.take_off(name, body)
+    return tags.untag(name, body)
 
 
-@tag_router.delete("/{name}", status_code=204, dependencies=SUBMIT, responses=responses(404, 409))
+@tag_router.delete("/{name}", status_code=204, dependencies=SUBMIT, responses=problem_responses(404, 409))
 def delete_tag(name: TagName, tags: TagsOf) -> None:
     """Delete a tag; its grasps remain."""
     tags.remove(name)

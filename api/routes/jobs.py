@@ -12,7 +12,7 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 
 from graspd.api.catalog import events
 from graspd.api.models import Job, JobDetail, Shard
-from graspd.api.problems import ApiError, responses
+from graspd.api.problems import ApiError, problem_responses
 from graspd.api.routes.dependencies import READ, SUBMIT, JobsOf, PagingOf, ShardsOf, is_unmodified, range_applies
 from graspd.service.index.views import Page
 from graspd.service.model.domain import JobRequest
@@ -30,7 +30,7 @@ IdempotencyKey = Annotated[
     "",
     status_code=202,
     dependencies=SUBMIT,
-    responses=responses(
+    responses=problem_responses(
         400, 404, 409, others={200: {"model": JobDetail, "description": "The job existed already and has ended"}}
     ),
 )
@@ -59,40 +59,40 @@ def list_jobs(
     return paging.linked(page)
 
 
-@router.get("/{job_id}", dependencies=READ, responses=responses(404))
+@router.get("/{job_id}", dependencies=READ, responses=problem_responses(404))
 def get_job(job_id: str, jobs: JobsOf) -> JobDetail:
     """Return a job with the progress of its stages, failed attempts, mean metrics and shards."""
     return jobs.one(job_id)
 
 
-@router.post("/{job_id}/cancel", status_code=202, dependencies=SUBMIT, responses=responses(404, 409))
+@router.post("/{job_id}/cancel", status_code=202, dependencies=SUBMIT, responses=problem_responses(404, 409))
 def cancel(job_id: str, jobs: JobsOf) -> JobDetail:
     """Cancel a job's waiting and running tasks; results remain."""
     return jobs.cancel(job_id)
 
 
-@router.post("/{job_id}/retry", status_code=202, dependencies=SUBMIT, responses=responses(404, 409))
+@router.post("/{job_id}/retry", status_code=202, dependencies=SUBMIT, responses=problem_responses(404, 409))
 def retry(job_id: str, jobs: JobsOf) -> JobDetail:
     """Run failed and cancelled tasks again; existing results are not made again."""
     return jobs.retry(job_id)
 
 
-@router.delete("/{job_id}", status_code=204, dependencies=SUBMIT, responses=responses(404, 409))
+@router.delete("/{job_id}", status_code=204, dependencies=SUBMIT, responses=problem_responses(404, 409))
 def delete(job_id: str, jobs: JobsOf) -> None:
     """Delete an ended job; `POST .../restore` restores it. Shards that only it uses stay for a grace time."""
     jobs.delete(job_id)
 
 
-def known_job(job_id: str, jobs: JobsOf) -> None:
+def require_known_job(job_id: str, jobs: JobsOf) -> None:
     """Refuse an unknown job before its event stream starts, because the HTTP status cannot change later."""
-    jobs.moving(job_id)
+    jobs.get_progress(job_id)
 
 
 @router.get(
     "/{job_id}/events",
-    dependencies=[*READ, Depends(known_job)],
+    dependencies=[*READ, Depends(require_known_job)],
     response_class=EventSourceResponse,
-    responses=responses(404),
+    responses=problem_responses(404),
 )
 async def watch(job_id: str, request: Request, jobs: JobsOf) -> AsyncIterable[ServerSentEvent]:
     """Stream a job's progress: `progress` with the job at each change, `end` with its last state."""
@@ -107,7 +107,7 @@ _MEDIA_TYPE = "application/x-hdf5"
 _RANGE = re.compile(r"bytes=([0-9]{0,18})-([0-9]{0,18})")
 
 
-@shard_router.get("", dependencies=READ, responses=responses(404))
+@shard_router.get("", dependencies=READ, responses=problem_responses(404))
 def list_shards(
     shards: ShardsOf,
     paging: PagingOf,
@@ -118,7 +118,7 @@ def list_shards(
     return paging.linked(shards.page(job=job, kind=kind, limit=paging.limit, cursor=paging.cursor))
 
 
-@shard_router.get("/{shard_id}", dependencies=READ, responses=responses(404))
+@shard_router.get("/{shard_id}", dependencies=READ, responses=problem_responses(404))
 def get_shard(shard_id: str, shards: ShardsOf) -> Shard:
     """Return a shard with its whole manifest."""
     return shards.one(shard_id)
@@ -129,7 +129,7 @@ def get_shard(shard_id: str, shards: ShardsOf) -> Shard:
     "/{shard_id}/file",
     dependencies=READ,
     response_class=StreamingResponse,
-    responses=responses(
+    responses=problem_responses(
         404,
         416,
         others={
@@ -145,13 +145,13 @@ def get_file(shard_id: str, request: Request, shards: ShardsOf) -> Response:
 
     Range, If-None-Match and If-Range are supported.
     """
-    shard = shards.intact(shard_id)
+    shard = shards.get_intact(shard_id)
     # The id depends on the content, so cached copies never become stale.
     headers = {"ETag": f'"{shard.sha256}"', "Cache-Control": "private, max-age=31536000, immutable"}
     if is_unmodified(request.headers, headers["ETag"]):
         return Response(status_code=304, headers=headers)
     only_head = request.method == "HEAD"
-    if not only_head and (address := shards.address(shard)) is not None:
+    if not only_head and (address := shards.signed_url(shard)) is not None:
         return RedirectResponse(address, status_code=307)
     size = shards.size(shard)
     wanted = request.headers.get("range")

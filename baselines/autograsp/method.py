@@ -82,7 +82,7 @@ STEPS: Final = 400
 ADVANCES: Final = 40
 
 
-def levers(hand: HandModel, points: SurfacePoints) -> Floats:
+def lever_arm_bounds(hand: HandModel, points: SurfacePoints) -> Floats:
     """Return (D, L) bounds on the motion of body l's points per unit of dof d, by chain lengths [m/rad]."""
     radius = np.zeros(hand.bodies)
     np.maximum.at(radius, points.body, np.linalg.norm(points.position, axis=1))
@@ -135,7 +135,7 @@ class HandCloser:
 
     def _closing(self) -> Any:
         hand, points = self.hand, self.pair.fine.points
-        lever = levers(hand, points)
+        lever = lever_arm_bounds(hand, points)
         moves = lever > 0
         out = kernels.Closing()
         with wp.ScopedDevice(self.model.device):

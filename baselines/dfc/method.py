@@ -14,7 +14,7 @@ import warp as wp
 from numpy.typing import NDArray
 from pydantic import Field
 
-from graspd.baselines.common import frame_along, grasp_set, inside_points, load_pair
+from graspd.baselines.common import frame_along, grasp_set, inner_side_points, load_pair
 from graspd.baselines.dfc import kernels
 from graspd.service.model.transforms import (
     IDENTITY_POSE,
@@ -143,7 +143,7 @@ class Descent:
         self.pair, self.n = pair, len(starts.pivot)
         hand = pair.hand.model
         self.obj = pair.fine.obj.thinned(SAMPLES)
-        self.candidates = inside_points(hand, each=EACH, on_palm=ON_PALM)
+        self.candidates = inner_side_points(hand, each=EACH, on_palm=ON_PALM)
         # Model of the proposals; only its kinematics is computed.
         self.model = Model.create(pair.hand, self.obj, pair.coarse.points, pair.coarse.own, pair.options)
         self.proposal = Data(self.model, self.n)

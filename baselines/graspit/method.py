@@ -21,7 +21,7 @@ from pydantic import Field
 
 from graspd.baselines.autograsp import kernels as closing_kernels
 from graspd.baselines.autograsp.method import HandCloser
-from graspd.baselines.common import cached_search, frame_along, grasp_set, inside_points, load_pair
+from graspd.baselines.common import cached_search, frame_along, grasp_set, inner_side_points, load_pair
 from graspd.baselines.graspit import kernels
 from graspd.baselines.graspit.kernels import FIRST_STEP
 from graspd.service.model.errors import InputError
@@ -51,7 +51,7 @@ class Search:
             self.problem = self._problem()
 
     def _problem(self) -> Any:
-        hand, obj, contacts = self.hand, self.pair.fine.obj, inside_points(self.hand, each=EACH, on_palm=ON_PALM)
+        hand, obj, contacts = self.hand, self.pair.fine.obj, inner_side_points(self.hand, each=EACH, on_palm=ON_PALM)
         out = kernels.Problem()
         out.tree, out.surface, out.pieces = self.pair.hand.tree, obj.surface, self.pair.hand.pieces
         out.points = body_points(self.pair.fine.points, hand.bodies)

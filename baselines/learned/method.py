@@ -21,9 +21,9 @@ from graspd.service.store.network_file import ProposalNetwork
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
-from graspd.worker.objects.mesh_geometry import points_in
+from graspd.worker.objects.mesh_geometry import points_on_triangles
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.planners.fast_graspd.planner import plan, plan_joined
+from graspd.worker.planners.fast_graspd.planner import plan, plan_batches
 from graspd.worker.planners.fast_graspd.scene_starts import ROOM, clear_scene_starts
 from graspd.worker.planners.fast_graspd.starts import CLEAR, Probe
 from graspd.worker.planners.network_cache import cache_file, load_network
@@ -52,7 +52,7 @@ class LearnedPlanner:
 
     def joined(self, hand: HandModel, obj: ObjectModel, asked: Sequence[BatchRequest]) -> list[GraspSet | Exception]:
         """See `worker.planners.port.BatchPlanner`."""
-        return plan_joined(hand, obj, asked, warm=self._seeds(hand))
+        return plan_batches(hand, obj, asked, warm=self._seeds(hand))
 
     def _seeds(self, hand: HandModel) -> Seeds:
         network = load_network(self.options.network)
@@ -133,7 +133,7 @@ class Seeds:
             inputs, anchor = cloud_inputs(*cloud, table)
             condition = conditions(self.network, inputs[None], anchor[2:] - table)
             # Proposals of each grasp are computed separately, so that grasps are independent.
-            noise = np.concatenate([g.standard_normal((draws, self.network.numbers)) for g in mine])
+            noise = np.concatenate([g.standard_normal((draws, self.network.row_size)) for g in mine])
             rows = flow(self.network, noise.astype(np.float32), np.repeat(condition, len(noise), axis=0))
             found = decode(rows, anchor)
             at = compose(invert(pose), found.hand_pose)
@@ -218,7 +218,7 @@ class SurfaceView:
         area = np.linalg.norm(cross, axis=1)
         sums = np.cumsum(area)
         face = np.minimum(np.searchsorted(sums, sums[-1] * rng.random(DENSE)), len(area) - 1)
-        points = points_in(corners[face], *rng.random((2, DENSE, 1)))
+        points = points_on_triangles(corners[face], *rng.random((2, DENSE, 1)))
         return cls(obj, points, cross[face] / np.maximum(area[face, None], 1e-20))
 
     def camera(self, pose: Floats, rng: np.random.Generator) -> Floats:

@@ -88,7 +88,7 @@ def propose(
         spread: standard deviation of the noise; 1 as in training. Below 1, grasps are likelier and less diverse."""
     inputs, anchor = cloud_inputs(points, normals, table_height)
     condition = conditions(network, inputs[None], np.array([anchor[2] - table_height]), label)
-    noise = (spread * rng.standard_normal((count, network.numbers))).astype(np.float32)
+    noise = (spread * rng.standard_normal((count, network.row_size))).astype(np.float32)
     return decode(flow(network, noise, np.repeat(condition, count, axis=0)), anchor)
 
 

@@ -13,8 +13,8 @@ from benchmarks.modelling.common import SEED, Floats, Row, Subject, cpu, share
 from graspd.service.model.transforms import compose, quat_rotate
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.scenes import simulate
-from graspd.worker.scenes.clearance import transfer
-from graspd.worker.scenes.rest import RestingFaces, same_face
+from graspd.worker.scenes.clearance import transfer_grasps
+from graspd.worker.scenes.rest import RestingFaces, same_face_mask
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 
 #: Forearm: a straight round rod from the palm through the Allegro's flange, along -z of its root [m].
@@ -74,7 +74,7 @@ def _in_pieces(obj: ObjectModel, pieces: ConvexPieces, hull: Any) -> Any:
 
 
 def _same(faces: RestingFaces, a: int, b: int) -> bool:
-    return bool(same_face(faces, int(a), np.array([b]))[0])
+    return bool(same_face_mask(faces, int(a), np.array([b]))[0])
 
 
 def _distance(faces: RestingFaces, a: Any, b: Any) -> float:
@@ -101,7 +101,7 @@ def arm(subjects: list[Subject], scenes: int) -> Row:
     kept, hit, down, candidates, distinct = 0, 0, 0, 0, 0
     for s in subjects:
         poses = simulate.drop(s.obj, count=scenes, seed=SEED)["scene/object_pose"]
-        found = transfer(s.hand, s.grasps.grasp, s.grasps.pregrasp, poses)
+        found = transfer_grasps(s.hand, s.grasps.grasp, s.grasps.pregrasp, poses)
         valid = np.flatnonzero(found["grasp/valid"])
         distinct += len(np.unique(found["grasp/base_index"][valid]))
         base = s.grasps.grasp.hand_pose[found["grasp/base_index"][valid]]

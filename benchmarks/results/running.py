@@ -28,7 +28,7 @@ from graspd.service.model.cores import available_cores
 from graspd.service.model.version import STAGE_REVISIONS
 from graspd.service.run.supervisor import Supervisor
 from graspd.service.settings import Settings
-from graspd.worker.rendering.sheets import png
+from graspd.worker.rendering.sheets import png_bytes
 
 #: Mean difference of a channel, of 255, above which a palette shows steps in gradients, as in depth images.
 STEPS: Final = 0.45
@@ -207,7 +207,7 @@ def slim(file: Path) -> None:
         full = picture.convert("RGB")
     few = full.quantize(256, kmeans=1)
     lost = max(ImageStat.Stat(ImageChops.difference(full, few.convert("RGB"))).mean)
-    if lost <= STEPS and len(smaller := png(few)) < file.stat().st_size:
+    if lost <= STEPS and len(smaller := png_bytes(few)) < file.stat().st_size:
         file.write_bytes(smaller)
 
 

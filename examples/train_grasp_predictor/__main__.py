@@ -138,7 +138,7 @@ def main(
 ) -> None:
     """Train a grasp predictor on each source of data; lift unseen objects and faces with its proposals."""
     torch.set_num_threads(threads)
-    backend.start()
+    backend.start_warp()
     model = hand_from_path(hand)
 
     def opened(where: str) -> Shards:

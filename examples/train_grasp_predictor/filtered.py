@@ -13,7 +13,7 @@ from examples.train_grasp_predictor.execution import table
 from examples.train_grasp_predictor.samples import Floats, Scene, TrainedModel, rows_of
 from graspd.service.readers import Shards
 from graspd.service.store.shards import read_shard
-from graspd.worker.grasps import GraspSet, joined
+from graspd.worker.grasps import GraspSet, join_grasp_sets
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.scenes.trajectory import plan_trajectory
@@ -32,7 +32,7 @@ def valid_grasps(shards: Shards, obj: str) -> GraspSet | None:
         kept = np.flatnonzero(shard["quality/valid"] == 1)
         if len(kept):
             found.append(GraspSet.from_columns(shard.arrays).take(kept))
-    return joined(found) if found else None
+    return join_grasp_sets(found) if found else None
 
 
 def filtered(
@@ -78,7 +78,7 @@ def filtered(
                     missing -= len(grasps)
     if not parts:
         return nothing(hand)
-    return _to_be_proposed([scenes[s] for s in owner], rows_of(joined(parts), object_pose[owner]))
+    return _to_be_proposed([scenes[s] for s in owner], rows_of(join_grasp_sets(parts), object_pose[owner]))
 
 
 def nothing(hand: HandModel) -> TrainedModel:

@@ -253,7 +253,7 @@ def time_motions(paths: Sequence[Path], names: Sequence[str], velocity: Floats, 
     limits and on those of the hand."""
     phase, time, pose, joints = [paths[0].phase], [0.0], [paths[0].hand_pose[:1]], [paths[0].joints[:1]]
     for path in paths:
-        seconds = max(SHORTEST_S, _STEEPEST * _slowness(path, velocity) / speed)
+        seconds = max(SHORTEST_S, _STEEPEST * _shortest_duration(path, velocity) / speed)
         count = math.ceil(seconds / STEP_S)
         u = np.arange(1, count + 1) / count
         share = u**3 * (10 - 15 * u + 6 * u**2)
@@ -273,7 +273,7 @@ def time_motions(paths: Sequence[Path], names: Sequence[str], velocity: Floats, 
     return RobotTrajectory(tuple(names), tuple(phase), when, np.concatenate(pose), found, rate)
 
 
-def _slowness(path: Path, velocity: Floats) -> float:
+def _shortest_duration(path: Path, velocity: Floats) -> float:
     """Return the shortest duration of the motion at a constant rate within its limits [s]."""
     pieces = len(path.joints) - 1
     joints = np.abs(np.diff(path.joints, axis=0)) / velocity

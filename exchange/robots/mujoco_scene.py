@@ -45,13 +45,13 @@ def write(bundle: Bundle, folder: Path) -> list[Path]:
         geom.set("user", element_text([scene.tip_geoms[number], scene.pressing[number]]))
     site = {"name": "object_frame", "pos": element_text(-scene.centre), "size": "0.002", "group": "4"}
     SubElement(only_element(tree, ".//body[@name='object']"), "site", site)
-    _settle(tree, found)
+    _set_physics(tree, found)
     add_appearance(
         tree, found, ("body0", "object", "supports", *(f"neighbour{k}" for k in range(len(scene.neighbours))))
     )
     keys = SubElement(tree, "keyframe")
     for row, posture in product(range(len(found)), POSTURES):
-        SubElement(keys, "key", {"name": f"{bundle.name(row)}/{posture}", **_key(found, scene, posture, row)})
+        SubElement(keys, "key", {"name": f"{bundle.name(row)}/{posture}", **_key_frame(found, scene, posture, row)})
     rename(tree, _names(found.hand))
     ElementTree.indent(tree)
     file, script = folder / "scene.xml", folder / "replay.py"
@@ -74,7 +74,7 @@ def _restore_digits(tree: Element, spec: Any) -> None:
                         element.set(key, element_text(exact))
 
 
-def _settle(tree: Element, found: Executions) -> None:
+def _set_physics(tree: Element, found: Executions) -> None:
     """Fix supports in the world; set gravity as in the lift test, without effect on the hand."""
     option = only_element(tree, "option")
     support = tree.find(".//body[@name='supports']")
@@ -107,7 +107,7 @@ def add_appearance(tree: Element, found: Executions, names: tuple[str, ...]) -> 
     SubElement(tree, "statistic", center=element_text(middle), extent=element_text([size]))
 
 
-def _key(found: Executions, scene: Scene, posture: str, row: int) -> dict[str, str]:
+def _key_frame(found: Executions, scene: Scene, posture: str, row: int) -> dict[str, str]:
     """Return state and targets of a key frame; in squeeze and lift the fingers' state is the grasp."""
     command = found.postures[posture]
     stands = found.postures["grasp"] if posture in ("squeeze", "lift") else command

@@ -18,7 +18,7 @@ from graspd.service.model.transforms import Floats, pose_to_matrix
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.primitives import hull
 from graspd.worker.hands.robot import Ints
-from graspd.worker.objects.glb_document import Document, plain
+from graspd.worker.objects.glb_document import Document, rounded_values
 from graspd.worker.objects.mesh_geometry import corner_normals
 from graspd.worker.rendering.hands import drawn_bodies, hand_parts
 from graspd.worker.simulation.environment import Obstacle
@@ -37,8 +37,8 @@ def write_glb(bundle: Bundle, folder: Path) -> list[Path]:
         nodes: list[dict[str, Any]] = [{"name": bundle.name(row), "rotation": _UPRIGHT}]
 
         def add(solid: Solid, pose: Floats | None, document: Document = document, nodes: list[Any] = nodes) -> None:
-            primitive = document.triangles(solid.vertices, solid.faces, solid.normals, solid.colour)
-            nodes.append({"name": solid.name, "mesh": document.mesh([primitive]), **_placed(pose)})
+            primitive = document.add_triangles(solid.vertices, solid.faces, solid.normals, solid.colour)
+            nodes.append({"name": solid.name, "mesh": document.add_mesh([primitive]), **_placed(pose)})
 
         bodies = posed_bodies(found, "grasp", row)
         for solid in moving:
@@ -50,14 +50,14 @@ def write_glb(bundle: Bundle, folder: Path) -> list[Path]:
         nodes[0]["children"] = list(range(1, len(nodes)))
         said = {"kind": "grasp", "row": int(found.rows[row]), "frame": found.frame, "tool_frame": found.tool.name}
         written.append(folder / f"{bundle.name(row)}.glb")
-        written[-1].write_bytes(document.bytes(nodes, said))
+        written[-1].write_bytes(document.to_bytes(nodes, said))
     return written
 
 
 def _placed(pose: Floats | None) -> dict[str, Any]:
     if pose is None:
         return {}
-    return {"translation": plain(pose[:3]), "rotation": plain(np.roll(pose[3:], -1))}
+    return {"translation": rounded_values(pose[:3]), "rotation": rounded_values(np.roll(pose[3:], -1))}
 
 
 Colour = tuple[float, float, float]

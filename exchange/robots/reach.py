@@ -88,7 +88,7 @@ class Description:
     """Joints that the description couples to others; its readers move these joints themselves."""
 
 
-def describe(files: Mapping[str, bytes], options: Mapping[str, Any] | None = None) -> Description:
+def read_description(files: Mapping[str, bytes], options: Mapping[str, Any] | None = None) -> Description:
     """Return links and couplings of a hand; `files` and `options` as in `load_hand`."""
     source = HandSource.read(files, options)
     robot, tree = source.robot, build_tree(source.robot, source.options)
@@ -168,7 +168,7 @@ class ReachSearch:
         for start in range(STARTS):
             middle = 0.5 * (arm.lower + arm.upper)
             q = middle if start == 0 else rng.uniform(arm.lower, arm.upper)
-            found, why = self._from(q, ways, row)
+            found, why = self._search_from(q, ways, row)
             if found is not None:
                 return found, ""
             stage = next(k for k, one in enumerate(REASONS) if why.startswith(one))
@@ -176,7 +176,7 @@ class ReachSearch:
                 farthest, reason = stage, why
         return None, reason
 
-    def _from(self, q: Floats, ways: list[Path], row: int) -> tuple[list[Path] | None, str]:
+    def _search_from(self, q: Floats, ways: list[Path], row: int) -> tuple[list[Path] | None, str]:
         approach, *others = ways
         arrived = self._solve(q, approach.hand_pose[-1], STEPS)
         if arrived is None:

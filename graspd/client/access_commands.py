@@ -12,7 +12,7 @@ from graspd.api.access.keys import Key, KeyFile, KeyLimits, ProjectLimits, Scope
 from graspd.api.formatting import minute
 from graspd.client.client import path_of
 from graspd.client.reports import UrlOption, YesOption, confirm, open_client, print_rows, report_deletion
-from graspd.service.cli import CommandGroup, JsonFlag, load_settings, report
+from graspd.service.cli import CommandGroup, JsonFlag, load_settings, print_result
 from graspd.service.model.errors import InputError
 
 keys_app = CommandGroup(no_args_is_help=True, help="Make, list, rotate, limit and revoke API keys.")
@@ -91,7 +91,7 @@ def limit_key(
         raise InputError("give at least one limit, such as --jobs-per-day 100")
     limits = _key_file().limit(name, KeyLimits(**given))
     document = {"name": name, "limits": limits.model_dump(exclude_none=True)}
-    report(document, f"limits of {name}: {_key_limits(limits)}", json=json)
+    print_result(document, f"limits of {name}: {_key_limits(limits)}", json=json)
 
 
 @keys_app.command("list", epilog="graspd keys list --json")
@@ -114,7 +114,7 @@ def list_keys(json: JsonFlag = False) -> None:
 def revoke_key(name: NameArgument, json: JsonFlag = False) -> None:
     """Revoke a key; it is refused from the next request on."""
     _key_file().revoke(name)
-    report({"name": name, "revoked": True}, f"the key {name} is revoked", json=json)
+    print_result({"name": name, "revoked": True}, f"the key {name} is revoked", json=json)
 
 
 def duration(text: str) -> timedelta:
@@ -130,7 +130,7 @@ def _given_limits(**limits: int | None) -> dict[str, int]:
 
 
 def _show_token(name: str, scope: Scope, token: str, *, json: bool) -> None:
-    report({"name": name, "scope": scope, "key": token}, token, json=json)
+    print_result({"name": name, "scope": scope, "key": token}, token, json=json)
     if not json:
         typer.echo("This is the only time the key is shown. Send it as `Authorization: Bearer ...`.", err=True)
 
@@ -192,7 +192,7 @@ def limit_project(
         raise InputError("give at least one limit, such as --grasps-per-day 1000000")
     limits = _key_file().limit_project(name, ProjectLimits(**given))
     document = {"project": name, "limits": limits.model_dump(exclude_none=True)}
-    report(document, f"limits of {name}: {_project_limits(limits)}", json=json)
+    print_result(document, f"limits of {name}: {_project_limits(limits)}", json=json)
 
 
 def _project_limits(limits: ProjectLimits) -> str:
@@ -220,7 +220,7 @@ def add_webhook(
     states = [one.strip() for one in on.split(",") if one.strip()]
     with open_client(url) as client:
         made = client.send("POST", "/v1/webhooks", json={"url": address, "states": states}).json()
-    report(made, made["secret"], json=json)
+    print_result(made, made["secret"], json=json)
     if not json:
         typer.echo(f"webhook {made['id']}. This is the only time its secret is shown.", err=True)
 

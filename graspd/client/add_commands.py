@@ -18,7 +18,7 @@ import typer
 from graspd.api.uploads import name_of_upload
 from graspd.client.client import Client
 from graspd.client.reports import UrlOption, open_client, show_asset
-from graspd.service.cli import JsonFlag, emit
+from graspd.service.cli import JsonFlag, print_json
 from graspd.service.command_options import with_options
 from graspd.service.model.errors import InputError
 from graspd.service.model.states import AssetKind
@@ -85,7 +85,7 @@ def add_object(
     sizes = sizes_of(options.pop("scale_to", None))
     options |= provenance(licence, source) | ({"scale_to": sizes[0]} if len(sizes) == 1 else {})
     if len(sizes) > 1:
-        swept = sweep(files_of_set(file) or single_object(file, name), sizes)
+        swept = scale_objects(files_of_set(file) or single_object(file, name), sizes)
         add = partial(add_set, swept, name=name or name_of_set(file), prefix=None)
     elif files := files_of_set(file):
         add = partial(add_set, files, name=name or name_of_set(file), prefix=name)
@@ -151,7 +151,7 @@ def single_object(path: Path, name: str | None) -> Objects:
     return {name or name_of_upload(path.name): {path.name: path.read_bytes()}}
 
 
-def sweep(objects: Objects, sizes: Sequence[float]) -> Objects:
+def scale_objects(objects: Objects, sizes: Sequence[float]) -> Objects:
     """Return each object in each size [m]: `mug` at 0.08 becomes `mug-80mm`."""
     made: Objects = {}
     for name, files in objects.items():
@@ -186,7 +186,7 @@ def add_set(
     refused = [one["name"] for one in told if one["verdict"] == "refuse"]
     taken = len(told) - len(refused)
     if json:
-        emit({"objects": told, "refused": refused, "set": name if taken else None})
+        print_json({"objects": told, "refused": refused, "set": name if taken else None})
     elif taken:
         typer.echo(f"set {name}: {taken} objects; `graspd datasets create NAME --hands HANDS --objects {name}`")
     if refused:

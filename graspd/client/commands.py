@@ -26,8 +26,8 @@ from graspd.client.reports import (
     show_job,
     watch,
 )
-from graspd.service.cli import CommandGroup, JsonFlag, emit, plain_console
-from graspd.service.command_options import pairs, parsed_options, with_options
+from graspd.service.cli import CommandGroup, JsonFlag, plain_console, print_json
+from graspd.service.command_options import parse_pairs, parsed_options, with_options
 from graspd.service.model.domain import NETWORK_METHODS, JobOptions, JobRequest
 from graspd.service.model.errors import InputError
 from graspd.service.model.scene_spec import scene_option
@@ -53,7 +53,7 @@ def submit(
     with open_client(url) as client:
         as_object = partial(_asset_name, client, AssetKind.OBJECT)
         pair = {"hand": _asset_name(client, AssetKind.HAND, hand), "object": as_object(object)}
-        own = pairs(options.get("options", ()))
+        own = parse_pairs(options.get("options", ()))
         if options.get("method") in NETWORK_METHODS and "network" in own:
             own["network"] = _asset_name(client, AssetKind.NETWORK, str(own["network"]))
         place = {
@@ -147,7 +147,7 @@ def logs(job_id: JobArgument, url: UrlOption = None, json: JsonFlag = False) -> 
     with open_client(url) as client:
         job = client.job(_full_id(client, job_id))
     if json:
-        emit({"job": job.id, "attempts": [attempt.model_dump(mode="json") for attempt in job.attempts]})
+        print_json({"job": job.id, "attempts": [attempt.model_dump(mode="json") for attempt in job.attempts]})
         return
     console = plain_console()
     if not job.attempts:

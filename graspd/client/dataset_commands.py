@@ -31,14 +31,14 @@ from graspd.client.reports import (
     restore,
     watch_dataset,
 )
-from graspd.service.cli import CommandGroup, JsonFlag, emit, plain_console, report
-from graspd.service.command_options import pairs, parsed_options, with_options
+from graspd.service.cli import CommandGroup, JsonFlag, plain_console, print_json, print_result
+from graspd.service.command_options import parse_pairs, parsed_options, with_options
 from graspd.service.index.views import DatasetView
 from graspd.service.model.base import Name, error_text
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import InputError, TaskError, did_you_mean
 from graspd.service.model.options import validate
-from graspd.service.model.scene_spec import known_name, scene_option
+from graspd.service.model.scene_spec import check_object_name, scene_option
 from graspd.service.model.states import AssetKind, State
 from graspd.service.pipeline.datasets.export import export_shards
 from graspd.service.pipeline.datasets.spec import DatasetRequest, Estimate, Matrix
@@ -74,7 +74,7 @@ class PlanRequest:
     options: dict[str, Any]
     total: int | None = None
 
-    def shared_out(self, matrix: dict[str, Any], objects: int) -> dict[str, Any]:
+    def matrix_per_cell(self, matrix: dict[str, Any], objects: int) -> dict[str, Any]:
         """Return the matrix with grasps per cell; a total over all cells is divided and rounded up."""
         if self.total is None or not objects:
             return matrix
@@ -87,11 +87,11 @@ def plan_request(
     """Combine spec and options; options take precedence. The name is empty if neither contains it."""
     given = dict(options)
     if "options" in given:
-        given["options"] = pairs(given["options"])
+        given["options"] = parse_pairs(given["options"])
     if "scene" in given:
         given["scene"] = scene_option(given["scene"])
     if "neighbours" in given:
-        given["neighbours"] = [known_name(one) for one in given["neighbours"]]
+        given["neighbours"] = [check_object_name(one) for one in given["neighbours"]]
     said = read_spec(spec) if spec is not None else {}
     total = None if "grasps" in given else said.pop("total_grasps", None)
     said.pop("total_grasps", None)
@@ -120,7 +120,7 @@ def read_spec(file: Path) -> dict[str, Any]:
         if isinstance(found.get("scene"), str):
             found["scene"] = scene_option(found["scene"], beside=file.parent)
         if isinstance(beside := found.get("neighbours"), list):
-            found["neighbours"] = [known_name(one) if isinstance(one, str) else one for one in beside]
+            found["neighbours"] = [check_object_name(one) if isinstance(one, str) else one for one in beside]
         spec = validate(Spec, found)
     except InputError as error:
         raise InputError(f"{file}: {error}") from None
@@ -182,7 +182,7 @@ def create(
         refused: list[str] = []
         if files is not None:
             refused = _upload(client, files, name_of_set(Path(asked.objects)), console)
-            matrix = asked.shared_out(matrix, len(files) - len(refused))
+            matrix = asked.matrix_per_cell(matrix, len(files) - len(refused))
             request = parsed_options(DatasetRequest, {"name": asked.name, **matrix, "objects": []})
         dataset = client.create_dataset(request)
         if wait:
@@ -213,7 +213,7 @@ def estimate(
         files, matrix = _matrix(client, asked)
         found = _estimate(client, matrix, files)
     if json:
-        emit(found)
+        print_json(found)
     else:
         print_estimate(found, plain_console())
 
@@ -249,7 +249,7 @@ def status(
     with open_client(url) as client:
         dataset, cells = client.dataset(name), list(client.cells(name, state=state))
     if json:
-        emit({**dataset.model_dump(mode="json"), "matrix": [cell.model_dump(mode="json") for cell in cells]})
+        print_json({**dataset.model_dump(mode="json"), "matrix": [cell.model_dump(mode="json") for cell in cells]})
         return
     print_dataset(dataset, plain_console())
     print_cells(dataset, cells, plain_console())
@@ -309,7 +309,7 @@ def snapshot(name: NameArgument, url: UrlOption = None, json: JsonFlag = False) 
         f"{taken.digest}  {count(taken.shards)} shards, {count(taken.grasps)} grasps of which {count(taken.valid)} "
         f"are valid, {size(taken.size_bytes)}; {whole}"
     )
-    report(taken, line, json=json)
+    print_result(taken, line, json=json)
 
 
 @group.command(epilog="graspd datasets export kitchen -o kitchen-v1 --snapshot 3f2a...")
@@ -335,7 +335,7 @@ def export(
             fetched = export_shards(taken, out, lambda shard: client.fetch(path_of("shards", shard.id, "file")), show)
     told = {"dataset": name, "snapshot": taken.digest, "out": str(out), "files": len(taken.shards), "fetched": fetched}
     line = f"{out}: {count(len(taken.shards))} files, {size(taken.size_bytes)}, snapshot {taken.digest}"
-    report({**told, "bytes": taken.size_bytes, "complete": taken.complete}, line, json=json)
+    print_result({**told, "bytes": taken.size_bytes, "complete": taken.complete}, line, json=json)
 
 
 def _matrix(client: Client, asked: PlanRequest) -> tuple[Objects | None, dict[str, Any]]:
@@ -347,7 +347,7 @@ def _matrix(client: Client, asked: PlanRequest) -> tuple[Objects | None, dict[st
     # A bare name means the known set, even if a folder of that name exists; ./NAME is the folder.
     if objects not in known and (files := files_of_set(path)):
         matrix |= {"objects": sorted(files), "sets": [name_of_set(path)]}
-        return files, asked.shared_out(matrix, len(files))
+        return files, asked.matrix_per_cell(matrix, len(files))
     if objects not in known and path.is_file():
         raise InputError(f"{objects} is one object; run `graspd objects add {objects}`, then give its name here")
     if "/" in objects:
@@ -355,7 +355,7 @@ def _matrix(client: Client, asked: PlanRequest) -> tuple[Objects | None, dict[st
     single = [name for name in names if name not in known]
     matrix |= {"objects": single, "sets": [name for name in names if name in known]}
     members = {*single, *(member for name in names for member in known.get(name, ()))}
-    return None, asked.shared_out(matrix, len(members))
+    return None, asked.matrix_per_cell(matrix, len(members))
 
 
 def _estimate(client: Client, matrix: dict[str, Any], files: Objects | None) -> Estimate:
@@ -389,12 +389,12 @@ def _confirm() -> bool:
 
 def _emit(json: bool, **parts: Estimate | DatasetView | list[str]) -> None:
     if json:
-        emit({k: part if isinstance(part, list) else part.model_dump(mode="json") for k, part in parts.items()})
+        print_json({k: part if isinstance(part, list) else part.model_dump(mode="json") for k, part in parts.items()})
 
 
 def _show(dataset: DatasetView, *, json: bool) -> None:
     if json:
-        emit(dataset)
+        print_json(dataset)
     else:
         print_dataset(dataset, plain_console())
 

@@ -18,7 +18,7 @@ from rich.text import Text
 from graspd.api.formatting import count, duration, metric, percent, size, valid_yield, worker_time
 from graspd.api.models import Job, JobDetail, StageStatus
 from graspd.client.client import Client, path_of
-from graspd.service.cli import emit, load_settings, plain_console, plain_table, report
+from graspd.service.cli import load_settings, plain_console, plain_table, print_json, print_result
 from graspd.service.index.views import CellView, DatasetView, Validated
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import InputError, TaskError
@@ -59,7 +59,7 @@ def confirm(question: str, what: str, *, yes: bool) -> None:
 
 
 def report_deletion(what: str, name: str, *, json: bool, undo: str = "") -> None:
-    report({"deleted": name, "kind": what}, f"{what} {name} is deleted", json=json)
+    print_result({"deleted": name, "kind": what}, f"{what} {name} is deleted", json=json)
     if undo and not json:
         typer.echo(f"`{undo}` restores it within the grace time (GRASPD_SHARD_GRACE_S)", err=True)
 
@@ -67,7 +67,7 @@ def report_deletion(what: str, name: str, *, json: bool, undo: str = "") -> None
 def restore(url: str | None, what: str, name: str, *, json: bool) -> None:
     with open_client(url) as client:
         found = client.send("POST", path_of(f"{what}s", name, "restore")).json()
-    report({"restored": found["id"], "kind": what}, f"{what} {name} is restored", json=json)
+    print_result({"restored": found["id"], "kind": what}, f"{what} {name} is restored", json=json)
 
 
 def print_rows(
@@ -81,7 +81,7 @@ def print_rows(
 ) -> None:
     """Print a list as JSON or a table; `empty` replaces an empty table; columns `whole` are not wrapped."""
     if json:
-        emit(document)
+        print_json(document)
         return
     table = plain_table(*headings, whole=whole)
     for row in rows:
@@ -98,7 +98,7 @@ def watch(client: Client, job_id: str) -> JobDetail:
 def show_job(job: JobDetail, *, json: bool, url: str, must_succeed: bool = True) -> None:
     """Report the result of a job; TaskError if it failed or was cancelled and `must_succeed`."""
     if json:
-        emit(job_summary(job))
+        print_json(job_summary(job))
     else:
         _print_job(job, url)
     if must_succeed and job.state in (State.FAILED, State.CANCELLED):
@@ -130,7 +130,7 @@ def job_summary(job: JobDetail) -> dict[str, Any]:
 
 def show_asset(asset: dict[str, Any], *, json: bool) -> None:
     if json:
-        emit(asset)
+        print_json(asset)
         return
     console = plain_console()
     # The time of a built-in asset is that of the release, so it is omitted.

@@ -11,7 +11,7 @@ import typer
 from graspd.api.formatting import count, minute
 from graspd.client.client import path_of
 from graspd.client.reports import UrlOption, YesOption, confirm, open_client, print_rows, report_deletion, restore
-from graspd.service.cli import CommandGroup, JsonFlag, report
+from graspd.service.cli import CommandGroup, JsonFlag, print_result
 from graspd.service.model.errors import InputError
 
 app = CommandGroup(no_args_is_help=True, help="Tag grasps of the service; list and export tagged ones.")
@@ -102,7 +102,7 @@ def export_tag(
         raise InputError(f"{out}: the name of the file must end in .zip, .csv or .json")
     with open_client(url) as client:
         client.save("/v1/grasps/export", out, params={"tag": tag, "format": format}, patience_s=_PATIENCE_S)
-    report({"tag": tag, "file": str(out), "bytes": out.stat().st_size}, str(out), json=json)
+    print_result({"tag": tag, "file": str(out), "bytes": out.stat().st_size}, str(out), json=json)
 
 
 def _selection(grasps: list[str] | None, **filters: str | None) -> dict[str, Any]:
@@ -122,4 +122,4 @@ def _selection(grasps: list[str] | None, **filters: str | None) -> dict[str, Any
 def _report_change(change: dict[str, Any], words: str, *, json: bool) -> None:
     tag = change["tag"]
     line = f"{count(change['changed'])} grasps {words} {tag['name']}; {count(tag['grasps'])} grasps have the tag"
-    report(change, line, json=json)
+    print_result(change, line, json=json)

@@ -7,12 +7,12 @@ from typing import Annotated
 
 import typer
 
-from graspd.service.cli import CommandGroup, JsonFlag, report
+from graspd.service.cli import CommandGroup, JsonFlag, print_result
 from graspd.service.model.errors import InputError
 from graspd.service.readers import Pictures
 from graspd.service.readers.clouds import Frame
 from graspd.service.readers.depth_noise import NOISES
-from graspd.service.readers.where import parse
+from graspd.service.readers.where import compile_expression
 from graspd.worker.files.clouds import hand_surface, write_clouds
 from graspd.worker.files.curation import KINDS, Balance
 from graspd.worker.files.subsets import UnvalidatedOption, shards_of, write_subset
@@ -42,7 +42,7 @@ def where(
     json: JsonFlag = False,
 ) -> None:
     """Write the grasps that satisfy an expression as new base shards."""
-    test = parse(expression)
+    test = compile_expression(expression)
     said = {"where": expression, "from": source}
     found = write_subset(
         shards_of(source), lambda some: [test(shard.arrays, shard.attributes) for shard in some], out, said=said
@@ -77,7 +77,7 @@ def balance(
 
 def _report(found: dict[str, int], out: Path, *, json: bool) -> None:
     line = f"{out}: {found['kept']} of {found['looked_at']} grasps in {found['shards']} shards"
-    report({"folder": str(out), **found}, line, json=json)
+    print_result({"folder": str(out), **found}, line, json=json)
     if found["passed_over"] and not json:
         typer.echo(f"{found['passed_over']} shards of scenes and pictures are not copied", err=True)
 
@@ -120,4 +120,4 @@ def clouds(
     more = {"voxel_m": voxel, "graspness": graspness, "unvalidated": unvalidated, "seed": seed}
     done = write_clouds(found, out, said | more)
     line = f"{out}: {done['clouds']} clouds in {done['files']} files, {done['empty']} of them empty"
-    report({"folder": str(out), **done}, line, json=json)
+    print_result({"folder": str(out), **done}, line, json=json)

@@ -27,8 +27,8 @@ Child = Callable[[Sequence[str]], "subprocess.CompletedProcess[str]"]
 def checks_of(settings: Settings) -> list[Check]:
     hung = "restart the driver, or the machine; see dmesg"
     return [
-        Check("gpu", lambda: gpu(settings), limit_s=_GPU_S + 5, mend_hang=hung),
-        Check("kernels", lambda: kernels(settings), limit_s=_KERNELS_S + 5, mend_hang="see `top`, then retry"),
+        Check("gpu", lambda: check_gpu(settings), limit_s=_GPU_S + 5, mend_hang=hung),
+        Check("kernels", lambda: check_kernels(settings), limit_s=_KERNELS_S + 5, mend_hang="see `top`, then retry"),
     ]
 
 
@@ -44,7 +44,7 @@ def run_child(arguments: Sequence[str]) -> subprocess.CompletedProcess[str]:
     )
 
 
-def gpu(settings: Settings, *, child: Child = run_child, has_driver: Callable[[], bool] | None = None) -> Finding:
+def check_gpu(settings: Settings, *, child: Child = run_child, has_driver: Callable[[], bool] | None = None) -> Finding:
     """Check which GPUs Warp finds, and their free memory; `has_driver` tells if a driver is installed."""
     found, wrong = _run_check(child, ["gpus"])
     if wrong:
@@ -75,7 +75,7 @@ def gpu(settings: Settings, *, child: Child = run_child, has_driver: Callable[[]
     return good(f"{line}; {needed}")
 
 
-def kernels(settings: Settings, *, child: Child = run_child) -> Finding:
+def check_kernels(settings: Settings, *, child: Child = run_child) -> Finding:
     """Check that the engine gives plausible results, as a worker does before its first task."""
     found, wrong = _run_check(child, ["kernels", settings.device])
     if wrong:
@@ -114,7 +114,7 @@ def _report_gpus() -> dict[str, Any]:
 
     from graspd.worker.engines import backend
 
-    backend.start()
+    backend.start_warp()
     found = [
         {"name": str(one), "model": str(one.name), "total": int(one.total_memory), "free": int(one.free_memory)}
         for one in wp.get_cuda_devices()
@@ -129,7 +129,7 @@ def _report_kernels(wanted: str) -> dict[str, Any]:
     from graspd.worker.engines.devices import Device
     from graspd.worker.process.selfcheck import EngineError, check_engine
 
-    backend.start()
+    backend.start_warp()
     device, error = Device(wanted), ""
     try:
         check_engine(device.resolve, [stage for stage in Stage if stage is not Stage.INGEST])

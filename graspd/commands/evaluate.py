@@ -11,14 +11,14 @@ from rich.box import SIMPLE_HEAD
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from graspd.exchange.inputs import expand, load_case
-from graspd.service.cli import CommandGroup, JsonFlag, emit, plain_console, write_output
-from graspd.service.model.errors import InputError, one_of
+from graspd.exchange.inputs import expand_path, load_case
+from graspd.service.cli import CommandGroup, JsonFlag, plain_console, print_json, write_output
+from graspd.service.model.errors import InputError, choices_text
 from graspd.service.model.metrics import AXIS_MEANINGS, MOST_ROBUST_MODELS
 from graspd.service.store.shards import carried_attributes, json_attribute, read_shard, write_shard
 from graspd.studies.evaluation import Protocol, combine, evaluate
 from graspd.worker.execution_context import ExecutionContext
-from graspd.worker.files.subsets import require_empty
+from graspd.worker.files.subsets import require_empty_folder
 from graspd.worker.hands.hand_matching import TOLERANCE_M, match_hands
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.validation.key import Level
@@ -100,7 +100,7 @@ def evaluate_command(
         raise InputError(f"--validation-hand validates by protocol dexgraspbench, not by {protocol}")
     other = None if validation_hand is None else hand_from_path(validation_hand, drag=True)
     twins = _joint_map(joint_map)
-    listed = [one for path in files for one in expand(path)]
+    listed = [one for path in files for one in expand_path(path)]
     copies = _copies(files, listed, out, robust=robust, hard=hard)
     rows: list[dict[str, Any]] = []
     name, done = TextColumn("{task.description}", markup=False), TextColumn("{task.completed:.0f}/{task.total:.0f}")
@@ -134,11 +134,11 @@ def evaluate_command(
 def _validate_level(protocol: str, level: str) -> str:
     """Return the level, or the protocol's default if empty; InputError for an invalid one."""
     if protocol not in get_args(Protocol):
-        raise InputError(f"unknown protocol {protocol!r}; choose {one_of(protocol, get_args(Protocol))}")
+        raise InputError(f"unknown protocol {protocol!r}; choose {choices_text(protocol, get_args(Protocol))}")
     levels = get_args(LiftLevel if protocol == "lift" else Level)
     level = level or ("lift" if protocol == "lift" else "standard")
     if level not in levels:
-        raise InputError(f"unknown level {level!r} of protocol {protocol}; choose one of {one_of(level, levels)}")
+        raise InputError(f"unknown level {level!r} of protocol {protocol}; choose one of {choices_text(level, levels)}")
     return level
 
 
@@ -146,7 +146,9 @@ def _report(rows: list[dict[str, Any]], foreign: str, *, json: bool) -> None:
     whole = combine([{key: value for key, value in row.items() if key != "file"} for row in rows])
     if json:
         verdicts = [{"file": row["file"], **one} for row in rows for one in row.pop("verdicts", [])]
-        emit({key: value for key, value in whole.items() if key != "verdicts"} | {"verdicts": verdicts, "files": rows})
+        print_json(
+            {key: value for key, value in whole.items() if key != "verdicts"} | {"verdicts": verdicts, "files": rows}
+        )
     else:
         plain_console().print(_table(rows, whole))
         if whole.get("robust_share") is not None:
@@ -166,7 +168,7 @@ def _copies(paths: list[Path], files: list[Path], out: Path | None, *, robust: i
     if other := next((file for file in files if file.suffix != ".h5"), None):
         raise InputError(f"{other} is no shard of graspd: only shards can store the shares")
     if paths[0].is_dir():
-        require_empty(out)
+        require_empty_folder(out)
         return {file: out / file.relative_to(paths[0]) for file in files}
     if not out.parent.is_dir() or out.is_dir():
         raise InputError(f"{out} cannot be written: choose a file in an existing folder")

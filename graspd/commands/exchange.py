@@ -13,8 +13,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from graspd.exchange.opening import check_written_files
 from graspd.exchange.plan import ExportSummary
-from graspd.service.cli import CommandGroup, DataDir, JsonFlag, load_settings, plain_console, report
-from graspd.service.model.errors import InputError, one_of
+from graspd.service.cli import CommandGroup, DataDir, JsonFlag, load_settings, plain_console, print_result
+from graspd.service.model.errors import InputError, choices_text
 from graspd.service.store import validity
 from graspd.service.store.shards import read_shard
 from graspd.service.store.store import open_store
@@ -74,7 +74,7 @@ def export(
 ) -> None:
     """Write grasps or pictures in other formats."""
     if format_ not in EXPORTS:
-        raise InputError(f"there is no export format {format_!r}; choose one of {one_of(format_, EXPORTS)}")
+        raise InputError(f"there is no export format {format_!r}; choose one of {choices_text(format_, EXPORTS)}")
     if depth not in ("exr", "png"):
         raise InputError(f"there is no depth format {depth!r}; use exr or png")
     with check_written_files(output):
@@ -97,7 +97,7 @@ def export(
             done = _pictures(source, format_, depth, output)
     told = {"folder": str(output), "format": format_, **done.counts, **({"notes": done.notes} if done.notes else {})}
     line = f"{output}: " + ", ".join(f"{n} {what}" for what, n in done.counts.items() if isinstance(n, int))
-    report(told, line, json=json)
+    print_result(told, line, json=json)
     for note in () if json else done.notes:
         typer.echo(note, err=True)
 
@@ -129,7 +129,7 @@ def import_(
     """
     from graspd.worker.engines import backend
 
-    backend.start()
+    backend.start_warp()
     from graspd.exchange.imported import Origin
     from graspd.exchange.scoring import write_scored
 
@@ -150,7 +150,7 @@ def import_(
         if one["agreement_published"] is not None:
             validated += f", {one['agreement_published']:.0%} of them equal to ours"
         lines.append(f"{one['file']}: {one['grasps']} grasps, {one['feasible']} feasible, {validated}")
-    report({"folder": str(output), "shards": found}, "\n".join(lines), json=json)
+    print_result({"folder": str(output), "shards": found}, "\n".join(lines), json=json)
 
 
 def read_sets(format_: str, source: Path, hand: str | None, obj: str | None, options: dict[str, Any]) -> list[Any]:
@@ -161,7 +161,7 @@ def read_sets(format_: str, source: Path, hand: str | None, obj: str | None, opt
     from graspd.exchange import dexgraspbench, dexgraspnet2, graspgen, huggingface, lerobot, published
 
     if format_ not in IMPORTS:
-        raise InputError(f"there is no import format {format_!r}; choose one of {one_of(format_, IMPORTS)}")
+        raise InputError(f"there is no import format {format_!r}; choose one of {choices_text(format_, IMPORTS)}")
     if not source.exists():
         raise InputError(f"{source} does not exist")
     if format_ == "reference":
@@ -222,9 +222,9 @@ def _bench(
 
 def _summary(file: Path) -> dict[str, Any]:
     shard = read_shard(file, kind="base")
-    valid, feasible = validity.valid(shard.arrays), validity.feasible(shard.arrays)
+    valid, feasible = validity.valid_mask(shard.arrays), validity.feasible_mask(shard.arrays)
     said = np.asarray(shard.arrays.get("quality/published", np.full(len(valid), -1)))
-    both = (said >= 0) & validity.validated(shard.arrays)
+    both = (said >= 0) & validity.validated_mask(shard.arrays)
     agree = float((said == shard.arrays["quality/success"])[both].mean()) if both.any() else None
     return {
         "file": str(file),
@@ -278,4 +278,6 @@ def card(
     told = {"out": str(out), "dataset": found["name"], "snapshot": (found["snapshot"] or {}).get("digest")}
     told |= {"grasps": made["grasps"], "valid": made["valid"], "pictures": made["pictures"], "plots": found["plots"]}
     plots = len(found["plots"])
-    report(told, f"{out}/README.md: {made['valid']:,} valid grasps, {plots} plots, checksums, card.json", json=json)
+    print_result(
+        told, f"{out}/README.md: {made['valid']:,} valid grasps, {plots} plots, checksums, card.json", json=json
+    )

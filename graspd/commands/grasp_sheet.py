@@ -30,13 +30,13 @@ from graspd.worker.grasps import GraspSet, Posture
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.rendering.pictures import SAMPLES, THREE_SIDES, grasp_pictures
-from graspd.worker.rendering.sheets import contact_sheet, figures, label_page, three_sides_sheet
+from graspd.worker.rendering.sheets import caption_entries, contact_sheet, label_page, three_sides_sheet
 from graspd.worker.rendering.trajectory_pictures import (
     FREE_STRIP,
     STRIP,
     PictureScenes,
-    animation,
     animation_kind,
+    encode_animation,
     trajectory_pictures,
 )
 
@@ -76,7 +76,7 @@ class GraspSheet:
         said = self.shard.attributes
         title = f"{said.get('hand', self.hand.name)} on {said.get('object', self.obj.name)}"
         title += f", {self.scene}" if self.scene else ""
-        captions = figures(self.shard.arrays, self.rows)
+        captions = caption_entries(self.shard.arrays, self.rows)
         if self.kind == "trajectory":
             names, drawn = self._strip_pictures()
             below = [[f"{k + 1}   " + ",  ".join(" ".join(pair) for pair in one)] for k, one in enumerate(captions)]
@@ -167,7 +167,7 @@ class GraspAnimation:
             shown[0] += BEFORE_S
             shown[-1] += AFTER_S
             seconds += shown
-        return animation(np.concatenate(pictures), seconds, suffix)
+        return encode_animation(np.concatenate(pictures), seconds, suffix)
 
     def _execute(self, row: np.intp) -> Executions:
         one, placed = np.array([row]), scenes_of_shard(self.shard)

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from graspd.service.cli import CommandGroup, JsonFlag, emit, plain_console
+from graspd.service.cli import CommandGroup, JsonFlag, plain_console, print_json
 from graspd.service.command_options import with_options
 from graspd.service.model.errors import GraspdError, InputError
 from graspd.service.model.states import AssetKind
@@ -67,7 +67,7 @@ def check(
             for label, says in self_test_lines(report):
                 typer.echo(f"  {label:<18} {says}")
     if json:
-        emit(report | {"closing": report["facts"].get("closing", {})})
+        print_json(report | {"closing": report["facts"].get("closing", {})})
     if report["verdict"] == "refuse":
         raise typer.Exit(InputError.exit_code)
 

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from graspd.service.cli import CommandGroup, JsonFlag, emit
+from graspd.service.cli import CommandGroup, JsonFlag, print_json
 from graspd.service.command_options import with_options
 from graspd.service.model.errors import GraspdError, InputError
 from graspd.service.model.object_options import ObjectOptions
@@ -43,7 +43,7 @@ def check(
 
         write_png(object_portrait(object_from_path(file, options=options)), picture)
     if json:
-        emit(report)
+        print_json(report)
     else:
         print_check(AssetKind.OBJECT, report)
     if report["verdict"] == "refuse":
@@ -70,7 +70,7 @@ def _check_set(objects: Objects, options: dict[str, Any], *, json: bool) -> None
             typer.echo(verdict_line(reports[-1]))
     refused = [str(one["name"]) for one in reports if one["verdict"] == "refuse"]
     if json:
-        emit({"objects": reports, "refused": refused})
+        print_json({"objects": reports, "refused": refused})
     if refused:
         raise InputError(f"{len(refused)} of {len(reports)} objects were refused: {', '.join(refused[:5])}")
 

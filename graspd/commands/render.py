@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from graspd.commands.grasp_sheet import GraspAnimation, GraspSheet
-from graspd.service.cli import CommandGroup, JsonFlag, plain_console, report, write_output
+from graspd.service.cli import CommandGroup, JsonFlag, plain_console, print_result, write_output
 from graspd.service.model.errors import InputError
 from graspd.service.model.scene_spec import supports_in
 from graspd.service.model.transforms import compose
@@ -40,7 +40,7 @@ from graspd.worker.rendering.annotate import parse_channels
 from graspd.worker.rendering.cameras import BASELINE_M, SAMPLED, read_cameras
 from graspd.worker.rendering.hands import DrawnHand
 from graspd.worker.rendering.scenery import TABLE
-from graspd.worker.rendering.sheets import best, best_in_scenes, best_kept, views_page, with_palette
+from graspd.worker.rendering.sheets import best_in_scenes, best_rows, best_transferred_rows, views_page, with_palette
 from graspd.worker.rendering.trajectory_pictures import animation_kind
 from graspd.worker.rendering.views import Extras
 from graspd.worker.rendering.views import render as render_views
@@ -123,7 +123,7 @@ def render(
         subtitle = f"{count} pictures, {size[0]} x {size[1]} pixels"
         write_output(page, views_page(result, title=title, subtitle=subtitle))
     told = {"file": str(output), "pictures": count, "seconds": round(seconds, 2), "device": used}
-    report(told, f"{output}: {count} pictures, {seconds:.1f} s on {used}", json=json)
+    print_result(told, f"{output}: {count} pictures, {seconds:.1f} s on {used}", json=json)
 
 
 @app.command(epilog="graspd pictures grasps.h5 -o sheet.png --three-sides")
@@ -174,7 +174,7 @@ def pictures(
     if row:
         rows = _named_rows(base, row, chosen, word)
     else:
-        rows = best(base.arrays, count or (1 if animate else 4 if trajectory else 12), chosen)
+        rows = best_rows(base.arrays, count or (1 if animate else 4 if trajectory else 12), chosen)
     among = int(chosen.sum())
     models = (hand_of_shard(base, hand), object_of_shard(base, object), rows)
     run = ExecutionContext(Device(device).resolve())
@@ -187,7 +187,7 @@ def pictures(
         page = sheet.png(subtitle=f"{len(rows)} of {among} {word}{'' if row else ', by epsilon at 5 mm'}")
     write_output(output, with_palette(page) if palette and not animate else page)
     told = {"file": str(output), "grasps": len(rows), "of": among, "kind": word, "rows": rows.tolist()}
-    report(told, f"{output}: {'' if row else 'the best '}{len(rows)} of {among} {word}", json=json)
+    print_result(told, f"{output}: {'' if row else 'the best '}{len(rows)} of {among} {word}", json=json)
 
 
 def _named_rows(base: Shard, rows: list[int], chosen: NDArray[np.bool_], word: str) -> NDArray[np.intp]:
@@ -211,8 +211,8 @@ def _scenes(path: Path) -> Shard:
 
 def _best_grasps(base: Shard, hand: str | None) -> DrawnHand | None:
     """Return the best valid grasp of each scene; of an unvalidated shard, the best feasible grasp."""
-    validated = validity.valid(base.arrays).any()
-    rows = best_in_scenes(base.arrays, validity.selection(base.arrays, unvalidated=not validated))
+    validated = validity.valid_mask(base.arrays).any()
+    rows = best_in_scenes(base.arrays, validity.selection_mask(base.arrays, unvalidated=not validated))
     if not len(base["grasp/hand_pose"]):
         return None
     poses, joints = (np.asarray(base[f"grasp/{name}"], float)[rows] for name in ("hand_pose", "joint_positions"))
@@ -231,7 +231,7 @@ def _hand_in_pictures(scene: Shard, base_file: Path | None, hand: str | None) ->
     if source.max() >= len(base["grasp/joint_positions"]):
         fix = "give the base shard of these scenes"
         raise InputError(f"{base_file} has fewer grasps than the scenes refer to; {fix}")
-    rows = best_kept(scene.arrays, base.arrays)
+    rows = best_transferred_rows(scene.arrays, base.arrays)
     joints = np.asarray(base["grasp/joint_positions"], float)[source[rows]]
     poses = np.asarray(scene["grasp/hand_pose"], float)[rows]
     return DrawnHand(model, rows, poses, joints, wrists_of(scene, rows))
@@ -252,9 +252,9 @@ def view(
     object: Annotated[str | None, typer.Option(help="Object file; default: found by its digest.")] = None,
 ) -> None:
     """Show grasps in 3D in the browser: hand, object, scene, contacts, trajectory. Ends with Ctrl-C."""
-    from graspd.worker.viewing import Viewer, ViewerContent, missing
+    from graspd.worker.viewing import Viewer, ViewerContent, missing_viewer_text
 
-    if said := missing():
+    if said := missing_viewer_text():
         raise InputError(said)
     base = read_shard(grasps, kind="base")
     shown = ViewerContent(base, hand_of_shard(base, hand), object_of_shard(base, object), neighbours_of_shard(base, []))
@@ -264,14 +264,14 @@ def view(
     viewer = Viewer(shown, host=host, port=port)
     try:
         typer.echo(f"{grasps}: {viewer.url}")
-        command = forwarding(viewer.server.get_port())
+        command = forwarding_command(viewer.server.get_port())
         typer.echo(f"from another machine: run {command}, then open the same address; Ctrl-C ends the viewer")
         ended.wait()
     finally:
         viewer.close()
 
 
-def forwarding(port: int) -> str:
+def forwarding_command(port: int) -> str:
     """Return the ssh command that forwards a port of this machine's loopback to the user's machine."""
     # sshd sets the address at which this machine was reached.
     reached = os.environ.get("SSH_CONNECTION", "").split()

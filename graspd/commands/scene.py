@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from graspd.service.cli import CommandGroup, JsonFlag, report, write_output
+from graspd.service.cli import CommandGroup, JsonFlag, print_result, write_output
 from graspd.service.store.columns import Attribute
 from graspd.service.store.shards import read_shard, write_shard
 from graspd.worker.files.provenance import (
@@ -23,7 +23,7 @@ from graspd.worker.files.provenance import (
 )
 from graspd.worker.grasps import Posture
 from graspd.worker.objects.prepare import object_from_path
-from graspd.worker.scenes.clearance import count_rejections, transfer
+from graspd.worker.scenes.clearance import count_rejections, transfer_grasps
 from graspd.worker.scenes.neighbours import Neighbours, drop_together
 from graspd.worker.scenes.rest import rolling_note, rolling_poses
 from graspd.worker.scenes.simulate import drop
@@ -58,7 +58,7 @@ def scene(
     poses = result["scene/object_pose"]
     beside = Neighbours(others, result["scene/neighbour_pose"]) if others else None
     grasp, pregrasp = (Posture.from_columns(base.arrays, name) for name in ("grasp", "pregrasp"))
-    result |= transfer(model, grasp, pregrasp, poses, beside)
+    result |= transfer_grasps(model, grasp, pregrasp, poses, beside)
     seconds = perf_counter() - started
     attributes: dict[str, Attribute] = {key: base.attributes[key] for key in INHERITED if key in base.attributes}
     attributes |= {"seed": number, "device": "cpu", "seconds": round(seconds, 4)}
@@ -75,4 +75,4 @@ def scene(
         lines.append("too near: " + ", ".join(f"{n} {reason.replace('_', ' ')}" for reason, n in reasons.items() if n))
     if (note := rolling_note(rolling, scenes)) is not None:
         lines.append(note)
-    report(found, "\n".join(lines), json=json)
+    print_result(found, "\n".join(lines), json=json)

@@ -13,18 +13,18 @@ from typing import Annotated, Any, Final
 
 import typer
 
-from graspd.service.cli import CommandGroup, JsonFlag, load_settings, report
+from graspd.service.cli import CommandGroup, JsonFlag, load_settings, print_result
 from graspd.service.model.clock import timestamp
 from graspd.service.model.cores import available_cores
-from graspd.service.model.errors import InputError, one_of
+from graspd.service.model.errors import InputError, choices_text
 from graspd.service.model.fidelity import FIDELITIES, OFFERED, Fidelity
 from graspd.service.model.metrics import ROBUST_MODELS
 from graspd.service.model.renamed import convert_chart
 from graspd.service.model.scene_spec import SceneSpec, parse_scene
 from graspd.service.model.studies import Stability, from_json
 from graspd.service.model.version import PACKAGE_VERSION
-from graspd.service.store.records import STABILITY, kind_of
-from graspd.service.store.records import publish as publish_record
+from graspd.service.store.records import STABILITY, chart_kind
+from graspd.service.store.records import publish_record as publish_record
 from graspd.service.store.store import open_store
 from graspd.worker.engines.devices import Device
 from graspd.worker.execution_context import ExecutionContext
@@ -69,7 +69,7 @@ def bench(
     )
     if out is not None:
         write(result, out)
-    report(result, table(result), json=json)
+    print_result(result, table(result), json=json)
 
 
 def _fidelities(names: list[str] | None, points: list[int] | None, errors: list[float] | None) -> list[Fidelity]:
@@ -84,7 +84,7 @@ def _fidelities(names: list[str] | None, points: list[int] | None, errors: list[
 def _check_fidelities(fidelities: Sequence[str]) -> list[str]:
     for name in fidelities:
         if name not in FIDELITIES:
-            raise InputError(f"unknown fidelity {name!r}; choose one of {one_of(name, FIDELITIES)}")
+            raise InputError(f"unknown fidelity {name!r}; choose one of {choices_text(name, FIDELITIES)}")
     return list(fidelities)
 
 
@@ -115,7 +115,7 @@ def stability(
     from graspd.studies.stability.report import markdown, write
 
     if unknown := [name for name in only or [] if name not in STUDIES]:
-        raise InputError(f"there is no study {unknown[0]!r}; choose one of {one_of(unknown[0], STUDIES)}")
+        raise InputError(f"there is no study {unknown[0]!r}; choose one of {choices_text(unknown[0], STUDIES)}")
     if source:
         found = _merge([_read_maps(path) for path in source])
         found = replace(found, maps=[one for one in found.maps if not only or one.name in only])
@@ -127,13 +127,13 @@ def stability(
     good = {one.name: {panel: one.share(panel) for panel in one.panels} for one in found.maps}
     still = {one.name: one.still_breaks() for one in found.maps}
     told = {"good": good, "still_breaks": still, "out": None if out is None else str(out), "published": key}
-    report(told, markdown(found), json=json)
+    print_result(told, markdown(found), json=json)
 
 
 def _measure(names: tuple[str, ...], hand: str, obj: str, *, quick: bool, long: bool, threads: int) -> Stability:
     from graspd.worker.engines import backend
 
-    backend.start()
+    backend.start_warp()
     import warp as wp
 
     from graspd.studies.stability.studies import run
@@ -281,8 +281,8 @@ def _finish(result: dict[str, Any], out: Path | None, data_dir: Path | None, *, 
     if out is not None:
         write(result, out)
     if publish:
-        _publish(kind_of(result), result, data_dir)
-    report(result, markdown(result), json=json)
+        _publish(chart_kind(result), result, data_dir)
+    print_result(result, markdown(result), json=json)
 
 
 def _read_chart(path: Path) -> dict[str, Any]:

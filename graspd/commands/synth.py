@@ -18,10 +18,10 @@ from graspd.service.cli import (
     engine_settings,
     fail,
     plain_console,
-    report,
+    print_result,
     write_output,
 )
-from graspd.service.command_options import pairs, parsed_options, with_options
+from graspd.service.command_options import parse_pairs, parsed_options, with_options
 from graspd.service.model.errors import InputError, TaskCancelled
 from graspd.service.model.local_options import LocalOptions
 from graspd.service.model.metrics import DIRECTION_CELLS
@@ -55,7 +55,7 @@ def synth(
         raise InputError(f"the folder {out.parent} does not exist; create it or choose another --out")
     if out.is_dir():
         raise InputError(f"{out} is a folder; name a file in it, such as --out {out / 'grasps.h5'}")
-    options["options"] = pairs(options.get("options", ()))
+    options["options"] = parse_pairs(options.get("options", ()))
     asked = parsed_options(LocalOptions, options)
     if "payload" not in options and asked.place.kind != "free" and asked.validation != "none":
         asked = asked.model_copy(update={"payload": asked.mass is not None or asked.density is not None})
@@ -77,7 +77,7 @@ def synth(
         shard = write_shard("base", made.arrays, {**made.attributes, "shard_id": id_of_columns(made.arrays)})
         write_output(out, shard)
     found = {"file": str(out), **made.summary()}
-    report(found, _format_summary(found | ({"reason": None} if made.interrupted else {})), json=json)
+    print_result(found, _format_summary(found | ({"reason": None} if made.interrupted else {})), json=json)
     if made.interrupted:
         fail(f"interrupted: {out} contains {found['grasps']} of {asked.grasps} grasps", 128 + stop[0])
     if made.reason is not None:

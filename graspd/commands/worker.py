@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from graspd.service.cli import CommandGroup, JsonFlag, load_settings, log_to_stderr, report, restrict_file_access
+from graspd.service.cli import CommandGroup, JsonFlag, load_settings, log_to_stderr, print_result, restrict_file_access
 from graspd.service.model.errors import InputError, UnavailableError
 from graspd.service.model.libraries import pause_garbage_collection
 from graspd.service.model.states import Stage
@@ -85,13 +85,13 @@ def kernels(
     os.environ["WARP_CACHE_PATH"] = str(folder.resolve())
     from graspd.worker.engines import backend
 
-    backend.start()
+    backend.start_warp()
     architectures = (arch or backend.ARCHITECTURES) if cuda else ()
-    files = backend.compile_modules(backend.modules(), architectures=architectures, cpu=cpu)
+    files = backend.compile_modules(backend.kernel_modules(), architectures=architectures, cpu=cpu)
     size = sum(file.stat().st_size for file in files)
     made = {"folder": str(folder), "files": len(files), "bytes": size, "architectures": list(architectures), "cpu": cpu}
     line = f"{len(files)} kernel files, {size / 1e6:.1f} MB, in {folder}; GRASPD_KERNELS={folder.resolve()}"
-    report(made, line, json=json)
+    print_result(made, line, json=json)
 
 
 def run_workers(

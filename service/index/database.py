@@ -49,7 +49,7 @@ from sqlalchemy.exc import ArgumentError, DataError, NoSuchModuleError, SQLAlche
 
 from graspd.service.index.tables import assets, grasps, jobs, metadata, tasks
 from graspd.service.model.errors import IndexDamaged, IndexUnavailable, InputError, NotFoundError
-from graspd.service.model.metrics import indexed
+from graspd.service.model.metrics import indexed_metrics
 from graspd.service.model.projects import ProjectScope
 
 log = logging.getLogger(__name__)
@@ -92,7 +92,7 @@ class Database:
             self._engine = self._open()
 
     @contextmanager
-    def reading(self, within: Connection | None = None) -> Iterator[Connection]:
+    def read_transaction(self, within: Connection | None = None) -> Iterator[Connection]:
         """Yield a connection whose queries all see one snapshot, or the given connection."""
         if within is not None:
             yield within
@@ -105,7 +105,7 @@ class Database:
             yield connection
 
     @contextmanager
-    def writing(self, within: Connection | None = None) -> Iterator[Connection]:
+    def write_transaction(self, within: Connection | None = None) -> Iterator[Connection]:
         """Yield the given transaction, or a new one that is committed as a whole or not at all.
 
         Writers run one at a time, because a transaction derives states from rows that a concurrent one might
@@ -125,7 +125,7 @@ class Database:
             connection.commit()
 
     def rows(self, query: Select[Any], within: Connection | None = None) -> Sequence[RowMapping]:
-        with self.reading(within) as connection:
+        with self.read_transaction(within) as connection:
             return connection.execute(query).mappings().all()
 
     def one(self, query: Select[Any], what: str, within: Connection | None = None) -> RowMapping:
@@ -135,17 +135,17 @@ class Database:
         return found[0]
 
     def column(self, query: Select[Any]) -> list[Any]:
-        with self.reading() as connection:
+        with self.read_transaction() as connection:
             return list(connection.scalars(query))
 
-    def among(self, query: Select[Any], column: ColumnElement[Any], wanted: Iterable[Any]) -> list[Any]:
+    def matching_rows(self, query: Select[Any], column: ColumnElement[Any], wanted: Iterable[Any]) -> list[Any]:
         """Return the rows whose column has one of the wanted values; the number of values is unlimited."""
-        with self.reading() as connection:
+        with self.read_transaction() as connection:
             return list(rows_in(connection, query, column, wanted))
 
     def value(self, query: Select[Any], within: Connection | None = None) -> Any:
         """Return the first column of the first row; None without rows."""
-        with self.reading(within) as connection:
+        with self.read_transaction(within) as connection:
             return connection.scalar(query)
 
     def ping(self) -> float:
@@ -160,7 +160,7 @@ class Database:
     def _open(self) -> Engine:
         engine = _engine(self._url)
         try:
-            with convert_errors(), self._file.opening() if self._file is not None else nullcontext():
+            with convert_errors(), self._file.lock_for_opening() if self._file is not None else nullcontext():
                 self._store_identity()
                 self.was = _make_tables(engine, anew=self._anew) or self.was
                 self._store_identity()
@@ -194,7 +194,7 @@ class Database:
 
     def _move_damaged_file(self) -> None:
         if self._file is not None:
-            with convert_errors(), self._file.opening():
+            with convert_errors(), self._file.lock_for_opening():
                 self._file.set_aside(self._identity)
 
 
@@ -263,7 +263,7 @@ def _sqlite_engine(url: str | URL) -> Engine:
 
     @event.listens_for(engine, "connect")
     def _pragmas(connection: Any, _record: Any) -> None:
-        connection.isolation_level = None  # Only `writing` begins transactions.
+        connection.isolation_level = None  # Only `write_transaction` begins transactions.
         for pragma in ("journal_mode=WAL", "synchronous=NORMAL", "foreign_keys=ON", "temp_store=MEMORY"):
             connection.execute(f"PRAGMA {pragma}")
 
@@ -349,7 +349,7 @@ def _add_missing_metrics(connection: Connection) -> list[str]:
     """Add missing columns and indexes within the given transaction; return the names of the columns."""
     found = inspect(connection)
     there = {column["name"] for column in found.get_columns(grasps.name)}
-    missing = [metric.name for metric in indexed() if metric.name not in there]
+    missing = [metric.name for metric in indexed_metrics() if metric.name not in there]
     for name in missing:
         kind = grasps.c[name].type.compile(connection.dialect)
         connection.exec_driver_sql(f"ALTER TABLE {grasps.name} ADD COLUMN {name} {kind}")
@@ -380,7 +380,7 @@ class SqliteFile:
         return facts.st_dev, facts.st_ino
 
     @contextmanager
-    def opening(self) -> Iterator[None]:
+    def lock_for_opening(self) -> Iterator[None]:
         """Hold the inter-process lock, and remove files that belonged to a missing database."""
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -395,7 +395,7 @@ class SqliteFile:
             yield
 
     def set_aside(self, damaged: Identity) -> None:
-        """Move a damaged file away, unless another process did so; requires the lock of `opening`."""
+        """Move a damaged file away, unless another process did so; requires the lock of `lock_for_opening`."""
         if damaged is None or self.identity() != damaged:
             return
         suffix = f".damaged-{datetime.now(UTC):%Y%m%dT%H%M%S}"
@@ -438,31 +438,31 @@ def update_rows(connection: Connection, table: Table, rows: Sequence[Row], *, st
 Tests = tuple[ColumnElement[bool], ...]
 
 
-def in_scope(scope: ProjectScope, table: Table) -> Tests:
+def scope_conditions(scope: ProjectScope, table: Table) -> Tests:
     """Return the scope's conditions on a table that has a column `project`."""
     return () if scope.everything else (table.c.project == scope.project,)
 
 
-def in_scope_by_job(scope: ProjectScope, table: Table) -> Tests:
+def scope_conditions_by_job(scope: ProjectScope, table: Table) -> Tests:
     """Return the scope's conditions on a table that has a column `job_id`."""
     of_project = select(jobs.c.id).where(jobs.c.project == scope.project)
     return () if scope.everything else (table.c.job_id.in_(of_project),)
 
 
-def assets_in_scope(scope: ProjectScope) -> Tests:
+def asset_scope_conditions(scope: ProjectScope) -> Tests:
     """Return the scope's conditions on hands and objects: own, built-in and shared ones."""
     if scope.everything:
         return ()
     return (or_(assets.c.project == scope.project, assets.c.builtin.is_(True), assets.c.shared.is_(True)),)
 
 
-def nearest_asset(scope: ProjectScope) -> ColumnElement[int]:
+def asset_scope_order(scope: ProjectScope) -> ColumnElement[int]:
     """Return the sort key of assets of one name: own ones first, then shared ones."""
     shared = or_(assets.c.builtin.is_(True), assets.c.shared.is_(True))
     return case((assets.c.project == scope.project, 0), (shared, 1), else_=2)
 
 
-def shards_in_scope(scope: ProjectScope, shard: ColumnElement[Any]) -> Tests:
+def shard_scope_conditions(scope: ProjectScope, shard: ColumnElement[Any]) -> Tests:
     """Return the conditions that a job of the scope's project makes or reuses a shard."""
     wanted = (tasks.c.shard_id == shard, tasks.c.job_id == jobs.c.id, jobs.c.project == scope.project)
     return () if scope.everything else (exists().where(*wanted),)
@@ -481,21 +481,21 @@ def page_rows(
     cursor: str | None,
     descending: bool = True,
 ) -> tuple[Sequence[RowMapping], str | None]:
-    """Return a page's rows in the order of a key, and the next page's cursor; InputError as in `decode`."""
+    """Return a page's rows in the order of a key, and the next page's cursor; InputError as in `decode_cursor`."""
     size = page_size(limit)
     if cursor is not None:
-        start = decode(cursor, *(part.type.python_type for part in key))
+        start = decode_cursor(cursor, *(part.type.python_type for part in key))
         query = query.where(tuple_(*key) < start if descending else tuple_(*key) > start)
     query = query.order_by(*(part.desc() if descending else part for part in key)).limit(size + 1)
     rows = connection.execute(query).mappings().all()
-    return rows[:size], encode(*(rows[size - 1][part.key] for part in key)) if len(rows) > size else None
+    return rows[:size], encode_cursor(*(rows[size - 1][part.key] for part in key)) if len(rows) > size else None
 
 
-def encode(*key: Any) -> str:
+def encode_cursor(*key: Any) -> str:
     return base64.urlsafe_b64encode(json.dumps(key, separators=(",", ":")).encode()).decode().rstrip("=")
 
 
-def decode(cursor: str, *kinds: type | tuple[type, ...]) -> tuple[Any, ...]:
+def decode_cursor(cursor: str, *kinds: type | tuple[type, ...]) -> tuple[Any, ...]:
     """Decode the sort key of a cursor and check its types; InputError for an invalid cursor."""
     try:
         key = from_json(base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4)), allow_inf_nan=False)

@@ -29,7 +29,7 @@ def export(database: Database, folder: Path) -> dict[str, int]:
     """
     # The import precedes the query, so that a missing package is reported at once.
     schemas = {name: schema_of({c.name: _type_name(c) for c in table.columns}) for name, table in TABLES.items()}
-    with database.reading() as connection:
+    with database.read_transaction() as connection:
         return {
             name: write(folder / f"{name}.parquet", schemas[name], _groups(connection, table))
             for name, table in TABLES.items()

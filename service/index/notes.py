@@ -39,7 +39,7 @@ class StoreMark:
     mark: str = ""
     """Mark that index and store share; empty before the first mark."""
     before: str = ""
-    """Previous mark of the store during an update; otherwise equal to `mark`."""
+    """Previous mark of the store during an update; otherwise equal to `update`."""
     changes: int = 0
 
 
@@ -70,14 +70,14 @@ class Notes(IndexPart):
 
     def name_service(self, identity: str, *, instead: bool = False) -> str:
         """Set the id of the index's service if it is unset or `instead` is true; return the present id."""
-        with self.database.writing() as connection:
+        with self.database.write_transaction() as connection:
             known = None if instead else self.service(within=connection)
             if known is None:
                 self._set(_SERVICE, {"id": identity}, connection)
         return known or identity
 
     def set_incomplete(self) -> None:
-        with self.database.writing() as connection:
+        with self.database.write_transaction() as connection:
             connection.execute(delete(notes).where(notes.c.name == _REBUILT))
 
     def count_change(self, *, within: Connection) -> None:
@@ -86,10 +86,10 @@ class Notes(IndexPart):
     def changes(self) -> int:
         return int(self._get(_CHANGES) or 0)
 
-    def marked(self) -> StoreMark:
+    def store_mark(self) -> StoreMark:
         return StoreMark(**(self._get(_MARK) or {}))
 
-    def set_marked(self, marked: StoreMark, *, within: Connection | None = None) -> None:
+    def set_store_mark(self, marked: StoreMark, *, within: Connection | None = None) -> None:
         self._set(_MARK, asdict(marked), within)
 
     def scan_note(self) -> ScanNote:
@@ -100,7 +100,7 @@ class Notes(IndexPart):
 
     def pause_scan(self, lasts_s: float, *, begin: bool = False) -> bool:
         """Pause the integrity scan for `lasts_s` [s]; with `begin`, return False if it is paused already."""
-        with self.database.writing() as connection:
+        with self.database.write_transaction() as connection:
             if begin and self.is_scan_paused(within=connection):
                 return False
             self._set(_SCAN_PAUSE, timestamp(-lasts_s), connection)
@@ -113,7 +113,7 @@ class Notes(IndexPart):
         return self.database.value(select(notes.c.value).where(notes.c.name == name), within)
 
     def _set(self, name: str, value: Any, within: Connection | None = None) -> None:
-        with self.database.writing(within) as connection:
+        with self.database.write_transaction(within) as connection:
             upsert(connection, notes, [{"name": name, "value": value}])
 
 
@@ -130,23 +130,23 @@ class Damage:
 class KnownDamage(IndexPart):
     """List of damaged and missing stored objects."""
 
-    def known(self, *, limit: int = 100) -> tuple[int, list[Damage]]:
+    def summary(self, *, limit: int = 100) -> tuple[int, list[Damage]]:
         """Return the number of damaged stored objects, and the first of them."""
         query = select(damage).order_by(damage.c.found, damage.c.key).limit(limit)
-        with self.database.reading() as connection:
+        with self.database.read_transaction() as connection:
             count = int(connection.scalar(select(func.count()).select_from(damage)) or 0)
             rows = connection.execute(query).mappings()
             return count, [Damage(row["key"], row["what"], row["shard"], row["found"]) for row in rows]
 
-    def mark(self, found: Sequence[Damage], *, intact: Sequence[str] = ()) -> None:
+    def update(self, found: Sequence[Damage], *, intact: Sequence[str] = ()) -> None:
         rows = [{"key": one.key, "what": one.what, "shard": one.shard, "found": timestamp()} for one in found]
-        with self.database.writing() as connection:
+        with self.database.write_transaction() as connection:
             upsert(connection, damage, rows, keep=("found",))
             if intact:
                 connection.execute(delete(damage).where(damage.c.key.in_(list(intact))))
 
     def replace(self, found: Sequence[Damage]) -> None:
         """Replace the list after a full scan of the store."""
-        with self.database.writing() as connection:
+        with self.database.write_transaction() as connection:
             connection.execute(delete(damage).where(damage.c.key.not_in([one.key for one in found])))
-        self.mark(found)
+        self.update(found)

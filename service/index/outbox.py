@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from sqlalchemy import Connection, delete, func, select, update
 
-from graspd.service.index.database import IndexPart, in_scope, upsert
+from graspd.service.index.database import IndexPart, scope_conditions, upsert
 from graspd.service.index.tables import datasets, deliveries, ends, webhooks
 from graspd.service.index.views import DeliveryView, EndView, WebhookView
 from graspd.service.model.clock import timestamp
@@ -46,40 +46,40 @@ def last_end(connection: Connection) -> int:
 
 class Outbox(IndexPart):
     def ends(self, since: int, *, limit: int, scope: ProjectScope = EVERYTHING) -> list[EndView]:
-        query = select(ends).where(ends.c.seq > since, *in_scope(scope, ends)).order_by(ends.c.seq).limit(limit)
+        query = select(ends).where(ends.c.seq > since, *scope_conditions(scope, ends)).order_by(ends.c.seq).limit(limit)
         return [EndView(**row) for row in self.database.rows(query)]
 
-    def untold_datasets(self, *, limit: int = 200) -> list[tuple[str, int]]:
+    def unreported_datasets(self, *, limit: int = 200) -> list[tuple[str, int]]:
         """Return datasets whose end was not reported after their last event, with their number of events."""
         query = select(datasets.c.name, datasets.c.events).where(
             datasets.c.planned.is_(True), datasets.c.applied >= datasets.c.events, datasets.c.told < datasets.c.events
         )
         return [(row["name"], row["events"]) for row in self.database.rows(query.limit(limit))]
 
-    def tell_dataset(self, name: str, events: int, row: dict[str, Any]) -> None:
-        with self.database.writing() as connection:
+    def report_dataset_end(self, name: str, events: int, row: dict[str, Any]) -> None:
+        with self.database.write_transaction() as connection:
             untold = (datasets.c.name == name, datasets.c.told < events)
             if connection.execute(update(datasets).where(*untold).values(told=events)).rowcount:
                 append_ends(connection, [row])
 
     def add(self, hook: Webhook, *, seen: int | None = None, within: Connection | None = None) -> None:
         """Add a webhook; it receives ends after `seen`, by default all future ends."""
-        with self.database.writing(within) as connection:
+        with self.database.write_transaction(within) as connection:
             last = seen if seen is not None else last_end(connection)
             row = {name: getattr(hook, name) for name in ("id", "url", "created", "owner", "project")}
             row |= {"states": list(hook.states), "seen": last}
             upsert(connection, webhooks, [row], keep=("seen",))
 
-    def hooks(self, *, scope: ProjectScope = EVERYTHING) -> list[WebhookView]:
-        query = select(webhooks).where(*in_scope(scope, webhooks)).order_by(webhooks.c.created, webhooks.c.id)
+    def webhooks(self, *, scope: ProjectScope = EVERYTHING) -> list[WebhookView]:
+        query = select(webhooks).where(*scope_conditions(scope, webhooks)).order_by(webhooks.c.created, webhooks.c.id)
         return [WebhookView(**row) for row in self.database.rows(query)]
 
-    def hook(self, webhook: str, *, scope: ProjectScope = EVERYTHING) -> WebhookView:
-        query = select(webhooks).where(webhooks.c.id == webhook, *in_scope(scope, webhooks))
+    def webhook(self, webhook: str, *, scope: ProjectScope = EVERYTHING) -> WebhookView:
+        query = select(webhooks).where(webhooks.c.id == webhook, *scope_conditions(scope, webhooks))
         return WebhookView(**self.database.one(query, f"webhook {webhook!r}"))
 
     def remove(self, webhook: str) -> None:
-        with self.database.writing() as connection:
+        with self.database.write_transaction() as connection:
             connection.execute(delete(deliveries).where(deliveries.c.webhook == webhook))
             connection.execute(delete(webhooks).where(webhooks.c.id == webhook))
 
@@ -93,14 +93,14 @@ class Outbox(IndexPart):
         )
         return [DeliveryView(**row) for row in self.database.rows(query)]
 
-    def plan(self) -> None:
+    def create_deliveries(self) -> None:
         """Create deliveries of newly ended jobs and datasets; they fail at once if too many already wait."""
-        for hook in self.hooks():
+        for hook in self.webhooks():
             mine = (ends.c.project == hook.project, ends.c.seq > hook.seen)
             query = select(ends.c.seq, ends.c.state).where(*mine).order_by(ends.c.seq).limit(_AT_ONCE)
             if not (found := self.database.rows(query)):
                 continue
-            with self.database.writing() as connection:
+            with self.database.write_transaction() as connection:
                 of_waiting = select(func.count(), func.max(deliveries.c.due))
                 of_waiting = of_waiting.where(deliveries.c.webhook == hook.id, deliveries.c.state == "waiting")
                 number, rest_until = connection.execute(of_waiting).one()
@@ -118,8 +118,8 @@ class Outbox(IndexPart):
                 upsert(connection, deliveries, rows, keep=("state", "attempts", "due", "detail"))
                 connection.execute(update(webhooks).where(webhooks.c.id == hook.id).values(seen=found[-1]["seq"]))
 
-    def due(self, now: float) -> list[DueDelivery]:
-        hooks = {hook.id: hook for hook in self.hooks()}
+    def due_deliveries(self, now: float) -> list[DueDelivery]:
+        hooks = {hook.id: hook for hook in self.webhooks()}
         first = (
             select(func.min(deliveries.c.seq).label("seq"), deliveries.c.webhook)
             .where(deliveries.c.state == "waiting", deliveries.c.due <= now)
@@ -137,7 +137,9 @@ class Outbox(IndexPart):
             if row["webhook"] in hooks
         ]
 
-    def settle(self, due: DueDelivery, *, status: int | None, detail: str, done: bool, final: bool = False) -> None:
+    def record_attempt(
+        self, due: DueDelivery, *, status: int | None, detail: str, done: bool, final: bool = False
+    ) -> None:
         """Record an attempt: a failure delays all deliveries of the webhook, or fails them if `final`."""
         last = final or due.attempts >= len(WAITS_S)
         rest_until = 0.0 if done else time.time() + WAITS_S[min(due.attempts, len(WAITS_S) - 1)]
@@ -151,12 +153,12 @@ class Outbox(IndexPart):
         }
         others = {"due": rest_until} | ({"state": "failed", "detail": values["detail"]} if final else {})
         of_hook = update(deliveries).where(deliveries.c.webhook == due.hook.id)
-        with self.database.writing() as connection:
+        with self.database.write_transaction() as connection:
             connection.execute(of_hook.where(deliveries.c.seq == due.end.seq).values(**values))
             connection.execute(of_hook.where(deliveries.c.state == "waiting").values(**others))
 
     def forget_old(self) -> None:
         oldest = int((time.time() - KEPT_S) * 1000)
-        with self.database.writing() as connection:
+        with self.database.write_transaction() as connection:
             connection.execute(delete(deliveries).where(deliveries.c.seq < oldest))
             connection.execute(delete(ends).where(ends.c.seq < oldest))

@@ -36,7 +36,7 @@ from graspd.service.model.webhooks import Webhook
 from graspd.service.settings import sqlite_url
 from graspd.service.store.library import load_asset, load_check, stored_assets
 from graspd.service.store.manifests import ShardManifest
-from graspd.service.store.records import newest_mark, parse_record, pending
+from graspd.service.store.records import newest_mark, parse_record, pending_deletions
 from graspd.service.store.store import Store
 
 log = logging.getLogger(__name__)
@@ -56,19 +56,19 @@ def rebuild(index: Index, store: Store, *, progress: Progress = lambda what, num
 
     The old rows stay until all new ones exist. The log names all damaged records; `index.notes` stores the first 50.
     """
-    with index.database.writing() as connection:
+    with index.database.write_transaction() as connection:
         connection.execution_options(**{QUIET: True})
         made = _Rebuild(index, store, connection, progress)
         for table in metadata.tables.values():
             if table.name not in LIVE_TABLES:
                 connection.execute(delete(table))
-        index.notes.set_marked(StoreMark(mark := newest_mark(store), mark), within=connection)
-        made.assets()
-        made.jobs()
-        made.shards()
-        made.datasets()
-        made.webhooks()
-        made.tags()
+        index.notes.set_store_mark(StoreMark(mark := newest_mark(store), mark), within=connection)
+        made.add_assets()
+        made.add_jobs()
+        made.add_shards()
+        made.add_datasets()
+        made.add_webhooks()
+        made.add_tags()
         index.notes.set_complete(made.left_out, within=connection)
     return {**made.counts, "left_out": len(made.left_out)}
 
@@ -80,19 +80,19 @@ class _Rebuild:
         self._index, self._store, self._connection, self._progress = index, store, connection, progress
         self.counts = dict.fromkeys(("assets", "jobs", "attempts", "shards", "datasets", "snapshots", "object_sets"), 0)
         self.left_out: list[str] = []
-        self._gone = pending(store)
+        self._gone = pending_deletions(store)
         self._last = last_end(connection)
         self._seen = {row.id: row.seen for row in connection.execute(select(webhooks))}
         self._told = {row.name: row.told for row in connection.execute(select(datasets))}
 
-    def assets(self) -> None:
+    def add_assets(self) -> None:
         for kind, digest in stored_assets(self._store):
-            with self._skip_invalid(names.asset_check(kind, digest)):
+            with self._skip_invalid(names.asset_check_key(kind, digest)):
                 check = load_check(self._store, kind, digest)
-                with self._skip_invalid(names.asset_record(kind, digest), "assets"):
+                with self._skip_invalid(names.asset_record_key(kind, digest), "assets"):
                     self._index.write.add_asset(load_asset(self._store, kind, digest), check, within=self._connection)
 
-    def jobs(self) -> None:
+    def add_jobs(self) -> None:
         """Read jobs, then failed attempts by number, then events."""
         known = []
         for key, data in self._read(names.JOBS, lambda key: key.endswith("/job.json") and key.count("/") == 2):
@@ -102,25 +102,25 @@ class _Rebuild:
                 known.append(record.id)
         attempts = self._parse_records(AttemptRecord, names.TASKS)
         for attempt in sorted(attempts, key=lambda attempt: attempt.number):
-            with self._skip_invalid(names.attempt(attempt.task_id, attempt.number), "attempts"):
+            with self._skip_invalid(names.attempt_key(attempt.task_id, attempt.number), "attempts"):
                 self._index.write.add_attempt(attempt, within=self._connection)
         for job in known:
-            if events := self._parse_records(JobEvent, names.job_events(job)):
+            if events := self._parse_records(JobEvent, names.job_events_folder(job)):
                 self._index.write.set_job_events(job, events, within=self._connection)
 
-    def shards(self) -> None:
+    def add_shards(self) -> None:
         for key, data in self._read(names.SHARDS):
             with self._skip_invalid(key, "shards"):
                 self._index.write.add_manifests([parse_record(ShardManifest, data, key)], within=self._connection)
 
-    def datasets(self) -> None:
+    def add_datasets(self) -> None:
         for key, data in self._read(names.DATASETS, lambda key: key.endswith("/dataset.json")):
             with self._skip_invalid(key, "datasets"):
                 record = parse_record(DatasetRecord, data, key)
                 self._index.write_dataset.add(record, within=self._connection)
-                if events := self._parse_records(DatasetEvent, names.dataset_events(record.name)):
+                if events := self._parse_records(DatasetEvent, names.dataset_events_folder(record.name)):
                     self._index.write_dataset.set_events(record.name, events, within=self._connection)
-        told = self._index.datasets.ended(within=self._connection) | self._told
+        told = self._index.datasets.ended_event_counts(within=self._connection) | self._told
         for name, events in told.items():
             self._connection.execute(update(datasets).where(datasets.c.name == name).values(told=events))
         for key, data in self._read(names.DATASETS, lambda key: "/snapshots/" in key):
@@ -130,12 +130,12 @@ class _Rebuild:
             with self._skip_invalid(key, "object_sets"):
                 self._index.write_dataset.add_object_set(parse_record(ObjectSet, data, key), within=self._connection)
 
-    def webhooks(self) -> None:
+    def add_webhooks(self) -> None:
         for hook in self._parse_records(Webhook, names.WEBHOOKS):
-            with self._skip_invalid(names.webhook(hook.id)):
+            with self._skip_invalid(names.webhook_key(hook.id)):
                 self._index.outbox.add(hook, seen=self._seen.get(hook.id, self._last), within=self._connection)
 
-    def tags(self) -> None:
+    def add_tags(self) -> None:
         """Read the last version of each tag; earlier versions remain after interrupted changes."""
         last = {key.rpartition("/")[0]: (key, data) for key, data in sorted(self._read(names.TAGS))}
         for key, data in last.values():
@@ -153,13 +153,15 @@ class _Rebuild:
         self, prefix: str, wanted: Callable[[str], bool] = lambda key: key.endswith(".json")
     ) -> Iterator[tuple[str, bytes]]:
         """Yield keys and bytes of records; records removed since the listing are skipped."""
-        keys = [entry.key for entry in self._store.list(prefix) if wanted(entry.key) and not self._deleted(entry.key)]
+        keys = [
+            entry.key for entry in self._store.list(prefix) if wanted(entry.key) and not self._is_deleted(entry.key)
+        ]
         with ThreadPoolExecutor(_READERS) as pool:
             for key, data in zip(keys, pool.map(self._bytes, keys), strict=True):
                 if data is not None:
                     yield key, data
 
-    def _deleted(self, key: str) -> bool:
+    def _is_deleted(self, key: str) -> bool:
         folder, _, rest = key.partition("/")
         what = {names.JOBS: "job", names.DATASETS: "dataset"}.get(folder, "")
         return (what, rest.partition("/")[0]) in self._gone
@@ -200,21 +202,21 @@ def differences(index: Index, store: Store) -> list[str]:
         rebuild(fresh, store)
         made = fresh.notes.completeness()
         damaged = [f"{name}: damaged, so not in the index" for name in made.names] if made is not None else []
-        with index.database.reading() as live, fresh.database.reading() as derived:
+        with index.database.read_transaction() as live, fresh.database.read_transaction() as derived:
             rows = [line for table in metadata.tables.values() for line in _compare(table, live, derived)]
         return [*damaged, *rows][:_SHOWN_DIFFERENCES]
 
 
 def missing_names(index: Index, store: Store) -> list[str]:
     """List shards and jobs missing in the index or in the store, one line each, without reading records."""
-    gone = {f"jobs {name}" for what, name in pending(store) if what == "job"}
+    gone = {f"jobs {name}" for what, name in pending_deletions(store) if what == "job"}
     stored = {
         f"shards {entry.key.rpartition('/')[2].removesuffix('.json')}"
         for entry in store.list(names.SHARDS)
         if entry.key.endswith(".json")
     }
     stored |= {f"jobs {entry.key.split('/')[1]}" for entry in store.list(names.JOBS) if entry.key.endswith("/job.json")}
-    with index.database.reading() as connection:
+    with index.database.read_transaction() as connection:
         rows = {f"{table.name} {one}" for table in (shards, jobs) for one in connection.scalars(select(table.c.id))}
     return [f"{name}: not in the {'index' if name in stored else 'store'}" for name in sorted((rows ^ stored) - gone)]
 

@@ -11,7 +11,7 @@ from typing import Any, Final
 from sqlalchemy import JSON, BigInteger, Boolean, Column, Float, Index, Integer, MetaData, String, Table, Text, false
 from sqlalchemy.types import TypeEngine
 
-from graspd.service.model.metrics import IndexLevel, indexed
+from graspd.service.model.metrics import IndexLevel, indexed_metrics
 
 metadata: Final = MetaData()
 
@@ -138,14 +138,14 @@ shards: Final = Table(
     Index("shards_charged", "created", "charged", "kind", "device", "count", "valid", "seconds", "size_bytes"),
 )
 #: Metrics for bounds and sorting.
-METRICS: Final = tuple(metric.name for metric in indexed(IndexLevel.SORTED))
+METRICS: Final = tuple(metric.name for metric in indexed_metrics(IndexLevel.SORTED))
 grasps: Final = Table(
     "grasps",
     metadata,
     Column("shard_id", String(32), primary_key=True),
     Column("row", Integer, primary_key=True),
     *required_columns(String(64), "hand", "object"),
-    *(Column(metric.name, Integer if metric.whole else Float) for metric in indexed()),
+    *(Column(metric.name, Integer if metric.whole else Float) for metric in indexed_metrics()),
     Column("valid", Boolean, nullable=False),
     Column("success", Boolean),
     Column("verdict_level", String(12)),

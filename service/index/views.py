@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, computed_field
 
 from graspd.service.model.domain import JobOptions, JobRequest
 from graspd.service.model.metric_fields import insert_fields, value_fields
-from graspd.service.model.planning import shortfall
+from graspd.service.model.planning import explain_shortfall
 from graspd.service.model.records import Choice
 from graspd.service.model.states import AssetKind, Priority, Stage, State
 
@@ -84,7 +84,7 @@ class JobView(Validated):
         found = self.valid if request.counted == "valid" else self.grasps
         if self.state is not State.SUCCEEDED or request.want != "valid":
             return None
-        return shortfall(found, request.grasps, request.counted, self.candidates, request.budget, self.outcomes)
+        return explain_shortfall(found, request.grasps, request.counted, self.candidates, request.budget, self.outcomes)
 
 
 class TaskView(View):
@@ -326,7 +326,9 @@ class DatasetView(Validated):
         if not self.state.is_final or self.options.want != "valid":
             return None
         options = self.options
-        return shortfall(self.counted, self.asked, options.counted, self.candidates, options.budget, self.outcomes)
+        return explain_shortfall(
+            self.counted, self.asked, options.counted, self.candidates, options.budget, self.outcomes
+        )
 
     @property
     def counted(self) -> int:

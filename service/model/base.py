@@ -10,7 +10,7 @@ from typing import Annotated, Any, Final, get_args, get_origin
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 from pydantic.fields import FieldInfo
 
-from graspd.service.model.errors import one_of
+from graspd.service.model.errors import choices_text
 
 
 class Model(BaseModel):
@@ -98,7 +98,7 @@ def problem_text(entry: Mapping[str, Any]) -> str:
         expected = choices["expected"] if choices else facts["expected"]
         known = re.findall(r"'([^']*)'", expected)
         word = choices["word"] if choices else entry.get("input")
-        return f"must be one of {one_of(str(word), known)}" if known else message
+        return f"must be one of {choices_text(str(word), known)}" if known else message
     said = _WORDS.get(entry["type"])
     bounds = {name: f"{value:g}" if isinstance(value, float) else value for name, value in facts.items()}
     return said.format(**bounds) if said else message

@@ -7,7 +7,7 @@ import json
 from collections.abc import Iterable, Mapping
 from typing import Final
 
-from graspd.service.model.domain import JobRequest, batches_of
+from graspd.service.model.domain import JobRequest, count_batches
 from graspd.service.model.metrics import MIN_DISTANCE_M
 from graspd.service.model.renamed import original_request
 from graspd.service.model.states import AssetKind, Stage
@@ -70,8 +70,8 @@ def shard_id(
             "fidelity": request.knobs.model_dump(mode="json"),
             "friction": request.friction,
             **({"options": request.options} if request.options else {}),
-            **({"matter": request.matter} if request.matter else {}),
-            **_verdict_text(request, range(batch, batch + batches_of(count))),
+            **({"matter": request.object_properties} if request.object_properties else {}),
+            **_verdict_text(request, range(batch, batch + count_batches(count))),
         }
     elif stage is Stage.SCENE:
         inputs_of |= {"scenes": request.scenes}

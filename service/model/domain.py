@@ -286,10 +286,10 @@ class JobOptions(Model):
             raise ValueError("a target requires fidelity auto")
         if self.mass is not None and self.density is not None:
             raise ValueError("mass and density exclude each other: give one")
-        if self.validation == "dexgraspbench" and self.matter:
+        if self.validation == "dexgraspbench" and self.object_properties:
             raise ValueError(
                 f"validation dexgraspbench gives all objects {MASS_KG:g} kg and friction "
-                f"{FRICTION:g}: {', '.join(self.matter)} requires standard, fast or none"
+                f"{FRICTION:g}: {', '.join(self.object_properties)} requires standard, fast or none"
             )
         self._check_scene()
         if self.views and not self.scenes:
@@ -326,7 +326,7 @@ class JobOptions(Model):
         return self.payload or self.min_payload > 0
 
     @property
-    def matter(self) -> dict[str, float]:
+    def object_properties(self) -> dict[str, float]:
         """Mass, density and friction of the object, without those that are not given."""
         said = {"mass": self.mass, "density": self.density, "object_friction": self.object_friction}
         return {name: value for name, value in said.items() if value is not None}
@@ -407,7 +407,7 @@ class JobRequest(JobOptions):
     object: Name = Field(description="name of an object known to the service")
 
 
-def batches_of(grasps: int) -> int:
+def count_batches(grasps: int) -> int:
     return -(-grasps // BATCH_SIZE)
 
 

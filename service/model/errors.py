@@ -218,6 +218,6 @@ def did_you_mean(word: str, choices: Iterable[str]) -> str:
     return f"; did you mean {known[like[0]]}?" if like else ""
 
 
-def one_of(word: str, choices: Iterable[str]) -> str:
+def choices_text(word: str, choices: Iterable[str]) -> str:
     known = list(choices)
     return f"{', '.join(known)}{did_you_mean(word, known)}"

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Final, Literal
 from pydantic import Field, field_validator, model_validator
 
 from graspd.service.model.domain import SCENES, JobOptions
-from graspd.service.model.errors import one_of
+from graspd.service.model.errors import choices_text
 from graspd.service.model.fidelity import FIDELITIES, Fidelity
 from graspd.service.model.object_options import MeshOptions
 from graspd.service.model.options import Option, Place, validate
@@ -63,7 +63,7 @@ class LocalOptions(MeshOptions, JobOptions):
     @classmethod
     def _check_fidelity(cls, value: str | Fidelity) -> str | Fidelity:
         if not isinstance(value, str) or value not in FIDELITIES:
-            raise ValueError(f"unknown fidelity {value!r}; choose one of {one_of(str(value), FIDELITIES)}")
+            raise ValueError(f"unknown fidelity {value!r}; choose one of {choices_text(str(value), FIDELITIES)}")
         return value
 
     @field_validator("join", mode="before")

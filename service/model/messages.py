@@ -117,7 +117,7 @@ class WorkerBeat:
         return cls(name, *facts, schemas=own.schemas, revisions=dict(own.revisions))
 
     @property
-    def ability(self) -> Capabilities:
+    def capabilities(self) -> Capabilities:
         return Capabilities(self.schemas, self.revisions)
 
 

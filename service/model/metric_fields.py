@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, cast
 
 from pydantic import BaseModel, Field, create_model
 
-from graspd.service.model.metrics import IndexLevel, indexed
+from graspd.service.model.metrics import IndexLevel, indexed_metrics
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -15,13 +15,13 @@ if TYPE_CHECKING:
     SortedName = str
     OfferedName = str
 else:
-    SortedName = Literal[tuple(metric.name for metric in indexed(IndexLevel.SORTED))]
-    OfferedName = Literal[tuple(metric.name for metric in indexed(IndexLevel.OFFERED))]
+    SortedName = Literal[tuple(metric.name for metric in indexed_metrics(IndexLevel.SORTED))]
+    OfferedName = Literal[tuple(metric.name for metric in indexed_metrics(IndexLevel.OFFERED))]
 
 
 def value_fields(*, optional: bool, default: Any = ...) -> dict[str, Any]:
     # Manifests list the sorted metrics first.
-    chosen = sorted(indexed(), key=lambda metric: metric.indexed < IndexLevel.SORTED)
+    chosen = sorted(indexed_metrics(), key=lambda metric: metric.indexed < IndexLevel.SORTED)
     return {
         metric.name: (int | None if metric.whole else float | None, Field(default, description=metric.meaning))
         for metric in chosen
@@ -30,12 +30,12 @@ def value_fields(*, optional: bool, default: Any = ...) -> dict[str, Any]:
 
 
 def mean_fields() -> dict[str, Any]:
-    return {metric.name: (float | None, None) for metric in indexed(IndexLevel.OFFERED)}
+    return {metric.name: (float | None, None) for metric in indexed_metrics(IndexLevel.OFFERED)}
 
 
 def filter_fields() -> dict[str, Any]:
     fields: dict[str, Any] = {}
-    for metric in indexed(IndexLevel.OFFERED):
+    for metric in indexed_metrics(IndexLevel.OFFERED):
         low, high = metric.limits
         bound = Annotated[float | None, Field(ge=low, le=high, allow_inf_nan=False)]
         fields |= {f"{end}_{metric.name}": (bound, None) for end in ("min", "max")}

@@ -247,7 +247,7 @@ GRASP_METRICS: Final[tuple[GraspMetric, ...]] = (
 )
 
 
-def indexed(least: IndexLevel = IndexLevel.KEPT) -> tuple[GraspMetric, ...]:
+def indexed_metrics(least: IndexLevel = IndexLevel.KEPT) -> tuple[GraspMetric, ...]:
     return tuple(metric for metric in GRASP_METRICS if metric.indexed >= least)
 
 

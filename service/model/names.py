@@ -28,103 +28,103 @@ MARKS: Final = "marks"
 SHARD_KINDS: Final[dict[Stage, str]] = {Stage.SYNTHESIZE: "base", Stage.SCENE: "scene", Stage.RENDER: "views"}
 
 
-def asset_files(kind: AssetKind, digest: str) -> str:
+def asset_files_key(kind: AssetKind, digest: str) -> str:
     return f"{ASSETS}/{kind.value}/{digest}/files.zip"
 
 
-def asset_record(kind: AssetKind, digest: str) -> str:
+def asset_record_key(kind: AssetKind, digest: str) -> str:
     return f"{ASSETS}/{kind.value}/{digest}/asset.json"
 
 
-def asset_check(kind: AssetKind, digest: str) -> str:
+def asset_check_key(kind: AssetKind, digest: str) -> str:
     return f"{ASSETS}/{kind.value}/{digest}/check.json"
 
 
-def hand_expanded(digest: str) -> str:
+def expanded_hand_key(digest: str) -> str:
     return f"{ASSETS}/{AssetKind.HAND.value}/{digest}/expanded.json"
 
 
-def asset_model(kind: AssetKind, digest: str) -> str:
+def asset_model_key(kind: AssetKind, digest: str) -> str:
     return f"{ASSETS}/{kind.value}/{digest}/model.glb"
 
 
-def object_prepared(digest: str, key: str) -> str:
+def prepared_object_key(digest: str, key: str) -> str:
     return f"{ASSETS}/{AssetKind.OBJECT.value}/{digest}/prepared/{key}.npz"
 
 
-def object_pieces(digest: str, key: str) -> str:
+def object_pieces_key(digest: str, key: str) -> str:
     return f"{ASSETS}/{AssetKind.OBJECT.value}/{digest}/pieces/{key}.npz"
 
 
-def job_record(job: str) -> str:
+def job_record_key(job: str) -> str:
     return f"{JOBS}/{job}/job.json"
 
 
-def job_events(job: str) -> str:
+def job_events_folder(job: str) -> str:
     return f"{JOBS}/{job}/events"
 
 
-def attempts(task: str) -> str:
+def attempts_folder(task: str) -> str:
     return f"{TASKS}/{task}/attempts"
 
 
-def attempt(task: str, number: int) -> str:
-    return f"{attempts(task)}/{number}.json"
+def attempt_key(task: str, number: int) -> str:
+    return f"{attempts_folder(task)}/{number}.json"
 
 
-def shard_file(stage: Stage, shard: str) -> str:
+def shard_file_key(stage: Stage, shard: str) -> str:
     return f"{SHARDS}/{SHARD_KINDS[stage]}/{shard}.h5"
 
 
-def shard_manifest(stage: Stage, shard: str) -> str:
+def shard_manifest_key(stage: Stage, shard: str) -> str:
     return f"{SHARDS}/{SHARD_KINDS[stage]}/{shard}.json"
 
 
-def dataset_record(dataset: str) -> str:
+def dataset_record_key(dataset: str) -> str:
     return f"{DATASETS}/{dataset}/dataset.json"
 
 
-def dataset_events(dataset: str) -> str:
+def dataset_events_folder(dataset: str) -> str:
     return f"{DATASETS}/{dataset}/events"
 
 
-def event(events: str, number: int, what: str) -> str:
+def event_key(events: str, number: int, what: str) -> str:
     return f"{events}/{number:06}-{what}.json"
 
 
-def dataset_snapshots(dataset: str) -> str:
+def dataset_snapshots_folder(dataset: str) -> str:
     return f"{DATASETS}/{dataset}/snapshots"
 
 
-def dataset_snapshot(dataset: str, digest: str) -> str:
-    return f"{dataset_snapshots(dataset)}/{digest}.json"
+def dataset_snapshot_key(dataset: str, digest: str) -> str:
+    return f"{dataset_snapshots_folder(dataset)}/{digest}.json"
 
 
-def object_set(name: str, digest: str) -> str:
+def object_set_key(name: str, digest: str) -> str:
     return f"{OBJECT_SETS}/{name}/{digest}.json"
 
 
-def webhook(webhook: str) -> str:
+def webhook_key(webhook: str) -> str:
     return f"{WEBHOOKS}/{webhook}.json"
 
 
-def tag_versions(tag: str) -> str:
+def tag_versions_folder(tag: str) -> str:
     return f"{TAGS}/{tag}"
 
 
-def tag_version(tag: str, number: int) -> str:
-    return f"{tag_versions(tag)}/{number:06}.json"
+def tag_version_key(tag: str, number: int) -> str:
+    return f"{tag_versions_folder(tag)}/{number:06}.json"
 
 
-def service(number: int) -> str:
+def service_key(number: int) -> str:
     return f"{SERVICE}/{number:06}.json"
 
 
-def mark(mark: str) -> str:
+def mark_key(mark: str) -> str:
     return f"{MARKS}/{mark}.json"
 
 
-def deletion(what: str, name: str) -> str:
+def deletion_key(what: str, name: str) -> str:
     return f"{DELETIONS}/{what}/{name}.json"
 
 

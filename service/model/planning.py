@@ -15,7 +15,7 @@ from itertools import zip_longest
 from typing import Final, TypeVar
 
 from graspd.service.model.digests import digest_json, shard_id
-from graspd.service.model.domain import BATCH_SIZE, JobOptions, JobRequest, batches_of
+from graspd.service.model.domain import BATCH_SIZE, JobOptions, JobRequest, count_batches
 from graspd.service.model.messages import IngestMessage, TaskMessage
 from graspd.service.model.options import rows
 from graspd.service.model.records import JobRecord
@@ -68,15 +68,15 @@ def task_id(job: str, stage: Stage, batch: int) -> str:
     return digest_json({"job": job, "stage": stage, "batch": batch})
 
 
-def ranges_of(grasps: int, span: int) -> int:
-    return -(-batches_of(grasps) // span)
+def count_ranges(grasps: int, span: int) -> int:
+    return -(-count_batches(grasps) // span)
 
 
-def plan(job: JobRecord, ranges: range | None = None) -> Iterator[PlannedTask]:
+def plan_tasks(job: JobRecord, ranges: range | None = None) -> Iterator[PlannedTask]:
     """Yield the tasks of a job for all or some `ranges`, range by range in the order of stages."""
     request = job.request
     digests = {"hand_digest": job.hand_digest, "object_digest": job.object_digest}
-    for number in ranges if ranges is not None else range(ranges_of(request.grasps, job.span)):
+    for number in ranges if ranges is not None else range(count_ranges(request.grasps, job.span)):
         batch = number * job.span
         count = min(job.span * BATCH_SIZE, request.grasps - batch * BATCH_SIZE)
         inputs: tuple[str, ...] = ()
@@ -91,7 +91,7 @@ def plan(job: JobRecord, ranges: range | None = None) -> Iterator[PlannedTask]:
 
 def message_of(job: JobRecord, task: PlannedTask, *, attempt: int, max_attempt: int) -> TaskMessage:
     return TaskMessage(
-        schema_=max(needed_schema(job.request), SCHEMA_OF_RANGES if batches_of(task.count) > 1 else 0),
+        schema_=max(needed_schema(job.request), SCHEMA_OF_RANGES if count_batches(task.count) > 1 else 0),
         newest_schema=TASK_SCHEMA,
         task_id=task.id,
         job_id=job.id,
@@ -145,7 +145,7 @@ def ingest_message(kind: AssetKind, name: str, digest: str, *, attempt: int, max
     )
 
 
-def batch_states(chain: Sequence[TaskFacts], *, job_cancelled: bool) -> list[State]:
+def range_states(chain: Sequence[TaskFacts], *, job_cancelled: bool) -> list[State]:
     """Return the states of one range's tasks; tasks after a failed or cancelled one are cancelled."""
     states: list[State] = []
     blocked = False
@@ -158,7 +158,7 @@ def batch_states(chain: Sequence[TaskFacts], *, job_cancelled: bool) -> list[Sta
     return states
 
 
-def batch_ready(states: Sequence[State]) -> list[bool]:
+def range_ready_mask(states: Sequence[State]) -> list[bool]:
     """Return which tasks of a range are ready to start: unfinished, with all earlier tasks succeeded."""
     return [
         not state.is_final and all(before is State.SUCCEEDED for before in states[:i]) for i, state in enumerate(states)
@@ -193,13 +193,13 @@ _REMEMBERED: Final = 100_000
 
 @dataclass(frozen=True)
 class WaitingJob:
-    """Job with tasks ready for the queue, and the owner of its share (see `share_of`)."""
+    """Job with tasks ready for the queue, and the owner of its share (see `queue_owner`)."""
 
     id: str
     key: str
 
 
-def share_of(project: str, key: str) -> str:
+def queue_owner(project: str, key: str) -> str:
     """Return the owner of a job's share of the queue: its project, or else its key ("" without keys)."""
     return f"project {project}" if project else key
 
@@ -223,7 +223,7 @@ class RoundRobin:
             number[job.key] += 1
         return [(job, -(-limit // (len(number) * number[job.key]))) for job in chosen]
 
-    def served(self, jobs: Sequence[WaitingJob]) -> None:
+    def record_served(self, jobs: Sequence[WaitingJob]) -> None:
         for job in jobs:
             self._count += 1
             self._served[f"job {job.id}"] = self._served[f"key {job.key}"] = self._count
@@ -271,7 +271,7 @@ def format_outcomes(outcomes: Mapping[str, int]) -> str:
     return ", ".join(f"{count:,} {OUTCOMES.get(name, name.replace('_', ' '))}" for name, count in order if count)
 
 
-def shortfall(
+def explain_shortfall(
     found: int, wanted: int, counted: str, candidates: int, budget: float, outcomes: Mapping[str, int], limit: str = ""
 ) -> str | None:
     """Explain why fewer grasps were found than wanted, None if enough were; `limit` replaces the budget."""

@@ -24,7 +24,7 @@ class ProjectScope:
     """Project whose resource is preferred if other projects have one of the same name."""
     everything: bool = True
 
-    def sees(self, project: str) -> bool:
+    def can_see(self, project: str) -> bool:
         return self.everything or project == self.project
 
 

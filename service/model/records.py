@@ -208,7 +208,7 @@ class SnapshotShard(Record):
     def _convert_pack_key(cls, key: str, info: ValidationInfo) -> str:
         # A snapshot of 0.2 may refer to a part of a pack; now each shard is a file.
         stages = {kind: stage for stage, kind in names.SHARD_KINDS.items()}
-        return names.shard_file(stages[info.data["kind"]], info.data["id"]) if "@" in key else key
+        return names.shard_file_key(stages[info.data["kind"]], info.data["id"]) if "@" in key else key
 
 
 class Snapshot(Record):
@@ -304,6 +304,6 @@ def tag_id(name: str, project: str) -> str:
     return digest_json(["tag", project, name])
 
 
-def by_shard(grasps: Iterable[Grasp]) -> Mapping[str, tuple[int, ...]]:
+def rows_by_shard(grasps: Iterable[Grasp]) -> Mapping[str, tuple[int, ...]]:
     groups = groupby(sorted(set(grasps)), key=itemgetter(0))
     return {shard: tuple(row for _, row in rows) for shard, rows in groups}

@@ -112,7 +112,7 @@ class SceneSpec(Model):
             raise ValueError("a target with a pose lies on one face: faces all requires a dropped target")
         return self
 
-    def told(self) -> dict[str, Any]:
+    def to_attribute(self) -> dict[str, Any]:
         """Return the scene for a shard's attribute; another attribute has the neighbours' digests."""
         return self.model_dump(mode="json", exclude={"neighbours": {"__all__": {"digest"}}})
 
@@ -297,7 +297,7 @@ def scene_of(
         raise ValueError(first_error(error)) from None
 
 
-def known_name(text: str) -> str:
+def check_object_name(text: str) -> str:
     """Return the name of an object; InputError for a file, because jobs need names known to the service."""
     if "/" in text or Path(text).is_file():
         raise InputError(f"the neighbour {text} is a file: run `graspd objects add {text}` first, then give its name")
@@ -305,7 +305,7 @@ def known_name(text: str) -> str:
 
 
 def scene_option(
-    text: str, *, beside: Path | None = None, named: Callable[[str], str] = known_name
+    text: str, *, beside: Path | None = None, named: Callable[[str], str] = check_object_name
 ) -> str | dict[str, Any]:
     """Return a request's scene from a user's text; `named` maps neighbours in a file to service names."""
     if text in KINDS:

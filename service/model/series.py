@@ -86,7 +86,7 @@ _ALL: Final = (
 SERIES: Final[dict[str, Series]] = {series.name: series for series in _ALL}
 
 
-def field(name: str, *labels: str) -> str:
+def field_name(name: str, *labels: str) -> str:
     return json.dumps([name, *labels])
 
 

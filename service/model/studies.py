@@ -79,10 +79,10 @@ class StabilityMap:
             by_x: dict[float | str, list[str]] = {}
             for cell in self.of(panel):
                 if cell.reached and cell.outcome == "broken":
-                    by_x.setdefault(cell.x, []).append(tick(cell.y))
+                    by_x.setdefault(cell.x, []).append(format_tick(cell.y))
             by_y: dict[str, list[str]] = {}
             for x, ys in by_x.items():
-                by_y.setdefault(", ".join(ys), []).append(tick(x))
+                by_y.setdefault(", ".join(ys), []).append(format_tick(x))
             if by_y:
                 lines.append(f"{panel} " + "; ".join(f"{', '.join(xs)} ({ys})" for ys, xs in by_y.items()))
         return lines
@@ -114,7 +114,7 @@ def pareto(points: Sequence[tuple[float, float]]) -> set[int]:
     }
 
 
-def counts(cells: Iterable[MapCell]) -> dict[Outcome, int]:
+def count_outcomes(cells: Iterable[MapCell]) -> dict[Outcome, int]:
     outcomes = [cell.outcome for cell in cells]
     return {outcome: outcomes.count(outcome) for outcome in OUTCOMES}
 
@@ -125,7 +125,7 @@ def grade(value: float, weak: float, broken: float) -> Outcome:
     return "good" if value < weak else "weak"
 
 
-def reachable(cells: Iterable[MapCell], where: Callable[[MapCell], bool]) -> list[MapCell]:
+def mark_reachable(cells: Iterable[MapCell], where: Callable[[MapCell], bool]) -> list[MapCell]:
     return [replace(cell, reached=where(cell)) for cell in cells]
 
 
@@ -139,13 +139,13 @@ def format_short(value: float) -> str:
     return f"{value / 1e3:.0f}k" if 999.5 <= size < 999_500 else _exponent(f"{value:.0e}")
 
 
-def tick(value: float | str) -> str:
+def format_tick(value: float | str) -> str:
     if isinstance(value, str):
         return value
     return f"{value:g}" if value == 0 or 1e-3 <= abs(value) < 1e4 else _exponent(f"{value:g}")
 
 
-def between(ticks: Sequence[Any], value: float) -> float:
+def tick_position(ticks: Sequence[Any], value: float) -> float:
     """Return a value's position on logarithmic ticks, in steps from the first, extrapolated beyond them."""
     logs, at = [math.log(tick) for tick in ticks], math.log(value)
     if len(logs) < 2:

@@ -17,7 +17,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from graspd.service.model.errors import InputError, one_of
+from graspd.service.model.errors import InputError, choices_text
 from graspd.service.model.metrics import GRASP_METRICS, GraspType
 
 LONGEST: Final = 1000
@@ -146,7 +146,7 @@ class _Parser:
             return Flag(name)
         if name not in _METRICS and name not in _WORDS:
             known = [*_METRICS, *FLAGS, *_WORDS]
-            raise InputError(f"there is no {token.text!r}; the names are {one_of(token.text, known)}")
+            raise InputError(f"there is no {token.text!r}; the names are {choices_text(token.text, known)}")
         if not compared or following is None:
             raise InputError(f"{name} needs a comparison, such as `{name} {'= power' if name == 'type' else '> 0'}`")
         self.at += 1
@@ -178,5 +178,5 @@ def _word_comparison(name: str, op: str, value: _Token) -> Node:
     if name != "type":
         return WordComparison(name, op, value.text)
     if value.text not in _TYPES:
-        raise InputError(f"there is no type {value.text!r}; choose one of {one_of(value.text, _TYPES)}")
+        raise InputError(f"there is no type {value.text!r}; choose one of {choices_text(value.text, _TYPES)}")
     return TypeComparison(op, GraspType[value.text.upper()])

@@ -1,4 +1,4 @@
-"""Store, index and queue of a process; `recording` writes records and their index rows together."""
+"""Store, index and queue of a process; `record_transaction` writes records and their index rows together."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Services:
 
 
 @contextmanager
-def recording(services: Services, made: Sequence[str] = ()) -> Iterator[tuple[Connection, Put]]:
+def record_transaction(services: Services, made: Sequence[str] = ()) -> Iterator[tuple[Connection, Put]]:
     """Yield an index transaction and a function to store records; a failure deletes them and keys `made`.
 
     No other process writes to the index meanwhile, so checks before a record still hold when its rows are written.
@@ -65,7 +65,7 @@ def recording(services: Services, made: Sequence[str] = ()) -> Iterator[tuple[Co
         keys.extend([key] if is_new else [])
         return is_new
 
-    with services.index.database.writing() as connection:
+    with services.index.database.write_transaction() as connection:
         try:
             yield connection, put
             services.index.notes.count_change(within=connection)

@@ -163,12 +163,12 @@ class Controller:
     def _mark(self) -> None:
         """Renew the mark of index and store after changes, to detect and rebuild an older copy of the index."""
         notes = self._services.index.notes
-        present, changes = notes.marked(), notes.changes()
+        present, changes = notes.store_mark(), notes.changes()
         if changes != present.changes or self._made:
             fresh = next_mark(present.mark)
-            notes.set_marked(StoreMark(fresh, newest_mark(self._services.store), changes))
+            notes.set_store_mark(StoreMark(fresh, newest_mark(self._services.store), changes))
             set_mark(self._services.store, fresh)
-            notes.set_marked(StoreMark(fresh, fresh, changes))
+            notes.set_store_mark(StoreMark(fresh, fresh, changes))
             self._known, self._made = fresh, False
 
     def _publish_progress(self) -> None:
@@ -188,12 +188,12 @@ class Controller:
 
         Such jobs alternate. A note in the index stores the position, so another controller can continue.
         """
-        if not (jobs := self._services.index.write.entering()):
+        if not (jobs := self._services.index.write.partly_entered_jobs()):
             return
         self._entered = next((job for job in jobs if job > self._entered), jobs[0])
         record = None
         try:
-            record = read_record(JobRecord, self._services.store, names.job_record(self._entered))
+            record = read_record(JobRecord, self._services.store, names.job_record_key(self._entered))
         except (NotFoundError, DamagedError) as error:
             log.error("the remaining tasks of job %s are not entered: %s", self._entered, error)
         self._services.index.write.enter_more(self._entered, record)
@@ -227,7 +227,7 @@ class Controller:
         publish_builtins(self._services.store)
         for manifest in unpack_all(self._services.store):
             self._alive.touch()
-            self._indexer.made(manifest)
+            self._indexer.index_shard(manifest)
         complete_if_new(self._services.index, self._services.store)
         made = self._services.index.notes.completeness()
         # Omitted records may be repaired by now.
@@ -239,7 +239,7 @@ class Controller:
 
     def _is_stale(self) -> bool:
         """Return whether index or store was replaced by an older copy."""
-        present = self._services.index.notes.marked()
+        present = self._services.index.notes.store_mark()
         # A kill between the two writes leaves the previous mark in the store.
         if present.mark == self._known or newest_mark(self._services.store) in (present.mark, present.before):
             self._known = present.mark
@@ -328,13 +328,13 @@ class Controller:
     def _feed_checks(self, present: set[str] | None, missing: Collection[str], now: float) -> None:
         for check in self._services.index.feed.ready_checks(now=now, limit=self._services.settings.queue_window):
             self._services.index.live.set_asset_waiting([check.digest], queued=True)
-            if self._services.store.exists(names.asset_check(check.kind, check.digest)):
+            if self._services.store.exists(names.asset_check_key(check.kind, check.digest)):
                 with _log_failures([]):
                     self._indexer.checked(check.kind, check.digest)
             elif ingest_id(check.kind, check.digest) not in (present or ()):
                 numbers = {"attempt": check.last_attempt + 1, "max_attempt": self._services.settings.task_attempts}
                 message = ingest_message(check.kind, check.name, check.digest, **numbers)
-                place = self._routes.place(requirements_of(message))
+                place = self._routes.route_of(requirements_of(message))
                 if place.held:
                     self._services.index.live.set_asset_waiting([check.digest], queued=False, not_before=now + HELD_S)
                 else:

@@ -21,12 +21,12 @@ from graspd.service.index.database import chunks
 from graspd.service.model import names
 from graspd.service.model.clock import timestamp
 from graspd.service.model.errors import ConflictError, DamagedError, NotFoundError
-from graspd.service.model.planning import plan
+from graspd.service.model.planning import plan_tasks
 from graspd.service.model.projects import EVERYTHING, ProjectScope
 from graspd.service.model.records import AttemptRecord, JobRecord, Record, Snapshot, Tag
 from graspd.service.model.states import AssetKind, Stage
 from graspd.service.pipeline import job_actions, tagging
-from graspd.service.pipeline.backends import Services, recording
+from graspd.service.pipeline.backends import Services, record_transaction
 from graspd.service.store.library import load_asset, load_check
 from graspd.service.store.records import (
     DeletedJob,
@@ -61,8 +61,8 @@ def delete_asset(
     asset = services.index.assets.get(kind, name)
     if asset.builtin:
         raise ConflictError(f"the {kind.value} {asset.name!r} comes with graspd and cannot be deleted")
-    with recording(services) as (connection, put):
-        if user := services.index.removals.user_of_asset(asset, within=connection):
+    with record_transaction(services) as (connection, put):
+        if user := services.index.removals.reason_to_keep_asset(asset, within=connection):
             if asset.shared and not scope.everything:
                 user = "a job, a dataset or a set of objects"
             raise ConflictError(f"the {kind.value} {asset.name!r} is needed by {user}; delete that first")
@@ -75,11 +75,11 @@ def delete_job(services: Services, job_id: str, *, owner: str = "") -> None:
     """Delete a job, and later the shards that only it needs; ConflictError if unfinished or in a dataset."""
     job = services.index.jobs.get(job_id)
     try:
-        record = read_record(JobRecord, services.store, names.job_record(job_id))
+        record = read_record(JobRecord, services.store, names.job_record_key(job_id))
     except (NotFoundError, DamagedError):
         record = None  # Shards of an unreadable record are unknown, and stay.
-    with recording(services) as (connection, put):
-        if user := services.index.removals.user_of_job(job_id, within=connection):
+    with record_transaction(services) as (connection, put):
+        if user := services.index.removals.reason_to_keep_job(job_id, within=connection):
             raise ConflictError(f"job {job_id} {user}")
         attempts = services.index.removals.attempts_of(job_id, within=connection)
         said = {"name": f"{job.request.hand} on {job.request.object}", "submitter": job.owner, "project": job.project}
@@ -93,8 +93,8 @@ def delete_dataset(services: Services, name: str, *, owner: str = "", with_snaps
     dataset = services.index.datasets.get(name)
     if not dataset.state.is_final:
         raise ConflictError(f"dataset {name!r} is {dataset.state}; cancel it first: graspd datasets cancel {name}")
-    with recording(services) as (connection, put):
-        taken = services.index.removals.snapshots_of(name, within=connection)
+    with record_transaction(services) as (connection, put):
+        taken = services.index.removals.count_snapshots(name, within=connection)
         if taken and not with_snapshots:
             raise ConflictError(
                 f"dataset {name!r} has {taken} snapshot{'s' * (taken > 1)}, which papers and training runs may name; "
@@ -108,17 +108,17 @@ def delete_dataset(services: Services, name: str, *, owner: str = "", with_snaps
 def move_to_removed(services: Services, deletion: Deletion) -> None:
     """Move a deleted resource below `removed/`, its record last, unless it was restored."""
     record = _record_of(deletion)
-    with services.index.database.writing():
-        if not services.store.exists(names.deletion(deletion.what, deletion.id)):
+    with services.index.database.write_transaction():
+        if not services.store.exists(names.deletion_key(deletion.what, deletion.id)):
             return
         folder = removed_folder(deletion)
         put_record(services.store, f"{folder}/deletion.json", deletion)
         if deletion.job is not None:
             put_record(services.store, released_key(deletion), DeletedJob(at=deletion.at, job=deletion.job))
-        attempts = [names.attempt(task, number) for task, number in deletion.attempts]
+        attempts = [names.attempt_key(task, number) for task, number in deletion.attempts]
         for key in [*attempts, *_record_last(_keys_below(services.store, record.rpartition("/")[0]), record)]:
             services.store.move(key, f"{folder}/{key}")
-        services.store.delete(names.deletion(deletion.what, deletion.id))
+        services.store.delete(names.deletion_key(deletion.what, deletion.id))
 
 
 def restore(
@@ -142,7 +142,7 @@ def restore(
     if what == "tag":
         _restore_tag(services, known[0])
         return known[0]
-    with services.index.database.writing() as connection:
+    with services.index.database.write_transaction() as connection:
         connection.execution_options(**{QUIET: True})
         _restore(services, known[0], connection)
     return known[0]
@@ -151,7 +151,7 @@ def restore(
 def _restore(services: Services, deletion: Deletion, connection: Connection) -> None:
     """Restore stored objects, then rows, then remove the deletion; requires the index's write lock."""
     store, record, folder = services.store, _record_of(deletion), removed_folder(deletion)
-    waiting = names.deletion(deletion.what, deletion.id)
+    waiting = names.deletion_key(deletion.what, deletion.id)
     if not store.exists(waiting) and store.exists(record):
         called = deletion.id if deletion.what in ("job", "dataset") else deletion.name
         raise ConflictError(f"there is a {deletion.what} {called!r} again; delete that first")
@@ -174,10 +174,10 @@ def _restore_rows(services: Services, deletion: Deletion, connection: Connection
     """Write the rows that follow from the records of a job, dataset, hand, object or network."""
     store, index = services.store, services.index
     if deletion.what == "job":
-        record = read_record(JobRecord, store, names.job_record(deletion.id))
+        record = read_record(JobRecord, store, names.job_record_key(deletion.id))
         _require(services, record.assets, connection)
         index.write.add_job(record, within=connection)
-        tried = [read_record(AttemptRecord, store, names.attempt(*one)) for one in deletion.attempts]
+        tried = [read_record(AttemptRecord, store, names.attempt_key(*one)) for one in deletion.attempts]
         for attempt in sorted(tried, key=lambda one: one.number):
             index.write.add_attempt(attempt, within=connection)
         if events := job_events(store, record.id):
@@ -188,7 +188,7 @@ def _restore_rows(services: Services, deletion: Deletion, connection: Connection
         _require(services, [*members, *((AssetKind.OBJECT, one.digest) for one in dataset.objects)], connection)
         index.write_dataset.add(dataset, within=connection)
         index.write_dataset.set_events(dataset.name, dataset_events(store, dataset.name), within=connection)
-        for key in _keys_below(store, names.dataset_snapshots(dataset.name)):
+        for key in _keys_below(store, names.dataset_snapshots_folder(dataset.name)):
             index.write_dataset.add_snapshot(read_record(Snapshot, store, key), within=connection)
     else:
         kind = AssetKind(deletion.what)
@@ -208,7 +208,9 @@ def _restore_jobs(services: Services, deletion: Deletion, connection: Connection
         if one.id in wanted and one.at >= deletion.at:
             newest.setdefault(one.id, one)
     for one in newest.values():
-        if services.store.exists(names.deletion("job", one.id)) or not services.store.exists(names.job_record(one.id)):
+        if services.store.exists(names.deletion_key("job", one.id)) or not services.store.exists(
+            names.job_record_key(one.id)
+        ):
             _restore(services, one, connection)
 
 
@@ -229,10 +231,10 @@ def _require(services: Services, wanted: Collection[tuple[AssetKind, str]], conn
 def _record_of(deletion: Deletion) -> str:
     """Return the key of the record whose presence makes the resource exist."""
     if deletion.what == "job":
-        return names.job_record(deletion.id)
+        return names.job_record_key(deletion.id)
     if deletion.what == "dataset":
-        return names.dataset_record(deletion.id)
-    return names.asset_record(AssetKind(deletion.what), deletion.id)
+        return names.dataset_record_key(deletion.id)
+    return names.asset_record_key(AssetKind(deletion.what), deletion.id)
 
 
 def _keys_below(store: Store, folder: str) -> list[str]:
@@ -244,7 +246,7 @@ def _record_last(keys: Iterable[str], record: str) -> list[str]:
 
 
 def _put(put: Put, deletion: Deletion) -> None:
-    put(names.deletion(deletion.what, deletion.id), deletion)
+    put(names.deletion_key(deletion.what, deletion.id), deletion)
 
 
 class GarbageCollector:
@@ -295,8 +297,8 @@ class GarbageCollector:
 
     def _execute(self, deletion: Deletion, deadline: float) -> bool:
         """Remove rows that a killed process left, then stored objects; return whether all is done."""
-        with self._services.index.database.writing() as connection:
-            if not self._services.store.exists(names.deletion(deletion.what, deletion.id)):
+        with self._services.index.database.write_transaction() as connection:
+            if not self._services.store.exists(names.deletion_key(deletion.what, deletion.id)):
                 return True  # The resource was restored after the listing.
             removals = self._services.index.removals
             if deletion.what == "job":
@@ -317,7 +319,7 @@ class GarbageCollector:
         except (NotFoundError, DamagedError):
             return True
         for some in chunks(jobs, _AT_ONCE):
-            for job in self._services.index.removals.planned_only(some):
+            for job in self._services.index.removals.orphaned_dataset_jobs(some):
                 if self._clock() > deadline:
                     return False
                 try:
@@ -330,14 +332,14 @@ class GarbageCollector:
         return True
 
     def _unneeded(self, released: DeletedJob) -> Iterator[tuple[Stage, str]]:
-        planned = [(task.stage, task.output) for task in plan(released.job)]
+        planned = [(task.stage, task.output) for task in plan_tasks(released.job)]
         for some in chunks(planned, _AT_ONCE):
             unneeded = self._services.index.removals.unneeded_shards([shard for _, shard in some])
             yield from ((stage, shard) for stage, shard in some if shard in unneeded)
 
     def _remove_shard(self, stage: Stage, shard: str) -> None:
         """Remove the manifest first, so the shard no longer exists; a job entered meanwhile makes it again."""
-        with self._services.index.database.writing() as connection:
+        with self._services.index.database.write_transaction() as connection:
             if self._services.index.removals.remove_shard(shard, within=connection):
-                self._services.store.delete(names.shard_manifest(stage, shard))
-                self._services.store.delete(names.shard_file(stage, shard))
+                self._services.store.delete(names.shard_manifest_key(stage, shard))
+                self._services.store.delete(names.shard_file_key(stage, shard))

@@ -15,7 +15,7 @@ from graspd.service.model.records import Choice
 from graspd.service.model.renamed import convert_chart
 from graspd.service.model.studies import FREE, IN_SCENE, IN_SCENES, SPEEDS
 from graspd.service.store.integrity import get_document
-from graspd.service.store.records import charts_of, latest_key
+from graspd.service.store.records import latest_key, scene_chart_kind
 from graspd.service.store.store import Store
 
 Row = Mapping[str, Any]
@@ -80,7 +80,7 @@ class Resolver:
         key = (request.method, request.target, *(pair if pair in chart.pairs else (hand, "")))
         if key not in chart.found:
             method, target, hand, object_ = key
-            chart.found[key] = cheapest(chart.content, target, method=method, hand=hand, object_=object_)
+            chart.found[key] = cheapest_fidelity(chart.content, target, method=method, hand=hand, object_=object_)
         found = chart.found[key]
         reached = round(found.reached, 4)
         how = Choice(target=request.target, chart=chart.key, measured_on=found.measured_on, reached=reached)
@@ -88,14 +88,14 @@ class Resolver:
 
     def _chart(self, request: JobRequest) -> _Chart:
         if request.scene not in self._charts:
-            key = latest_key(self._store, charts_of(request.place))
+            key = latest_key(self._store, scene_chart_kind(request.place))
             if not key:
-                raise InputError(_no_chart(request))
+                raise InputError(_no_chart_text(request))
             self._charts[request.scene] = _Chart(key, convert_chart(get_document(self._store, key)))
         return self._charts[request.scene]
 
 
-def _no_chart(request: JobRequest) -> str:
+def _no_chart_text(request: JobRequest) -> str:
     if not request.in_scene:
         return "fidelity auto needs a chart: run `graspd chart --publish` once, or name a fidelity"
     scene = request.place.kind
@@ -121,7 +121,7 @@ def parse_target(text: str, *, in_scene: bool = False) -> tuple[str, float]:
     return metric, float(bound)
 
 
-def cheapest(chart: Row, target: str, *, method: str, hand: str, object_: str) -> ChosenFidelity:
+def cheapest_fidelity(chart: Row, target: str, *, method: str, hand: str, object_: str) -> ChosenFidelity:
     """Return a method's fastest fidelity (valid grasps per second) that meets a target; else InputError.
 
     Runs of the same hand and object count, else runs of the hand, else all runs. In a chart of scenes only grasps

@@ -91,7 +91,7 @@ def identify(
     """
     # Redis is read before store and index, so that concurrent new processes see each other's writes.
     redis = services.queue.service() if ask_redis else None
-    left = recorded(folder)
+    left = recorded_service(folder)
     chain = service_ids(services.store)
     index = services.index.notes.service()
     if not chain:
@@ -139,7 +139,7 @@ def service_ids(store: Store) -> list[str]:
     return [read_record(ServiceRecord, store, key).id for key in keys]
 
 
-def recorded(folder: Path | None) -> str | None:
+def recorded_service(folder: Path | None) -> str | None:
     """Return the id of the last service that ran in a data folder."""
     if folder is not None:
         with contextlib.suppress(OSError, UnicodeDecodeError):
@@ -155,4 +155,4 @@ def _foreign_index_error(store: str) -> str:
 
 
 def _add(store: Store, number: int, identity: str) -> None:
-    put_record(store, names.service(number), ServiceRecord(id=identity, at=timestamp()))
+    put_record(store, names.service_key(number), ServiceRecord(id=identity, at=timestamp()))

@@ -13,10 +13,10 @@ from typing import Final
 from graspd.service.index.database import chunks
 from graspd.service.model.clock import timestamp
 from graspd.service.model.errors import InputError, StoreUnavailable, UnavailableError
-from graspd.service.model.names import attempt as attempt_key
+from graspd.service.model.names import attempt_key as attempt_key
 from graspd.service.model.planning import backoff
 from graspd.service.model.records import AttemptRecord
-from graspd.service.model.series import SERIES, STAGE_BUCKETS_S, field
+from graspd.service.model.series import SERIES, STAGE_BUCKETS_S, field_name
 from graspd.service.model.states import AssetKind, Stage, State
 from graspd.service.pipeline.backends import Services
 from graspd.service.queue.port import Event, EventKind
@@ -76,7 +76,7 @@ class Indexer:
         """Mark tasks as started by workers; remove them from the argument."""
         if started:
             with _skip_invalid(f"the start of {len(started)} tasks"):
-                self.tell(self._services.index.live.set_running(started))
+                self.publish_states(self._services.index.live.set_running(started))
             started.clear()
 
     def _finish(self, events: Sequence[Event], places: Sequence[int]) -> list[int]:
@@ -123,10 +123,10 @@ class Indexer:
                 for manifest in made:
                     self._index([manifest])
             return
-        self.tell(states)
-        self._tally.made(made)
+        self.publish_states(states)
+        self._tally.count_shards(made)
 
-    def tell(self, states: Mapping[str, State]) -> None:
+    def publish_states(self, states: Mapping[str, State]) -> None:
         changed = {job: state for job, state in states.items() if self._told.get(job) is not state}
         if changed:
             now = timestamp()
@@ -142,9 +142,9 @@ class Indexer:
         while len(self._told) > _REMEMBERED_JOBS:
             self._told.popitem(last=False)
 
-    def made(self, manifest: ShardManifest) -> None:
-        self.tell(self._services.index.write.add_manifests([manifest]))
-        self._tally.made([manifest])
+    def index_shard(self, manifest: ShardManifest) -> None:
+        self.publish_states(self._services.index.write.add_manifests([manifest]))
+        self._tally.count_shards([manifest])
 
     def checked(self, kind: AssetKind, digest: str) -> None:
         asset = load_asset(self._services.store, kind, digest)
@@ -159,8 +159,8 @@ class Indexer:
             about: dict[str, object] = {"job": attempt.job_id, "task": attempt.task_id}
             about |= {"attempt": attempt.number, "worker": attempt.worker}
             log.warning("attempt failed: %s: %s", attempt.kind, attempt.reason, extra=about)
-            self._tally.failed(attempt.stage.value, attempt.kind)
-            self.tell({attempt.job_id: state})
+            self._tally.count_failure(attempt.stage.value, attempt.kind)
+            self.publish_states({attempt.job_id: state})
 
     def flush(self) -> None:
         self._tally.flush()
@@ -203,7 +203,9 @@ class Indexer:
             digest = event.output.partition("/")[2]
             self._services.index.live.set_asset_waiting([digest], queued=False, not_before=not_before, message=message)
         else:
-            self.tell(self._services.index.live.set_waiting([event.task_id], not_before=not_before, message=message))
+            self.publish_states(
+                self._services.index.live.set_waiting([event.task_id], not_before=not_before, message=message)
+            )
 
 
 @contextmanager
@@ -234,7 +236,7 @@ class Tally:
         self._amounts: defaultdict[str, float] = defaultdict(float)
         self._kinds: set[tuple[str, str]] = set()
 
-    def made(self, manifests: Iterable[ShardManifest]) -> None:
+    def count_shards(self, manifests: Iterable[ShardManifest]) -> None:
         for manifest in manifests:
             stage = manifest.stage.value
             self.add("graspd_shards_total", stage)
@@ -243,9 +245,9 @@ class Tally:
             if manifest.kind == "base":
                 self.add("graspd_grasps_total", "all", amount=manifest.count)
                 self.add("graspd_grasps_total", "valid", amount=manifest.valid)
-                self.add("graspd_grasps_total", "validated", amount=manifest.validated)
+                self.add("graspd_grasps_total", "validated", amount=manifest.validated_candidates)
 
-    def failed(self, stage: str, kind: str) -> None:
+    def count_failure(self, stage: str, kind: str) -> None:
         if (stage, kind) not in self._kinds:
             if len(self._kinds) >= MOST_KINDS:
                 kind = OTHER_KIND
@@ -260,9 +262,9 @@ class Tally:
 
     def _observe(self, name: str, *labels: str, seconds: float) -> None:
         bound = next((bound for bound in STAGE_BUCKETS_S if seconds <= bound), None)
-        self._amounts[field(f"{name}_bucket", *labels, "+Inf" if bound is None else str(bound))] += 1
-        self._amounts[field(f"{name}_sum", *labels)] += seconds
+        self._amounts[field_name(f"{name}_bucket", *labels, "+Inf" if bound is None else str(bound))] += 1
+        self._amounts[field_name(f"{name}_sum", *labels)] += seconds
 
     def add(self, name: str, *labels: str, amount: float = 1) -> None:
         assert len(SERIES[name].labels) == len(labels)
-        self._amounts[field(name, *labels)] += amount
+        self._amounts[field_name(name, *labels)] += amount

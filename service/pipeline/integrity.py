@@ -24,7 +24,7 @@ from graspd.service.model.clock import age_of, timestamp
 from graspd.service.model.digests import digest_files
 from graspd.service.model.domain import Asset
 from graspd.service.model.errors import DamagedError, GraspdError, InputError, NotFoundError
-from graspd.service.model.planning import PlannedTask, message_of, plan
+from graspd.service.model.planning import PlannedTask, message_of, plan_tasks
 from graspd.service.model.records import (
     AttemptRecord,
     DatasetEvent,
@@ -154,8 +154,8 @@ def examine(
             return Damage(key, FOREIGN) if store.exists(key) else None
         kind, shard, ending = match.groups()
         if ending == "json":
-            return _manifest(store, key, STAGES[kind], shard, read, unsealed)
-        manifest = names.shard_manifest(STAGES[kind], shard)
+            return _check_manifest(store, key, STAGES[kind], shard, read, unsealed)
+        manifest = names.shard_manifest_key(STAGES[kind], shard)
         # A worker writes the manifest last; it may have arrived since the listing.
         orphan = not store.exists(manifest) and store.exists(key) and not store.exists(manifest)
         return Damage(key, NO_MANIFEST, shard) if orphan else None
@@ -199,7 +199,7 @@ def _check_upload(store: Store, key: str, kind: AssetKind, digest: str) -> None:
         raise DamagedError(f"{key} in the store is damaged: its files do not match its name; upload it again")
 
 
-def _manifest(store: Store, key: str, stage: Stage, shard: str, read: Read, unsealed: Unsealed) -> Damage | None:
+def _check_manifest(store: Store, key: str, stage: Stage, shard: str, read: Read, unsealed: Unsealed) -> Damage | None:
     try:
         data = store.get(key)
         manifest = parse_record(ShardManifest, data, key)
@@ -207,7 +207,7 @@ def _manifest(store: Store, key: str, stage: Stage, shard: str, read: Read, unse
         return Damage(key, BAD_MANIFEST, shard)
     if not is_sealed(key, [data], len(data)):
         unsealed(key)
-    file = names.shard_file(stage, shard)
+    file = names.shard_file_key(stage, shard)
     if (manifest.shard_id, manifest.key) != (shard, file):
         return Damage(key, BAD_MANIFEST, shard)
     try:
@@ -288,14 +288,14 @@ class IntegrityScan:
         if self._clock() - self._looked > _AGAIN_S:
             if reached is not None:
                 self._services.index.notes.set_scan_note(reached)
-            self.look_again()
+            self.recheck_damage()
 
-    def look_again(self) -> None:
+    def recheck_damage(self) -> None:
         """Check known damage again; remove repaired and deleted entries from the list."""
         self._looked = self._clock()
-        _, known = self._services.index.damage.known(limit=_KNOWN)
+        _, known = self._services.index.damage.summary(limit=_KNOWN)
         if well := [one.key for one in known if self._is_repaired(one)]:
-            self._services.index.damage.mark([], intact=well)
+            self._services.index.damage.update([], intact=well)
 
     def _is_repaired(self, one: Damage) -> bool:
         stem, dot, _ = one.key.rpartition(".")
@@ -307,7 +307,7 @@ class IntegrityScan:
         wrong = examine(self._services.store, key, read=self._pace)
         if wrong is not None and not may_await_manifest(self._services.store, wrong):
             log.warning("%s: %s", wrong.key, wrong.what)
-            self._services.index.damage.mark([wrong])
+            self._services.index.damage.update([wrong])
 
     def _keys(self, folder: str, after: str) -> list[str]:
         listed = self._services.store.list(folder, offset=after or None)
@@ -342,7 +342,7 @@ def _fix(services: Services, one: Damage, harmed: set[str]) -> str:
         services.store.set_aside(one.key)
         return ""
     if match := _OF_ASSET.fullmatch(one.key):
-        return _asset(services, one.key, AssetKind(match[1]), match[2], match[3])
+        return _repair_asset(services, one.key, AssetKind(match[1]), match[2], match[3])
     if not one.shard:
         return "put a copy in its place"
     stage = STAGES[one.key.split("/")[1]]
@@ -358,14 +358,14 @@ def _fix(services: Services, one: Damage, harmed: set[str]) -> str:
     if harmed & set(task.inputs):
         return "its input is made again first; run the command again when that is done"
     if one.what != MISSING:
-        _clear(services, one, stage)
+        _set_aside_result(services, one, stage)
     number = len(task_attempts(services.store, task.id)) + 1
     message = message_of(job, task, attempt=number, max_attempt=number)
     services.queue.enqueue([message], Priority.BULK, again=True)
     return ""
 
 
-def _asset(services: Services, key: str, kind: AssetKind, digest: str, file: str) -> str:
+def _repair_asset(services: Services, key: str, kind: AssetKind, digest: str, file: str) -> str:
     """Move derived files of a hand or an object away; a new check and the next task make them again.
 
     Built-in assets are stored again from the program.
@@ -380,16 +380,16 @@ def _asset(services: Services, key: str, kind: AssetKind, digest: str, file: str
     else:
         services.store.set_aside(key)
     if file in ("model.glb", "check.json") and not services.store.exists(key):
-        services.store.set_aside(names.asset_check(kind, digest))
+        services.store.set_aside(names.asset_check_key(kind, digest))
         with contextlib.suppress(NotFoundError, DamagedError):
             services.index.write.add_asset(load_asset(services.store, kind, digest), None)
             services.index.live.set_asset_waiting([digest], queued=False)
     return ""
 
 
-def _clear(services: Services, one: Damage, stage: Stage) -> None:
+def _set_aside_result(services: Services, one: Damage, stage: Stage) -> None:
     """Move a damaged result away; a file without manifest stays if the index contains its checksum."""
-    file, manifest = names.shard_file(stage, one.shard), names.shard_manifest(stage, one.shard)
+    file, manifest = names.shard_file_key(stage, one.shard), names.shard_manifest_key(stage, one.shard)
     if one.what == BAD_MANIFEST:
         services.store.set_aside(manifest)
     if one.what not in (BAD_MANIFEST, NO_MANIFEST) or not _matches_index(services, one.shard, file):
@@ -409,10 +409,10 @@ def _task_of_shard(services: Services, stage: Stage, shard: str) -> tuple[JobRec
     if job is None:
         return "no job makes it, so it cannot be made again; put a copy in its place"
     try:
-        record = read_record(JobRecord, services.store, names.job_record(job))
+        record = read_record(JobRecord, services.store, names.job_record_key(job))
     except (NotFoundError, DamagedError) as error:
         return f"the job that makes it cannot be read: {error}"
     if (made := record.revisions.get(stage)) != STAGE_REVISIONS[stage]:
         return f"it is of revision {made} of {stage}, and this graspd makes revision {STAGE_REVISIONS[stage]}"
-    task = next((task for task in plan(record) if task.output == shard), None)
+    task = next((task for task in plan_tasks(record) if task.output == shard), None)
     return (record, task) if task is not None else "its job does not make it"

@@ -16,12 +16,12 @@ from sqlalchemy import Connection
 
 from graspd.service.index.queries.feed import ReadyTask
 from graspd.service.index.queries.overview import BatchCost
-from graspd.service.index.queries.rates import Rates, candidates
+from graspd.service.index.queries.rates import Rates, expected_candidates
 from graspd.service.index.views import AssetView, JobView
 from graspd.service.model import names
 from graspd.service.model.clock import timestamp
 from graspd.service.model.digests import job_id
-from graspd.service.model.domain import JobOptions, JobRequest, batches_of
+from graspd.service.model.domain import JobOptions, JobRequest, count_batches
 from graspd.service.model.errors import ConflictError, InputError, NotFoundError, SceneError, UnavailableError
 from graspd.service.model.fidelity import AUTO
 from graspd.service.model.messages import (
@@ -40,11 +40,11 @@ from graspd.service.model.scene_spec import HalfSpace, Pose, Supports
 from graspd.service.model.states import AssetKind, Priority, Stage, State
 from graspd.service.model.transforms import quat_conjugate, quat_rotate
 from graspd.service.model.version import SCHEMA_OF_RANGES
-from graspd.service.pipeline.backends import Services, recording
+from graspd.service.pipeline.backends import Services, record_transaction
 from graspd.service.pipeline.fidelity_choice import Resolver
 from graspd.service.queue.port import Event, EventKind
-from graspd.service.store.records import add_job_event, job_events, put_record, read_record, refuse_pending
-from graspd.service.telemetry import bound
+from graspd.service.store.records import add_job_event, job_events, put_record, read_record, refuse_pending_deletion
+from graspd.service.telemetry import bound_subject
 
 log = logging.getLogger(__name__)
 Options = TypeVar("Options", bound=JobOptions)
@@ -71,9 +71,9 @@ class TaskRanges:
         self._workers: list[WorkerBeat] = []
         self._costs: list[BatchCost] = []
 
-    def sized(self, job: JobRecord, *, among: int = 1) -> JobRecord:
+    def with_span(self, job: JobRecord, *, among: int = 1) -> JobRecord:
         """Return a job with its number of batches per task; `among`: number of jobs that share the workers."""
-        batches, wanted_s = batches_of(job.request.grasps), self._services.settings.task_s
+        batches, wanted_s = count_batches(job.request.grasps), self._services.settings.task_s
         # The pictures of one batch already fill a file of megabytes.
         if batches == 1 or job.request.views or not wanted_s:
             return job
@@ -82,13 +82,13 @@ class TaskRanges:
             self._costs = self._services.index.costs.of_batches(Stage.SYNTHESIZE, limit=_LOOKED_AT, scope=self._scope)
             self._read_again = self._clock() + _KNOWN_S
         able = [worker for worker in self._workers if Stage.SYNTHESIZE in worker.stages]
-        if any(worker.ability.schemas[1] < SCHEMA_OF_RANGES for worker in able):
+        if any(worker.capabilities.schemas[1] < SCHEMA_OF_RANGES for worker in able):
             return job
         # A small job shows its grasps batch by batch; a GPU makes them all in one launch.
         if job.priority is Priority.INTERACTIVE and not (able and all(one.device.startswith("cuda") for one in able)):
             return job
         rate = Rates(self._costs, job.request, {one.device for one in able}).of(job.request.hand, job.request.object)
-        batch_s = rate.seconds_per_try * candidates(rate, job.request) / batches
+        batch_s = rate.seconds_per_try * expected_candidates(rate, job.request) / batches
         by_time = int(wanted_s / max(1e-3, batch_s or wanted_s))
         workers = -(-(len(able) or _EXPECTED) // among)
         return job.model_copy(update={"span": span_of(batches, by_time, workers)})
@@ -160,7 +160,7 @@ def with_network(
 
 def submit(services: Services, request: JobRequest, *, priority: Priority | None = None) -> tuple[JobView, bool]:
     """Prepare and enter a job. Equal requests give one job; `retry` restarts a failed or cancelled one."""
-    return enter(services, prepare(services, request, priority=priority))
+    return enter_job(services, prepare(services, request, priority=priority))
 
 
 def prepare(
@@ -186,7 +186,7 @@ def prepare(
     services.queue.ping()
     named = request.model_copy(update={"hand": hand.name, "object": obj.name})
     request, choice = Resolver(services.store).choose(named) if named.fidelity == AUTO else (named, None)
-    origin = Origin(request=bound("request"), key=bound("key"))
+    origin = Origin(request=bound_subject("request"), key=bound_subject("key"))
     record = JobRecord(
         id=job_id(request, hand.digest, obj.digest, scope.project),
         request=request,
@@ -199,22 +199,22 @@ def prepare(
         project=scope.project,
         choice=choice,
     )
-    return TaskRanges(services, scope=scope).sized(record)
+    return TaskRanges(services, scope=scope).with_span(record)
 
 
-def enter(services: Services, record: JobRecord, *, keeps_assets: bool = False) -> tuple[JobView, bool]:
+def enter_job(services: Services, record: JobRecord, *, keeps_assets: bool = False) -> tuple[JobView, bool]:
     """Record a planned job and queue its first tasks; return the job, and whether it is new.
 
     The controller enters the rest. With `keeps_assets` a dataset protects hand, object, neighbours and network from
     deletion meanwhile. NotFoundError: one of them was deleted. ConflictError: the same job was deleted, and its
     stored objects are still being removed.
     """
-    key = names.job_record(record.id)
+    key = names.job_record_key(record.id)
     # A dataset needs its jobs even after an interruption, and must not hold the lock while it accesses the store.
     new = keeps_assets and put_record(services.store, key, record)
-    with recording(services, [key] if new else []) as (connection, put):
+    with record_transaction(services, [key] if new else []) as (connection, put):
         new = new or (not keeps_assets and put(key, record))
-        refuse_pending(services.store, "job", record.id)
+        refuse_pending_deletion(services.store, "job", record.id)
         if not new:
             if not services.store.exists(key):
                 raise ConflictError(f"job {record.id} was deleted just now; submit it again")
@@ -243,7 +243,7 @@ def cancel(services: Services, job_id: str, *, cause: str = "") -> JobView:
 
 def retry(services: Services, job_id: str, *, cause: str = "") -> JobView:
     """Queue the failed and cancelled tasks of a job again, with fresh attempts; ConflictError without any."""
-    with _transaction(services, job_id, _refuse_unfailed) as add:
+    with _transaction(services, job_id, _require_failures) as add:
         add("retried", services.index.feed.failed_tasks(job_id), cause=cause)
     _start(services, job_id)
     return _publish_state(services, job_id)
@@ -261,10 +261,10 @@ class Routes:
         self._here: dict[Stage, list[Capabilities]] = defaultdict(list)
         for beat in present:
             for stage in beat.stages:
-                if beat.ability not in self._here[stage]:
-                    self._here[stage].append(beat.ability)
+                if beat.capabilities not in self._here[stage]:
+                    self._here[stage].append(beat.capabilities)
 
-    def place(self, need: Requirements) -> Route:
+    def route_of(self, need: Requirements) -> Route:
         """Return the route of a task.
 
         If all workers of its stage are capable, the task enters their common list; if some are capable, a separate
@@ -287,7 +287,7 @@ def queue_tasks(services: Services, ready: Sequence[ReadyTask], *, routes: Route
     for task in ready:
         most = task.retried_upto + services.settings.task_attempts
         message = message_of(task.job, task.task, attempt=task.last_attempt + 1, max_attempt=most)
-        place = routes.place(requirements_of(message))
+        place = routes.route_of(requirements_of(message))
         if place.held:
             held[place.held].append(task.task.id)
         else:
@@ -307,7 +307,7 @@ def _start(services: Services, job_id: str) -> None:
         room = services.settings.queue_window - sum(services.queue.depths().values())
         if room > 0:
             routes = Routes(services.queue.workers())
-            queue_tasks(services, services.index.feed.ready_of_job(job_id, limit=room), routes=routes)
+            queue_tasks(services, services.index.feed.ready_tasks_of_job(job_id, limit=room), routes=routes)
         _publish_state(services, job_id)
     except UnavailableError as error:
         log.warning("job %s is recorded; its tasks are queued when the queue answers: %s", job_id, error)
@@ -321,7 +321,7 @@ def _transaction(services: Services, job_id: str, refuse: Callable[[JobView], No
     """
     refuse(services.index.jobs.get(job_id))
     before = job_events(services.store, job_id)
-    with recording(services) as (connection, put):
+    with record_transaction(services) as (connection, put):
         refuse(services.index.jobs.get(job_id))
 
         def add(
@@ -341,7 +341,7 @@ def _refuse_ended(job: JobView) -> None:
         raise ConflictError(f"job {job.id} has already {ended}; there is nothing to cancel")
 
 
-def _refuse_unfailed(job: JobView) -> None:
+def _require_failures(job: JobView) -> None:
     if job.state not in (State.FAILED, State.CANCELLED):
         raise ConflictError(f"job {job.id} is {job.state}; only a failed or cancelled job can be retried")
 

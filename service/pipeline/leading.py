@@ -51,7 +51,7 @@ class Leadership:
         return False
 
     @contextmanager
-    def held(self, stop: threading.Event) -> Iterator[threading.Event]:
+    def hold(self, stop: threading.Event) -> Iterator[threading.Event]:
         """Hold the lease, then release it; yield an event that is set once another process leads or on `stop`.
 
         Only another holder in Redis ends the lease: while Redis is unavailable, no process can take it.
@@ -84,7 +84,7 @@ class Leadership:
     def _renew_lease(self) -> bool | None:
         """Return whether this process leads for the next lease; None if Redis is unavailable."""
         try:
-            return self._queue.lead(self.holder, self._lease_s)
+            return self._queue.renew_leadership(self.holder, self._lease_s)
         except QueueUnavailable as error:
             log.debug("it is unknown which controller leads: %s", error)
             return None

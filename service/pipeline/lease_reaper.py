@@ -59,7 +59,7 @@ class LeaseReaper:
 
     def find_missing(self, present: Collection[str]) -> list[str]:
         """Recover tasks that the index counts as queued but neither queue nor workers have; return their ids."""
-        tasks, checks = self._services.index.feed.believed_queued()
+        tasks, checks = self._services.index.feed.queued_tasks_and_checks()
         believed = tasks | {ingest_id(kind, digest) for kind, digest in checks}
         now = self._clock()
         self._missing = {task: self._missing.get(task, now) for task in believed - set(present)}
@@ -76,7 +76,7 @@ class LeaseReaper:
         for made in (
             unpack_all(self._services.store) if missing else ()
         ):  # Written by a worker of 0.2, in a rolling upgrade.
-            self._indexer.made(made)
+            self._indexer.index_shard(made)
         for task, (stage, shard) in self._services.index.feed.outputs(missing).items():
             if self._find(task, Stage(stage), shard):
                 continue
@@ -92,12 +92,12 @@ class LeaseReaper:
                 again.append(task)
         if again:
             log.warning("%d tasks were lost from the queue and are queued again", len(again))
-            self._indexer.tell(self._services.index.live.set_waiting(again))
+            self._indexer.publish_states(self._services.index.live.set_waiting(again))
 
     def _find(self, task_id: str, stage: Stage, shard: str) -> bool:
         """Index an existing shard; return whether it exists; a damaged manifest fails its task permanently."""
         try:
-            self._indexer.made(load_manifest(self._services.store, stage, shard))
+            self._indexer.index_shard(load_manifest(self._services.store, stage, shard))
         except NotFoundError:
             return False
         except DamagedError as error:
@@ -109,11 +109,11 @@ class LeaseReaper:
         about = {"task_id": task_id, "job_id": task.job_id, "stage": stage, "number": task.attempt}
         why = {"kind": type(error).__name__, "reason": str(error), "worker": "controller"}
         attempt = AttemptRecord.model_validate({**about, **why, "ended": timestamp(), "last": True})
-        put_record(self._services.store, names.attempt(task_id, attempt.number), attempt)
+        put_record(self._services.store, names.attempt_key(task_id, attempt.number), attempt)
         self._indexer.failed(attempt)
 
     def _recover_check(self, kind: AssetKind, digest: str) -> None:
-        if self._services.store.exists(names.asset_check(kind, digest)):
+        if self._services.store.exists(names.asset_check_key(kind, digest)):
             try:
                 self._indexer.checked(kind, digest)
             except DamagedError as error:
@@ -146,7 +146,7 @@ class LeaseReaper:
             worker=worker,
             last=message.attempt >= message.max_attempt,
         )
-        key = names.attempt(message.task_id, message.attempt)
+        key = names.attempt_key(message.task_id, message.attempt)
         if not put_record(self._services.store, key, attempt):
             try:
                 attempt = read_record(AttemptRecord, self._services.store, key)
@@ -161,7 +161,7 @@ class LeaseReaper:
             ended = f"the check of this {message.kind.value} crashed its worker {message.attempt} times"
             reason = f"{ended}; delete it to try again"
             found = {"verdict": "refuse", "message": reason, "repairs": [], "facts": {}}
-            put_document(self._services.store, names.asset_check(message.kind, message.digest), found)
+            put_document(self._services.store, names.asset_check_key(message.kind, message.digest), found)
             self._indexer.checked(message.kind, message.digest)
         else:
             self._services.index.live.add_asset_attempt(message.digest, message.attempt, not_before=0.0)

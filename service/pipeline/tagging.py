@@ -7,9 +7,16 @@ from collections.abc import Callable, Collection
 from graspd.service.model import names
 from graspd.service.model.clock import timestamp
 from graspd.service.model.errors import ConflictError, LimitError, NotFoundError
-from graspd.service.model.records import MOST_TAGGED, Grasp, Tag, by_shard, tag_id
-from graspd.service.pipeline.backends import Services, recording
-from graspd.service.store.records import Deletion, drop_older, newest_version, put_record, put_version, removed_folder
+from graspd.service.model.records import MOST_TAGGED, Grasp, Tag, rows_by_shard, tag_id
+from graspd.service.pipeline.backends import Services, record_transaction
+from graspd.service.store.records import (
+    Deletion,
+    drop_older_versions,
+    newest_version,
+    put_record,
+    put_version,
+    removed_folder,
+)
 
 #: Called with the tag to change, None for a new one; raises if the change is not allowed.
 Permit = Callable[[Tag | None], None]
@@ -24,7 +31,7 @@ def tag_grasps(
         members = tag.members | set(grasps)
         if len(members) > MOST_TAGGED:
             raise LimitError(f"the tag {name!r} would name {len(members)} grasps; a tag names at most {MOST_TAGGED}")
-        return tag.model_copy(update={"grasps": by_shard(members)})
+        return tag.model_copy(update={"grasps": rows_by_shard(members)})
 
     now = timestamp()
     fresh = Tag(id=tag_id(name, project), name=name, number=1, created=now, changed=now, owner=owner, project=project)
@@ -35,7 +42,7 @@ def tag_grasps(
 def untag_grasps(services: Services, tag: str, grasps: Collection[Grasp], *, permit: Permit) -> int:
     """Remove a tag, by its id, from grasps; return how many had it."""
     before, after = _change(
-        services, tag, lambda one: one.model_copy(update={"grasps": by_shard(one.members - set(grasps))}), permit
+        services, tag, lambda one: one.model_copy(update={"grasps": rows_by_shard(one.members - set(grasps))}), permit
     )
     return len(before.members) - len(after.members)
 
@@ -47,7 +54,7 @@ def delete_tag(services: Services, tag: str, *, permit: Permit, owner: str = "")
         said = {"name": one.name, "submitter": one.owner, "project": one.project}
         deletion = Deletion(what="tag", id=one.id, at=timestamp(), owner=owner, **said)
         folder = removed_folder(deletion)
-        put_record(services.store, f"{folder}/{names.tag_version(one.id, one.number)}", one)
+        put_record(services.store, f"{folder}/{names.tag_version_key(one.id, one.number)}", one)
         put_record(services.store, f"{folder}/deletion.json", deletion)
         return one.model_copy(update={"grasps": {}, "gone": True})
 
@@ -68,7 +75,7 @@ def _change(
     services: Services, tag: str, change: Callable[[Tag], Tag], permit: Permit, *, fresh: Tag | None = None
 ) -> tuple[Tag, Tag]:
     """Change a tag; return it before and after the change. The index's lock makes changes sequential."""
-    with recording(services) as (connection, put):
+    with record_transaction(services) as (connection, put):
         found = newest_version(services.store, tag)
         known = None if found is None or found.gone else found
         if known is None and fresh is None:
@@ -83,6 +90,6 @@ def _change(
             services.index.tags.put(after, within=connection)
     if is_changed:
         # Older versions are dropped only after the commit, and while no other process reads the last version.
-        with services.index.database.writing():
-            drop_older(services.store, after)
+        with services.index.database.write_transaction():
+            drop_older_versions(services.store, after)
     return before, after

@@ -69,11 +69,11 @@ class Response:
     """Whether a retry is useless because the address is refused."""
 
     @property
-    def is_taken(self) -> bool:
+    def is_accepted(self) -> bool:
         return self.status is not None and 200 <= self.status < 300
 
 
-def networks(text: str) -> Networks:
+def parse_networks(text: str) -> Networks:
     """Parse networks of a setting, separated by commas or spaces; InputError for an invalid one."""
     try:
         return tuple(ipaddress.ip_network(one) for one in text.replace(",", " ").split())
@@ -99,7 +99,7 @@ def is_public(address: Address) -> bool:
     return address.is_global and not address.is_multicast and not address.is_reserved
 
 
-def reachable(host: str, port: int, allowed: Networks) -> list[str]:
+def resolve_allowed_addresses(host: str, port: int, allowed: Networks) -> list[str]:
     """Return a host's addresses; RefusedAddress unless all are public or in `allowed`, OSError if none."""
     found = list(dict.fromkeys(str(info[4][0]) for info in _resolve_host(host, port)))
     for one in found:
@@ -135,7 +135,7 @@ def post(
     port = parts.port or (443 if parts.scheme == "https" else 80)
     path = parts.path or "/"
     try:
-        addresses = reachable(host, port, allowed)
+        addresses = resolve_allowed_addresses(host, port, allowed)
         connection = _Connection(parts.scheme, host, port, addresses, patience_s)
     except RefusedAddress as error:
         return Response(None, str(error), is_final=True)
@@ -202,7 +202,7 @@ class WebhookDispatcher:
         self._send = send
         secret = services.settings.webhook_secret
         self._master = secret.get_secret_value() if secret else ""
-        self._allowed: Networks = networks(services.settings.webhook_networks or "")
+        self._allowed: Networks = parse_networks(services.settings.webhook_networks or "")
         self._forget_again = -math.inf
         self._lock = threading.Lock()
         self._under_way: dict[str, DueDelivery] = {}
@@ -219,7 +219,7 @@ class WebhookDispatcher:
             self._ended.clear()
             try:
                 if time.monotonic() > look_again:
-                    self.tell_datasets()
+                    self.report_dataset_ends()
                     look_again = time.monotonic() + _DATASETS_EVERY_S
                 self.start_deliveries()
             except UnavailableError as error:
@@ -236,9 +236,9 @@ class WebhookDispatcher:
             self._forget_again = time.monotonic() + _FORGET_EVERY_S
         if not self._master:
             return []
-        out.plan()
+        out.create_deliveries()
         started = []
-        for due in self._fair_order(out.due(time.time() if now is None else now)):
+        for due in self._fair_order(out.due_deliveries(time.time() if now is None else now)):
             with self._lock:
                 slow = sum(map(self._has_failed, self._under_way.values()))
                 full = len(self._under_way) >= AT_ONCE or (self._has_failed(due) and slow >= SLOW_AT_ONCE)
@@ -258,13 +258,13 @@ class WebhookDispatcher:
     def _has_failed(self, due: DueDelivery) -> bool:
         return due.attempts > 0 or self._last.get(due.hook.id, (0.0, False))[1]
 
-    def tell_datasets(self) -> None:
-        untold = dict(self._services.index.outbox.untold_datasets())
+    def report_dataset_ends(self) -> None:
+        untold = dict(self._services.index.outbox.unreported_datasets())
         for name in untold.keys() - self._services.index.datasets.unfinished(untold):
             dataset = self._services.index.datasets.get(name)
             row = {"kind": "dataset", "subject": name, "state": dataset.state.value}
             row |= {"project": dataset.project, "owner": dataset.owner}
-            self._services.index.outbox.tell_dataset(name, untold[name], row)
+            self._services.index.outbox.report_dataset_end(name, untold[name], row)
 
     def _attempt(self, due: DueDelivery) -> None:
         is_settled = False
@@ -291,9 +291,9 @@ class WebhookDispatcher:
             SIGNATURE: signature(secret_of(self._master, due.hook.id), at, body),
         }
         answer = self._send(due.hook.url, body, headers, allowed=self._allowed)
-        self._last[due.hook.id] = (time.monotonic(), not answer.is_taken)
-        self._services.index.outbox.settle(
-            due, status=answer.status, detail=answer.detail, done=answer.is_taken, final=answer.is_final
+        self._last[due.hook.id] = (time.monotonic(), not answer.is_accepted)
+        self._services.index.outbox.record_attempt(
+            due, status=answer.status, detail=answer.detail, done=answer.is_accepted, final=answer.is_final
         )
 
 

@@ -1,8 +1,8 @@
 """Entries in Redis: lists of waiting tasks, parsing of messages, jobs restricted to graspd's own task.
 
-Any client can write any value under any name. Unreadable entries are skipped; `sweep` removes permanent obstacles. RQ
-imports and calls any function or callback named in a job's hash, even with the JSON serializer, and posts to any
-webhook URL in it. A worker therefore rebuilds each job from its id and message only. It passes the message to its
+Any client can write any value under any name. Unreadable entries are skipped; `remove_mistyped_keys` removes permanent
+obstacles. RQ imports and calls any function or callback of a job's hash, even with the JSON serializer. It posts to any
+webhook URL in the hash. A worker therefore rebuilds each job from its id and message only. It passes the message to its
 engine and calls nothing that the job names.
 
 There is one list per priority and stage, so that workers can serve selected stages. During an upgrade, a task that only
@@ -45,7 +45,7 @@ _MESSAGE_BYTES: Final = 1 << 20
 _FUTURE_MS: Final = 24 * 3600 * 1000
 
 
-def text(raw: bytes | None) -> str:
+def decode_text(raw: bytes | None) -> str:
     """Decode bytes from Redis; invalid UTF-8 becomes text that matches no name."""
     return (raw or b"").decode(errors="replace")
 
@@ -60,7 +60,7 @@ def is_type_error(error: Exception) -> bool:
     return str(error).startswith("WRONGTYPE")
 
 
-def message(data: bytes | None) -> Message | None:
+def parse_message(data: bytes | None) -> Message | None:
     if data is None:
         return None
     try:
@@ -70,7 +70,7 @@ def message(data: bytes | None) -> Message | None:
         return None
 
 
-def read(kind: type[Entry], data: bytes | None) -> Entry | None:
+def parse_entry(kind: type[Entry], data: bytes | None) -> Entry | None:
     """Parse a worker's report or an event; None if it is malformed or of an incompatible version."""
     try:
         found: Entry = _ADAPTERS[kind].validate_json(data or b"")
@@ -79,26 +79,26 @@ def read(kind: type[Entry], data: bytes | None) -> Entry | None:
         return None
 
 
-def events(reply: Any) -> list[tuple[str, Event | None]]:
+def parse_events(reply: Any) -> list[tuple[str, Event | None]]:
     """Return id and event of each entry of a reply; the event is None if trimmed or malformed."""
     streams = reply.items() if isinstance(reply, dict) else reply or []
     return [
-        (event_id.decode(), read(Event, fields.get(b"e")) if fields else None)
+        (event_id.decode(), parse_entry(Event, fields.get(b"e")) if fields else None)
         for _, found in streams
         for entry in found
         for event_id, fields in ([entry] if isinstance(entry, tuple) else entry)
     ]
 
 
-def sweep(connection: Any, kinds: Mapping[str, str], stream: str) -> None:
-    """Remove keys whose type differs from that in `kinds`, and the event stream if it accepts no entries."""
+def remove_mistyped_keys(connection: Any, kinds: Mapping[str, str], stream: str) -> None:
+    """Remove keys whose type differs from that in `key_types`, and the event stream if it accepts no entries."""
     with connection.pipeline(transaction=False) as pipe:
         for name in kinds:
             pipe.type(name)
-        found = dict(zip(kinds, map(text, pipe.execute()), strict=True))
+        found = dict(zip(kinds, map(decode_text, pipe.execute()), strict=True))
     wrong = [name for name, kind in found.items() if kind not in ("none", kinds[name])]
     if found[stream] == "stream":
-        newest = int(text(connection.xinfo_stream(stream)["last-generated-id"]).partition("-")[0])
+        newest = int(decode_text(connection.xinfo_stream(stream)["last-generated-id"]).partition("-")[0])
         wrong += [stream] if newest > connection.time()[0] * 1000 + _FUTURE_MS else []
     if wrong:
         connection.delete(*wrong)
@@ -115,7 +115,7 @@ def new_job(message: dict[str, Any], **options: Any) -> Job:
     return Job.create(TASK_FUNCTION, args=(message,), **lifetimes, serializer=JSONSerializer, **options)
 
 
-def allowed_job(job: Job, queue: Queue) -> Job:
+def checked_job(job: Job, queue: Queue) -> Job:
     """Return a safe copy of a job from Redis; TaskRefused if the job is not a task of graspd."""
     try:
         name, message = str(job.func_name), job.args[0]
@@ -173,11 +173,11 @@ def list_names(connection: Any) -> list[str]:
         if not is_type_error(error):
             raise
         found = set()
-    named = (text(raw).removeprefix(Queue.redis_queue_namespace_prefix) for raw in found)
+    named = (decode_text(raw).removeprefix(Queue.redis_queue_namespace_prefix) for raw in found)
     return [*_COMMON, *sorted(name for name in named if is_separate(name))[:_MOST_APART]]
 
 
-def place_of(name: str) -> tuple[Priority, Stage]:
+def priority_and_stage_of(name: str) -> tuple[Priority, Stage]:
     return _PLACES[_common(name)]
 
 
@@ -230,6 +230,6 @@ def execution_keys(entry: str) -> tuple[str, str]:
     return Execution(execution, job, connection=None).key, str(ExecutionRegistry.key_template.format(job))
 
 
-def kinds(lists: list[str]) -> dict[str, str]:
+def key_types(lists: list[str]) -> dict[str, str]:
     of_each = ((list_key, "list"), (held_key, "zset"), (workers_key, "set"))
     return {key(name): kind for name in lists for key, kind in of_each}

@@ -36,11 +36,11 @@ from graspd.service.queue.entries import (
     execution_keys,
     held_key,
     job_key,
-    kinds,
+    key_types,
     list_key,
     list_names,
     new_job,
-    place_of,
+    priority_and_stage_of,
     queue_name,
     rq_worker_key,
     unserved_lists,
@@ -117,16 +117,16 @@ class RqQueue:
             pipe.execute()
             for key in self._list_keys():
                 for job in self.connection.lrange(key, 0, -1):
-                    if entries.task_of(entries.text(job))[0] in wanted:
+                    if entries.task_of(entries.decode_text(job))[0] in wanted:
                         pipe.lrem(key, 0, job)
-                        pipe.delete(job_key(entries.text(job)))
+                        pipe.delete(job_key(entries.decode_text(job)))
             pipe.execute()
 
     def waiting(self) -> set[str]:
         with _convert_errors(), self.connection.pipeline(transaction=True) as pipe:
             for key in self._list_keys():
                 pipe.lrange(key, 0, -1)
-            return {entries.task_of(entries.text(job))[0] for jobs in pipe.execute() for job in jobs}
+            return {entries.task_of(entries.decode_text(job))[0] for jobs in pipe.execute() for job in jobs}
 
     def depths(self) -> dict[tuple[Priority, Stage], int]:
         with _convert_errors(), self.connection.pipeline(transaction=False) as pipe:
@@ -135,17 +135,17 @@ class RqQueue:
                 pipe.llen(list_key(name))
             depths: Counter[tuple[Priority, Stage]] = Counter()
             for name, length in zip(lists, pipe.execute(), strict=True):
-                depths[place_of(name)] += length
+                depths[priority_and_stage_of(name)] += length
             return dict(depths)
 
     def clear_untaken(self, present: Collection[WorkerBeat]) -> None:
         """Remove separate lists without capable workers; the controller then finds their tasks missing."""
-        abilities = [(stage, beat.ability) for beat in present for stage in beat.stages]
+        abilities = [(stage, beat.capabilities) for beat in present for stage in beat.stages]
         with _convert_errors(), self.connection.pipeline(transaction=False) as pipe:
             for name in unserved_lists(list_names(self.connection), abilities):
                 key = list_key(name)
                 for job in self.connection.lrange(key, 0, -1):
-                    pipe.delete(job_key(entries.text(job)))
+                    pipe.delete(job_key(entries.decode_text(job)))
                 pipe.delete(key)
                 # Leases of running tasks are read under the list's name.
                 if not self.connection.exists(held_key(name)):
@@ -162,7 +162,7 @@ class RqQueue:
             found = pipe.execute()
         # Every heartbeat changes the score, and an entry belongs to one execution only.
         return [
-            Lease(*entries.task_of(entries.text(entry.partition(b":")[0])), key=(key, entry), beat=str(score))
+            Lease(*entries.task_of(entries.decode_text(entry.partition(b":")[0])), key=(key, entry), beat=str(score))
             for key, held in zip(keys, found, strict=True)
             for entry, score in held
         ]
@@ -170,15 +170,15 @@ class RqQueue:
     def holder(self, lease: Lease) -> tuple[str, Message | None]:
         """Return worker and message of a lost lease; "" and None for data that Redis has lost."""
         with _convert_errors(), self.connection.pipeline(transaction=False) as pipe:
-            pipe.hmget(job_key(entries.text(lease.key[1].partition(b":")[0])), "worker_name", "data")
+            pipe.hmget(job_key(entries.decode_text(lease.key[1].partition(b":")[0])), "worker_name", "data")
             (found,) = pipe.execute(raise_on_error=False)  # The name may have a value of another type.
         worker, data = (None, None) if isinstance(found, Exception) else found
-        return entries.text(worker), entries.message(data)
+        return entries.decode_text(worker), entries.parse_message(data)
 
     def release(self, lease: Lease) -> None:
         """Remove the lease of a lost worker; a worker that still lives detects the loss and stops."""
         key, entry = lease.key
-        name = entries.text(entry)
+        name = entries.decode_text(entry)
         with _convert_errors(), self.connection.pipeline(transaction=True) as pipe:
             pipe.zrem(key, entry)
             pipe.delete(*execution_keys(name), job_key(name.partition(":")[0]))
@@ -189,7 +189,7 @@ class RqQueue:
         with _convert_errors():
             names = sorted(self.connection.smembers(WORKERS))
             found = self.connection.mget([_WORKER + name for name in names]) if names else []
-        return [beat for data in found if (beat := entries.read(WorkerBeat, data)) is not None]
+        return [beat for data in found if (beat := entries.parse_entry(WorkerBeat, data)) is not None]
 
     def publish(self, *events: Event) -> None:
         with _convert_errors(), self.connection.pipeline(transaction=False) as pipe:
@@ -201,11 +201,11 @@ class RqQueue:
         """Return the next events for the controller, oldest first; unacknowledged ones are delivered again."""
         with _convert_errors():
             while self._unread != ">":
-                pending = self._of_group(self._unread, limit, 0.0)
+                pending = self._read_group(self._unread, limit, 0.0)
                 self._unread = pending[-1][0] if pending else ">"
                 if known := self._readable_events(pending):
                     return known
-            return self._readable_events(self._of_group(">", limit, wait_s))
+            return self._readable_events(self._read_group(">", limit, wait_s))
 
     def acknowledge(self, event_ids: Sequence[str]) -> None:
         if event_ids:
@@ -216,14 +216,14 @@ class RqQueue:
         """Return events after an id, for any number of readers; `"$"` means future ones only, `"0"` all."""
         with _convert_errors():
             found = self.connection.xread({EVENTS: after}, count=limit, block=int(wait_s * 1000) or None)
-        return [(event_id, event) for event_id, event in entries.events(found) if event is not None]
+        return [(event_id, event) for event_id, event in entries.parse_events(found) if event is not None]
 
     def announce(self, part: str, seconds: float) -> None:
         """Announce that a part of the service (the controller) lives, for some seconds."""
         with _convert_errors():
             self.connection.set(_part_key(part), "1", px=int(seconds * 1000))
 
-    def announced(self, part: str) -> bool:
+    def is_announced(self, part: str) -> bool:
         with _convert_errors():
             return bool(self.connection.exists(_part_key(part)))
 
@@ -231,14 +231,14 @@ class RqQueue:
         """Return the identity of the service that owns this queue; None if unset, or lost by Redis."""
         with _convert_errors():
             found = self.connection.get(_SERVICE)
-        return None if found is None else entries.text(found)
+        return None if found is None else entries.decode_text(found)
 
     def set_service(self, identity: str, *, instead: bool = False) -> None:
         """Set the identity of the owning service, if it is unset or `instead` is given."""
         with _convert_errors():
             self.connection.set(_SERVICE, identity, nx=not instead)
 
-    def lead(self, holder: str, seconds: float) -> bool:
+    def renew_leadership(self, holder: str, seconds: float) -> bool:
         """Acquire or renew the controllers' leadership for some seconds; False if another controller leads."""
         with _convert_errors():
             new = self.connection.lock(LEAD, timeout=seconds, thread_local=False)
@@ -264,7 +264,7 @@ class RqQueue:
         with _convert_errors(), suppress(LockError):
             self.connection.lock(LEAD).do_release(holder)
 
-    def now(self, *, lease_s: float) -> QueueStatus:
+    def status(self, *, lease_s: float) -> QueueStatus:
         """Return queue lengths, ages and workers for the metrics, at a cost independent of the queue's length."""
         beats = self.workers()
         with _convert_errors(), self.connection.pipeline(transaction=False) as pipe:
@@ -275,16 +275,18 @@ class RqQueue:
                 pipe.zcard(held_key(name))
             found = pipe.execute()
             for head in found[1::3]:
-                pipe.hget(job_key(entries.text(head)), "enqueued_at")
+                pipe.hget(job_key(entries.decode_text(head)), "enqueued_at")
             for beat in beats:
                 pipe.pttl(worker_key(beat.name))
             # A name may have a forged value of any type, which must not hide the others.
             since = [None if isinstance(one, Exception) else one for one in pipe.execute(raise_on_error=False)]
         depth, running, oldest = Counter[Place](), Counter[Place](), dict[Place, float]()
-        for place, waiting, held, when in zip(map(place_of, lists), found[0::3], found[2::3], since, strict=False):
+        for place, waiting, held, when in zip(
+            map(priority_and_stage_of, lists), found[0::3], found[2::3], since, strict=False
+        ):
             depth[place] += waiting
             running[place] += held
-            if (age := age_of(entries.text(when))) is not None:
+            if (age := age_of(entries.decode_text(when))) is not None:
                 oldest[place] = max(age, oldest.get(place, 0.0))
         workers = {
             beat.name: (beat, max(0.0, lease_s - (left_ms or 0) / 1000))
@@ -298,26 +300,26 @@ class RqQueue:
                 pipe.hincrbyfloat(METRICS, name, amount)
             pipe.execute()
 
-    def counted(self) -> dict[str, float]:
+    def counter_sums(self) -> dict[str, float]:
         with _convert_errors():
             found = self.connection.hgetall(METRICS)
         sums: dict[str, float] = {}
         for name, raw in found.items():
             with suppress(ValueError):
-                sums[entries.text(name)] = float(raw)
+                sums[entries.decode_text(name)] = float(raw)
         return sums
 
     def tidy(self) -> None:
         # RQ cleans its registries of workers in its own maintenance, which is off.
         with _convert_errors(), self.connection.pipeline(transaction=False) as pipe:
             lists = list_names(self.connection)
-            entries.sweep(self.connection, {**_KINDS, **kinds(lists)}, EVENTS)
+            entries.remove_mistyped_keys(self.connection, {**_KINDS, **key_types(lists)}, EVENTS)
             known = list(self.connection.smembers(WORKERS))
             for name in known:
                 pipe.exists(_WORKER + name)
             for name, lives in zip(known, pipe.execute(), strict=True):
                 if not lives:
-                    key = rq_worker_key(entries.text(name))
+                    key = rq_worker_key(entries.decode_text(name))
                     pipe.delete(key)
                     for registry in (RQ_WORKERS, *map(workers_key, lists)):
                         pipe.srem(registry, key)
@@ -327,18 +329,18 @@ class RqQueue:
     def close(self) -> None:
         self.connection.close()
 
-    def _of_group(self, after: str, limit: int, wait_s: float) -> list[tuple[str, Event | None]]:
+    def _read_group(self, after: str, limit: int, wait_s: float) -> list[tuple[str, Event | None]]:
         """Read events of the controllers' consumer group; create the group if necessary."""
         block = int(wait_s * 1000) or None
         read = partial(self.connection.xreadgroup, _GROUP, _GROUP, {EVENTS: after}, count=limit, block=block)
         try:
-            return entries.events(read())
+            return entries.parse_events(read())
         except ResponseError as error:
             if not str(error).startswith("NOGROUP"):
                 raise
         with suppress(ResponseError):
             self.connection.xgroup_create(EVENTS, _GROUP, id="0", mkstream=True)
-        return entries.events(read())
+        return entries.parse_events(read())
 
     def _readable_events(self, found: Sequence[tuple[str, Event | None]]) -> list[tuple[str, Event]]:
         """Return the readable events; acknowledge and discard the unreadable ones."""
@@ -392,14 +394,14 @@ def renew_lease(pipe: Any, job: Job, execution: Execution, ttl: int) -> None:
     pipe.zadd(registry.key, {execution.composite_key: time.time() + ttl}, xx=True)
 
 
-def list_worker(connection: Any, beat: Mapping[str, Any], lease_s: float) -> None:
+def register_worker(connection: Any, beat: Mapping[str, Any], lease_s: float) -> None:
     with connection.pipeline() as pipe:
         pipe.set(worker_key(beat["name"]), json.dumps(beat), ex=max(2, round(lease_s)))
         pipe.sadd(WORKERS, beat["name"])
         pipe.execute()
 
 
-def unlist_worker(connection: Any, left: Event) -> None:
+def unregister_worker(connection: Any, left: Event) -> None:
     """End a worker's registration and append the event of its end."""
     with connection.pipeline() as pipe:
         pipe.delete(worker_key(left.worker))

@@ -261,14 +261,14 @@ class CloudView:
         wanted = np.isfinite(self.seen) & ((labels > 0) if whole else (labels == _OBJECT))
         if self._noise is None:  # A pixel without neighbours has no normal.
             wanted &= np.isfinite(self._normals[..., 0])
-        row, column = np.nonzero(wanted & np.isfinite(self._true[..., 2]))
+        row, column = np.nonzero(wanted & np.isfinite(self._true_positions[..., 2]))
         return row, column
 
     def points(self, row: Ints, column: Ints) -> Floats:
         return transforms.apply(self._back, self._points[row, column])
 
     def true_points(self, row: Ints, column: Ints) -> Floats:
-        return transforms.apply(self._back, self._true[row, column])
+        return transforms.apply(self._back, self._true_positions[row, column])
 
     def normals(self, row: Ints, column: Ints) -> Floats:
         """Return unit normals (P, 3) of pixels, toward the camera, in the frame of the table."""
@@ -283,13 +283,13 @@ class CloudView:
         return np.asarray(self.columns["image/segmentation"][row, column] == _OBJECT)
 
     @cached_property
-    def _true(self) -> Floats:
+    def _true_positions(self) -> Floats:
         return back_project(self._k, self.columns["image/depth"])
 
     @cached_property
     def _points(self) -> Floats:
-        return self._true if self._noise is None else back_project(self._k, self.seen)
+        return self._true_positions if self._noise is None else back_project(self._k, self.seen)
 
     @cached_property
     def _normals(self) -> Floats:
-        return surface_normals(self._true)
+        return surface_normals(self._true_positions)

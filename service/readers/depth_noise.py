@@ -30,7 +30,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.service.model.errors import InputError, one_of
+from graspd.service.model.errors import InputError, choices_text
 from graspd.service.model.pinhole import EDGE, back_project, surface_normals
 from graspd.service.model.transforms import Floats
 
@@ -74,13 +74,13 @@ class DepthNoise:
 
         `angle` is the angle of incidence [rad]; quantisation adds variance step^2 / 12.
         """
-        total = self.axial(depth, angle) ** 2 + self.depth_step_m**2 / 12
+        total = self.axial_sigma(depth, angle) ** 2 + self.depth_step_m**2 / 12
         if self.baseline_m:
             per_pixel = depth**2 / (self.focal_px * self.baseline_m)
             total = total + per_pixel**2 * (self.disparity_px**2 + self.disparity_step_px**2 / 12)
         return np.sqrt(total)
 
-    def axial(self, depth: Floats, angle: Floats) -> Floats:
+    def axial_sigma(self, depth: Floats, angle: Floats) -> Floats:
         """Return the axial noise [m], without disparity noise and quantisation."""
         beyond = np.maximum(depth - self.axial_from_m, 0.0)
         found = self.axial_m + self.axial_slope * beyond + self.axial_square * beyond**2
@@ -106,7 +106,7 @@ class DepthNoise:
             seen = _shift_pixels(true, scale * (self.lateral_px + self.lateral_angle_px * _steepness(angle)), draw)
             if self.mixed:
                 seen = _mix_edges(seen, draw)
-            seen = seen + self.axial(seen, angle) * draw.standard_normal(true.shape)
+            seen = seen + self.axial_sigma(seen, angle) * draw.standard_normal(true.shape)
             if self.baseline_m:
                 seen = self._quantize_disparity(seen, draw)
             if self.depth_step_m:
@@ -217,5 +217,5 @@ def noise_of(given: str | DepthNoise | None) -> DepthNoise | None:
     if given is None or isinstance(given, DepthNoise):
         return given
     if given not in NOISES:
-        raise InputError(f"there is no depth noise {given!r}; choose one of {one_of(given, NOISES)}")
+        raise InputError(f"there is no depth noise {given!r}; choose one of {choices_text(given, NOISES)}")
     return NOISES[given]

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from graspd.service.model import names
 from graspd.service.model.errors import DamagedShard, InputError, NotFoundError
-from graspd.service.model.planning import plan
+from graspd.service.model.planning import plan_tasks
 from graspd.service.model.records import JobRecord
 from graspd.service.store.columns import ShardKind
 from graspd.service.store.integrity import check_content, check_digest, check_file, missing_error
@@ -22,7 +22,7 @@ from graspd.service.store.packs import PACKED, has_packs
 from graspd.service.store.records import newest_snapshot, read_record
 from graspd.service.store.shards import kind_of, open_shard
 from graspd.service.store.store import Store, open_store
-from graspd.service.user_cache import evict, folder, write_atomically
+from graspd.service.user_cache import cache_folder, evict, write_atomically
 
 DEFAULT_BYTES: Final = 20 << 30
 _STAGES: Final = {kind: stage for stage, kind in names.SHARD_KINDS.items()}
@@ -166,7 +166,7 @@ def open_shards(
     if isinstance(source, Store) or (isinstance(source, str) and "://" in source):
         store = source if isinstance(source, Store) else open_store(source, make=False)
         found = _shards_of_store(store, job, dataset, snapshot)
-        kept = ShardCache(cache or folder("shards"), limit_bytes=cache_bytes)
+        kept = ShardCache(cache or cache_folder("shards"), limit_bytes=cache_bytes)
         return Shards(_ordered(found), store, kept)
     given = [source] if isinstance(source, str | Path) else list(source)
     return Shards(_ordered(_shard_file(path) for entry in given for path in _paths(Path(entry))))
@@ -206,8 +206,8 @@ def _shards_of_store(store: Store, job: str | None, dataset: str | None, snapsho
 
 
 def _shards_of_job(store: Store, job: str) -> Iterator[ShardFile]:
-    record = read_record(JobRecord, store, names.job_record(job))
-    for task in plan(record):
+    record = read_record(JobRecord, store, names.job_record_key(job))
+    for task in plan_tasks(record):
         try:
             made = load_manifest(store, task.stage, task.output)
         except NotFoundError:

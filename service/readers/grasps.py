@@ -114,7 +114,7 @@ class Grasps(Sequence[dict[str, Any]]):
     def _selected_rows(self, file: ShardFile) -> NDArray[np.intp]:
         held = self._load(file, tuple(SCHEMAS["base"]) if self._where else validity.COLUMNS, keep=False)
         if self._valid or self._unvalidated:
-            mask = validity.selection(held, unvalidated=self._unvalidated)
+            mask = validity.selection_mask(held, unvalidated=self._unvalidated)
         else:
             mask = np.ones(len(held["quality/valid"]), bool)
         if self._where is not None:

@@ -175,7 +175,7 @@ class Scenes:
         free = np.asarray(base["quality/success"]) >= 0 if planned else np.asarray(scenes["grasp/valid"]) == 1
         mask = free if clear else np.ones(len(scene), bool)
         if valid or unvalidated:
-            mask = mask & validity.selection(base.arrays, unvalidated=unvalidated)[row]
+            mask = mask & validity.selection_mask(base.arrays, unvalidated=unvalidated)[row]
         kept = np.flatnonzero(mask)
         self._scene, self._row = scene[kept], row[kept]
         pose = np.asarray(scenes["grasp/hand_pose"], float)[kept]

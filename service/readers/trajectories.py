@@ -55,7 +55,7 @@ def trajectory_of(shard: Shard, row: int) -> list[Waypoint]:
     return way
 
 
-def slider_axis(way: Sequence[Waypoint]) -> Floats:
+def slider_positions(way: Sequence[Waypoint]) -> Floats:
     """Return each waypoint's slider position (W,): 0, 1, 2, ... for stops, evenly spaced between them."""
     stops = [k for k, point in enumerate(way) if point.name]
     return np.interp(np.arange(len(way)), stops, np.arange(len(stops)))
@@ -63,7 +63,7 @@ def slider_axis(way: Sequence[Waypoint]) -> Floats:
 
 def point_at(way: Sequence[Waypoint], place: float) -> Waypoint:
     """Interpolate a posture at a slider position: linear for positions and joints, slerp for rotation."""
-    places = slider_axis(way)
+    places = slider_positions(way)
     place = float(np.clip(place, places[0], places[-1]))
     k = min(int(np.searchsorted(places, place, side="right")) - 1, len(way) - 2)
     a, b = way[k], way[k + 1]

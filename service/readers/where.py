@@ -22,12 +22,16 @@ Test = Callable[[Mapping[str, Array], Mapping[str, Any]], Mask]
 
 _METRICS: Final = {metric.name: metric for metric in GRASP_METRICS}
 _OPERATORS: Final = {"<": lt, "<=": le, ">": gt, ">=": ge, "=": eq, "!=": ne}
-_STATUSES: Final = {"valid": validity.valid, "feasible": validity.feasible, "validated": validity.validated}
+_STATUSES: Final = {
+    "valid": validity.valid_mask,
+    "feasible": validity.feasible_mask,
+    "validated": validity.validated_mask,
+}
 #: Columns of flags; 1 means true.
 _FLAGS: Final = {"held": "quality/success", "lift": "quality/lift_outcome", "lift_hard": "quality/lift_hard"}
 
 
-def parse(text: str) -> Test:
+def compile_expression(text: str) -> Test:
     """Compile an expression, or raise InputError; comparisons with a missing metric or nan are false."""
     tree = parse_where(text)
     return lambda columns, said: _mask(tree, columns, said)

@@ -121,7 +121,7 @@ class ListenAddress:
                 self.file.unlink(missing_ok=True)
 
 
-def joining(settings: Settings, file: Path, *, host: str | None = None, port: int = 0) -> ListenAddress:
+def new_listen_address(settings: Settings, file: Path, *, host: str | None = None, port: int = 0) -> ListenAddress:
     """Return an address of this machine, a free port (or `port`) and a new password.
 
     InputError: other machines cannot share the configured Redis or store through this file.

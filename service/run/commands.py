@@ -17,11 +17,11 @@ from graspd.service.cli import (
     CommandGroup,
     DataDir,
     JsonFlag,
-    emit,
     load_settings,
     log_to_stderr,
     plain_console,
-    report,
+    print_json,
+    print_result,
     restrict_file_access,
 )
 from graspd.service.model import names
@@ -61,7 +61,7 @@ def up(
     """Run the whole service on this machine until Ctrl-C."""
     if any(find_spec(library) is None for library in ("httpx", "fastapi", *(("warp",) if workers else ()))):
         raise UnavailableError("`graspd up` is not part of this install; run pip install 'graspd[all]'")
-    from graspd.service.run.address import joining
+    from graspd.service.run.address import new_listen_address
     from graspd.service.run.supervisor import Supervisor
 
     settings = load_settings(host=host, port=port, device=device, data_dir=data_dir)
@@ -69,7 +69,7 @@ def up(
     restrict_file_access(settings)
     stop = stop_on_signals()
     console = plain_console(stderr=True)
-    others = joining(settings, share, host=share_host, port=redis_port) if share is not None else None
+    others = new_listen_address(settings, share, host=share_host, port=redis_port) if share is not None else None
     supervisor = Supervisor(settings, workers=workers, joining=others)
     supervisor.start()
     try:
@@ -77,7 +77,7 @@ def up(
             where = f"{supervisor.api_url} (data in {supervisor.settings.data_dir})"
             console.print(f"graspd is up: {where}; Ctrl-C stops it", soft_wrap=True)
             if json:
-                emit({"api_url": supervisor.api_url, "pid": os.getpid(), "processes": supervisor.pids})
+                print_json({"api_url": supervisor.api_url, "pid": os.getpid(), "processes": supervisor.pids})
             stop.wait()
         console.print("stopping ...")
     finally:
@@ -100,7 +100,7 @@ def controller(
         from graspd.service.queue.rq_queue import open_queue
 
         with closing(open_queue(settings, patience=0)) as queue:
-            if not queue.announced(PART):
+            if not queue.is_announced(PART):
                 raise UnavailableError("no controller sent a heartbeat lately; start `graspd controller`")
         return
     _run_controller(settings, stop_on_signals())
@@ -120,7 +120,7 @@ def _run_controller(settings: Settings, stop: threading.Event) -> None:
         _identify(settings, stop, alive)
         while leadership.wait(stop):
             # A new controller receives again the events that an earlier one did not finish.
-            with leadership.held(stop) as over, closing(Services.open(settings)) as services:
+            with leadership.hold(stop) as over, closing(Services.open(settings)) as services:
                 Controller(services).run(over)
 
 
@@ -181,7 +181,7 @@ def rebuild(
     except IndexDamaged:
         found, counts = ["the index file was damaged and is replaced"], {} if check else make()
     if json:
-        emit({"differences": found, "changed": bool(found) and not check, **counts})
+        print_json({"differences": found, "changed": bool(found) and not check, **counts})
     else:
         for line in found:
             typer.echo(line)
@@ -203,7 +203,7 @@ def export(
 
     with closing(Index(load_settings(data_dir=data_dir).resolved_index_url)) as index:
         rows = write(index.database, output)
-    report(rows, "\n".join(f"{output / name}.parquet  {count} rows" for name, count in rows.items()), json=json)
+    print_result(rows, "\n".join(f"{output / name}.parquet  {count} rows" for name, count in rows.items()), json=json)
 
 
 @index_app.command(epilog="graspd admin index path")

@@ -44,7 +44,7 @@ def find_server() -> tuple[Path, str]:
 
 
 def server_command(settings: Settings, joining: ListenAddress | None = None) -> list[str]:
-    """Return the foreground command of the embedded Redis; create its folders. Call `own_redis` first."""
+    """Return the foreground command of the embedded Redis; create its folders. Call `lock_redis` first."""
     server, _ = find_server()
     folder = settings.data_dir.resolve() / "redis"
     socket = socket_path(settings.data_dir)
@@ -75,7 +75,7 @@ def server_command(settings: Settings, joining: ListenAddress | None = None) -> 
     return [str(server), *configuration, *(part for name, value in options.items() for part in (f"--{name}", value))]
 
 
-def own_redis(settings: Settings) -> IO[str]:
+def lock_redis(settings: Settings) -> IO[str]:
     """Lock a data folder's Redis until the returned file is closed; BusyError if another process runs it."""
     folder = settings.data_dir.resolve() / "redis"
     _private_folder(folder)

@@ -7,7 +7,7 @@ from typing import Annotated, Final
 
 import typer
 
-from graspd.service.cli import CommandGroup, DataDir, JsonFlag, emit, load_settings
+from graspd.service.cli import CommandGroup, DataDir, JsonFlag, load_settings, print_json
 from graspd.service.model import names
 from graspd.service.model.errors import ConflictError
 
@@ -63,7 +63,7 @@ def verify(
         services.close()
     if json:
         damaged = [{"shard": one.shard or one.key, "what": one.what, "key": one.key} for one in found]
-        emit(
+        print_json(
             {
                 "shards": shards,
                 "without_digest": len(unsealed),
@@ -93,6 +93,6 @@ def upgrade(data_dir: DataDir = None, json: JsonFlag = False) -> None:
     store = open_store(load_settings(data_dir=data_dir).resolved_store_url, make=False)
     shards = sum(1 for _ in unpack_all(store))
     if json:
-        emit({"shards": shards})
+        print_json({"shards": shards})
     else:
         typer.echo(f"{shards} shards extracted from packs", err=True)

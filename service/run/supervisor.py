@@ -19,13 +19,13 @@ from pydantic import SecretStr
 
 from graspd.service.model.errors import GraspdError, UnavailableError
 from graspd.service.pipeline.backends import Services
-from graspd.service.pipeline.identity import identify_if_redis_answers, recorded
+from graspd.service.pipeline.identity import identify_if_redis_answers, recorded_service
 from graspd.service.pipeline.leading import PART
 from graspd.service.queue.connection import redis_url
 from graspd.service.queue.rq_queue import RqQueue, open_queue
 from graspd.service.run.address import ListenAddress, bind, forget_address, local_url, record_address
 from graspd.service.run.children import Child, keep_alive, kill_leftovers, stop_children
-from graspd.service.run.embedded import find_server, lock_file, move_broken_log, move_log, own_redis, server_command
+from graspd.service.run.embedded import find_server, lock_file, lock_redis, move_broken_log, move_log, server_command
 from graspd.service.settings import Settings
 from graspd.service.store.store import open_store
 
@@ -153,7 +153,7 @@ class Supervisor:
     def _missing_parts(self, queue: RqQueue) -> list[str]:
         missing = []
         try:
-            if not queue.announced(PART):
+            if not queue.is_announced(PART):
                 missing.append("controller")
             beats = queue.workers()
             if sum(beat.state != "quarantined" for beat in beats) < self._workers:
@@ -185,7 +185,7 @@ class Supervisor:
     def _identify(self, folder: Path) -> None:
         """Check that store, index and Redis belong to one service; without Redis the children check it later."""
         open_store(self.settings.resolved_store_url)
-        before = recorded(folder)
+        before = recorded_service(folder)
         try:
             services = Services.open(self.settings, patience=0)
         except UnavailableError as error:
@@ -211,7 +211,7 @@ class Supervisor:
 
         children = []
         if self._wanted.redis_url is None:
-            self._locks.append(own_redis(self.settings))
+            self._locks.append(lock_redis(self.settings))
             log.info("Redis: %s, from %s", *find_server())
             redis = child("redis", *server_command(self.settings, self._joining))
             redis.fix = lambda output: move_broken_log(self.settings, output)

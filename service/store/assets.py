@@ -205,7 +205,9 @@ def builtin_names(kind: AssetKind) -> tuple[str, ...]:
     return tuple(sorted(path.parent.name for path in _builtin_folder(kind).glob("*/asset.json")))
 
 
-def describe(kind: AssetKind, name: str, files: Mapping[str, bytes], *, created: str, builtin: bool = False) -> Asset:
+def create_asset(
+    kind: AssetKind, name: str, files: Mapping[str, bytes], *, created: str, builtin: bool = False
+) -> Asset:
     """Create the asset record of files; the key `file` of their `asset.json` names the main file."""
     described = parse_description(asset_json(files), f"{kind.value} {name!r}")
     main = described.file
@@ -232,4 +234,4 @@ def asset_json(files: Mapping[str, bytes]) -> bytes:
 
 def builtin_asset(kind: AssetKind, name: str) -> tuple[Asset, dict[str, bytes]]:
     files = builtin_files(kind, name)
-    return describe(kind, name, files, created=_BUILTIN_CREATED, builtin=True), files
+    return create_asset(kind, name, files, created=_BUILTIN_CREATED, builtin=True), files

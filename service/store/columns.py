@@ -43,18 +43,18 @@ def _posture(prefix: str, what: str) -> dict[str, Column]:
     }
 
 
-def _absent(shape: str, dtype: str, units: str, frame: str, description: str) -> Column:
+def _optional_column(shape: str, dtype: str, units: str, frame: str, description: str) -> Column:
     return Column(shape, dtype, units, frame, description, optional=True)
 
 
 def _flag(description: str, dtype: str = "i1") -> Column:
-    return _absent("N", dtype, "bool", "none", description)
+    return _optional_column("N", dtype, "bool", "none", description)
 
 
 def _code(description: str, shape: str = "N", *, outcomes: Mapping[Any, str] | None = None) -> Column:
     if outcomes:
         description += ", ".join(f"{int(code)} {meaning}" for code, meaning in outcomes.items())
-    return _absent(shape, "u1", "enum", "none", description)
+    return _optional_column(shape, "u1", "enum", "none", description)
 
 
 #: Meanings of the codes of a push and of a lift.
@@ -69,7 +69,7 @@ def _wrist(rows: str) -> Column:
     description = (
         "angles of wrist joints above the hand's root at which all links above the root are clear, order in attribute"
     )
-    return _absent(f"{rows} U", "f8", "rad", "joint", f"{description} wrist_joint_names")
+    return _optional_column(f"{rows} U", "f8", "rad", "joint", f"{description} wrist_joint_names")
 
 
 def _measured(*, optional: bool) -> dict[str, Column]:
@@ -102,7 +102,7 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
             "verdict of the validator at the level of attribute verdict_level: 1 held, 0 dropped, -1 not tested"
         ),
         "quality/verdict_outcome": _code("outcome per push +x -x +y -y +z -z: ", "N D", outcomes=PUSH_OUTCOMES),
-        "quality/verdict_margin": _absent(
+        "quality/verdict_margin": _optional_column(
             "N",
             "f8",
             "1",
@@ -121,23 +121,25 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
             "perturbed parameter of the first model in which the grasp does not hold: 0 none, ", outcomes=AXIS_MEANINGS
         ),
         # Grasps planned in scenes also have the scene, the approach and the lift.
-        "scene/object_pose": _absent("S 7", "f8", "m, 1", "scene", "object frame at rest in each scene; z is up"),
-        "scene/rest_probability": _absent("S", "f8", "1", "none", _REST),
-        "scene/neighbour_pose": _absent(
+        "scene/object_pose": _optional_column(
+            "S 7", "f8", "m, 1", "scene", "object frame at rest in each scene; z is up"
+        ),
+        "scene/rest_probability": _optional_column("S", "f8", "1", "none", _REST),
+        "scene/neighbour_pose": _optional_column(
             "S M 7", "f8", "m, 1", "scene", "poses of the neighbours in each scene; names in attribute neighbours"
         ),
-        "grasp/scene_index": _absent("N", "i4", "1", "none", "row of the grasp's scene in /scene"),
-        "grasp/approach": _absent(
+        "grasp/scene_index": _optional_column("N", "i4", "1", "none", "row of the grasp's scene in /scene"),
+        "grasp/approach": _optional_column(
             "N W 7",
             "f8",
             "m, 1",
             "object",
             f"approach waypoints from standoff to pregrasp, joints in approach_joint_positions: {_POSE}",
         ),
-        "grasp/approach_joint_positions": _absent(
+        "grasp/approach_joint_positions": _optional_column(
             "N J", "f8", "rad or m", "joint", "joints of the open hand on approach, order in joint_names"
         ),
-        "grasp/lift": _absent("N 7", "f8", "m, 1", "object", f"squeeze posture raised by 10 cm: {_POSE}"),
+        "grasp/lift": _optional_column("N 7", "f8", "m, 1", "object", f"squeeze posture raised by 10 cm: {_POSE}"),
         "grasp/wrist_positions": _wrist("N"),
         "quality/lift_outcome": _code("lift test: ", outcomes=LIFT_OUTCOMES),
         "quality/lift_hard": _flag("lift test at half the friction: 1 lifted, 0 not, -1 not tested"),
@@ -165,10 +167,10 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
             "approach, 3 a neighbour at contact, 4 a neighbour on the approach",
             "K",
         ),
-        "grasp/contact_table_clearance_m": _absent(
+        "grasp/contact_table_clearance_m": _optional_column(
             "K", "f8", "m", "table", "height of the lowest point of hand and forearm above the table, at contact"
         ),
-        "grasp/neighbour_clearance_m": _absent(
+        "grasp/neighbour_clearance_m": _optional_column(
             "K",
             "f8",
             "m",
@@ -176,7 +178,7 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
             "signed distance of the hand from the neighbours' convex hulls at contact and on approach, at most 0.1",
         ),
         "grasp/wrist_positions": _wrist("K"),
-        "scene/neighbour_pose": _absent(
+        "scene/neighbour_pose": _optional_column(
             "S M 7", "f8", "m, 1", "table", "poses of the neighbours at rest; names in attribute neighbours"
         ),
     },
@@ -202,15 +204,19 @@ SCHEMAS: Final[dict[ShardKind, dict[str, Column]]] = {
             "V 4", "f4", "px", "image", "x_min y_min x_max y_max of the projected object, occluded or not"
         ),
         "box/bounding_box_3d": Column("V 8 3", "f4", "m", "camera", "corners of the object-aligned box"),
-        "box/occlusion_ratio": _absent(
+        "box/occlusion_ratio": _optional_column(
             "V", "f4", "1", "image", "occluded share of the object's pixels; nan: not in view"
         ),
-        "image/distance": _absent("V H W", "f4", "m", "camera", "distance from the optical centre; inf: no surface"),
-        "image/normals": _absent("V H W 3", "f2", "1", "table", "unit shading normal, outward; 0 0 0: no surface"),
-        "image/rgb_hand": _absent(
+        "image/distance": _optional_column(
+            "V H W", "f4", "m", "camera", "distance from the optical centre; inf: no surface"
+        ),
+        "image/normals": _optional_column(
+            "V H W 3", "f2", "1", "table", "unit shading normal, outward; 0 0 0: no surface"
+        ),
+        "image/rgb_hand": _optional_column(
             "V H W 3", "u1", "sRGB", "image", "colour with the hand in its grasp pose, for display"
         ),
-        "camera/hand_grasp": _absent(
+        "camera/hand_grasp": _optional_column(
             "V", "i4", "1", "none", "row, in the scene shard, of the grasp in rgb_hand; -1: none"
         ),
     },

@@ -149,7 +149,7 @@ def description_of(facts: Mapping[str, Any]) -> dict[str, Any]:
     return {"root": facts["root"], "palm": palm, **same}
 
 
-def corrected(said: Mapping[str, Any], facts: HandFacts, corrections: HandCorrections) -> dict[str, Any]:
+def apply_corrections(said: Mapping[str, Any], facts: HandFacts, corrections: HandCorrections) -> dict[str, Any]:
     """Return an `asset.json` with given, found and corrected values; InputError if one is out of range."""
     _check(facts, corrections)
     found = description_of(facts.model_dump())

@@ -124,7 +124,7 @@ def _block_digest(data: bytes) -> bytes:
 def check_file(path: Path) -> None:
     """Check a shard in a folder by its manifest or checksum list, if any; once per version of the file."""
     if _known.get(path) != _file_stamp(path):
-        check_content(path, _expected(path))
+        check_content(path, _expected_checksum(path))
 
 
 def check_content(path: Path, sha256: str | None) -> None:
@@ -147,7 +147,7 @@ def _file_stamp(path: Path) -> tuple[int, int, int]:
     return facts.st_size, facts.st_mtime_ns, facts.st_ino
 
 
-def _expected(path: Path) -> str | None:
+def _expected_checksum(path: Path) -> str | None:
     path = path.absolute()
     if (digest := _manifest_checksum(path)) is not None:
         return digest
@@ -189,7 +189,7 @@ _END_MARK: Final = b"PK\x05\x06"
 
 
 def put_sealed(store: Store, key: str, data: bytes) -> bool:
-    return store.put(key, sealed(key, data))
+    return store.put(key, add_seal(key, data))
 
 
 def get_sealed(store: Store, key: str) -> bytes:
@@ -215,7 +215,7 @@ def get_document(store: Store, key: str) -> dict[str, Any]:
     return found
 
 
-def sealed(key: str, data: bytes) -> bytes:
+def add_seal(key: str, data: bytes) -> bytes:
     """Return the bytes with a seal; formats other than JSON object, ZIP and glTF are unchanged."""
     if key.endswith(".json") and data[:1] == b"{":
         data, at = _JSON + _ZEROS + b'",' + data[1:], len(_JSON)

@@ -14,8 +14,8 @@ from graspd.service.model.digests import digest_files
 from graspd.service.model.domain import Asset
 from graspd.service.model.errors import ConflictError, DamagedError, InputError
 from graspd.service.model.states import AssetKind
-from graspd.service.store.assets import builtin_asset, builtin_model, builtin_names, describe, pack_into, unpack
-from graspd.service.store.integrity import get_document, is_sealed, seal_archive, sealed
+from graspd.service.store.assets import builtin_asset, builtin_model, builtin_names, create_asset, pack_into, unpack
+from graspd.service.store.integrity import add_seal, get_document, is_sealed, seal_archive
 from graspd.service.store.records import Put, put_record, read_record
 from graspd.service.store.store import Store
 
@@ -38,11 +38,11 @@ def store_files(
 
     `said` are further fields of the record. Private files contain their project's mark (`service.model.projects`).
     """
-    asset = describe(kind, name, files, created=timestamp()).model_copy(update=dict(said or {}))
+    asset = create_asset(kind, name, files, created=timestamp()).model_copy(update=dict(said or {}))
     with tempfile.TemporaryFile() as archive:
         pack_into(files, archive)
         seal_archive(archive)
-        key = names.asset_files(kind, asset.digest)
+        key = names.asset_files_key(kind, asset.digest)
         if not store.put_file(key, archive) and _is_damaged(store, key):
             store.set_aside(key)
             store.put_file(key, archive)
@@ -59,9 +59,9 @@ def _is_damaged(store: Store, key: str) -> bool:
 
 def record_asset(store: Store, asset: Asset, put: Put | None = None) -> Asset:
     """Write the record, by `put` if given. ConflictError: content has another name, or is being removed."""
-    record = names.asset_record(asset.kind, asset.digest)
+    record = names.asset_record_key(asset.kind, asset.digest)
     new = put(record, asset) if put is not None else put_record(store, record, asset)
-    if store.exists(names.deletion(asset.kind.value, asset.digest)):
+    if store.exists(names.deletion_key(asset.kind.value, asset.digest)):
         if new:
             store.delete(record)
         raise ConflictError(
@@ -88,8 +88,8 @@ def publish_builtins(store: Store) -> list[Asset]:
                 published.append(publish_asset(store, kind, name, files, {"builtin": True, "created": asset.created}))
             except DamagedError as error:
                 log.warning("the built-in %s %s cannot be used: %s", kind.value, name, error)
-            key = names.asset_model(kind, asset.digest)
-            model = sealed(key, builtin_model(kind, name))
+            key = names.asset_model_key(kind, asset.digest)
+            model = add_seal(key, builtin_model(kind, name))
             # The model depends on code and asset: a model of an older version is replaced.
             if not store.put(key, model) and store.get(key) != model:
                 store.delete(key)
@@ -102,16 +102,16 @@ def stored_assets(store: Store) -> list[tuple[AssetKind, str]]:
     gone = {entry.key for entry in store.list(names.DELETIONS)}
     # Other files of an asset may have deeper keys, such as an object's convex pieces.
     found = [key for key in records if len(key) == 4 and key[1] in set(AssetKind) and key[3] == "asset.json"]
-    return [(AssetKind(key[1]), key[2]) for key in found if names.deletion(key[1], key[2]) not in gone]
+    return [(AssetKind(key[1]), key[2]) for key in found if names.deletion_key(key[1], key[2]) not in gone]
 
 
 def load_asset(store: Store, kind: AssetKind, digest: str) -> Asset:
-    return read_record(Asset, store, names.asset_record(kind, digest))
+    return read_record(Asset, store, names.asset_record_key(kind, digest))
 
 
 def load_asset_files(store: Store, kind: AssetKind, digest: str) -> dict[str, bytes]:
     """Load all files of a hand or object; InputError if they do not match the digest."""
-    files = unpack(store.get(names.asset_files(kind, digest)), limit_bytes=UNPACKED_LIMIT_BYTES)
+    files = unpack(store.get(names.asset_files_key(kind, digest)), limit_bytes=UNPACKED_LIMIT_BYTES)
     if digest_files(kind, files) != digest:
         raise InputError(f"the archive of {kind.value} {digest} in the store is damaged; upload it again")
     return files
@@ -119,7 +119,7 @@ def load_asset_files(store: Store, kind: AssetKind, digest: str) -> dict[str, by
 
 def load_check(store: Store, kind: AssetKind, digest: str) -> dict[str, object] | None:
     """Load the report of ingest (`verdict`, `message`, `repairs`, `facts`); None before its end."""
-    key = names.asset_check(kind, digest)
+    key = names.asset_check_key(kind, digest)
     if not store.exists(key):
         return None
     with contextlib.suppress(DamagedError):

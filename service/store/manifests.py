@@ -13,10 +13,10 @@ from pydantic import Field, model_validator
 from graspd.service.model import names
 from graspd.service.model.base import Digest, json_value
 from graspd.service.model.clock import timestamp
-from graspd.service.model.domain import JobRequest, batches_of
+from graspd.service.model.domain import JobRequest, count_batches
 from graspd.service.model.messages import TaskMessage
 from graspd.service.model.metric_fields import insert_fields, value_fields
-from graspd.service.model.metrics import axis_word, indexed
+from graspd.service.model.metrics import axis_word, indexed_metrics
 from graspd.service.model.records import Record
 from graspd.service.model.states import Stage
 from graspd.service.model.version import PACKAGE_VERSION, STAGE_REVISIONS
@@ -94,7 +94,7 @@ class ShardManifest(Record):
         return self
 
     @property
-    def validated(self) -> int:
+    def validated_candidates(self) -> int:
         """Number of candidates tested against the geometric limits and by a validator; 0 without validator."""
         has_verdicts = any(grasp.success is not None for grasp in self.grasps)
         return self.candidates if has_verdicts or (not self.grasps and self.request.validation != "none") else 0
@@ -122,7 +122,7 @@ def manifest_of(
         shard_id=message.output,
         stage=message.stage,
         kind=kind,
-        key=names.shard_file(message.stage, message.output),
+        key=names.shard_file_key(message.stage, message.output),
         sha256=hashlib.sha256(data).hexdigest(),
         size_bytes=len(data),
         counts=dict(counts),
@@ -133,7 +133,7 @@ def manifest_of(
         request=message.request,
         seed=message.request.seed,
         batch=message.batch,
-        batches=batches_of(message.count),
+        batches=count_batches(message.count),
         inputs=message.inputs,
         code_version=PACKAGE_VERSION,
         stage_revision=STAGE_REVISIONS[message.stage],
@@ -148,7 +148,7 @@ def manifest_of(
 
 
 def _contents(kind: str, arrays: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]) -> dict[str, Any]:
-    valid = validity.valid(arrays) if kind == "base" else arrays.get("grasp/valid")
+    valid = validity.valid_mask(arrays) if kind == "base" else arrays.get("grasp/valid")
     fields: dict[str, Any] = {"valid": 0 if valid is None else int(np.count_nonzero(valid))}
     if kind == "base":
         recheck = arrays.get("quality/recheck", np.empty(0, np.int8))
@@ -168,10 +168,10 @@ def _summaries(
     count = len(arrays["quality/valid"])
     columns: dict[str, list[Any]] = {
         metric.name: json_value(np.asarray(arrays[metric.path], float)[(..., at) if metric.swept else ...].tolist())
-        for metric in indexed()
+        for metric in indexed_metrics()
         if not metric.optional or metric.path in arrays
     }
-    columns["valid"] = validity.valid(arrays).tolist()
+    columns["valid"] = validity.valid_mask(arrays).tolist()
     columns["success"] = [_verdict(int(v)) for v in arrays.get("quality/success", np.full(count, -1))]
     level = attributes.get("verdict_level")
     columns["verdict_level"] = [None if verdict is None else level for verdict in columns["success"]]
@@ -186,11 +186,11 @@ def publish_shard(store: Store, manifest: ShardManifest, data: bytes) -> bool:
     if not store.put(manifest.key, data):
         # After concurrent writes, or a kill between the two writes, the manifest describes the bytes in the store.
         manifest = rebuild_manifest(manifest.model_dump(mode="json"), store.get(manifest.key))
-    return put_record(store, names.shard_manifest(manifest.stage, manifest.shard_id), manifest)
+    return put_record(store, names.shard_manifest_key(manifest.stage, manifest.shard_id), manifest)
 
 
 def load_manifest(store: Store, stage: Stage, shard: str) -> ShardManifest:
-    return read_record(ShardManifest, store, names.shard_manifest(stage, shard))
+    return read_record(ShardManifest, store, names.shard_manifest_key(stage, shard))
 
 
 def load_shard(store: Store, stage: Stage, shard: str) -> Shard:
@@ -199,7 +199,7 @@ def load_shard(store: Store, stage: Stage, shard: str) -> Shard:
 
 
 def shard_exists(store: Store, stage: Stage, shard: str) -> bool:
-    return store.exists(names.shard_manifest(stage, shard))
+    return store.exists(names.shard_manifest_key(stage, shard))
 
 
 def rebuild_manifest(said: Mapping[str, Any], data: bytes) -> ShardManifest:

@@ -89,11 +89,11 @@ class ProposalNetwork:
     about: str = field(default="", kw_only=True)
 
     @property
-    def numbers(self) -> int:
-        return numbers(len(self.joint_names))
+    def row_size(self) -> int:
+        return row_size(len(self.joint_names))
 
 
-def numbers(joints: int) -> int:
+def row_size(joints: int) -> int:
     return POSE + 3 * joints
 
 
@@ -101,12 +101,12 @@ def sizes(joints: int) -> dict[str, tuple[int, ...]]:
     return {
         "encoder": (*ENCODER, FEATURE),
         "condition": (CONDITION,),
-        "flow": (numbers(joints) + TIME_FEATURES + CONDITION, *(HIDDEN,) * (1 + BLOCKS), numbers(joints)),
+        "flow": (row_size(joints) + TIME_FEATURES + CONDITION, *(HIDDEN,) * (1 + BLOCKS), row_size(joints)),
     }
 
 
 def weight_shapes(joints: int) -> dict[str, tuple[int, ...]]:
-    count = numbers(joints)
+    count = row_size(joints)
     layers = {f"encoder.{i}": (out, into) for i, (into, out) in enumerate(pairwise(ENCODER))}
     layers["encoder.out"] = (FEATURE, ENCODER[-1])
     layers["flow.in"] = (HIDDEN, count + TIME_FEATURES + CONDITION)
@@ -173,7 +173,7 @@ def check_size(size: int, what: str) -> None:
 
 
 def _expected(joints: int) -> dict[str, tuple[int, ...]]:
-    return {"mean": (numbers(joints),), "std": (numbers(joints),), **weight_shapes(joints)}
+    return {"mean": (row_size(joints),), "std": (row_size(joints),), **weight_shapes(joints)}
 
 
 def _read_meta(archive: zipfile.ZipFile, what: str) -> _Meta:

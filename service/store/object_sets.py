@@ -43,11 +43,11 @@ def object_set(files: Mapping[str, bytes]) -> Objects:
     owners: dict[tuple[str, ...], list[str]] = {}
     for mesh in meshes:
         owners.setdefault(_owner(mesh), []).append(mesh)
-    top = _common(owners)
+    top = _common_folders(owners)
     chosen: dict[str, str] = {}
     for owner, names in owners.items():
         # EGAD: each mesh of one folder is an object; YCB: each object has a folder, perhaps with variants of its mesh.
-        is_object = len(owner) > len(top) and _variants(names)
+        is_object = len(owner) > len(top) and _are_variants(names)
         for name in [min(names, key=_rank)] if is_object else names:
             parts = owner[len(top) :] if is_object else (*owner[len(top) :], PurePosixPath(name).stem)
             chosen[_name("_".join(parts), chosen)] = name
@@ -77,15 +77,15 @@ def _owner(mesh: str) -> tuple[str, ...]:
     return parts
 
 
-def _common(owners: Mapping[tuple[str, ...], list[str]]) -> tuple[str, ...]:
+def _common_folders(owners: Mapping[tuple[str, ...], list[str]]) -> tuple[str, ...]:
     """Return the common leading folders; for a single object the parent, so that its folder names it."""
     folders = list(owners)
     if len(folders) == 1:
-        return folders[0][:-1] if _variants(owners[folders[0]]) else folders[0]
+        return folders[0][:-1] if _are_variants(owners[folders[0]]) else folders[0]
     return PurePosixPath(posixpath.commonpath(["/".join(folder) for folder in folders])).parts
 
 
-def _variants(names: list[str]) -> bool:
+def _are_variants(names: list[str]) -> bool:
     """Check whether a folder's meshes belong to one object: a single mesh, or names of processing steps."""
     stems = [PurePosixPath(name).stem.lower() for name in names]
     return len(stems) == 1 or any(stem in PREFERRED for stem in stems)

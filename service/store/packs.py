@@ -86,11 +86,11 @@ def _unpack(store: Store, key: str, dead: list[str]) -> Iterator[ShardManifest]:
         if manifest is None:
             continue
         made = parse_record(ShardManifest, manifest, f"{shard.id} in the pack {key}")
-        made = made.model_copy(update={"key": names.shard_file(shard.stage, shard.id)})
+        made = made.model_copy(update={"key": names.shard_file_key(shard.stage, shard.id)})
         if file is not None:
             publish_shard(store, made, file)
         else:
-            put_record(store, names.shard_manifest(shard.stage, shard.id), made)
+            put_record(store, names.shard_manifest_key(shard.stage, shard.id), made)
         yield load_manifest(store, shard.stage, shard.id)
     if whole:
         store.delete(key)

@@ -72,17 +72,17 @@ def _records(model: type[RecordT], store: Store, prefix: str) -> list[RecordT]:
     return [read_record(model, store, key) for key in _keys(store, prefix)]
 
 
-def _added(make: Callable[..., EventT], store: Store, folder: str, put: Put | None) -> EventT:
+def _append_event(make: Callable[..., EventT], store: Store, folder: str, put: Put | None) -> EventT:
     """Write an event under the next free number, which another process may take at the same time."""
     while True:
         number = max((int(key.rpartition("/")[2].partition("-")[0]) for key in _keys(store, folder)), default=0) + 1
         event = make(number=number, at=timestamp())
-        if (put or partial(put_record, store))(names.event(folder, number, event.what), event):
+        if (put or partial(put_record, store))(names.event_key(folder, number, event.what), event):
             return event
 
 
 def job_events(store: Store, job: str) -> list[JobEvent]:
-    return _records(JobEvent, store, names.job_events(job))
+    return _records(JobEvent, store, names.job_events_folder(job))
 
 
 def add_job_event(
@@ -95,55 +95,55 @@ def add_job_event(
     put: Put | None = None,
 ) -> JobEvent:
     make = partial(JobEvent, what=what, retried=retried or {}, cause=cause)
-    return _added(make, store, names.job_events(job), put)
+    return _append_event(make, store, names.job_events_folder(job), put)
 
 
 def task_attempts(store: Store, task: str) -> list[AttemptRecord]:
-    return sorted(_records(AttemptRecord, store, names.attempts(task)), key=lambda attempt: attempt.number)
+    return sorted(_records(AttemptRecord, store, names.attempts_folder(task)), key=lambda attempt: attempt.number)
 
 
 def load_dataset(store: Store, name: str) -> DatasetRecord:
-    return read_record(DatasetRecord, store, names.dataset_record(name))
+    return read_record(DatasetRecord, store, names.dataset_record_key(name))
 
 
 def dataset_events(store: Store, name: str) -> list[DatasetEvent]:
-    return _records(DatasetEvent, store, names.dataset_events(name))
+    return _records(DatasetEvent, store, names.dataset_events_folder(name))
 
 
 def add_dataset_event(
     store: Store, name: str, what: Literal["cancelled", "retried"], *, put: Put | None = None
 ) -> DatasetEvent:
-    return _added(partial(DatasetEvent, what=what), store, names.dataset_events(name), put)
+    return _append_event(partial(DatasetEvent, what=what), store, names.dataset_events_folder(name), put)
 
 
 def load_snapshot(store: Store, dataset: str, digest: str) -> Snapshot:
-    return read_record(Snapshot, store, names.dataset_snapshot(dataset, digest))
+    return read_record(Snapshot, store, names.dataset_snapshot_key(dataset, digest))
 
 
 def newest_snapshot(store: Store, dataset: str, digest: str | None = None) -> Snapshot:
     if digest is not None:
         return load_snapshot(store, dataset, digest)
-    taken = _records(Snapshot, store, names.dataset_snapshots(dataset))
+    taken = _records(Snapshot, store, names.dataset_snapshots_folder(dataset))
     if not taken:
         raise NotFoundError(f"dataset {dataset!r} has no snapshot; `graspd datasets snapshot {dataset}` takes one")
     return max(taken, key=lambda one: (one.created, one.digest))
 
 
 def newest_version(store: Store, tag: str) -> Tag | None:
-    keys = _keys(store, names.tag_versions(tag))
+    keys = _keys(store, names.tag_versions_folder(tag))
     return read_record(Tag, store, keys[-1]) if keys else None
 
 
 def put_version(put: Put, tag: Tag) -> None:
     """Write a tag after a change; ConflictError if another change was written first."""
-    if not put(names.tag_version(tag.id, tag.number), tag):
+    if not put(names.tag_version_key(tag.id, tag.number), tag):
         raise ConflictError(f"the tag {tag.name!r} was changed a moment ago; try again")
 
 
-def drop_older(store: Store, tag: Tag) -> None:
+def drop_older_versions(store: Store, tag: Tag) -> None:
     """Remove outdated versions of a tag; finally also the last version of a deleted tag."""
-    last = names.tag_version(tag.id, tag.number)
-    for key in _keys(store, names.tag_versions(tag.id)):
+    last = names.tag_version_key(tag.id, tag.number)
+    for key in _keys(store, names.tag_versions_folder(tag.id)):
         if key < last or (key == last and tag.gone):
             store.delete(key)
 
@@ -159,9 +159,9 @@ def next_mark(mark: str) -> str:
 
 
 def set_mark(store: Store, mark: str) -> None:
-    put_document(store, names.mark(mark), {"at": timestamp()})
+    put_document(store, names.mark_key(mark), {"at": timestamp()})
     for key in _keys(store, names.MARKS):
-        if key != names.mark(mark):
+        if key != names.mark_key(mark):
             store.delete(key)
 
 
@@ -170,7 +170,7 @@ IN_SCENES: Final = "scene_charts"
 STABILITY: Final = "stability"
 
 
-def charts_of(place: SceneSpec) -> str:
+def scene_chart_kind(place: SceneSpec) -> str:
     """Return the kind of charts for a scene; supports and the target's pose identify a scene file."""
     if place.kind == "free":
         return CHARTS
@@ -180,15 +180,15 @@ def charts_of(place: SceneSpec) -> str:
     return f"{IN_SCENES}/file-{digest_json(told)[:12]}"
 
 
-def kind_of(chart: Mapping[str, Any]) -> str:
-    return charts_of(SceneSpec.model_validate(chart["scene"])) if "scene" in chart else CHARTS
+def chart_kind(chart: Mapping[str, Any]) -> str:
+    return scene_chart_kind(SceneSpec.model_validate(chart["scene"])) if "scene" in chart else CHARTS
 
 
 def scene_kinds(store: Store) -> list[str]:
     return sorted({key.rpartition("/")[0] for key in _keys(store, IN_SCENES) if key.endswith(".json")})
 
 
-def publish(store: Store, kind: str, record: Mapping[str, Any]) -> str:
+def publish_record(store: Store, kind: str, record: Mapping[str, Any]) -> str:
     """Store a record of a kind; return its key, made from `created`, with a number if that key is taken."""
     stem = f"{kind}/{re.sub(r'[^0-9A-Za-z]', '', str(record['created']))}"
     keys = (f"{stem}{number:03}.json" if number else f"{stem}.json" for number in itertools.count())
@@ -196,7 +196,7 @@ def publish(store: Store, kind: str, record: Mapping[str, Any]) -> str:
     return next(key for key in keys if put_sealed(store, key, data))
 
 
-def latest(store: Store, kind: str) -> dict[str, Any] | None:
+def latest_record(store: Store, kind: str) -> dict[str, Any] | None:
     """Load the record of a kind that was published last, with present names; None if there is none."""
     key = latest_key(store, kind)
     return convert_chart(get_document(store, key)) if key else None
@@ -233,13 +233,13 @@ class DeletedJob(Record):
     job: JobRecord
 
 
-def pending(store: Store) -> set[tuple[str, str]]:
+def pending_deletions(store: Store) -> set[tuple[str, str]]:
     keys = [key.split("/") for key in _keys(store, names.DELETIONS)]
     return {(key[1], key[2].removesuffix(".json")) for key in keys if len(key) == 3}
 
 
-def refuse_pending(store: Store, what: str, name: str) -> None:
-    if store.exists(names.deletion(what, name)):
+def refuse_pending_deletion(store: Store, what: str, name: str) -> None:
+    if store.exists(names.deletion_key(what, name)):
         raise ConflictError(f"the deleted {what} {name} is still being removed; try again in a moment")
 
 

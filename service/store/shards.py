@@ -226,7 +226,7 @@ def part_of_shard(shard: Shard, mask: NDArray[np.bool_]) -> bytes:
     return write_shard("base", arrays, attributes)
 
 
-def place_of(shard: Shard, taken: Collection[PurePosixPath]) -> PurePosixPath:
+def relative_path_of(shard: Shard, taken: Collection[PurePosixPath]) -> PurePosixPath:
     """Return `HAND/OBJECT/base-BATCH.h5`, numbered if taken: two jobs may have equal batch numbers."""
     said = shard.attributes
     names = [str(said.get(name, "")).replace("/", "-").strip(".") or "unnamed" for name in ("hand", "object")]

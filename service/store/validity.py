@@ -16,21 +16,21 @@ from numpy.typing import NDArray
 COLUMNS: Final = ("quality/valid", "quality/feasible", "quality/success")
 
 
-def validated(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
+def validated_mask(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
     if "quality/success" not in columns:
         return np.zeros(len(columns["quality/valid"]), bool)
     return np.asarray(columns["quality/success"]) >= 0
 
 
-def valid(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
-    return (np.asarray(columns["quality/valid"]) == 1) & validated(columns)
+def valid_mask(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
+    return (np.asarray(columns["quality/valid"]) == 1) & validated_mask(columns)
 
 
-def feasible(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
+def feasible_mask(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
     """Return the mask (N,) of grasps known to be within the geometric limits, such as valid grasps."""
     return np.asarray(columns.get("quality/feasible", columns["quality/valid"])) == 1
 
 
-def selection(columns: Mapping[str, NDArray[Any]], *, unvalidated: bool = False) -> NDArray[np.bool_]:
+def selection_mask(columns: Mapping[str, NDArray[Any]], *, unvalidated: bool = False) -> NDArray[np.bool_]:
     """Return the mask (N,) of valid grasps; with `unvalidated` of feasible grasps without validation."""
-    return feasible(columns) & ~validated(columns) if unvalidated else valid(columns)
+    return feasible_mask(columns) & ~validated_mask(columns) if unvalidated else valid_mask(columns)

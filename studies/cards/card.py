@@ -17,7 +17,7 @@ from graspd.service.pipeline.datasets.export import path_of
 from graspd.service.readers import ShardFile, Shards
 from graspd.service.store.shards import open_shard
 from graspd.studies.cards.contents import Contents, ShardContents, read_shards
-from graspd.studies.cards.numbers import numbers
+from graspd.studies.cards.numbers import card_content
 from graspd.studies.cards.page import render_card
 from graspd.studies.cards.plots import draw
 from graspd.studies.cards.tally import tally_of
@@ -57,7 +57,7 @@ def write_card(
             progress(number, len(contents.shards))
 
     tally = tally_of(contents, counted())
-    card = numbers(contents, tally, licence=licence, source=source)
+    card = card_content(contents, tally, licence=licence, source=source)
     plots = draw(card, tally, folder)
     if write_samples(contents.shards, folder / SHEET):
         plots[SHEET] = "Some of the pictures"
@@ -82,7 +82,7 @@ def checksums(contents: Contents) -> Iterator[str]:
 
 def write_samples(shards: Shards, file: Path) -> bool:
     """Write a JPEG of sample pictures from whole shards; return False for a dataset without pictures."""
-    chosen = choose(shards.of("views"))
+    chosen = choose_shards(shards.of("views"))
     if not chosen:
         return False
     pictures = [Image.fromarray(_picture(shards.path(one))) for one in chosen]
@@ -100,7 +100,7 @@ def write_samples(shards: Shards, file: Path) -> bool:
     return True
 
 
-def choose(files: tuple[ShardFile, ...]) -> list[ShardFile]:
+def choose_shards(files: tuple[ShardFile, ...]) -> list[ShardFile]:
     """Choose at most `MOST` shards, spread over the objects, with hands in rotation."""
     cells: dict[tuple[str, str], list[ShardFile]] = {}
     for file in files:

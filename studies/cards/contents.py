@@ -18,7 +18,7 @@ from pydantic_core import from_json
 from graspd.service.model import names
 from graspd.service.model.errors import InputError, NotFoundError
 from graspd.service.model.metrics import GRASP_METRICS
-from graspd.service.model.planning import plan
+from graspd.service.model.planning import plan_tasks
 from graspd.service.model.records import DatasetRecord, Snapshot, job_of
 from graspd.service.model.states import AssetKind
 from graspd.service.model.version import PACKAGE_VERSION
@@ -182,7 +182,9 @@ def _gaps(store: Store, record: DatasetRecord, taken: Snapshot) -> dict[Pair, tu
     there = {shard.id for shard in taken.shards}
     gaps = {}
     for cell in record.cells():
-        missing = [task for task in plan(job_of(cell, record.options, record.revisions)) if task.output not in there]
+        missing = [
+            task for task in plan_tasks(job_of(cell, record.options, record.revisions)) if task.output not in there
+        ]
         if missing:
             reasons = (attempts[-1].reason for task in missing if (attempts := task_attempts(store, task.id)))
             gaps[cell.hand.name, cell.object.name] = len(missing), next(reasons, "not made yet, or cancelled")

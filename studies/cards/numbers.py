@@ -30,7 +30,7 @@ _PERCENTILES: Final = {"p5": 5, "p25": 25, "median": 50, "p75": 75, "p95": 95}
 _KINDS: Final = ("base", "scene", "views")
 
 
-def numbers(contents: Contents, tally: Tally, *, licence: str = "", source: str = "") -> Row:
+def card_content(contents: Contents, tally: Tally, *, licence: str = "", source: str = "") -> Row:
     """Return the whole content of a card as JSON values."""
     whole = CellTally.of(tally.cells.values())
     taken = contents.snapshot

@@ -51,7 +51,7 @@ def render_card(card: Row, plots: Mapping[str, str]) -> str:
     return _TEMPLATE.render(
         card,
         plots=plots,
-        head=head(card),
+        head=yaml_head(card),
         findings=findings(card),
         origins=_origins(card),
         quality_table=quality_table(card),
@@ -67,7 +67,7 @@ def render_card(card: Row, plots: Mapping[str, str]) -> str:
     )
 
 
-def head(card: Row) -> dict[str, Any]:
+def yaml_head(card: Row) -> dict[str, Any]:
     """Return the YAML head; every value is a JSON value, because JSON is valid YAML."""
     made = card["composition"]
     tags = ["grasping", "dexterous-manipulation", "synthetic", "graspd", *(hand["name"] for hand in made["hands"])]
@@ -145,12 +145,12 @@ def _cells_table(card: Row) -> str:
                 "candidates": f"{cell['candidates']:,}",
                 "valid": f"{cell['valid']:,}",
                 "valid of validated": percent(cell["of_validated"]),
-                **{digits[name][0]: fixed(cell["median"].get(name), digits[name][1]) for name in _MEDIANS},
+                **{digits[name][0]: format_fixed(cell["median"].get(name), digits[name][1]) for name in _MEDIANS},
                 "clear of table": percent(cell["clear_of_table"]),
-                "D": fixed(cell["diversity"], 2),
+                "D": format_fixed(cell["diversity"], 2),
                 "share of directions used": percent(used and 1 - used["empty"] / card["directions"]["cells"]),
-                "entropy of directions, bit": fixed(used and used["entropy_bits"], 2),
-                "entropy of grasp types, bit": fixed(types and types["entropy_bits"], 2),
+                "entropy of directions, bit": format_fixed(used and used["entropy_bits"], 2),
+                "entropy of grasp types, bit": format_fixed(types and types["entropy_bits"], 2),
                 **({"missing because": cell_text(cell["missing_because"], "")} if reasons else {}),
             }
         )
@@ -163,7 +163,7 @@ def cell_text(text: str | None, missing: str = "not recorded") -> str:
     return (text or missing).replace("|", "\\|").replace("\n", " ")
 
 
-def fixed(value: float | None, digits: int = 0) -> str:
+def format_fixed(value: float | None, digits: int = 0) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
 
 
@@ -203,7 +203,7 @@ def _template() -> Any:
     environment.filters |= {
         "cell": cell_text,
         "count": _count,
-        "fixed": fixed,
+        "fixed": format_fixed,
         "interval": lambda found: (
             f"{percent(found['share'])} ({percent(found['low'])} to {percent(found['high'])})" if found else "unknown"
         ),

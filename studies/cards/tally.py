@@ -214,11 +214,11 @@ def _note(tally: Tally, cell: CellTally, piece: ShardContents) -> None:
 def _add_base(tally: Tally, cell: CellTally, piece: ShardContents, hand: AssetFacts) -> Array:
     """Add a base shard; return its mask (N,) of valid grasps."""
     columns = piece.columns
-    valid = validity.valid(columns)
+    valid = validity.valid_mask(columns)
     cell.n.update(grasps=piece.rows, valid=int(valid.sum()))
     candidates = int(piece.said.get("candidates", piece.rows))
     cell.n["candidates"] += candidates
-    if validity.validated(columns).any() or (not piece.rows and piece.said.get("verdict_level", "none") != "none"):
+    if validity.validated_mask(columns).any() or (not piece.rows and piece.said.get("verdict_level", "none") != "none"):
         cell.n["validated"] += candidates
     cell.rejected.update({str(why): int(count) for why, count in dict(piece.info.get("rejected", {})).items()})
     for name, tested, held in (

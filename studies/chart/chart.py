@@ -14,7 +14,7 @@ from graspd.service.model.errors import InputError
 from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.model.version import PACKAGE_VERSION
 from graspd.studies.bench import device_name
-from graspd.studies.chart.statistics import figures, plain, summed
+from graspd.studies.chart.statistics import rounded_json_value, run_figures, summarise_runs
 from graspd.studies.chart.trials import FRICTION, Rollout, Setting
 from graspd.studies.evaluation import THRESHOLD_M
 from graspd.worker.execution_context import ExecutionContext
@@ -83,8 +83,8 @@ def _result(runs: Sequence[dict[str, Any]], settings: Sequence[Setting], models:
         "friction": FRICTION,
         "threshold_m": THRESHOLD_M,
         "runs": list(runs),
-        "summary": summed(runs),
-        "by_hand": {hand: summed([run for run in runs if run["hand"] == hand]) for hand in hands},
+        "summary": summarise_runs(runs),
+        "by_hand": {hand: summarise_runs([run for run in runs if run["hand"] == hand]) for hand in hands},
     }
 
 
@@ -96,8 +96,8 @@ def _row(cell: Rollout, hand: HandModel, thing: ChartObject) -> dict[str, Any]:
         "hand": hand.name,
         "object": thing.name,
         "options": dict(setting.options),
-        **figures(cell),
-        "best": {key: plain(value) for key, value in cell.best().items()},
+        **run_figures(cell),
+        "best": {key: rounded_json_value(value) for key, value in cell.best().items()},
     }
 
 

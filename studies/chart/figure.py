@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.studies.chart.statistics import most_valid
+from graspd.studies.chart.statistics import valid_rate_bound
 
 Row = Mapping[str, Any]
 #: Function from a point's row and all rows to its label.
@@ -95,7 +95,7 @@ def draw_hands(
 
 
 def _save(figure: Any, labels: Sequence[Label], files: Sequence[Path]) -> None:
-    place(figure, labels)
+    place_labels(figure, labels)
     for file in files:
         figure.savefig(file, dpi=150)
 
@@ -130,10 +130,10 @@ def draw_scenes(rows: Sequence[Row], files: Sequence[Path], *, second: str) -> N
     words = f"lifted grasps per {second}, end to end"
     labels = []
     for axes, (title, key) in zip(panels.flat[:4], IN_SCENES, strict=True):
-        labels += _over_speed(axes, rows, styles, key, title, words, one_of_several)
+        labels += _over_speed(axes, rows, styles, key, title, words, fidelity_label)
     timed = [row for row in rows if row["seconds_to_first"]]
     last = panels.flat[4]
-    labels += _panel(last, timed, styles, x="seconds_to_first", y="lift", label=one_of_several)
+    labels += _panel(last, timed, styles, x="seconds_to_first", y="lift", label=fidelity_label)
     last.set_xlabel(f"{second}s to the first that is lifted (less is better)")
     last.set_title("Lifted, by settings with a lift in every pair", loc="left", fontsize=11)
     last.set_ylim(-0.07, 1.07)
@@ -162,7 +162,7 @@ def _panel(
         colour, marker = styles[row["method"]]
         # Without valid grasps the marker is hollow, at the upper bound, with an arrow to lower values.
         none = not row[x]
-        at = most_valid(row) if none else row[x]
+        at = valid_rate_bound(row) if none else row[x]
         bars: dict[str, Any] = {
             f"{axis}err": _error(row, key) for axis, key in (("x", x), ("y", y)) if f"{key}_low" in row
         }
@@ -216,7 +216,7 @@ def _label(row: Row, rows: Sequence[Row]) -> str:
     return f"{row['fidelity']}, {row['batch']}" if several else str(row["fidelity"])
 
 
-def one_of_several(row: Row, rows: Sequence[Row]) -> str:
+def fidelity_label(row: Row, rows: Sequence[Row]) -> str:
     """Return the fidelity if the method has several, else no text, because the legend has its name."""
     return str(row["fidelity"]) if sum(r["method"] == row["method"] for r in rows) > 1 else ""
 
@@ -282,7 +282,7 @@ class Label:
     y_bar: tuple[float, float] | None = None
 
 
-def place(figure: Any, labels: Sequence[Label]) -> list[Any]:
+def place_labels(figure: Any, labels: Sequence[Label]) -> list[Any]:
     """Place the labels of all panels in an otherwise complete figure; return the new annotations."""
     figure.draw_without_rendering()
     made = []

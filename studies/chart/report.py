@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from graspd.service.model.studies import FILTERED, IN_SCENE, IN_SCENES
-from graspd.studies.chart.figure import SPEED, draw, draw_hands, draw_scenes, draw_sweeps, one_of_several
-from graspd.studies.chart.statistics import most_valid
+from graspd.studies.chart.figure import SPEED, draw, draw_hands, draw_scenes, draw_sweeps, fidelity_label
+from graspd.studies.chart.statistics import valid_rate_bound
 
 Row = Mapping[str, Any]
 
@@ -51,10 +51,10 @@ def write(chart: Row, folder: Path) -> None:
         writer.writerows(chart["runs"])
     pictures, by_hand = [folder / "chart.png", folder / "chart.svg"], folder / "chart.hands.png"
     if "scene" in chart:
-        draw_scenes([named(row) for row in chart["summary"]], pictures, second=second_of(chart))
-        hands = {hand: [named(row) for row in rows] for hand, rows in chart["by_hand"].items()}
-        words = ("lifted share of all candidates", f"lifted grasps per {second_of(chart)}, end to end")
-        draw_hands(hands, by_hand, key="lift", words=words, label=one_of_several)
+        draw_scenes([with_mode_name(row) for row in chart["summary"]], pictures, second=time_unit(chart))
+        hands = {hand: [with_mode_name(row) for row in rows] for hand, rows in chart["by_hand"].items()}
+        words = ("lifted share of all candidates", f"lifted grasps per {time_unit(chart)}, end to end")
+        draw_hands(hands, by_hand, key="lift", words=words, label=fidelity_label)
     else:
         draw(chart["summary"], pictures)
         words = ("success under the DexGraspBench protocol", "valid grasps per second, end to end")
@@ -173,7 +173,7 @@ def _ratios(rows: Sequence[Row]) -> str:
     for row in others:
         times = f"× {best[SPEED] / row[SPEED]:.3g}" if row[SPEED] else ""
         if not times:
-            times = f"> × {best[SPEED] / most_valid(row):.3g} (0 of {row['grasps']} valid)"
+            times = f"> × {best[SPEED] / valid_rate_bound(row):.3g} (0 of {row['grasps']} valid)"
         lines.append(
             f"| {row['method']} {row['fidelity']} | {times} | {best['dexgraspbench'] - row['dexgraspbench']:+.2f} "
             f"| {best['epsilon'] - row['epsilon']:+.3f} | {best['pd_mm'] - row['pd_mm']:+.2f} |"
@@ -236,22 +236,22 @@ def sweeps_table(sweeps: Sequence[Row]) -> str:
     return "\n".join(lines)
 
 
-def second_of(chart: Row) -> str:
+def time_unit(chart: Row) -> str:
     """Return the unit of time of the chart: core-seconds on a CPU, wall-clock seconds on a GPU."""
     return "CPU second" if str(chart["device"]).startswith("cpu") else "second"
 
 
-def named(row: Row) -> dict[str, Any]:
+def with_mode_name(row: Row) -> dict[str, Any]:
     """Return the row with its planning mode in the method's name, as in the plot."""
     return {**row, "method": f"{row['method']}, {row['way']}"}
 
 
 def _scene_page(chart: Row) -> str:
-    parts = [_scene_head(chart), "![Speed against lifts](chart.png)", _summary(chart["summary"], second_of(chart))]
+    parts = [_scene_head(chart), "![Speed against lifts](chart.png)", _summary(chart["summary"], time_unit(chart))]
     if len(chart["by_hand"]) > 1:
         parts += ["## Each hand", "![Lifted over speed](chart.hands.png)"]
-        parts += [f"### {hand}\n\n{_summary(rows, second_of(chart))}" for hand, rows in chart["by_hand"].items()]
-    parts += ["## Each hand and object", _runs(chart["runs"], second_of(chart))]
+        parts += [f"### {hand}\n\n{_summary(rows, time_unit(chart))}" for hand, rows in chart["by_hand"].items()]
+    parts += ["## Each hand and object", _runs(chart["runs"], time_unit(chart))]
     if refused := [run for run in chart["runs"] if run["note"]]:
         lines = [
             f"- {run['method']} {run['fidelity']}, {run['hand']}, {run['object']}: {run['note']}" for run in refused
@@ -262,7 +262,7 @@ def _scene_page(chart: Row) -> str:
 
 def _scene_head(chart: Row) -> str:
     hands, objects = _names(chart)
-    seconds = "core-seconds of the CPU" if second_of(chart) == "CPU second" else "wall-clock seconds"
+    seconds = "core-seconds of the CPU" if time_unit(chart) == "CPU second" else "wall-clock seconds"
     return (
         f"# Grasps planned in scenes, compared with filtered free grasps\n\n{_command(chart)}{chart['device']}, graspd "
         f"{chart['versions']['graspd']}, "

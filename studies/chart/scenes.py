@@ -26,7 +26,7 @@ from graspd.service.model.studies import FILTERED, IN_SCENE, IN_SCENES
 from graspd.service.model.version import PACKAGE_VERSION, STAGE_REVISIONS
 from graspd.studies.bench import clock_of, device_name
 from graspd.studies.chart.chart import TRUE_ERROR_M, ChartObject
-from graspd.studies.chart.statistics import first_valid, mark_fronts, plain
+from graspd.studies.chart.statistics import first_valid, mark_fronts, rounded_json_value
 from graspd.studies.chart.trials import FRICTION, MODELS_SEED, SEED, WARM_SEED, Setting
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
@@ -40,7 +40,7 @@ from graspd.worker.scenes.trajectory import plan_trajectory
 from graspd.worker.simulation.environment import PlacedGrasps, Scenes
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.lifting import validate_lifts
-from graspd.worker.validation.robust import robust
+from graspd.worker.validation.robust import validate_robustness
 
 Row = dict[str, Any]
 Say = Callable[[str], None]
@@ -172,7 +172,7 @@ def _run_setting(setting: Setting, way: str, hand: HandModel, place: ObjectScene
         # The scene has no free approach, or the method refuses the pair.
         note = str(error)
     row["first_grasps"] = few
-    told = figures([row])
+    told = lift_figures([row])
     told["seconds_to_first"] = first_valid(told["lift"], [row["first_seconds"]], few)
     return {**row, **told, "scenes": len(place.scenes.object_pose), "note": note}
 
@@ -215,7 +215,7 @@ class ValidatedGrasps:
         lifted = self.lifted
         grasps, placed = self.grasps.take(lifted), self.placed.take(lifted)
         given: dict[str, Any] = {"models": models, "seed": MODELS_SEED, "pieces": self.place.pieces}
-        shares = robust(self.hand, self.place.true, grasps, placed=placed, **given).share
+        shares = validate_robustness(self.hand, self.place.true, grasps, placed=placed, **given).share
         return {
             "clear_count": len(self.clear),
             "lift_count": len(lifted),
@@ -225,7 +225,7 @@ class ValidatedGrasps:
         }
 
 
-def figures(rows: Sequence[Mapping[str, Any]]) -> Row:
+def lift_figures(rows: Sequence[Mapping[str, Any]]) -> Row:
     """Return shares of all candidates with 95 % intervals (Wilson), and lifted grasps per second.
     `robust` is the mean share of models over lifted grasps. All grasps have equal weight. A refused cell has no
     time."""
@@ -245,10 +245,10 @@ def figures(rows: Sequence[Mapping[str, Any]]) -> Row:
     bar = wilson_of_mean(total, lifted) if lifted else (None, None)
     mean = total / lifted if lifted else None
     found |= {"robust_sum": total, "robust": mean, "robust_low": bar[0], "robust_high": bar[1]}
-    return {key: plain(value) for key, value in found.items()}
+    return {key: rounded_json_value(value) for key, value in found.items()}
 
 
-def summed(runs: Sequence[Row]) -> list[Row]:
+def summarise_runs(runs: Sequence[Row]) -> list[Row]:
     """Return a row for each mode, method and fidelity over all pairs.
     `gain`: median ratio of speeds, in scene to filtered, over pairs that have lifted grasps in mode filtered."""
     groups: dict[tuple[str, str, str, int], list[Row]] = {}
@@ -257,10 +257,10 @@ def summed(runs: Sequence[Row]) -> list[Row]:
     rows = []
     for (way, name, fidelity, batch), own in groups.items():
         row: Row = {"way": way, "method": name, "fidelity": fidelity, "batch": batch, "pairs": len(own)}
-        row |= figures(own)
+        row |= lift_figures(own)
         firsts = [run["seconds_to_first"] for run in own]
         # The time of pairs without a lift is unknown.
-        row["seconds_to_first"] = None if None in firsts else plain(float(np.mean(firsts)))
+        row["seconds_to_first"] = None if None in firsts else rounded_json_value(float(np.mean(firsts)))
         row["pairs_with_one"] = sum(run["lift_count"] > 0 for run in own)
         row["gain"] = _gain(own, groups.get((FILTERED, name, fidelity, batch), [])) if way == IN_SCENE else None
         rows.append(row)
@@ -271,7 +271,7 @@ def summed(runs: Sequence[Row]) -> list[Row]:
 def _gain(own: Sequence[Row], filtered: Sequence[Row]) -> float | None:
     there = {(run["hand"], run["object"]): run["valid_per_second"] for run in filtered}
     ratios = [run["valid_per_second"] / there[pair] for run in own if there.get(pair := (run["hand"], run["object"]))]
-    return plain(float(np.median(ratios))) if ratios else None
+    return rounded_json_value(float(np.median(ratios))) if ratios else None
 
 
 def _result(runs: Sequence[Row], settings: Sequence[Setting], spec: SceneSpec, models: int) -> Row:
@@ -284,8 +284,8 @@ def _result(runs: Sequence[Row], settings: Sequence[Setting], spec: SceneSpec, m
         "validation": {"protocol": "lift", "level": "lift"},
         "runs": list(runs),
         "models": models,
-        "summary": summed(runs),
-        "by_hand": {hand: summed([run for run in runs if run["hand"] == hand]) for hand in hands},
+        "summary": summarise_runs(runs),
+        "by_hand": {hand: summarise_runs([run for run in runs if run["hand"] == hand]) for hand in hands},
     }
 
 

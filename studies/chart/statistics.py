@@ -23,7 +23,7 @@ SPEEDS: Final = ("valid_per_second", "end_to_end_per_second")
 MEDIANS: Final = ("epsilon", "pd_mm", "spd_mm", "ca_cm2", "iv_cm3", "wrench_volume")
 
 
-def figures(cell: Rollout) -> dict[str, Any]:
+def run_figures(cell: Rollout) -> dict[str, Any]:
     """Return the values of a run: speed, accuracy, and `KEY_low`, `KEY_high` of each."""
     held, kept = (np.concatenate(rows).astype(float) for rows in (cell.success, cell.kept))
     seconds = np.array(cell.seconds)
@@ -47,7 +47,7 @@ def figures(cell: Rollout) -> dict[str, Any]:
     widen(row, int(held.sum()), len(held), len(held) / float(seconds.sum()))
     widen_speed(row, "end_to_end_per_second", int(kept.sum()), len(kept), len(kept) / sum(cell.end_seconds))
     row |= _strict_success(cell) if cell.dexgraspbench else {}
-    return {key: plain(value) for key, value in row.items()}
+    return {key: rounded_json_value(value) for key, value in row.items()}
 
 
 def widen(row: dict[str, Any], valid: int, grasps: int, per_second: float) -> None:
@@ -105,7 +105,7 @@ def _draws(cell: Rollout) -> dict[str, Floats]:
     return {key: np.array(values) for key, values in out.items()}
 
 
-def summed(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+def summarise_runs(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return one row per method, fidelity and batch, over all hands and objects.
     Speed is all valid grasps over all seconds; accuracies are means over the pairs, with bars of these means."""
     groups: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
@@ -133,7 +133,7 @@ def summed(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         widen(row, valid, row["grasps"], row["grasps_per_second"])
         widen_speed(row, "end_to_end_per_second", kept, row["grasps"], row["grasps"] / end)
         row["candidates_end_to_end_per_second"] = row["grasps"] / end
-        rows.append({key: plain(value) for key, value in row.items()})
+        rows.append({key: rounded_json_value(value) for key, value in row.items()})
     mark_fronts(rows, METRICS)
     return rows
 
@@ -167,14 +167,14 @@ def _ratio_bar(runs: Sequence[dict[str, Any]], key: str, seconds: str, side: str
     return float((weight * value).sum() / weight.sum()) + (spread if side == "high" else -spread)
 
 
-def most_valid(row: Mapping[str, Any]) -> float:
+def valid_rate_bound(row: Mapping[str, Any]) -> float:
     """Return the 95 % upper bound on valid grasps per second, end to end, if none of n is valid.
     The bound on the share is 3 / n. In scenes it applies to lifted grasps."""
     raw = row.get("candidates_end_to_end_per_second", row["grasps_per_second"])
     return float(raw) * min(1.0, 3.0 / row["grasps"])
 
 
-def plain(value: Any) -> Any:
+def rounded_json_value(value: Any) -> Any:
     """Return a JSON value: six significant digits, None for a non-number."""
     if isinstance(value, np.generic):
         value = value.item()

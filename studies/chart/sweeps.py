@@ -17,7 +17,7 @@ from graspd.service.model.errors import InputError
 from graspd.service.model.fidelity import FIDELITIES, Fidelity
 from graspd.studies.chart import kernels
 from graspd.studies.chart.chart import TRUE_ERROR_M, ChartObject
-from graspd.studies.chart.statistics import figures, plain
+from graspd.studies.chart.statistics import rounded_json_value, run_figures
 from graspd.studies.chart.trials import Rollout, Setting
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet
@@ -119,13 +119,13 @@ def sweep(
             # There are more settings than the device caches, so each is prepared just before it is timed.
             cell.warm_up()
             cell.repeat()
-    base = figures(cells[default.knob, default.value])
+    base = run_figures(cells[default.knob, default.value])
     rows = []
     for turn in knob_values(quick, knobs):
-        found = base if turn.default else figures(cells[turn.knob, turn.value])
+        found = base if turn.default else run_figures(cells[turn.knob, turn.value])
         faster = found["grasps_per_second"] / base["grasps_per_second"]
         row = {"knob": turn.knob, "value": turn.value, "default": turn.default, "hand": hand.name, "object": thing.name}
-        rows.append(row | {"speedup": plain(faster), **found})
+        rows.append(row | {"speedup": rounded_json_value(faster), **found})
         say(f"{turn.knob:22s} {turn.value:18s} x {faster:5.2f}  GSR {found['gsr']:.2f}  PD {found['pd_mm']:.2f} mm")
     return rows
 

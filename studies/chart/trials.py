@@ -20,13 +20,13 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners import PlanRequest, synthesize
 from graspd.worker.planners import Rollout as Tried
-from graspd.worker.quality.gate import passes
+from graspd.worker.quality.gate import passes_gate
 from graspd.worker.quality.table import measure
 from graspd.worker.scenes.rollout import rollout_on
 from graspd.worker.simulation.environment import PlacedGrasps
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.displacement import simulated_displacement_cm
-from graspd.worker.validation.robust import robust
+from graspd.worker.validation.robust import validate_robustness
 from graspd.worker.validation.validator import validate
 
 #: Coulomb coefficient for epsilon and wrench volume: the paper's.
@@ -156,7 +156,7 @@ class Rollout:
             self.hand, self.true, found, friction=FRICTION, thresholds_m=[THRESHOLD_M], run=self.setting.run
         )
         columns = {key: np.asarray(table[f"quality/{name}"], float).reshape(-1) for key, name in COLUMNS.items()}
-        return columns | {"feasible": np.asarray(passes(table), float)}
+        return columns | {"feasible": np.asarray(passes_gate(table), float)}
 
     def validate_strictly(self, models: int) -> None:
         """Validate by DexGraspBench's protocol, at half the friction, and in models around the nominal one."""
@@ -164,7 +164,9 @@ class Rollout:
         for found, success in zip(self.made, self.success, strict=True):
             self.dexgraspbench.append(validate(self.hand, self.true, found, level="dexgraspbench", **common).success)
             self.hard.append(validate(self.hand, self.true, found, hard=True, **common).success)
-            shares = robust(self.hand, self.true, found, held=success, models=models, seed=MODELS_SEED, **common).share
+            shares = validate_robustness(
+                self.hand, self.true, found, held=success, models=models, seed=MODELS_SEED, **common
+            ).share
             self.shares.append(shares)
 
     def time_first(self, grasps: int) -> None:

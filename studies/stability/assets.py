@@ -18,7 +18,7 @@ from graspd.service.model.digests import digest_files
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.errors import GraspdError
 from graspd.service.model.states import AssetKind
-from graspd.service.model.studies import MapCell, Outcome, StabilityMap, reachable
+from graspd.service.model.studies import MapCell, Outcome, StabilityMap, mark_reachable
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.generation import validated_grasps
 from graspd.worker.hands.load import load_hand
@@ -128,7 +128,7 @@ def shape_map(
         "fidelity",
         MEASURE,
         BOUNDS,
-        reachable(cells, lambda cell: True),
+        mark_reachable(cells, lambda cell: True),
         SHOWS,
         "ingest refuses meshes without an inside and reports `thin` walls; gate and validator reject grasps with "
         "deep penetration; a job with too few valid grasps reports it",
@@ -137,7 +137,7 @@ def shape_map(
     )
 
 
-def prepared(mesh: Any, face_error_m: float, *, allow_open: bool = False) -> ObjectModel:
+def prepare_mesh(mesh: Any, face_error_m: float, *, allow_open: bool = False) -> ObjectModel:
     """Prepare a mesh in metres like an upload; MeshError if it is refused."""
     files = {"shape.ply": bytes(mesh.export(file_type="ply"))}
     digest, options = digest_files(AssetKind.OBJECT, files), {"units": "m", "allow_open": allow_open}
@@ -158,7 +158,7 @@ def shape_cell(
     open one. `options` has size and execution context of the job, `asked` its fidelity or method."""
     request = JobRequest(hand="hand", object="shape", grasps=options.count, want="candidates", rechecks=0, **asked)
     try:
-        obj = prepared(mesh, request.knobs.face_error_m, allow_open=allow_open)
+        obj = prepare_mesh(mesh, request.knobs.face_error_m, allow_open=allow_open)
         found = validated_grasps(hand, obj, request, count=options.count, run=options.run)
     except GraspdError as error:
         return refused_cell(*place, error)
@@ -284,7 +284,7 @@ def hand_map(
         "joints per drive",
         MEASURE,
         BOUNDS,
-        reachable(cells, lambda cell: True),
+        mark_reachable(cells, lambda cell: True),
         "few or no valid grasps, and a low share in the hand's self-test",
         "a hand without two opposed parts is refused; the self-test of a new hand reports the share of its grasps that "
         "hold simple objects; a job with too few valid grasps reports it",

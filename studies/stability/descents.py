@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from graspd.service.model.fidelity import FIDELITIES, Fidelity
-from graspd.service.model.studies import MapCell, StabilityMap, format_short, grade, reachable
+from graspd.service.model.studies import MapCell, StabilityMap, format_short, grade, mark_reachable
 from graspd.service.model.transforms import Floats, quat_rotate
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
@@ -99,7 +99,7 @@ def start_map(hand: HandModel, obj: ObjectModel, *, count: int, say: Say) -> Sta
         "fidelity",
         _MEASURE,
         _BOUNDS,
-        reachable(cells, lambda cell: cell.x == 0.0),
+        mark_reachable(cells, lambda cell: cell.x == 0.0),
         "a hand that stays away has no contacts; a hand that starts inside the object stays there",
         "the planner's own starts retreat until they are free of contact; the merit rejects hands without contact "
         "balance, the gate rejects penetration",
@@ -127,7 +127,7 @@ def rate_map(
         "factor on the weights of penetration",
         _MEASURE,
         _BOUNDS,
-        reachable(cells, lambda cell: (cell.panel, cell.x, cell.y) == (_OPTIMIZERS["adam"], 1.0, 1.0)),
+        mark_reachable(cells, lambda cell: (cell.panel, cell.x, cell.y) == (_OPTIMIZERS["adam"], 1.0, 1.0)),
         "hands jump past the object or penetrate it",
         "the schedule fixes rates and weights; hands with numbers that are not finite are rejected, others validated",
         "tests/worker/test_certified.py::test_hands_that_are_no_numbers_are_dropped_and_counted",
@@ -152,7 +152,7 @@ def length_map(hand: HandModel, obj: ObjectModel, *, lengths: Sequence[int], say
         "measure",
         _MEASURE + "; drift: largest deviation of a quaternion's norm from 1",
         _BOUNDS + "; drift: 1e-5, 1e-3",
-        reachable(cells, lambda cell: True),
+        mark_reachable(cells, lambda cell: True),
         "rotations of poses become invalid, or hands drift away",
         "quaternions are normalised in each step; a grasp that does not improve stops after `patience` iterations",
         "tests/studies/test_stability.py::test_a_long_run_does_not_drift",

@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 import warp as wp
 
-from graspd.service.model.studies import MapCell, StabilityMap, grade, reachable
+from graspd.service.model.studies import MapCell, StabilityMap, grade, mark_reachable
 from graspd.service.model.transforms import Floats
 from graspd.studies.stability.integrators import Solver, sweep
 from graspd.worker.simulation import reference
@@ -99,7 +99,7 @@ def gradient_map(sizes: Sequence[float], gaps: Sequence[float], *, repeats: int)
         "spread of the gaps over the step",
         "sine of the angle between the gradients, median over contact sets",
         f"weak: {ANGLE[0]:g}; broken: {ANGLE[1]:g}",
-        reachable(cells, lambda cell: True),
+        mark_reachable(cells, lambda cell: True),
         "the loss does not fall, even with more iterations",
         "a descent that does not improve stops after `patience` iterations; the best of several starts is selected by "
         "the balance of forces, not by the loss",

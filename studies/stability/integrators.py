@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from graspd.service.model.studies import MapCell, StabilityMap, format_short, grade, reachable
+from graspd.service.model.studies import MapCell, StabilityMap, format_short, grade, mark_reachable
 from graspd.service.model.transforms import Floats
 from graspd.worker.simulation import reference
 from graspd.worker.simulation.model import LossOptions
@@ -171,7 +171,7 @@ def time_step_map(time_steps: Sequence[float], speeds: Sequence[float]) -> Stabi
     ]
     step = LossOptions().step
     # The grid approximates the planner's step within 10 %.
-    cells = reachable(cells, lambda c: c.panel in _OFFERED and abs(float(c.x) * float(c.y) / step - 1) < 0.15)
+    cells = mark_reachable(cells, lambda c: c.panel in _OFFERED and abs(float(c.x) * float(c.y) / step - 1) < 0.15)
     return StabilityMap(
         "time_step",
         "A ball of 1 kg in a cage of 24 points, 60 steps",
@@ -239,7 +239,7 @@ def contact_count_map(counts: Sequence[int]) -> StabilityMap:
         for count in counts
         for depth in (0.0, 1e-4, 1e-3)
     ]
-    cells = reachable(cells, lambda cell: cell.panel in _OFFERED)
+    cells = mark_reachable(cells, lambda cell: cell.panel in _OFFERED)
     return StabilityMap(
         "contact_count",
         "A step of 1 mm into a wall of contact points",

@@ -9,7 +9,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from graspd.service.model.studies import OUTCOMES, MapCell, Stability, StabilityMap, between, counts, tick
+from graspd.service.model.studies import (
+    OUTCOMES,
+    MapCell,
+    Stability,
+    StabilityMap,
+    count_outcomes,
+    format_tick,
+    tick_position,
+)
 
 #: Colours (fill, text) by outcome, distinguishable by lightness alone.
 COLOURS: Final = {
@@ -68,7 +76,7 @@ def _unguarded_failures(maps: Sequence[StabilityMap]) -> list[str]:
 
 
 def _row(cells: Sequence[MapCell]) -> str:
-    return " | ".join(str(number) for number in counts(cells).values())
+    return " | ".join(str(number) for number in count_outcomes(cells).values())
 
 
 def draw(one: StabilityMap, path: Path) -> None:
@@ -87,7 +95,7 @@ def draw(one: StabilityMap, path: Path) -> None:
         _panel(axes, one, panel)
     for axes in list(grid.flat)[len(panels) :]:
         axes.set_visible(False)
-    present = [outcome for outcome, number in counts(one.cells).items() if number]
+    present = [outcome for outcome, number in count_outcomes(one.cells).items() if number]
     handles = [Patch(color=COLOURS[outcome][0], label=outcome) for outcome in OUTCOMES if outcome in present]
     if one.is_divided:
         handles.append(Patch(facecolor="none", edgecolor="#14191d", linewidth=1.4, label="a job can reach this"))
@@ -122,7 +130,11 @@ def _panel(axes: Any, one: StabilityMap, panel: str) -> None:
     axes.tick_params(length=0)
     if line := one.lines.get(panel):
         axes.plot(
-            [between(xs, x) for x, _ in line], [between(ys, y) for _, y in line], color="#1f2937", lw=1.6, ls="--"
+            [tick_position(xs, x) for x, _ in line],
+            [tick_position(ys, y) for _, y in line],
+            color="#1f2937",
+            lw=1.6,
+            ls="--",
         )
 
 
@@ -140,4 +152,4 @@ def _fit(axes: Any) -> None:
 
 
 def _wrapped(value: float | str) -> str:
-    return textwrap.fill(tick(value), _TICK_LETTERS, break_long_words=False)
+    return textwrap.fill(format_tick(value), _TICK_LETTERS, break_long_words=False)

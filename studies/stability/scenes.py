@@ -14,9 +14,9 @@ from graspd.service.model.domain import JobRequest
 from graspd.service.model.errors import GraspdError
 from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.model.scene_spec import Box, HalfSpace, SceneSpec
-from graspd.service.model.studies import MapCell, Outcome, StabilityMap, reachable
+from graspd.service.model.studies import MapCell, Outcome, StabilityMap, mark_reachable
 from graspd.service.model.transforms import quat_rotate
-from graspd.studies.stability.assets import MILLIMETRES, MapOptions, outcome_of, prepared, refused_cell
+from graspd.studies.stability.assets import MILLIMETRES, MapOptions, outcome_of, prepare_mesh, refused_cell
 from graspd.worker.generation import ValidatedBatch, validated_grasps
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
@@ -117,7 +117,7 @@ def scene_map(
         *study.axes,
         measure,
         "weak: below 0.5; broken: 0",
-        reachable(cells, lambda cell: True),
+        mark_reachable(cells, lambda cell: True),
         "few or no valid grasps; `clear_share` or `lift_share` of `graspd synth --json` is low",
         guard,
         f"tests/studies/test_stability.py::{study.guard_test}",
@@ -177,7 +177,7 @@ def plan_candidates(hand: HandModel, sides_mm: Sequence[float], spec: SceneSpec,
     Raises GraspdError: the box or the scene is refused."""
     mesh: Any = trimesh.creation.box(np.asarray(sides_mm) * MILLIMETRES)
     count, fidelity = options.count, options.fidelity
-    obj = prepared(mesh, FIDELITIES[fidelity].face_error_m)
+    obj = prepare_mesh(mesh, FIDELITIES[fidelity].face_error_m)
     request = JobRequest(hand="hand", object="box", grasps=count, want="candidates", fidelity=fidelity, rechecks=0)
     scenes = None
     if spec.kind != "free":

@@ -7,7 +7,7 @@ from dataclasses import replace
 from itertools import product
 from typing import Any, Final
 
-from graspd.service.model.studies import StabilityMap, reachable
+from graspd.service.model.studies import StabilityMap, mark_reachable
 from graspd.studies.stability import assets, descents, gradients, integrators, model_errors, scenes
 from graspd.studies.stability.assets import BOUNDS, FAMILIES, MEASURE, SHOWS, MapOptions, shape_cell
 from graspd.worker.execution_context import ExecutionContext
@@ -129,7 +129,7 @@ def baseline_map(
         "method",
         MEASURE,
         BOUNDS,
-        reachable(cells, lambda cell: True),
+        mark_reachable(cells, lambda cell: True),
         SHOWS,
         "grasps with deep penetration, or rejected by the validator, are never valid; a job with too few valid "
         "grasps reports it",

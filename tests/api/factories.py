@@ -13,7 +13,7 @@ from graspd.service.model.clock import timestamp
 from graspd.service.model.digests import job_id
 from graspd.service.model.domain import JobRequest
 from graspd.service.model.metrics import Axis
-from graspd.service.model.planning import PlannedTask, message_of, plan
+from graspd.service.model.planning import PlannedTask, message_of, plan_tasks
 from graspd.service.model.records import JobRecord
 from graspd.service.model.states import AssetKind, Priority, Stage
 from graspd.service.model.transforms import pose_to_matrix
@@ -41,7 +41,7 @@ def add_job(services: Services, **fields: object) -> JobRecord:
     object_ = services.index.assets.get(AssetKind.OBJECT, request.object).digest
     of = {"id": job_id(request, hand, object_), "hand_digest": hand, "object_digest": object_}
     record = JobRecord(**of, request=request, priority=Priority.INTERACTIVE, created=timestamp())
-    put_record(services.store, names.job_record(record.id), record)
+    put_record(services.store, names.job_record_key(record.id), record)
     services.index.write.add_job(record)
     return record
 
@@ -80,17 +80,17 @@ def finish_with(services: Services, file: Path, **fields: object) -> ShardManife
     shard = read_shard(file, kind="base")
     said = {name: str(shard.attributes[name]) for name in ("hand", "object")}
     record = add_job(services, **said, grasps=len(shard["quality/valid"]), **fields)
-    task = next(task for task in plan(record) if task.stage is Stage.SYNTHESIZE)
+    task = next(task for task in plan_tasks(record) if task.stage is Stage.SYNTHESIZE)
     attributes = shard.attributes | {"shard_id": task.output, "batch": task.batch}
     return publish(services, record, task, shard.arrays, attributes)
 
 
 def finish_all(services: Services, record: JobRecord) -> list[ShardManifest]:
-    return [finish(services, record, task) for task in plan(record)]
+    return [finish(services, record, task) for task in plan_tasks(record)]
 
 
 def fail(services: Services, record: JobRecord, reason: str) -> None:
-    task = next(plan(record))
+    task = next(plan_tasks(record))
     fail_task(services, record.id, task, kind="MeshError", reason=reason, worker="worker-1", started=timestamp())
 
 

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 import warp as wp
 
-from graspd.baselines.common import inside_points, load_pair
+from graspd.baselines.common import inner_side_points, load_pair
 from graspd.baselines.graspit import kernels
 from graspd.baselines.graspit.kernels import FIRST_STEP
 from graspd.baselines.graspit.method import EACH, ON_PALM, Search, eigengrasps
@@ -93,7 +93,7 @@ def test_barrett_has_graspits_own_eigengrasps() -> None:
 @pytest.mark.parametrize("name", ["allegro", "barrett", "shadow"])
 def test_contacts_lie_on_every_finger_amplitudes_reach_limits(name: str) -> None:
     hand = hand_from_path(name)
-    found = inside_points(hand, each=EACH, on_palm=ON_PALM)
+    found = inner_side_points(hand, each=EACH, on_palm=ON_PALM)
     assert set(hand.fingertips) <= set(found.body.tolist())
     palm = found.normal[found.body == 0]
     assert len(palm) >= 1 and np.all(palm @ hand.palm.approach > 0.7)

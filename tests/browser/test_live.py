@@ -7,12 +7,12 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from graspd.service.model.planning import plan
+from graspd.service.model.planning import plan_tasks
 from graspd.service.pipeline import deletion, tagging
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.datasets import actions
 from graspd.service.pipeline.datasets.spec import DatasetRequest
-from graspd.service.store.records import publish
+from graspd.service.store.records import publish_record
 from tests.api.dashboard.test_stability_page import a_record
 from tests.api.dashboard.test_tradeoff import RUNS
 from tests.api.factories import add_job, add_worker, fail, finish, finish_all
@@ -39,8 +39,8 @@ def places(services: Services) -> list[str]:
     add_worker(services, "worker-1", "idle")
     wanted = DatasetRequest.model_validate({"name": "kitchen", "hands": ["allegro"], "objects": ["mug", "block"]})
     actions.create(services, wanted)
-    publish(services.store, "charts", CHART)
-    publish(services.store, "stability", a_record())
+    publish_record(services.store, "charts", CHART)
+    publish_record(services.store, "stability", a_record())
     tagging.tag_grasps(services, "good ones", [(shard, 0), (shard, 1)], project="", owner="", permit=lambda _: None)
     gone = add_job(services, seed=11)
     fail(services, gone, "a reason")
@@ -54,7 +54,7 @@ def places(services: Services) -> list[str]:
 
 def test_a_job_page_follows_its_job_without_a_reload(page: Any, services: Services) -> None:
     record = add_job(services, scenes=1, views=1)
-    tasks = list(plan(record))
+    tasks = list(plan_tasks(record))
     page.goto(f"/jobs/{record.id}")
     page.evaluate("window.stayed = true")
     page.wait_for_selector("#head .queued")
@@ -117,7 +117,7 @@ def test_maps_that_are_published_appear_and_say_what_a_cell_is(page: Any, servic
     page.clock.install()
     page.goto("/stability")
     page.wait_for_selector("text=No measurements yet")
-    publish(services.store, "stability", a_record())
+    publish_record(services.store, "stability", a_record())
     # The page's clock moves on by as long as it waits between two looks at what no event tells of.
     page.clock.fast_forward(1000 * int(page.get_attribute("body", "data-poll")))
     page.wait_for_selector(".cells td.broken")
@@ -126,7 +126,7 @@ def test_maps_that_are_published_appear_and_say_what_a_cell_is(page: Any, servic
 
 
 def test_the_bound_of_theory_lies_over_its_cells_at_every_width(page: Any, services: Services) -> None:
-    publish(services.store, "stability", a_record())
+    publish_record(services.store, "stability", a_record())
     for width in (390, 1440):
         page.set_viewport_size({"width": width, "height": 800})
         page.goto("/stability")
@@ -225,7 +225,7 @@ def test_a_dataset_is_deleted_by_its_name_and_comes_back(page: Any, services: Se
     actions.create(services, wanted)
     plan_all(services)
     finish_all(services, record_of(services, services.index.jobs.page().items[0].id))
-    actions.snapshot(services, "kitchen")
+    actions.take_snapshot(services, "kitchen")
     page.goto("/datasets/kitchen")
     page.click("button:has-text('Delete')")
     dialog = page.get_by_role("dialog")

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from graspd.cli import build
+from graspd.cli import build_app
 from graspd.worker.rendering import portraits
 from tests.worker.commands_run import refused
 
@@ -19,7 +19,7 @@ WARM = 60
 
 def check(*arguments: str) -> tuple[int, dict[str, Any]]:
     untried = ["--no-self-test"] if arguments[0] == "hands" else []
-    result = CliRunner().invoke(build(), [*arguments, *untried, "--json"])
+    result = CliRunner().invoke(build_app(), [*arguments, *untried, "--json"])
     return result.exit_code, json.loads(result.stdout.splitlines()[-1])
 
 
@@ -33,7 +33,7 @@ def test_a_folder_gets_a_verdict_each_and_code_2_if_refused(shared_data: Path, t
     said = {one["name"]: one["verdict"] for one in report["objects"]}
     assert said == {"mug": "repair", "noise": "refuse", "prism": "accept"}
     assert "--picture draws one object" in refused("objects check --picture p.png", tmp_path / "set")
-    told = CliRunner().invoke(build(), ["objects", "check", str(tmp_path / "set")])
+    told = CliRunner().invoke(build_app(), ["objects", "check", str(tmp_path / "set")])
     assert [line.split()[0] for line in told.stdout.splitlines()] == ["repair", "refuse", "accept"]
     assert "1 of 3 objects were refused: noise" in told.stderr
     (tmp_path / "set" / "noise" / "garbage.stl").unlink()
@@ -66,12 +66,12 @@ def test_without_json_refusals_are_one_line_and_guesses_are_told(tmp_path: Path)
         assert (code, report["verdict"]) == (2, "refuse") and ("allegro" in report["message"]) == (kind == "hands")
     (tmp_path / "o.stl").write_bytes(b"")
     (tmp_path / "none").mkdir()
-    result = CliRunner().invoke(build(), ["objects", "check", str(tmp_path / "o.stl")])
-    told = CliRunner().invoke(build(), ["objects", "check", str(tmp_path / "none")])
+    result = CliRunner().invoke(build_app(), ["objects", "check", str(tmp_path / "o.stl")])
+    told = CliRunner().invoke(build_app(), ["objects", "check", str(tmp_path / "none")])
     assert told.exit_code == 2 and "no mesh" in told.stderr
     assert (result.exit_code, result.stdout) == (2, "")
     assert len(result.stderr.splitlines()) == 1 and "o.stl" in result.stderr
-    said = CliRunner().invoke(build(), ["hands", "check", "barrett", "--no-self-test"]).stdout
+    said = CliRunner().invoke(build_app(), ["hands", "check", "barrett", "--no-self-test"]).stdout
     for word in ("palm", "approach", "fingertips", "dofs", "pre-shape"):
         assert word in said
 
@@ -87,7 +87,7 @@ def test_options_go_over_guesses_drop_fingers_and_weigh() -> None:
 
 @pytest.mark.parametrize("option", ["--approach 1,2", "--approach a,b,c", "--fix thumb", "--pre-shape thumb=x"])
 def test_an_option_that_cannot_be_read_is_the_callers_mistake(option: str) -> None:
-    result = CliRunner().invoke(build(), ["hands", "check", "allegro", *option.split()])
+    result = CliRunner().invoke(build_app(), ["hands", "check", "allegro", *option.split()])
     assert result.exit_code == 2 and option.split()[0] in result.stderr
 
 

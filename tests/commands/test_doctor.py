@@ -43,7 +43,7 @@ def test_gpus_are_validated(
     tmp_path: Path, device: str, there: list[dict[str, Any]], has_driver: bool, condition: Condition, told: str
 ) -> None:
     settings = Settings(data_dir=tmp_path, device=device)
-    found = doctor.gpu(settings, child=gpus(*there, driver=[12, 8]), has_driver=lambda: has_driver)
+    found = doctor.check_gpu(settings, child=gpus(*there, driver=[12, 8]), has_driver=lambda: has_driver)
     assert found.condition is condition, found
     assert told in found.message
     assert bool(found.fix) is (condition is not Condition.GOOD)
@@ -51,7 +51,7 @@ def test_gpus_are_validated(
 
 def test_an_engine_that_gives_nonsense_is_bad_with_its_reason(tmp_path: Path) -> None:
     child = says(device="cpu (CPU)", error="scene: ArithmeticError: a ball floats", cache="/cache/warp")
-    found = doctor.kernels(Settings(data_dir=tmp_path), child=child)
+    found = doctor.check_kernels(Settings(data_dir=tmp_path), child=child)
     assert not found.ok and "a ball floats" in found.message
     assert "/cache/warp" in found.fix
 
@@ -61,7 +61,7 @@ def test_a_driver_that_crashes_or_hangs_takes_only_the_child_with_it(tmp_path: P
         return subprocess.CompletedProcess([], -signal.SIGSEGV, "", "")
 
     hang = Mock(side_effect=subprocess.TimeoutExpired([], 120.0))
-    for look in (doctor.gpu, doctor.kernels):
+    for look in (doctor.check_gpu, doctor.check_kernels):
         for child, told in ((crash, "signal 11"), (hang, "no answer within 120 s")):
             found = look(Settings(data_dir=tmp_path), child=child)
             assert not found.ok and told in found.message

@@ -27,7 +27,7 @@ Floats = np.ndarray[Any, np.dtype[np.float64]]
 
 @pytest.fixture(scope="module")
 def hand() -> HandModel:
-    backend.start()
+    backend.start_warp()
     return hand_from_path("barrett")
 
 

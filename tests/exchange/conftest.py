@@ -17,7 +17,7 @@ from tests.worker.commands_run import graspd
 
 @pytest.fixture(scope="session")
 def hand():
-    backend.start()
+    backend.start_warp()
     return hand_from_path("barrett")
 
 

@@ -25,9 +25,9 @@ from PIL import Image
 from graspd.exchange import dexgraspnet2
 from graspd.exchange.dexgraspnet2 import (
     SceneGraspness,
+    aim_points,
     lines_of_sight,
     load_npz,
-    pointed_at,
     sum_graspness,
     surface_samples,
 )
@@ -306,9 +306,9 @@ def test_more_scenes_than_its_splits_have_numbers_are_told(on_tables: Path, tmp_
 def test_ten_degrees_weigh_as_fifteen_millimetres(degrees: float, best: int) -> None:
     # The first lies 7.5 mm deeper on the line, which is worth five degrees.
     aside = 0.1 * np.tan(np.radians(degrees))
-    assert pointed_at(ABOVE, DOWN, np.array([[0, 0, -0.0075], [aside, 0, 0]])).tolist() == [best]
+    assert aim_points(ABOVE, DOWN, np.array([[0, 0, -0.0075], [aside, 0, 0]])).tolist() == [best]
     # Where no point is seen, the nearest one counts.
-    assert pointed_at(ABOVE, DOWN, np.array([[0.3, 0, 0], [0, 0, 0.12]])).tolist() == [1]
+    assert aim_points(ABOVE, DOWN, np.array([[0.3, 0, 0], [0, 0, 0.12]])).tolist() == [1]
 
 
 def test_pixels_of_the_object_take_what_is_nearest() -> None:
@@ -345,7 +345,7 @@ def test_many_grasps_take_no_more_memory(block) -> None:
         palm = np.random.default_rng(0).normal(size=(count, 3)) * 0.2
         line = -palm / np.linalg.norm(palm, axis=1, keepdims=True)
         tracemalloc.start()
-        sum_graspness(surface, pointed_at(palm, line, surface))
+        sum_graspness(surface, aim_points(palm, line, surface))
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         return peak

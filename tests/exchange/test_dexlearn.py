@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from graspd.exchange import bench_scene, dexgraspbench, dexlearn
 from graspd.exchange.bench_hand import body_names
-from graspd.exchange.plan import held_out, pictures_without_pixels
+from graspd.exchange.plan import held_out_objects, pictures_without_pixels
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import apply, invert, pose_to_matrix
 from graspd.service.readers import Pictures, open_shards
@@ -183,6 +183,6 @@ def test_without_pictures_nothing_to_see_is_told(on_tables: Path, tmp_path: Path
 def test_objects_of_the_same_files_are_held_out_together() -> None:
     digests = {"mug": "1", "cup": "1", "bowl": "2", "pan": "3", "pot": "4"}
     for share in (0.01, 0.3, 0.5, 0.99):
-        out = held_out(digests, share)
+        out = held_out_objects(digests, share)
         assert out and out < set(digests) and ("mug" in out) == ("cup" in out)
-    assert held_out({"mug": "1", "cup": "1"}, 0.5) == frozenset()
+    assert held_out_objects({"mug": "1", "cup": "1"}, 0.5) == frozenset()

@@ -15,8 +15,8 @@ from graspd.commands.studies import _read_maps as read_stability
 from graspd.exchange import dexgraspbench, dexgraspnet2, graspgen, published
 from graspd.exchange.bench_hand import _read as read_mapping
 from graspd.exchange.bench_scene import object_of_scene, save_record
-from graspd.exchange.imported import Origin, joints_by_name, load_npy, scaled_object, verdicts
-from graspd.exchange.inputs import expand, load_case
+from graspd.exchange.imported import Origin, joints_by_name, load_npy, parse_verdicts, scaled_object
+from graspd.exchange.inputs import expand_path, load_case
 from graspd.exchange.published import friction
 from graspd.exchange.scoring import write_scored
 from graspd.service.model.errors import InputError
@@ -158,7 +158,7 @@ def test_published_reference_grasps_come_in_by_name(shared_data: Path) -> None:
 
 
 def test_verdicts_are_known_or_not_and_two_scales_are_two_objects() -> None:
-    assert verdicts([1, 0, True, None, "yes", 300, float("nan")]).tolist() == [1, 0, 1, -1, -1, -1, -1]
+    assert parse_verdicts([1, 0, True, None, "yes", 300, float("nan")]).tolist() == [1, 0, 1, -1, -1, -1, -1]
     # What is kept of a pair between calls is found by digest.
     assert len({scaled_object("block", scale).digest for scale in (1.0, 0.5, 2.0)}) == 3
 
@@ -224,7 +224,7 @@ REFUSED = {
     "no import format 'foo'": lambda at: read_sets("foo", at, "h", "o", {}),
     "give --hand and --object": lambda at: read_sets("ddgc", at, None, "o", {}),
     "--robot and --name": lambda at: read_sets("multidex", at, "h", "o", {"robot": ""}),
-    "no shards": expand,
+    "no shards": expand_path,
     r"nothing\.h5 does not exist": lambda at: load_case(at / "nothing.h5"),
     "name both: --hand and --object": load_case,
     "no file of reference grasps: KeyError": lambda at: load_case(listed(at, "{}")),

@@ -62,7 +62,7 @@ def test_its_grasps_are_ours_with_their_verdicts(data, hand, block, stored) -> N
     record = record_of(data, "block")
     poses, mask = np.array(record["grasps"]["transforms"]), np.array(record["grasps"]["object_in_gripper"])
     assert poses.shape == (8, 4, 4) and mask.dtype == bool
-    np.testing.assert_array_equal(mask, validity.valid(stored.arrays))
+    np.testing.assert_array_equal(mask, validity.valid_mask(stored.arrays))
     assert len(poses[mask]) + len(poses[~mask]) == 8
     joints = np.array(record["grasps"]["grasp_joints"])
     tip = hand.fingertips[0]
@@ -80,7 +80,7 @@ def test_hands_are_turned_into_its_convention_and_jaws_close_along_x(data: Path,
     matrix = Rotation.from_quat(turn).as_matrix()  # x y z w, as SciPy has it
     np.testing.assert_allclose(matrix[:, 2], hand.palm.approach, atol=1e-12)
     assert place == [0, 0, 0] and said["width"] > 0.05 and said["depth"] > 0.02
-    said = graspgen.convention(gripper())
+    said = graspgen.gripper_convention(gripper())
     turn = Rotation.from_quat(said["transform_offset_from_asset_to_graspgen_convention"][1]).as_matrix()
     assert np.abs(turn[:, 0]) == pytest.approx([1, 0, 0], abs=1e-9) and turn[:, 2] == pytest.approx([0, 0, 1], abs=1e-9)
     assert said["width"] == pytest.approx(OPENING, abs=1e-5)

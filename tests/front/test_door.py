@@ -10,7 +10,7 @@ from unittest.mock import Mock
 import pytest
 from typer.testing import CliRunner
 
-from graspd.cli import build
+from graspd.cli import build_app
 from graspd.commands.exchange import EXPORTS, IMPORTS
 from graspd.service.cli import run_command_line
 from tests.shell import completed
@@ -120,7 +120,7 @@ ABSENT = (
 
 def refused(command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     monkeypatch.chdir(tmp_path)
-    done = CliRunner().invoke(build(), command.split(), env={"GRASPD_API_URL": "http://127.0.0.1:9"})
+    done = CliRunner().invoke(build_app(), command.split(), env={"GRASPD_API_URL": "http://127.0.0.1:9"})
     assert done.exit_code == 2, done.output
     line = done.stderr.splitlines()[-1]
     assert line.startswith("graspd: ") and not any(word in done.stderr for word in FOREIGN), done.stderr

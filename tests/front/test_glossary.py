@@ -6,7 +6,7 @@ import re
 import pytest
 import typer
 
-from graspd.cli import COMMANDS, build, load
+from graspd.cli import COMMANDS, build_app, load
 from graspd.service.settings import Settings
 from graspd.service.store.columns import ATTRIBUTES, SCHEMAS
 from tests.conftest import PACKAGES, REPOSITORY
@@ -34,7 +34,7 @@ def names() -> dict[str, set[str]]:
             found["class"] |= {name for name in classes if not name.startswith("_")}
     found["setting"] = set(Settings.model_fields)
     found["column"] = {path for columns in SCHEMAS.values() for path in columns} | set(ATTRIBUTES)
-    root = typer.Context(typer.main.get_command(build()))
+    root = typer.Context(typer.main.get_command(build_app()))
     for name, module in {row[0]: row[1] for row in COMMANDS}.items():
         commands = [load(module, name, root)]
         while commands:

@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 import graspd.cli
-from graspd.cli import build
+from graspd.cli import build_app
 from tests.shell import completed
 
 OFFERED = {"": "synth", "admin ker": "kernels", "admin index re": "rebuild", "datasets cr": "create"}
@@ -55,12 +55,12 @@ UNIT = re.compile(r"\[\w+\]|\b(mm|kg|kg/m3|metres|coefficient|share|candidates)\
     ],
 )
 def test_a_mistake_is_one_line(command: str, line: str) -> None:
-    done = CliRunner().invoke(build(), command.split(), prog_name="graspd", env={"GRASPD_API_URL": "nobody"})
+    done = CliRunner().invoke(build_app(), command.split(), prog_name="graspd", env={"GRASPD_API_URL": "nobody"})
     assert done.exit_code == 2 and done.stderr.startswith(f"graspd: {line}") and done.stderr.count("\n") == 1
 
 
 def test_a_group_without_a_command_shows_its_help() -> None:
-    done = CliRunner().invoke(build(), ["tags"], prog_name="graspd")
+    done = CliRunner().invoke(build_app(), ["tags"], prog_name="graspd")
     assert done.exit_code == 2 and not done.stderr and "Usage: graspd tags" in done.stdout
 
 

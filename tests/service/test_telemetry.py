@@ -54,8 +54,8 @@ def test_a_line_is_one_json_object_with_process_message_and_trace(written: Calla
 
 def test_lines_are_about_what_was_bound_around_them_in_their_thread(written: Callable[[], str]) -> None:
     telemetry.set_up_logs(Settings())
-    with telemetry.bind(request="r1", key=""):
-        with telemetry.bind(job="j1"):
+    with telemetry.bind_subjects(request="r1", key=""):
+        with telemetry.bind_subjects(job="j1"):
             log.info("inside", extra={"task": "t1"})
             thread = threading.Thread(target=lambda: log.info("elsewhere"))
             thread.start()
@@ -70,7 +70,7 @@ def test_lines_are_about_what_was_bound_around_them_in_their_thread(written: Cal
 def test_on_a_terminal_a_message_is_one_line_of_text(written: Callable[[], str]) -> None:
     telemetry.set_up_logs(Settings(log_format="text", log_level="WARNING"))
     log.info("quiet")
-    with telemetry.bind(job="j1"):
+    with telemetry.bind_subjects(job="j1"):
         log.warning("GET %s", "/a\r\n12:00:00 ERROR forged\x1b[2J\x9b0m\u2028\u202e")
     said = r" WARNING graspd.test GET /a\r\n12:00:00 ERROR forged\x1b[2J\x9b0m\u2028\u202e [job=j1]"
     (line,) = written().splitlines()

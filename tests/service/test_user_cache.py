@@ -51,10 +51,10 @@ def test_the_longest_unused_entries_go_when_it_is_full(tmp_path: Path) -> None:
 
 def test_it_lies_where_the_environment_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
-    assert user_cache.folder("objects") == tmp_path / "xdg" / "graspd" / "objects"
+    assert user_cache.cache_folder("objects") == tmp_path / "xdg" / "graspd" / "objects"
     monkeypatch.setenv("XDG_CACHE_HOME", "relative")
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    assert user_cache.folder("objects") == tmp_path / "home" / ".cache" / "graspd" / "objects"
+    assert user_cache.cache_folder("objects") == tmp_path / "home" / ".cache" / "graspd" / "objects"
 
 
 @pytest.mark.parametrize("trouble", ["a file", "not writable"])
@@ -70,7 +70,7 @@ def test_a_home_that_cannot_be_written_is_told_once(
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
     monkeypatch.setenv("HOME", str(home))
     with caplog.at_level(logging.WARNING):
-        folders = {user_cache.folder(name) for name in ("objects", "convex", "objects")}
+        folders = {user_cache.cache_folder(name) for name in ("objects", "convex", "objects")}
     private = tmp_path / f"graspd-cache-{os.geteuid()}"
     assert folders == {private / "objects", private / "convex"}
     assert private.stat().st_mode & 0o777 == 0o700
@@ -84,7 +84,7 @@ def test_a_folder_that_others_can_write_is_not_used(tmp_path: Path, monkeypatch:
     planted = tmp_path / f"graspd-cache-{os.geteuid()}"
     planted.mkdir()
     planted.chmod(0o777)
-    file = user_cache.folder("objects") / "a.npz"
+    file = user_cache.cache_folder("objects") / "a.npz"
     user_cache.store(file, b"x")
     assert user_cache.load(file) is None
     assert list(planted.iterdir()) == []

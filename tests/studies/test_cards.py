@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from PIL import Image
 from typer.testing import CliRunner
 
-from graspd.cli import build
+from graspd.cli import build_app
 from graspd.service.model import names
 from graspd.service.model.errors import InputError
 from graspd.service.model.metrics import BANDS, SECTORS, evenness
-from graspd.service.model.planning import message_of, plan
+from graspd.service.model.planning import message_of, plan_tasks
 from graspd.service.model.records import JobRecord, Snapshot
 from graspd.service.model.states import Stage
 from graspd.service.model.transforms import quat_from_axis_angle
@@ -37,8 +37,8 @@ from graspd.studies.cards import contents as card_contents
 from graspd.studies.cards.card import write_card
 from graspd.studies.cards.contents import AssetFacts, Contents, contents_of_folder, contents_of_store, with_provenance
 from graspd.studies.cards.findings import findings
-from graspd.studies.cards.numbers import numbers, share
-from graspd.studies.cards.page import head, render_card
+from graspd.studies.cards.numbers import card_content, share
+from graspd.studies.cards.page import render_card, yaml_head
 from graspd.studies.cards.plots import draw
 from graspd.studies.cards.tally import CellTally, JointUse, Tally, cell_counts, elevations, tally_of
 from graspd.worker.hands.load import hand_from_path
@@ -77,7 +77,7 @@ class Case:
 
 def case(folder: Path, *, drawn: bool = True, **options: Any) -> Case:
     services = dataset(folder, **options)
-    snapshot = actions.snapshot(services, NAME)[0]
+    snapshot = actions.take_snapshot(services, NAME)[0]
     contents = contents_of_store(services.store, NAME, cache=folder / "cache")
     if drawn:
         card = write_card(contents, folder / "card", licence="CC-BY-4.0")
@@ -89,7 +89,7 @@ def case(folder: Path, *, drawn: bool = True, **options: Any) -> Case:
 
 
 def undrawn(contents: Contents) -> dict[str, Any]:
-    return numbers(contents, tally_of(contents, card_contents.read_shards(contents)))
+    return card_content(contents, tally_of(contents, card_contents.read_shards(contents)))
 
 
 @pytest.fixture(scope="module")
@@ -116,9 +116,9 @@ def dataset(folder: Path, change: Any = None, fails: Any = None, grasps: int = 4
     actions.create(services, DatasetRequest.model_validate(wanted))
     plan_all(services)
     for cell in services.index.datasets.cells(NAME, limit=200).items:
-        record = read_record(JobRecord, services.store, names.job_record(cell.job_id))
+        record = read_record(JobRecord, services.store, names.job_record_key(cell.job_id))
         if (cell.hand, cell.object) == fails:
-            fail_task(services, record.id, next(plan(record)), kind="MeshError", reason="the mesh is torn")
+            fail_task(services, record.id, next(plan_tasks(record)), kind="MeshError", reason="the mesh is torn")
         else:
             _finish(services, record, change)
     return services
@@ -127,7 +127,7 @@ def dataset(folder: Path, change: Any = None, fails: Any = None, grasps: int = 4
 def _finish(services, record: JobRecord, change: Any) -> None:
     request, base = record.request, dict[str, Array]()
     place = {"scene": json_attribute(request.place.model_dump(mode="json"))} if request.in_scene else {}
-    for task in plan(record):
+    for task in plan_tasks(record):
         rng = np.random.default_rng([task.batch, *map(ord, request.hand + request.object)])
         if task.stage is Stage.SYNTHESIZE:
             joints = hand_from_path(request.hand).joint_names
@@ -274,7 +274,7 @@ def test_the_command_writes_the_card_of_a_dataset(kitchen: Case, tmp_path: Path,
 )
 def test_a_mistake_is_one_line_and_exit_2(kitchen, tmp_path, monkeypatch, words: str, says: str) -> None:
     monkeypatch.setenv("GRASPD_DATA_DIR", str(kitchen.folder.parent))
-    done = CliRunner().invoke(build(), [*f"datasets card {words} -o".split(), str(tmp_path / "out")])
+    done = CliRunner().invoke(build_app(), [*f"datasets card {words} -o".split(), str(tmp_path / "out")])
     assert done.exit_code == 2 and len(done.stderr.strip().splitlines()) == 1
     assert says in done.stderr and not (tmp_path / "out").exists()
 
@@ -294,17 +294,17 @@ def matrix(valid: int) -> tuple[Contents, Tally]:
 
 def test_the_card_of_many_objects_is_folded_and_bounded(tmp_path: Path) -> None:
     contents, tally = matrix(40)
-    text = render_card(numbers(contents, tally), {})
+    text = render_card(card_content(contents, tally), {})
     assert "<details><summary>Objects: 200</summary>" in text
     assert "Licence not recorded** for 200 objects" in text and "and 192 more" in text
-    plots = draw(numbers(contents, tally), tally, tmp_path)
+    plots = draw(card_content(contents, tally), tally, tmp_path)
     assert {"yield.png", "quality.png", "sizes.png"} == set(plots)
     for name in plots:
         with Image.open(tmp_path / name) as picture:
             assert picture.height < 1200, name
     for valid, words in ((4, "n<1K"), (40, "1K<n<10K"), (5_000, "1M<n<10M")):
         contents, tally = matrix(valid)
-        assert head(numbers(contents, tally))["size_categories"] == [words]
+        assert yaml_head(card_content(contents, tally))["size_categories"] == [words]
 
 
 def closed(tmp_path: Path, *, drawn: bool = False, **options) -> Case:

@@ -12,15 +12,15 @@ from matplotlib.text import Text
 
 from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.model.studies import FILTERED, IN_SCENE
-from graspd.service.pipeline.fidelity_choice import cheapest
-from graspd.service.store.records import latest
+from graspd.service.pipeline.fidelity_choice import cheapest_fidelity
+from graspd.service.store.records import latest_record
 from graspd.service.store.store import open_store
 from graspd.studies.chart.chart import settings_of
-from graspd.studies.chart.figure import Label, place
+from graspd.studies.chart.figure import Label, place_labels
 from graspd.studies.chart.report import markdown
-from graspd.studies.chart.scenes import figures
-from graspd.studies.chart.scenes import summed as summed_in_scenes
-from graspd.studies.chart.statistics import METRICS, first_valid, summed
+from graspd.studies.chart.scenes import lift_figures
+from graspd.studies.chart.scenes import summarise_runs as summed_in_scenes
+from graspd.studies.chart.statistics import METRICS, first_valid, summarise_runs
 from graspd.studies.chart.sweeps import KnobValue, _make, knob_values, query_per_velocity
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.load import hand_from_path
@@ -79,7 +79,7 @@ def test_all_files_are_written_and_agree(made: tuple[dict, Path]) -> None:
     found, folder = made
     assert_written(folder, found, "gsr")
     assert "The best ten by epsilon" in (folder / "chart.md").read_text()
-    stored = latest(open_store((folder / "data" / "store").as_uri()), "charts")
+    stored = latest_record(open_store((folder / "data" / "store").as_uri()), "charts")
     assert stored is not None and stored["runs"] == found["runs"]
 
 
@@ -135,20 +135,20 @@ def run_of(method: str, valid: int, seconds: float, pd: float) -> dict:
 
 
 def test_sums_divide_all_valid_by_all_seconds() -> None:
-    (row,) = summed([run_of("a", 8, 1.0, 0.1), run_of("a", 2, 4.0, 0.3)])
+    (row,) = summarise_runs([run_of("a", 8, 1.0, 0.1), run_of("a", 2, 4.0, 0.3)])
     assert row["valid_per_second"] == pytest.approx(10 / 5.0)
     assert row["end_to_end_per_second"] == pytest.approx(10 / 10.0)
     assert row["gsr"] == row["dexgraspbench"] == pytest.approx(0.5) and row["pd_mm"] == pytest.approx(0.2)
-    able, unable = summed([run_of("a", 5, 1.0, 0.5), run_of("b", 0, 0.1, 0.0)])
+    able, unable = summarise_runs([run_of("a", 5, 1.0, 0.5), run_of("b", 0, 0.1, 0.0)])
     assert able["front"] == ["dexgraspbench", "hard", "robust", "gsr", "epsilon", "pd_mm"]
     assert unable["front"] == [] and unable["robust"] is None and unable["seconds_to_first_valid"] is None
-    fast, gentle = summed([run_of("a", 5, 1.0, 0.5), run_of("b", 5, 2.0, 0.1)])
+    fast, gentle = summarise_runs([run_of("a", 5, 1.0, 0.5), run_of("b", 5, 2.0, 0.1)])
     assert "pd_mm" in fast["front"] and gentle["front"] == ["pd_mm"]
 
 
 def test_a_ratio_to_a_method_without_a_valid_grasp_is_a_bound() -> None:
     """5 valid/s against 0 of 10 at 50 grasps/s: at most 3 of 10 hold, so at least a third of a time more."""
-    rows = summed([run_of("fast_graspd", 10, 1.0, 0.5), run_of("graspit", 0, 0.1, 0.0)])
+    rows = summarise_runs([run_of("fast_graspd", 10, 1.0, 0.5), run_of("graspit", 0, 0.1, 0.0)])
     chart = {"summary": rows, "runs": [], "by_hand": {}, "models": 8, "friction": 1.0, "threshold_m": 0.005}
     chart |= {"created": "", "device": "", "threads": 2, "versions": {"graspd": "", "warp": ""}}
     assert "> × 0.333 (0 of 10 valid)" in markdown(chart | {"validation": {"level": ""}})
@@ -178,7 +178,7 @@ def drawn(points: list[tuple[float, float]]) -> tuple:
     axes.set_xscale("log")
     axes.set_xlim(0.8, 130.0)
     axes.set_ylim(-0.07, 1.07)
-    words = place(figure, [Label(axes, x, y, "draft 9", "black", y_bar=(y - 0.03, y + 0.03)) for x, y in points])
+    words = place_labels(figure, [Label(axes, x, y, "draft 9", "black", y_bar=(y - 0.03, y + 0.03)) for x, y in points])
     figure.draw_without_rendering()
     return axes, words
 
@@ -245,13 +245,13 @@ def test_a_chart_of_earlier_is_published_apart_and_drawn(in_scenes: tuple[dict, 
     found, folder = in_scenes
     graspd("chart --publish --from", folder / "chart.json", "--data-dir", tmp_path, "--out", tmp_path)
     store = open_store((tmp_path / "store").as_uri())
-    stored = latest(store, "scene_charts/table")
-    assert stored is not None and stored["runs"] == found["runs"] and latest(store, "charts") is None
+    stored = latest_record(store, "scene_charts/table")
+    assert stored is not None and stored["runs"] == found["runs"] and latest_record(store, "charts") is None
     assert (tmp_path / "chart.json").read_bytes() == (folder / "chart.json").read_bytes()
     assert (tmp_path / "chart.md").read_text() == (folder / "chart.md").read_text()
     # What it promises is what a job in such a scene is given.
     draft = next(run for run in found["runs"] if run["way"] == IN_SCENE)
-    chosen = cheapest(stored, f"lift>={draft['lift']}", method="fast_graspd", hand="barrett", object_="block")
+    chosen = cheapest_fidelity(stored, f"lift>={draft['lift']}", method="fast_graspd", hand="barrett", object_="block")
     assert chosen == ("draft", "hand and object", draft["lift"])
 
 
@@ -267,7 +267,7 @@ def run_in_scenes(way: str, pair: str, lifted: int, seconds: float, grasps: int 
     counts = {"grasps": grasps, "seconds": seconds, "end_seconds": 2 * seconds, "robust_sum": 0.5 * lifted}
     counts |= dict.fromkeys(("clear_count", "lift_count", "lift_dexgraspbench_count"), lifted) | {"lift_hard_count": 0}
     said = {"way": way, "method": "m", "fidelity": "f", "batch": grasps, "hand": "h", "object": pair, "note": ""}
-    return {**said, **counts, **figures([counts]), "scenes": 1, "seconds_to_first": seconds if lifted else None}
+    return {**said, **counts, **lift_figures([counts]), "scenes": 1, "seconds_to_first": seconds if lifted else None}
 
 
 def test_gain_is_median_of_pairs_in_which_filtering_found_any() -> None:

@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from graspd.commands.evaluate import app
-from graspd.exchange.inputs import Case, expand, load_case
+from graspd.exchange.inputs import Case, expand_path, load_case
 from graspd.service.model.transforms import apply, invert
 from graspd.studies.evaluation import combine, evaluate
 from graspd.worker.control.postures import pregrasp, squeeze
@@ -84,7 +84,7 @@ def test_several_objects_are_weighed_and_seconds_add_up(tmp_path) -> None:
 
 
 def test_published_contacts_lie_on_fingertips_as_we_pose_them(shared_data) -> None:
-    found = expand(shared_data / "reference_grasps")
+    found = expand_path(shared_data / "reference_grasps")
     assert len(found) == 8
     file = next(file for file in found if file.name == "056_tennis_ball.json")
     case, stored = load_case(file), json.loads(file.read_text())["grasps"]

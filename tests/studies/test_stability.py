@@ -18,7 +18,7 @@ from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.model.metrics import Axis
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.studies import MapCell, Stability, StabilityMap, from_json, grade
-from graspd.service.store.records import latest
+from graspd.service.store.records import latest_record
 from graspd.service.store.store import open_store
 from graspd.studies.stability import assets, descents, gradients, integrators, scenes, studies
 from graspd.studies.stability.assets import Coupling, MapOptions, ring_hand
@@ -36,7 +36,7 @@ from graspd.worker.scenes.kinds import supports_of
 from graspd.worker.scenes.trajectory import MARGIN_M
 from graspd.worker.simulation.data import HandState
 from graspd.worker.simulation.model import LossOptions
-from graspd.worker.validation.variant import Variant, draw
+from graspd.worker.validation.variant import Variant, draw_variant
 from tests.worker.commands_run import graspd, refused
 from tests.worker.simulation.test_surroundings import mujoco_room
 
@@ -60,7 +60,7 @@ AMOUNTS = {
 
 @pytest.fixture(scope="module")
 def hand() -> HandModel:
-    backend.start()
+    backend.start_warp()
     return hand_from_path("barrett")
 
 
@@ -111,7 +111,7 @@ def test_a_start_that_is_too_far_is_flagged(pair: Pair) -> None:
 
 
 def test_a_job_whose_every_grasp_is_bad_ends_with_none(hand: HandModel) -> None:
-    crumb = assets.prepared(assets.cube(1), 1e-5)
+    crumb = assets.prepare_mesh(assets.cube(1), 1e-5)
     request = JobRequest(hand="hand", object="crumb", grasps=2, fidelity="draft", budget=2, rechecks=0)
     found = validated_grasps(hand, crumb, request, count=2)
     assert found.candidates == len(found.grasps) + sum(found.rejected.values())
@@ -191,7 +191,7 @@ def test_fingers_open_outward_scale_and_follow_by_ratio() -> None:
 
 
 def test_palm_without_fingers_is_refused_and_three_of_them_hold() -> None:
-    backend.start()
+    backend.start_warp()
     none, three = assets.hand_map(FEW, fingers=(0, 3), couplings=("distal follows",)).cells
     assert none.outcome == "refused" and three.value > 0
     driven = assets.hand_map(FEW, fingers=(3, 5), couplings=("one drive",)).cells
@@ -200,7 +200,7 @@ def test_palm_without_fingers_is_refused_and_three_of_them_hold() -> None:
 
 def validated(monkeypatch: pytest.MonkeyPatch, name: str, amounts: tuple[float, ...]) -> list[MapCell]:
     monkeypatch.setitem(ERRORS, name, replace(ERRORS[name], amounts=amounts))
-    backend.start()
+    backend.start_warp()
     hand, obj = hand_from_path("barrett"), object_from_path("block")
     return model_error_map([hand], obj, MapOptions(3), errors=[name]).cells
 
@@ -214,7 +214,7 @@ def test_the_models_friction_keeps_what_holds_ice_keeps_nothing(monkeypatch: pyt
 @pytest.mark.parametrize("name", ERRORS)
 def test_amounts_within_reach_are_those_that_robust_draws(name: str) -> None:
     hand, rng, (axis, amount) = hand_from_path("barrett"), np.random.default_rng(3), AMOUNTS[name]
-    drawn = [amount(draw(axis, hand, rng)) for _ in range(400)]
+    drawn = [amount(draw_variant(axis, hand, rng)) for _ in range(400)]
     low, high = ERRORS[name].drawn
     assert low - 1e-9 <= min(drawn) and max(drawn) <= high + 1e-9
     # Draws come near the ends, but for that of nothing: the bounds are no wider than they need be.
@@ -290,7 +290,7 @@ def test_maps_of_several_runs_are_drawn_and_published_as_one(tmp_path) -> None:
     given = [part for name in ("first", "second") for part in ("--from", tmp_path / f"{name}.json")]
     graspd("stability --publish", *given, "--out", tmp_path / "out", "--data-dir", tmp_path)
     written = json.loads((tmp_path / "out" / "stability.json").read_text())
-    assert latest(open_store((tmp_path / "store").as_uri()), "stability") == written
+    assert latest_record(open_store((tmp_path / "store").as_uri()), "stability") == written
     found = from_json(written)
     assert {one.name: one.title for one in found.maps} == {"shared": "second", "first": "first", "second": "second"}
     assert found.command == "graspd stability first; graspd stability second"

@@ -17,7 +17,7 @@ import pytest
 from graspd.service.index.queries.grasps import GraspFilter
 from graspd.service.index.rebuild import differences
 from graspd.service.model import names
-from graspd.service.model.planning import plan
+from graspd.service.model.planning import plan_tasks
 from graspd.service.model.states import Priority, Stage, State
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.datasets import actions
@@ -155,7 +155,7 @@ def test_random_kills_lose_nothing_and_repeat_nothing(
 def submitted(system: System, grasps: int, *, span: int) -> str:
     """A job in bulk whose tasks have so many batches."""
     record = job_actions.prepare(system.services, wanted(grasps=grasps), priority=Priority.BULK)
-    return job_actions.enter(system.services, record.model_copy(update={"span": span}))[0].id
+    return job_actions.enter_job(system.services, record.model_copy(update={"span": span}))[0].id
 
 
 def test_the_range_of_a_killed_worker_is_made_again_once(start: Start) -> None:
@@ -177,7 +177,7 @@ def test_the_range_of_a_killed_worker_is_made_again_once(start: Start) -> None:
     assert usual.lease_s + usual.controller_interval_s + usual.retry_backoff_s < RECOVERY_S
     assert differences(system.services.index, system.services.store) == []
     record = record_of(system.services, job)
-    made = [load_shard(system.services.store, Stage.SYNTHESIZE, task.output) for task in plan(record)]
+    made = [load_shard(system.services.store, Stage.SYNTHESIZE, task.output) for task in plan_tasks(record)]
     parts = {shard.attributes["batch"]: shard.attributes["batch_rows"] for shard in made}
     assert parts == {0: "[32, 32, 32]", 3: "[32, 32]"} and len(made) == 2
     rows = np.concatenate([shard["grasp/joint_positions"] for shard in made])
@@ -228,5 +228,5 @@ def test_a_dataset_goes_on_after_everything_was_killed(start: Start) -> None:
     assert len(after) == 2 * len(OBJECTS)
     assert {cell.state for cell in cells_of(system.services, "kitchen")} == {State.SUCCEEDED}
     assert differences(system.services.index, system.services.store) == []
-    taken, _ = actions.snapshot(system.services, "kitchen")
+    taken, _ = actions.take_snapshot(system.services, "kitchen")
     assert taken.complete and len(taken.shards) == len(after)

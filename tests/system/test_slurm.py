@@ -15,7 +15,7 @@ from graspd.service.model.states import State
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
 from graspd.service.queue.connection import redis_url
-from graspd.service.run.address import joining
+from graspd.service.run.address import new_listen_address
 from graspd.service.run.supervisor import Supervisor
 from graspd.service.settings import Settings
 from tests.conftest import REPOSITORY
@@ -53,7 +53,7 @@ def test_preemption_a_lost_node_and_a_time_limit_lose_nothing(tmp_path: Path, sl
     shared = tmp_path / "shared"
     store, quick = (shared / "store").as_uri(), {"controller_interval_s": 0.3, "lease_s": 2.0, "task_s": 0.0}
     settings = Settings(data_dir=tmp_path / "data", store_url=store, **quick)
-    others = joining(settings, shared / "join.env", host="127.0.0.1")
+    others = new_listen_address(settings, shared / "join.env", host="127.0.0.1")
     supervisor = Supervisor(settings, workers=0, api=False, joining=others)
     fakes = command(tmp_path / "bin" / "graspd", "tests.fakes")
     supervisor.start()
@@ -142,7 +142,7 @@ def submitted(shared: Path, slurm: FakeSlurm) -> str:
 
 def test_redis_asks_for_the_password_of_the_file(tmp_path: Path) -> None:
     settings = Settings(data_dir=tmp_path / "data", store_url=(tmp_path / "store").as_uri())
-    others = joining(settings, tmp_path / "shared" / "join.env", host="127.0.0.1")
+    others = new_listen_address(settings, tmp_path / "shared" / "join.env", host="127.0.0.1")
     with Supervisor(settings, workers=0, api=False, joining=others) as supervisor:
         supervisor.wait_ready(PATIENCE_S)
         arguments = Path(f"/proc/{supervisor.pids['redis']}/cmdline").read_bytes().decode()

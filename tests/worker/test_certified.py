@@ -67,7 +67,7 @@ def judge(monkeypatch: pytest.MonkeyPatch, *pushes: Outcome, feasible: bool) -> 
 
     monkeypatch.setattr(generation, "validate", verdicts)
     gate = lambda columns: np.full(len(columns["quality/success"]), feasible, np.uint8)  # noqa: E731
-    monkeypatch.setattr(generation, "passes", gate)
+    monkeypatch.setattr(generation, "passes_gate", gate)
 
 
 def test_tries_count_up_to_the_last_grasp_that_is_kept(hand, monkeypatch) -> None:
@@ -206,7 +206,7 @@ def test_valid_grasps_that_hold_in_no_other_model_are_told_apart(hand, monkeypat
         verdicts = np.where(held[:, None], 0, -1).astype(np.int8) * np.ones((1, models), np.int8)
         return Robustness(verdicts, np.full(verdicts.shape, Axis.POSE, np.uint8), wanted, 0.0)
 
-    monkeypatch.setattr(generation, "robust", nowhere)
+    monkeypatch.setattr(generation, "validate_robustness", nowhere)
     none = validated_grasps(hand, BLOCK, wish(robust=0.5, budget=1, rechecks=0), count=4)
     assert len(none.grasps) == 0 and none.rejected["not_robust"] > 0
     raw = validated_grasps(hand, BLOCK, wish(robust=0.5, want="candidates", rechecks=0), count=4)
@@ -229,7 +229,7 @@ def test_a_part_of_a_part_fills_its_share_of_the_whole() -> None:
 
 def test_a_quiet_part_tells_nothing_and_can_still_be_stopped() -> None:
     told: list[tuple[float, float, str]] = []
-    run = ExecutionContext(progress=lambda *what: told.append(what), cancelled=lambda: True).quiet()
+    run = ExecutionContext(progress=lambda *what: told.append(what), cancelled=lambda: True).without_progress()
     run.progress(1, 1, "done")
     assert not told
     with pytest.raises(TaskCancelled, match="the work was cancelled"):

@@ -22,7 +22,7 @@ from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import BatchRequest, NoStartFound, PlanRequest
 from graspd.worker.pool.pool import MODULES, Pool
-from graspd.worker.rounds import SMALLEST_PART, parts_of
+from graspd.worker.rounds import SMALLEST_PART, split_rows
 from tests.worker.models import assert_same_batch, on_tables
 
 REQUEST = JobOptions(fidelity=resolve_fidelity("draft"), rechecks=2, seed=3)
@@ -123,7 +123,7 @@ def test_the_first_valid_grasps_are_audited_whoever_finds_them(pair, monkeypatch
     [(range(32), 2, [16, 16]), (range(32), 16, [8] * 4), (range(5, 9), 4, [4]), (range(20), 2, [10, 10])],
 )
 def test_parts_are_as_many_as_cores_and_none_is_small(rows: range, cores: int, sizes: list[int]) -> None:
-    parts = parts_of(rows, cores)
+    parts = split_rows(rows, cores)
     assert [len(part) for part in parts] == sizes and [row for part in parts for row in part] == list(rows)
 
 

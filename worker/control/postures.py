@@ -27,7 +27,7 @@ from graspd.worker.grasps import Posture
 from graspd.worker.hands.jaws import jaws_of
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.quality.posed import PostureData, posing_of
+from graspd.worker.quality.posed import PostureData, posture_data_of
 from graspd.worker.simulation.environment import CLEAR_M, PlacedGrasps
 from graspd.worker.simulation.obstacles import body_clearance, obstacle_clearance
 
@@ -68,7 +68,7 @@ def pregrasp(
     Every finger moves away from the object along its contact normals until its points are `CLEARANCE_M` away. It stops
     earlier at other fingers and, for `placed` grasps, at obstacles of the scene. Then the root retreats along the
     palm's approach until contact ends. The root rises where fingers would penetrate a support they may touch."""
-    posing = posing_of(hand, obj, points=_POINTS, device=device)
+    posing = posture_data_of(hand, obj, points=_POINTS, device=device)
     poses, joints = np.zeros((len(grasp), 7)), np.zeros((len(grasp), len(hand.joint_names)))
     for rows in posing.parts(len(grasp)):
         some, scene = grasp.take(rows), placed.take(rows) if placed is not None else None
@@ -80,10 +80,10 @@ def pregrasp(
     return found if placed is None else raise_pregrasps(hand, grasp, found, placed)
 
 
-def wide_open(hand: HandModel, obj: ObjectModel, pregrasp: Posture, placed: PlacedGrasps) -> Floats:
+def wide_open_joints(hand: HandModel, obj: ObjectModel, pregrasp: Posture, placed: PlacedGrasps) -> Floats:
     """Return joint positions (N, J) for the approach, with fingers opened by `WIDE` of their range.
     Fingers open against `HandModel.closing`, and stop before they touch one another or an obstacle."""
-    posing = posing_of(hand, obj, points=_POINTS, device="cpu")
+    posing = posture_data_of(hand, obj, points=_POINTS, device="cpu")
     joints = np.zeros((len(pregrasp), len(hand.joint_names)))
     for rows in posing.parts(len(pregrasp)):
         some, scene = pregrasp.take(rows), placed.take(rows)
@@ -101,7 +101,7 @@ def squeeze(
     """Compute N commanded postures q + Kp^-1 J^T f that press (`worker.control.squeeze`); root unchanged."""
     force = normal_force(obj) if total_normal_force is None else total_normal_force
     if (jaws := jaws_of(hand)) is not None:
-        probe = posing_of(hand, obj, points=_POINTS, device=device).probe
+        probe = posture_data_of(hand, obj, points=_POINTS, device=device).probe
         return jaw_squeeze(probe, jaws, grasp, total_normal_force=force)
     holds = hold_forces(hand, obj, grasp, total_normal_force=force, closing=CLOSING_M, device=device)
     q = hand.reduce(grasp.joint_positions) + holds.torque / hand.stiffness
@@ -120,7 +120,7 @@ def hold_forces(
 ) -> HoldForces:
     """Compute balanced contact forces of N grasps; `HoldForces.residual` predicts whether a grasp holds.
     Fingers without contact press with their points within `closing` [m]."""
-    posing = posing_of(hand, obj, points=_POINTS, device=device)
+    posing = posture_data_of(hand, obj, points=_POINTS, device=device)
     total, reach = normal_force(obj) if total_normal_force is None else total_normal_force, (PRESSING_M, closing)
     found = HoldForces(np.ones(len(grasp)), np.zeros((len(grasp), hand.dofs)))
     for rows in posing.parts(len(grasp)):
@@ -136,12 +136,12 @@ def normal_force(obj: ObjectModel) -> float:
 
 def touching_links(hand: HandModel, obj: ObjectModel, grasp: Posture, *, device: str = "cpu") -> NDArray[np.int32]:
     """Return the number (N,) of the hand's bodies in contact, by the rule of the geometric gate."""
-    return posing_of(hand, obj, points=_POINTS, device=device).touching_links(grasp)
+    return posture_data_of(hand, obj, points=_POINTS, device=device).touching_links(grasp)
 
 
 def fingers_off_object(hand: HandModel, obj: ObjectModel, grasp: Posture, *, device: str = "cpu") -> NDArray[np.bool_]:
     """Return a mask (N,) of grasps with a finger whose distance from the object is in `STANDS_OFF_M`."""
-    return np.asarray(_fingers_off(posing_of(hand, obj, points=_POINTS, device=device), grasp).any(axis=1))
+    return np.asarray(_fingers_off_object(posture_data_of(hand, obj, points=_POINTS, device=device), grasp).any(axis=1))
 
 
 def close_fingers(
@@ -149,28 +149,28 @@ def close_fingers(
 ) -> Posture:
     """Close fingers of N grasps at a distance in `STANDS_OFF_M` until they touch the object.
     A finger that would first meet another finger or an obstacle keeps its posture. Grippers are unchanged."""
-    posing = posing_of(hand, obj, points=_POINTS, device=device)
-    off = _fingers_off(posing, grasp)
+    posing = posture_data_of(hand, obj, points=_POINTS, device=device)
+    off = _fingers_off_object(posing, grasp)
     rows = np.flatnonzero(off.any(axis=1))
     if not len(rows) or jaws_of(hand) is not None:
         return grasp
     pose, finger, joints = grasp.hand_pose[rows], fingers_of_dofs(hand), np.array(grasp.joint_positions, float)
     q, moved = hand.reduce(joints[rows]), off[rows][:, finger] & (finger >= 0)
-    closing = Openings(posing, pose, q, _closed_until_contact(posing, pose, q, moved))
+    closing = Openings(posing, pose, q, _close_until_contact(posing, pose, q, moved))
     closed = closing.without_jams(_blocked_paths(hand, closing, placed.take(rows)))
     reached = posing.finger_gaps(Posture(pose, hand.expand(closed)), FAR_M) < STANDS_OFF_M[0]
     joints[rows] = hand.expand(np.where(moved & reached[:, finger], closed, q))
     return Posture(np.array(grasp.hand_pose, float), joints)
 
 
-def _fingers_off(posing: PostureData, grasp: Posture) -> NDArray[np.bool_]:
+def _fingers_off_object(posing: PostureData, grasp: Posture) -> NDArray[np.bool_]:
     """Return a mask (N, F) of fingers at a distance from the object in `STANDS_OFF_M`."""
     near, far = STANDS_OFF_M
     gap = posing.finger_gaps(grasp, FAR_M)
     return np.asarray((gap > near) & (gap < far))
 
 
-def _closed_until_contact(posing: PostureData, hand_pose: Floats, q: Floats, moved: NDArray[np.bool_]) -> Floats:
+def _close_until_contact(posing: PostureData, hand_pose: Floats, q: Floats, moved: NDArray[np.bool_]) -> Floats:
     """Return dofs (n, D); those `moved` (n, D) are closed until their finger's distance is `CLOSED_M`."""
     hand, count, looks = posing.hand, len(q), CLOSING_STEPS + 1
     step = moved * hand.closing * dof_steps(hand)

@@ -47,7 +47,7 @@ def _set_thread_defaults() -> None:
     runtime.__class__ = Threaded
 
 
-def start() -> None:
+def start_warp() -> None:
     """Initialise Warp once, with warnings only; the note on a missing driver is not printed."""
     global _started
     with _lock:
@@ -86,7 +86,7 @@ def kernel_cache() -> Path | None:
         trouble = "not writable"
     except OSError as error:
         trouble = error.strerror or str(error)
-    folder = user_cache.folder("warp")
+    folder = user_cache.cache_folder("warp")
     log.warning("kernels cannot be cached in %s (%s); they are cached in %s", wanted, trouble, folder)
     return folder
 
@@ -97,7 +97,7 @@ VARIABLE: Final = "GRASPD_KERNELS"
 ARCHITECTURES: Final = (80, 90, 100)
 
 
-def modules() -> list[str]:
+def kernel_modules() -> list[str]:
     names = [
         info.name
         for package in map(import_module, ("graspd.worker", "graspd.baselines", "graspd.studies"))

@@ -77,7 +77,7 @@ def _find_device(wanted: str, number: int | None) -> tuple[str, str]:
         if wanted not in names:
             raise InputError(f"Warp finds no device {wanted!r}; there are: {', '.join(['cpu', *names])}")
         gpus, number = [gpus[names.index(wanted)]], None
-    gpu = select_gpu(gpus, user_cache.folder("gpus"), number=number)
+    gpu = select_gpu(gpus, user_cache.cache_folder("gpus"), number=number)
     return gpu.name, gpu.model
 
 
@@ -86,7 +86,7 @@ def visible_gpus() -> list[Gpu]:
 
     from graspd.worker.engines import backend
 
-    backend.start()
+    backend.start_warp()
     return [Gpu(str(device), str(device.uuid), str(device.name)) for device in wp.get_cuda_devices()]
 
 

@@ -17,7 +17,7 @@ from graspd.service.readers import Clouds
 from graspd.service.readers.clouds import OF_GRASPS
 from graspd.service.store.shards import Shard
 from graspd.worker.files.provenance import hand_of_shard
-from graspd.worker.files.subsets import require_empty
+from graspd.worker.files.subsets import require_empty_folder
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.surface import sample_surface
@@ -30,7 +30,7 @@ def write_clouds(clouds: Clouds, folder: Path, said: Mapping[str, Any]) -> dict[
     An npz has the keys of a sample (docs/how-to/clouds.md), stacked over its C clouds. Arrays with a row per grasp are
     concatenated; `grasp/count` (C,) is the number of rows of each cloud.
     Raises ConflictError: the folder exists and is not empty."""
-    require_empty(folder)
+    require_empty_folder(folder)
     folder.mkdir(parents=True, exist_ok=True)
     done = {"files": 0, "clouds": 0, "empty": 0}
     for _, samples in groupby(clouds, key=lambda sample: sample["shard_id"]):

@@ -9,13 +9,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from graspd.service.model.errors import InputError, one_of
+from graspd.service.model.errors import InputError, choices_text
 from graspd.service.model.transforms import quat_conjugate, quat_rotate
 from graspd.service.store import validity
 from graspd.service.store.shards import Shard
 from graspd.worker.files.provenance import hand_of_shard
 from graspd.worker.grasps import Posture
-from graspd.worker.quality.diversity import distinct, hand_points
+from graspd.worker.quality.diversity import distinct_mask, hand_points
 
 #: Categories over which grasps can be balanced.
 KINDS: Final = ("type", "direction", "face")
@@ -36,7 +36,9 @@ class Balance:
 
     def __post_init__(self) -> None:
         if unknown := [one for one in self.by if one not in KINDS]:
-            raise InputError(f"grasps cannot be balanced by {unknown[0]!r}; choose from {one_of(unknown[0], KINDS)}")
+            raise InputError(
+                f"grasps cannot be balanced by {unknown[0]!r}; choose from {choices_text(unknown[0], KINDS)}"
+            )
         if not self.by:
             raise InputError(f"choose categories to balance: {', '.join(KINDS)}")
 
@@ -44,7 +46,7 @@ class Balance:
         """Return masks of selected grasps: valid, drawn at random by the seed, limited per category.
         Raises InputError: a shard lacks the category."""
         kinds = self._kinds(shards)
-        wanted = np.concatenate([validity.valid(shard.arrays) for shard in shards])
+        wanted = np.concatenate([validity.valid_mask(shard.arrays) for shard in shards])
         if self.min_distance > 0 and wanted.any():
             wanted[np.flatnonzero(wanted)[~self._distinct(shards, wanted)]] = False
         _, kind = np.unique(kinds, axis=0, return_inverse=True)
@@ -73,7 +75,7 @@ class Balance:
         parts = [Posture.from_columns(shard.arrays) for shard in shards]
         pose = np.concatenate([part.hand_pose for part in parts])[wanted]
         joints = np.concatenate([part.joint_positions for part in parts])[wanted]
-        return distinct(hand_points(hand, Posture(pose, joints)), self.min_distance)
+        return distinct_mask(hand_points(hand, Posture(pose, joints)), self.min_distance)
 
 
 def _down_directions(shard: Shard) -> NDArray[np.float64]:

@@ -320,7 +320,7 @@ def base_attributes(
     if outcomes:
         said["outcomes"] = json_attribute(dict(outcomes))
     if request.in_scene:
-        said |= {"scene": json_attribute(request.place.told())} | wrist_attributes(hand)
+        said |= {"scene": json_attribute(request.place.to_attribute())} | wrist_attributes(hand)
     if request.models:
         said["robust"] = json_attribute({"models": request.models, "wanted": request.robust})
     if verdict_key is None:

@@ -16,7 +16,7 @@ from graspd.service.cli import load_settings
 from graspd.service.model.errors import ConflictError, InputError, NotFoundError
 from graspd.service.readers import Shards, open_shards
 from graspd.service.store import validity
-from graspd.service.store.shards import Shard, part_of_shard, place_of, read_shard
+from graspd.service.store.shards import Shard, part_of_shard, read_shard, relative_path_of
 from graspd.service.store.store import open_store
 
 #: Function from the base shards of one hand on one object to a mask (N,) for each shard.
@@ -35,7 +35,7 @@ def shards_of(source: str) -> Shards:
     return open_shards(store, dataset=source)
 
 
-def require_empty(folder: Path) -> None:
+def require_empty_folder(folder: Path) -> None:
     """Raise ConflictError unless a folder to write is new or empty."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ConflictError(f"{folder} exists already; choose another folder")
@@ -46,7 +46,7 @@ def write_subset(shards: Shards, choose: Chooser, out: Path, *, said: Mapping[st
     Shards without selected grasps are left out. All columns of a grasp, including its scene, are unchanged.
     Return the numbers looked_at and kept (grasps), shards (written), and passed_over (shards of scenes and views).
     Raises ConflictError: the folder contains files already. InputError: nothing is selected."""
-    require_empty(out)
+    require_empty_folder(out)
     looked_at = kept = 0
     ready: list[tuple[PurePosixPath, bytes]] = []
     for _, files in groupby(shards.of("base"), key=lambda file: (file.hand, file.object)):
@@ -54,7 +54,7 @@ def write_subset(shards: Shards, choose: Chooser, out: Path, *, said: Mapping[st
         for shard, mask in zip(together, choose(together), strict=True):
             looked_at, kept = looked_at + len(mask), kept + int(mask.sum())
             if mask.any():
-                ready.append((place_of(shard, {one for one, _ in ready}), part_of_shard(shard, mask)))
+                ready.append((relative_path_of(shard, {one for one, _ in ready}), part_of_shard(shard, mask)))
     if not ready:
         raise InputError(f"none of {looked_at} grasps is selected")
     for path, data in ready:
@@ -81,7 +81,7 @@ def select_grasps(base: Shard, *, unvalidated: bool = False, every: bool = False
     if every:
         mask, word = np.ones(count, bool), "grasps of any kind"
     else:
-        mask = validity.selection(base.arrays, unvalidated=unvalidated)
+        mask = validity.selection_mask(base.arrays, unvalidated=unvalidated)
         word = "feasible grasps that are not validated" if unvalidated else "valid grasps"
     if not mask.any():
         raise InputError(f"{base.path or 'the shard'} contains no {word}; {_available_text(base, count)}")
@@ -89,8 +89,8 @@ def select_grasps(base: Shard, *, unvalidated: bool = False, every: bool = False
 
 
 def _available_text(base: Shard, count: int) -> str:
-    waiting = int(validity.selection(base.arrays, unvalidated=True).sum())
-    valid = int(validity.valid(base.arrays).sum())
+    waiting = int(validity.selection_mask(base.arrays, unvalidated=True).sum())
+    valid = int(validity.valid_mask(base.arrays).sum())
     if waiting:
         return f"{waiting} of its {count} are feasible but not validated: select them with --unvalidated"
     if valid:

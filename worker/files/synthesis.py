@@ -15,7 +15,7 @@ from graspd.service.model.domain import BATCH_SIZE, SHAKE_NEEDS_A_SCENE, JobOpti
 from graspd.service.model.errors import InputError
 from graspd.service.model.local_options import LocalOptions
 from graspd.service.model.metrics import DIRECTION_CELLS, GraspType, entropy_bits
-from graspd.service.model.planning import shortfall, sum_outcomes
+from graspd.service.model.planning import explain_shortfall, sum_outcomes
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.transforms import Floats
 from graspd.service.store.columns import Attribute
@@ -33,11 +33,11 @@ from graspd.worker.files.provenance import (
     wrist_attributes,
 )
 from graspd.worker.generation import ValidatedBatch
-from graspd.worker.grasps import joined_columns
+from graspd.worker.grasps import join_columns
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.objects.options import for_request
+from graspd.worker.objects.options import apply_request
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import planner
 from graspd.worker.planners.registry import local_options
@@ -72,16 +72,16 @@ class SynthesisResult:
         if self.interrupted:
             return f"interrupted: {len(self.arrays['quality/valid'])} of {request.grasps} grasps were finished"
         limit, narrow = self.limit, self.narrow
-        reason = shortfall(
+        reason = explain_shortfall(
             len(self.arrays["quality/valid"]),
             request.grasps,
             request.counted,
             sum(batch.candidates for batch in self.batches),
             request.budget,
             sum_outcomes(batch.outcomes for batch in self.batches),
-            limit.line if limit is not None and limit.is_unreachable else "",
+            limit.line if limit is not None and limit.is_far_exceeded else "",
         )
-        if limit is not None and not limit.is_unreachable:
+        if limit is not None and not limit.is_far_exceeded:
             reason = f"{reason}; {limit.line}"
         return f"{reason}; {narrow}" if reason and narrow else reason
 
@@ -211,7 +211,7 @@ def synthesize_grasps(
         raise InputError(SHAKE_NEEDS_A_SCENE)
     options = dict(mesh or {})
     model = hand_from_path(hand)
-    thing = for_request(object_from_path(obj, face_error_m=request.knobs.face_error_m, options=options), request)
+    thing = apply_request(object_from_path(obj, face_error_m=request.knobs.face_error_m, options=options), request)
     chosen = Device(device).resolve()
     began = time.perf_counter()
     others = [object_from_path(one.object, face_error_m=NEIGHBOUR_FACE_ERROR_M) for one in place.neighbours]
@@ -233,7 +233,7 @@ def synthesize_grasps(
         )
     interrupted = partial and run.cancelled()
     seconds = time.perf_counter() - began
-    arrays = joined_columns([{**batch.grasps.to_columns(), **batch.columns} for batch in batches])
+    arrays = join_columns([{**batch.grasps.to_columns(), **batch.columns} for batch in batches])
     arrays |= {name: poses[name] for name in _KEPT if name in poses}
     attributes = _attributes(model, thing, request, batches, chosen, seconds) | path_attributes(hand, obj, options)
     if interrupted:
@@ -250,7 +250,7 @@ def synthesize_grasps(
 
 def _stored_scene(place: SceneSpec, others: Sequence[ObjectModel]) -> dict[str, Any]:
     """Return the scene as stored in a shard: neighbours by name, not by local file."""
-    said = place.told()
+    said = place.to_attribute()
     for one, other in zip(said["neighbours"], others, strict=True):
         one["object"] = other.name
     return said

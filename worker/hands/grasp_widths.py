@@ -140,9 +140,9 @@ class _PairSearch:
         way = ends[1] - ends[0]
         width = np.sqrt(np.einsum("npi,npi->np", way, way))
         axis = way / width[..., None]
-        cost += DEEP * self._stands_in(place, axis, *ends, width)
+        cost += DEEP * self._penetration(place, axis, *ends, width)
         parts = self.holding[one], self.holding[other]
-        cost += np.maximum(0.0, CLOSES_M - self._closes(q, bodies, axis, parts, ends))
+        cost += np.maximum(0.0, CLOSES_M - self._closing_distance(q, bodies, axis, parts, ends))
         best = cost.argmin(axis=1)
         row = np.arange(len(q))
         middle = 0.5 * (ends[0] + ends[1])
@@ -169,7 +169,7 @@ class _PairSearch:
             parts.append(cost.reshape(len(held), -1))
         return np.concatenate(parts, axis=1)
 
-    def _closes(
+    def _closing_distance(
         self, q: Floats, bodies: Floats, axis: Floats, parts: tuple[Ints, Ints], ends: tuple[Floats, Floats]
     ) -> Floats:
         """Return the distance (n, K) by which two points can approach each other, to first order [m]."""
@@ -181,7 +181,7 @@ class _PairSearch:
         nearer: Floats = np.where(np.abs(rate) > LEVER_M, np.abs(rate) * room, 0.0).sum(axis=2)
         return nearer
 
-    def _stands_in(self, place: Floats, axis: Floats, one: Floats, other: Floats, width: Floats) -> Floats:
+    def _penetration(self, place: Floats, axis: Floats, one: Floats, other: Floats, width: Floats) -> Floats:
         """Return the penetration (n, K) of the hand into cubes between two of its points [m]."""
         ahead = self.hand.palm.approach
         up = ahead - np.einsum("nki,i->nk", axis, ahead)[..., None] * axis

@@ -102,7 +102,7 @@ def _gripper(hand: HandModel, jaws: Jaws, tree: Tree, options: HandOptions) -> H
 def _approach_of_jaws(hand: HandModel, jaws: Jaws) -> Floats:
     """Return the approach of a gripper: perpendicular to the closing line and the axes of hinges."""
     ahead, axis = _unit(_pad_direction(hand, jaws)), jaws.axis[len(jaws.q) // 2]
-    if (line := _joint_direction(hand, ahead, ROUGH, 2, axis)) is not None:
+    if (line := _common_direction(hand, ahead, ROUGH, 2, axis)) is not None:
         return line
     # A root frame that is not aligned with the closing line does not suggest an approach.
     return _snap_to_axis(ahead) if _angle(axis, _root_axis(axis)) < GOOD else ahead
@@ -146,14 +146,14 @@ def guess_approach(hand: HandModel) -> tuple[Floats, bool]:
     Two estimates are added, since their sum has the smallest error. The mean motion of the fingertips during closing
     points out of a human-like palm. The half-closed tips lie ahead of a gripper's palm, but far along the fingers of a
     human-like hand. If fingers oppose each other, the tip motions cancel to a sideways residual or rounding noise: see
-    `_between_fingers`."""
-    ways, ahead = _tip_motions(hand), _unit(_tips_ahead(hand))
+    `_approach_between_fingers`."""
+    ways, ahead = _tip_motions(hand), _unit(_palm_to_tips(hand))
     if _residual_motion(ways, ahead) < OPPOSED:
-        return _between_fingers(hand)
+        return _approach_between_fingers(hand)
     mean = _unit(ways.sum(axis=0)) + ahead
     tied = bool(np.linalg.norm(mean) < CONTRADICTING)
     rough = ahead if tied else _unit(mean)
-    line = _joint_direction(hand, rough, ROUGH, 3)
+    line = _common_direction(hand, rough, ROUGH, 3)
     return (_snap_to_axis(rough) if line is None else line), tied
 
 
@@ -161,7 +161,7 @@ def _tip_motions(hand: HandModel) -> Floats:
     return tip_positions(hand, closing_posture(hand, 0.4)) - tip_positions(hand, closing_posture(hand, 0.05))
 
 
-def _tips_ahead(hand: HandModel) -> Floats:
+def _palm_to_tips(hand: HandModel) -> Floats:
     """Return the vector (3,) from the middle of the palm to the middle of the half-closed hand's tips."""
     body = shared_bodies(hand)[-1]
     pose = body_poses(hand, IDENTITY_POSE, hand.expand(closing_posture(hand, 0.6)))[0, body]
@@ -179,7 +179,7 @@ def _residual_motion(ways: Floats, ahead: Floats) -> float:
     return float(np.linalg.norm(across.sum(axis=0)) / max(np.linalg.norm(across, axis=1).sum(), 1e-12))
 
 
-def _between_fingers(hand: HandModel) -> tuple[Floats, bool]:
+def _approach_between_fingers(hand: HandModel) -> tuple[Floats, bool]:
     """Return the direction out of the palm between opposed fingers, and whether its sign is a tie.
     It runs from finger bases to half-closed tips, normal to a common closing line. Coplanar points give a tie."""
     body = shared_bodies(hand)[-1]
@@ -200,11 +200,11 @@ def _between_fingers(hand: HandModel) -> tuple[Floats, bool]:
             # Unequal numbers of fingers on the two sides shift the mean of their tips.
             along = along - (along @ lines[0]) * lines[0]
     along = _unit(along)
-    line = _joint_direction(hand, along, GOOD, 2)
+    line = _common_direction(hand, along, GOOD, 2)
     return (_snap_to_axis(along, GOOD / 2) if line is None else line), tied
 
 
-def _joint_direction(
+def _common_direction(
     hand: HandModel, rough: Floats, within: float, least: int, beside: Floats | None = None
 ) -> Floats | None:
     """Return a direction within `within` degrees of `rough` that at least `least` lines share; else None.

@@ -81,7 +81,7 @@ class Jaws:
         apart = np.linalg.norm((q[:, None] - self.q) / np.maximum(np.ptp(self.q, axis=0), 1e-9), axis=2)
         return self.speed[np.argmin(apart, axis=1)]
 
-    def at(self, width: Floats) -> tuple[Floats, Floats, Floats]:
+    def nearest_postures(self, width: Floats) -> tuple[Floats, Floats, Floats]:
         """Return dof values (n, D), middles and axes (n, 3) at the available widths nearest to `width` (n,)."""
         order = np.argsort(self.width, kind="stable")
         q, middle, axis = (

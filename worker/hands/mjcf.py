@@ -15,7 +15,7 @@ import numpy as np
 
 from graspd.service.model.errors import HandError
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, compose, invert
-from graspd.worker.hands.mjcf_drives import Couplings, chain_up, commanded, servos
+from graspd.worker.hands.mjcf_drives import Couplings, chain_up, commanded_ranges, servo_parameters
 from graspd.worker.hands.mjcf_source import inline_model
 from graspd.worker.hands.primitives import hull
 from graspd.worker.hands.robot import UNLIMITED_M, Joint, Link, Robot, Shape, build_robot
@@ -61,12 +61,12 @@ class _Reader:
         self._bare = not (model.geom_contype.any() or model.geom_conaffinity.any())
         coupled = Couplings(model, self.joint_name)
         self._mimics, self._faults = coupled.follows, coupled.faults
-        self._servos = servos(model, self._mimics, {j for pulls in coupled.tendons.values() for j in pulls})
+        self._servos = servo_parameters(model, self._mimics, {j for pulls in coupled.tendons.values() for j in pulls})
         self.tendons = {
             name: {self.joint_name(joint): pull for joint, pull in pulls.items()}
             for name, pulls in coupled.tendons.items()
         }
-        self._commanded = commanded(model)
+        self._commanded = commanded_ranges(model)
         self.notes = notes + coupled.notes
 
     def roots(self) -> list[int]:

@@ -39,7 +39,7 @@ class Couplings:
         self.tendons: dict[str, dict[int, float]] = {}
         #: Joints with an unsolved loop, and the error for a hand that moves by them.
         self.faults: dict[int, str] = {}
-        self._driven = [driven(model, actuator) for actuator in range(model.nu)]
+        self._driven = [driven_joints(model, actuator) for actuator in range(model.nu)]
         self._actuated = {joint for pulled in self._driven for joint, _ in pulled}
         active = [equality for equality in range(model.neq) if model.eq_active0[equality]]
         for equality in active:
@@ -86,7 +86,7 @@ class Couplings:
         if np.abs(polynomial[2:]).max() > 1e-9:
             at = np.linspace(*self._range(second), _RANGE_POINTS) - self._rest(second)
             values = np.asarray(np.polynomial.polynomial.polyval(at, polynomial), float)
-            slope, constant, error = _line(at, values)
+            slope, constant, error = _fit_line(at, values)
             self.notes.append(f"{self.name(first)!r} follows {self.name(second)!r} by a line within {error:.2g}")
         offset = self._rest(first) + constant - slope * self._rest(second)
         self.follows[first] = Mimic(self.name(second), slope, offset)
@@ -118,7 +118,7 @@ class Couplings:
             stays = f"stays at {values[0]:.3g}: its limits prevent the motion that its tendon requires"
             self.notes.append(f"{self.name(joint)!r} {stays}")
             return
-        slope, constant, error = _line(at, values)
+        slope, constant, error = _fit_line(at, values)
         self.follows[joint] = Mimic(self.name(driver), slope, constant)
         if error > 1e-6:
             self.notes.append(f"{self.name(joint)!r} follows {self.name(driver)!r} by a line within {error:.2g}")
@@ -194,7 +194,7 @@ class Couplings:
         worst = 0.0
         lines: dict[int, Mimic | float] = {}
         for joint, follower in zip(passive, followers.T, strict=True):
-            slope, constant, error = _line(values, follower)
+            slope, constant, error = _fit_line(values, follower)
             if error > MAX_ERROR_RAD:
                 raise HandError(
                     f"the loop of {driver!r} moves {self.name(joint)!r} nonlinearly (error {error:.2f}); "
@@ -228,7 +228,7 @@ class Couplings:
         return values, solved
 
 
-def _line(at: Floats, values: Floats) -> tuple[float, float, float]:
+def _fit_line(at: Floats, values: Floats) -> tuple[float, float, float]:
     """Return slope, constant and largest error of the best line."""
     slope, constant = map(float, np.polyfit(at, values, 1))
     return slope, constant, float(np.abs(values - constant - slope * at).max())
@@ -313,7 +313,9 @@ def _anchors(model: Any, data: Any, loop: int) -> tuple[Floats, Floats]:
     return points[0], points[1]
 
 
-def servos(model: Any, mimics: Mapping[int, Mimic | float], shared: Collection[int]) -> dict[int, tuple[float, float]]:
+def servo_parameters(
+    model: Any, mimics: Mapping[int, Mimic | float], shared: Collection[int]
+) -> dict[int, tuple[float, float]]:
     """Return effort [N m or N] and stiffness [N m/rad or N/m] of each driven joint; 0 if not stated.
     An actuator of gear g on a length l pulls joint q with g F dl/dq. A position servo of gain k gives the joint the
     stiffness k (g dl/dq)^2. If the actuator drives the joint itself, dl/dq is 1. On a fixed tendon, it is the joint's
@@ -324,7 +326,7 @@ def servos(model: Any, mimics: Mapping[int, Mimic | float], shared: Collection[i
     for actuator in range(model.nu):
         gear = float(model.actuator_gear[actuator, 0])
         rates: dict[int, float] = {}
-        for joint, coefficient in driven(model, actuator):
+        for joint, coefficient in driven_joints(model, actuator):
             driver, rate = _driver(joint, mimics, joint_of)
             if driver is not None:
                 rates[driver] = rates.get(driver, 0.0) + coefficient * rate
@@ -340,7 +342,7 @@ def servos(model: Any, mimics: Mapping[int, Mimic | float], shared: Collection[i
     return found
 
 
-def commanded(model: Any) -> dict[int, tuple[float, float]]:
+def commanded_ranges(model: Any) -> dict[int, tuple[float, float]]:
     """Return the range of equilibrium positions that each joint's position servo can command."""
     found = {}
     for actuator in range(model.nu):
@@ -355,7 +357,7 @@ def commanded(model: Any) -> dict[int, tuple[float, float]]:
     return found
 
 
-def driven(model: Any, actuator: int) -> list[tuple[int, float]]:
+def driven_joints(model: Any, actuator: int) -> list[tuple[int, float]]:
     """Return the joints that an actuator moves, each with the derivative of the actuator's length."""
     kind, target = int(model.actuator_trntype[actuator]), int(model.actuator_trnid[actuator, 0])
     if kind in (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)):

@@ -38,7 +38,7 @@ def mounting_tree(robot: Robot, root: str, options: HandOptions) -> Tree | None:
             break
         value = _value(joint, options)
         if value is None:
-            if len(bodies) > MAX_WRIST_JOINTS or way > MAX_WRIST_M or not _of_wrist(joint):
+            if len(bodies) > MAX_WRIST_JOINTS or way > MAX_WRIST_M or not _is_wrist_joint(joint):
                 break
             # Relative to the child, the parent turns in reverse about the same axis; then its offset follows.
             bodies.append(Body(joint.parent, len(bodies) - 1, replace(joint, axis=-joint.axis), pose))
@@ -46,7 +46,7 @@ def mounting_tree(robot: Robot, root: str, options: HandOptions) -> Tree | None:
         else:
             pose = compose(pose, invert(compose(joint.origin, joint_motion(joint, value))))
         way += float(np.linalg.norm(joint.origin[:3]))
-        links |= {link: (len(bodies) - 1, at) for link, at in _rigid(robot, joint, pose, options).items()}
+        links |= {link: (len(bodies) - 1, at) for link, at in _rigid_link_poses(robot, joint, pose, options).items()}
     if not any(robot.links[link].shapes for link in links):
         return None
     wrist = [body.joint for body in bodies if body.joint is not None]
@@ -62,15 +62,15 @@ def _value(joint: Joint, options: HandOptions) -> float | None:
         return 0.0
     if joint.name in options.fix:
         return options.fix[joint.name]
-    return joint.lower if joint.moves and joint.mimic is None and joint.upper - joint.lower < LEAST_RANGE else None
+    return joint.lower if joint.is_movable and joint.mimic is None and joint.upper - joint.lower < LEAST_RANGE else None
 
 
-def _of_wrist(joint: Joint) -> bool:
-    limited = joint.moves and joint.type == "revolute" and joint.mimic is None
+def _is_wrist_joint(joint: Joint) -> bool:
+    limited = joint.is_movable and joint.type == "revolute" and joint.mimic is None
     return limited and joint.upper - joint.lower <= MAX_WRIST_RANGE
 
 
-def _rigid(robot: Robot, joint: Joint, pose: Floats, options: HandOptions) -> dict[str, Floats]:
+def _rigid_link_poses(robot: Robot, joint: Joint, pose: Floats, options: HandOptions) -> dict[str, Floats]:
     """Return the poses of a joint's parent (`pose`) and of links fixed to it, except the joint's child."""
     found, stack = {joint.parent: pose}, [joint.parent]
     while stack:

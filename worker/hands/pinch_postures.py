@@ -233,11 +233,11 @@ def require_opposing(hand: HandModel) -> None:
 
 @cached_by_content(32)
 def _can_hold(hand: HandModel) -> bool:
-    made = cached_arrays("opposing", (hand.content,), _code(), lambda: {"opposes": np.array(opposes(hand))})
+    made = cached_arrays("opposing", (hand.content,), _code(), lambda: {"opposes": np.array(can_oppose(hand))})
     return bool(made["opposes"])
 
 
-def opposes(hand: HandModel) -> bool:
+def can_oppose(hand: HandModel) -> bool:
     """Check whether points on different bodies face each other in some posture over an adjustable gap."""
     points = sample_surface(hand, _CHECKED_POINTS)
     rng = np.random.default_rng(0)

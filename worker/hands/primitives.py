@@ -15,7 +15,7 @@ from graspd.service.model.errors import HandError
 from graspd.service.model.transforms import Floats, quat_rotate
 from graspd.worker.hands.robot import Ints
 from graspd.worker.objects.disk_cache import cached_step
-from graspd.worker.objects.topology import directed_edges, face_areas, face_vectors, on_faces, outward_hull
+from graspd.worker.objects.topology import directed_edges, face_areas, face_vectors, outward_hull, points_on_faces
 
 if TYPE_CHECKING:
     from graspd.worker.hands.model import ConvexPiece
@@ -27,11 +27,11 @@ SEGMENTS = 32
 def hull(points: Floats) -> tuple[Floats, Ints]:
     """Compute corners (V, 3) and outward triangles (F, 3) of the convex hull of points (N, 3).
     Raises HandError: the points lie in a plane."""
-    made = cached_step("hull", [points], lambda: new_hull(points))
+    made = cached_step("hull", [points], lambda: compute_hull(points))
     return made["0"], made["1"]
 
 
-def new_hull(points: Floats) -> tuple[Floats, Ints]:
+def compute_hull(points: Floats) -> tuple[Floats, Ints]:
     from scipy.spatial import ConvexHull, QhullError  # slow to load
 
     scale = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
@@ -103,7 +103,10 @@ def sample(
     # Stratified over the faces: each face gets its share of the number, rounded up or down.
     ladder = (np.arange(count) + rng.random()) / max(count, 1) * areas.sum()
     face = np.minimum(np.searchsorted(np.cumsum(areas), ladder, side="right"), len(faces) - 1)
-    points, normals = on_faces(vertices[faces[face]], *rng.random((2, count, 1))), face_vectors(vertices, faces[face])
+    points, normals = (
+        points_on_faces(vertices[faces[face]], *rng.random((2, count, 1))),
+        face_vectors(vertices, faces[face]),
+    )
     return points, normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
 

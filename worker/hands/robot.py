@@ -90,7 +90,7 @@ class Joint:
     """Error for a hand that moves by this joint. Above a hand the joint is fixed and the fault is ignored."""
 
     @property
-    def moves(self) -> bool:
+    def is_movable(self) -> bool:
         return self.type in MOVING and not self.fault
 
 
@@ -127,7 +127,7 @@ def build_robot(
     root = _check_tree(link_of, joint_of, filename)
     _check_limits(joint_of.values(), filename)
     joint_of = {name: _checked_mimic(joint, joint_of, filename) for name, joint in joint_of.items()}
-    if not any(joint.moves for joint in joint_of.values()):
+    if not any(joint.is_movable for joint in joint_of.values()):
         if faults := [joint.fault for joint in joint_of.values() if joint.fault]:
             raise HandError(faults[0])
         raise HandError(f"{filename}: no moving joint; a hand needs at least one revolute or prismatic joint")
@@ -186,7 +186,7 @@ def _check_tree(links: dict[str, Link], joints: dict[str, Joint], filename: str)
 
 def _check_limits(joints: Iterable[Joint], filename: str) -> None:
     """Refuse a robot whose limits are all zero: CAD exporters write zero for unstated limits."""
-    limited = [joint for joint in joints if joint.moves and joint.type != "continuous" and joint.mimic is None]
+    limited = [joint for joint in joints if joint.is_movable and joint.type != "continuous" and joint.mimic is None]
     if limited and all(joint.lower == joint.upper == 0 for joint in limited):
         many = f"all {len(limited)} joints have" if len(limited) > 1 else f"joint {limited[0].name!r} has"
         raise HandError(f"{filename}: {many} limits 0 .. 0: the exporter left them empty; fill them in")
@@ -197,7 +197,7 @@ def _checked_mimic(joint: Joint, joints: dict[str, Joint], filename: str) -> Joi
     seen, at = {joint.name}, joint
     while at.mimic is not None:
         target = joints.get(at.mimic.joint)
-        if target is None or not (target.moves or target.fault):
+        if target is None or not (target.is_movable or target.fault):
             fault = f"{filename}: joint {at.name!r} mimics {at.mimic.joint!r}, which is no moving joint"
         elif target.name in seen:
             fault = f"{filename}: joint {target.name!r} mimics itself through a cycle; free one joint"

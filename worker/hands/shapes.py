@@ -18,13 +18,13 @@ from graspd.service.model.errors import HandError, MeshError
 from graspd.service.model.libraries import version_of
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, quat_to_matrix
 from graspd.worker.hands.model import ConvexPiece
-from graspd.worker.hands.primitives import hull, hull_planes, new_hull, signed_distance, tessellate, volume
+from graspd.worker.hands.primitives import compute_hull, hull, hull_planes, signed_distance, tessellate, volume
 from graspd.worker.hands.robot import Ints, Shape
 from graspd.worker.hands.visuals import find_mesh, merge_and_thin
 from graspd.worker.objects.convex import WorkLimitExceeded, coacd_parts, default_cache, load_parts, save_parts
 from graspd.worker.objects.disk_cache import cached_step
 from graspd.worker.objects.formats import read_mesh
-from graspd.worker.objects.topology import face_areas, on_faces
+from graspd.worker.objects.topology import face_areas, points_on_faces
 
 #: A hull of V corners has at most 2 V - 4 triangles: 96 here. Every plane costs time in each distance query.
 MAX_HULL_VERTICES: Final = 50
@@ -92,7 +92,7 @@ def reduce_hull(points: Floats, limit: int = MAX_HULL_VERTICES) -> tuple[Floats,
 
 
 def _reduce(points: Floats, limit: int) -> tuple[Floats, Ints]:
-    vertices, faces = new_hull(points)
+    vertices, faces = compute_hull(points)
     if len(vertices) <= limit:
         return vertices, faces
     full = volume("hull", (), vertices, faces)
@@ -103,7 +103,7 @@ def _reduce(points: Floats, limit: int) -> tuple[Floats, Ints]:
         if farthest in chosen:
             break
         chosen.append(farthest)
-    corners, faces = new_hull(vertices[chosen])
+    corners, faces = compute_hull(vertices[chosen])
     centre = corners.mean(axis=0)
     growth = (full / volume("hull", (), corners, faces)) ** (1 / 3)
     return centre + (corners - centre) * growth, faces
@@ -114,7 +114,7 @@ def _excess_distance(points: Floats, corners: Floats) -> Floats:
     spread = np.linalg.svd(corners - corners.mean(axis=0), compute_uv=False)
     if len(corners) < 4 or spread[2] < 1e-6 * spread[0]:
         return np.linalg.norm(points[:, None] - corners[None], axis=2).min(axis=1)
-    return signed_distance("hull", (), *new_hull(corners), points)
+    return signed_distance("hull", (), *compute_hull(corners), points)
 
 
 #: Error of a hull above which the mesh is decomposed [m]: an object would rest this far off the finger.
@@ -202,7 +202,7 @@ def _sample(vertices: Floats, faces: Ints) -> Floats:
     areas = face_areas(vertices, faces)
     ladder = (np.arange(_POINTS) + 0.5) / _POINTS * areas.sum()
     face = np.minimum(np.searchsorted(np.cumsum(areas), ladder), len(faces) - 1)
-    return on_faces(vertices[faces[face]], *np.random.default_rng(0).random((2, _POINTS, 1)))
+    return points_on_faces(vertices[faces[face]], *np.random.default_rng(0).random((2, _POINTS, 1)))
 
 
 class _OpenSurface:

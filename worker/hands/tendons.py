@@ -40,7 +40,7 @@ class Tendon:
         return min(float(effort[d]) / abs(c) for d, c in zip(self.dofs, self.coefficients, strict=True))
 
 
-def actuators(tendons: tuple[Tendon, ...], dofs: int) -> Floats:
+def actuator_matrix(tendons: tuple[Tendon, ...], dofs: int) -> Floats:
     """Return the matrix (A, D) from dof values to lengths of the drives, in dof order.
     A tendon has the place of its first dof."""
     rows = np.eye(dofs)

@@ -75,7 +75,7 @@ def build_tree(robot: Robot, options: HandOptions) -> Tree:
     still = {
         joint.name: joint.lower
         for joint in kept
-        if joint.moves
+        if joint.is_movable
         and mimics[joint.name] is None
         and joint.name not in options.fix
         and joint.upper - joint.lower < LEAST_RANGE
@@ -282,7 +282,7 @@ def pick_root(robot: Robot, options: HandOptions) -> str:
             raise HandError(f"link {root!r} is dropped and has {len(children)} children; name the new root link")
         root = children[0]
     tree = _JointTree(robot, options)
-    root = _below_arm(tree, root, options)
+    root = _link_below_arm(tree, root, options)
     if options.palm or tree.reach[root] <= MAX_HAND_M:
         return root
     hands = hand_links(tree, root)
@@ -306,8 +306,8 @@ def hand_links(tree: _JointTree, root: str) -> list[str]:
     queue = deque([root])
     while queue:
         link = queue.popleft()
-        fingers = tree.onward(link)
-        if len(fingers) > 1 and tree.reach[link] <= MAX_FINGER_M and tree.touches(link):
+        fingers = tree.joints_onward(link)
+        if len(fingers) > 1 and tree.reach[link] <= MAX_FINGER_M and tree.has_shaped_branches(link):
             found.append(link)
         else:
             queue.extend(joint.child for joint in fingers)
@@ -325,11 +325,11 @@ class _JointTree:
         """Length of the joints below each link, along the longest chain that moves [m]."""
         for link in self._deepest_first(robot.root):
             children = self._children.get(link, [])
-            self._moves[link] = any(self.free(joint) or self._moves[joint.child] for joint in children)
+            self._moves[link] = any(self.is_free(joint) or self._moves[joint.child] for joint in children)
             ways = [
                 float(np.linalg.norm(joint.origin[:3])) + self.reach[joint.child]
                 for joint in children
-                if self.free_below(joint)
+                if self.is_free_below(joint)
             ]
             self.reach[link] = max(ways, default=0.0)
 
@@ -340,17 +340,17 @@ class _JointTree:
             stack += [joint.child for joint in self._children.get(link, [])]
         return order[::-1]
 
-    def free(self, joint: Joint) -> bool:
+    def is_free(self, joint: Joint) -> bool:
         return joint.type != "fixed" and joint.name not in self.options.fix
 
-    def free_below(self, joint: Joint) -> bool:
-        return self.free(joint) or self._moves[joint.child]
+    def is_free_below(self, joint: Joint) -> bool:
+        return self.is_free(joint) or self._moves[joint.child]
 
-    def onward(self, link: str) -> list[Joint]:
-        return [joint for joint in self._children.get(link, []) if self.free_below(joint)]
+    def joints_onward(self, link: str) -> list[Joint]:
+        return [joint for joint in self._children.get(link, []) if self.is_free_below(joint)]
 
-    def touches(self, link: str) -> bool:
-        return sum(self._has_shape(joint.child) for joint in self.onward(link)) > 1
+    def has_shaped_branches(self, link: str) -> bool:
+        return sum(self._has_shape(joint.child) for joint in self.joints_onward(link)) > 1
 
     def _has_shape(self, link: str) -> bool:
         if self.robot.links[link].shapes:
@@ -358,17 +358,17 @@ class _JointTree:
         return any(self._has_shape(joint.child) for joint in self._children.get(link, []))
 
 
-def _below_arm(tree: _JointTree, root: str, options: HandOptions) -> str:
+def _link_below_arm(tree: _JointTree, root: str, options: HandOptions) -> str:
     """Return the link at which a hand begins: below an arm's last joint before the fingers, else the root."""
     start, at = root, root
     palm = options.palm.link if options.palm else None
     while at != palm:
-        onward = tree.onward(at)
+        onward = tree.joints_onward(at)
         if len(onward) != 1:
             # A tree without branches is a single finger, so nothing above it is an arm.
             return start if onward else root
         (joint,) = onward
         at = joint.child
-        if tree.free(joint):
+        if tree.is_free(joint):
             start = at
     return start

@@ -18,7 +18,7 @@ from graspd.service.store.mesh_files import MAX_NAMES, appearance_files, match_n
 from graspd.worker.hands.primitives import tessellate
 from graspd.worker.hands.robot import Ints, Shape
 from graspd.worker.objects.formats import Nearby, Soup, read_mesh
-from graspd.worker.objects.topology import compact
+from graspd.worker.objects.topology import drop_unused_vertices
 
 #: Largest total number of faces of a hand's visual meshes: more would not change a picture.
 MAX_FACES: Final = 400_000
@@ -126,7 +126,7 @@ def _meshes(item: PlacedShape, files: Mapping[str, bytes], base: str, soups: dic
     winding = 1 if np.prod(scale) > 0 else -1
     found = []
     for colour, chosen in soup.by_colour():
-        points, triangles = compact(vertices, soup.faces[chosen, ::winding])
+        points, triangles = drop_unused_vertices(vertices, soup.faces[chosen, ::winding])
         found.append(VisualMesh(item.body, points, triangles.astype(np.int32), shape.colour or colour))
     return found
 

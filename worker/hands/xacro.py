@@ -29,7 +29,7 @@ _WALL_LIMIT_S: Final = 1800.0
 _READ: Final = (".xacro", ".urdf", ".xml", ".yaml", ".yml")
 
 
-def expand(files: Mapping[str, bytes], main: str, arguments: Mapping[str, str]) -> bytes:
+def expand_xacro(files: Mapping[str, bytes], main: str, arguments: Mapping[str, str]) -> bytes:
     """Expand a xacro file to a URDF, with values of its `<xacro:arg>`.
     Includes and `$(find PACKAGE)` are searched among the hand's files only. Raises HandError: the file cannot be
     expanded, or refers to files outside the hand's folder. OSError: the child was killed or hung; the file is not at
@@ -81,6 +81,6 @@ def read_robot(files: Mapping[str, bytes], main: str, arguments: Mapping[str, st
 
             return read_mjcf(files, main)
         case "xacro":
-            return read_urdf(expand(files, main, arguments or {}), main)
+            return read_urdf(expand_xacro(files, main, arguments or {}), main)
         case _:
             return read_urdf(files[main], main)

@@ -10,7 +10,7 @@ import numpy as np
 from graspd.service.model.errors import AssetError, InputError
 from graspd.service.model.object_options import ObjectOptions
 from graspd.worker.objects.options import parse_options
-from graspd.worker.objects.prepare import apply_options, build, main_file, repaired_mesh
+from graspd.worker.objects.prepare import apply_options, build_model, main_file, repaired_mesh
 from graspd.worker.objects.repair import RepairedMesh
 
 #: Simplification bound of the prepared mesh in the report [m]: that of the standard fidelity.
@@ -47,7 +47,7 @@ def check_object(
 
 
 def _facts(mesh: RepairedMesh, face_error_m: float, options: ObjectOptions) -> dict[str, Any]:
-    model = apply_options(build(mesh, face_error_m), options)
+    model = apply_options(build_model(mesh, face_error_m), options)
     away, extents = float(np.linalg.norm(mesh.centre)), np.ptp(mesh.vertices, axis=0)
     notes = list(mesh.notes)
     if away > FAR * extents.max():

@@ -58,7 +58,7 @@ def union_volume(parts: tuple[Floats, ...]) -> float:
 
 
 def default_cache() -> Path:
-    return user_cache.folder("convex")
+    return user_cache.cache_folder("convex")
 
 
 def load_parts(file: Path) -> tuple[Floats, ...] | None:

@@ -85,7 +85,7 @@ def cached_step(what: str, given: Sequence[NDArray[Any]], make: Callable[[], Seq
 
 def _file(kind: str, terms: tuple[str | int, ...], code: tuple[ModuleType, ...]) -> Path:
     address = digest_json([*terms, _revision(tuple(str(module.__file__) for module in code))])
-    return user_cache.folder(kind) / f"{address}.npz"
+    return user_cache.cache_folder(kind) / f"{address}.npz"
 
 
 def _read(file: Path) -> dict[str, NDArray[Any]] | None:

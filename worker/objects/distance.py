@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspd.service.model.transforms import Floats
-from graspd.worker.objects.topology import Indices, face_vectors, on_faces
+from graspd.worker.objects.topology import Indices, face_vectors, points_on_faces
 
 #: Least number of pieces of a mesh, so that pieces are small relative to the mesh.
 _PIECES = 10_000
@@ -25,7 +25,7 @@ class MeshDistance:
         from scipy.spatial import cKDTree
 
         self._corners = vertices[faces]
-        centres, self._radius, self._face = small_pieces(self._corners, 2, _PIECES)
+        centres, self._radius, self._face = subdivide_triangles(self._corners, 2, _PIECES)
         self._tree = cKDTree(centres)
 
     def __call__(self, points: Floats, enough: float = 0.0) -> Floats:
@@ -56,7 +56,7 @@ class MeshDistance:
         return proven
 
 
-def small_pieces(corners: Floats, factor: float, count: int) -> tuple[Floats, float, NDArray[np.int64]]:
+def subdivide_triangles(corners: Floats, factor: float, count: int) -> tuple[Floats, float, NDArray[np.int64]]:
     """Halve triangles (F, 3, 3) until no side exceeds `factor` * sqrt(total area / `count`).
     Return the centres (P, 3) of the pieces, their largest radius, and the triangle (P,) of each."""
     a, b, c = np.moveaxis(corners, 1, 0)
@@ -103,7 +103,7 @@ def sample_faces(vertices: Floats, faces: Indices, count: int, seed: int = 0) ->
     rng = np.random.default_rng(seed)
     ladder = (np.arange(count) + rng.random(count)) / count * areas.sum()
     face = np.minimum(np.searchsorted(np.cumsum(areas), ladder, side="right"), len(faces) - 1)
-    return on_faces(vertices[faces[face]], *rng.random((2, count, 1))), face.astype(np.int64)
+    return points_on_faces(vertices[faces[face]], *rng.random((2, count, 1))), face.astype(np.int64)
 
 
 def point_triangle_distance(points: Floats, triangles: Floats) -> Floats:

@@ -25,7 +25,7 @@ class Document:
         self._meshes: list[dict[str, Any]] = []
         self._materials: list[dict[str, Any]] = []
 
-    def triangles(
+    def add_triangles(
         self,
         vertices: NDArray[Any],
         faces: NDArray[Any],
@@ -45,7 +45,7 @@ class Document:
         padded = np.zeros((len(unique), 4), np.int8)
         padded[:, :3] = unique[:, 1:4]
         attributes = {
-            "POSITION": self.vectors(vertices[unique[:, 0]]),
+            "POSITION": self.add_vectors(vertices[unique[:, 0]]),
             "NORMAL": self._accessor(padded, _BYTE, "VEC3", _ARRAY, {"byteStride": 4}, {"normalized": True}),
         }
         if face_colours is not None:
@@ -58,26 +58,26 @@ class Document:
         primitive: dict[str, Any] = {"attributes": attributes, "indices": indices}
         return primitive if colour is None else primitive | {"material": self._material(colour)}
 
-    def points(self, values: NDArray[Any]) -> dict[str, Any]:
-        return {"attributes": {"POSITION": self.vectors(values)}, "mode": _POINTS}
+    def add_points(self, values: NDArray[Any]) -> dict[str, Any]:
+        return {"attributes": {"POSITION": self.add_vectors(values)}, "mode": _POINTS}
 
     def _material(self, colour: tuple[float, float, float]) -> int:
-        look = {"baseColorFactor": [*plain(colour), 1.0], "metallicFactor": 0.1, "roughnessFactor": 0.6}
+        look = {"baseColorFactor": [*rounded_values(colour), 1.0], "metallicFactor": 0.1, "roughnessFactor": 0.6}
         material = {"pbrMetallicRoughness": look, "doubleSided": True}
         if material not in self._materials:
             self._materials.append(material)
         return self._materials.index(material)
 
-    def vectors(self, values: NDArray[Any]) -> int:
+    def add_vectors(self, values: NDArray[Any]) -> int:
         data = np.ascontiguousarray(values, np.float32)
         bounds = {"min": data.min(axis=0).tolist(), "max": data.max(axis=0).tolist()}
         return self._accessor(data, _FLOAT, "VEC3", _ARRAY, {}, bounds)
 
-    def mesh(self, primitives: list[dict[str, Any]]) -> int:
+    def add_mesh(self, primitives: list[dict[str, Any]]) -> int:
         self._meshes.append({"primitives": primitives})
         return len(self._meshes) - 1
 
-    def bytes(self, nodes: list[dict[str, Any]], extras: dict[str, Any]) -> bytes:
+    def to_bytes(self, nodes: list[dict[str, Any]], extras: dict[str, Any]) -> bytes:
         """Return the file; node 0 is the root of the scene."""
         document = {
             "asset": {"version": "2.0", "generator": "graspd", "extras": extras},
@@ -113,6 +113,6 @@ class Document:
         return len(self._accessors) - 1
 
 
-def plain(values: Any) -> list[float]:
+def rounded_values(values: Any) -> list[float]:
     """Return rounded numbers for a node."""
     return [round(float(value), 7) for value in values]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from graspd.service.model.transforms import Floats
 from graspd.worker.objects import mesh_geometry, topology
-from graspd.worker.objects.distance import MeshDistance, small_pieces, surface_points
+from graspd.worker.objects.distance import MeshDistance, subdivide_triangles, surface_points
 from graspd.worker.objects.mesh_geometry import signed_volume
 from graspd.worker.objects.topology import Indices
 
@@ -32,7 +32,7 @@ _SAMPLES: Final = 4000
 _CHUNK: Final = 200_000
 
 
-def crossings(vertices: Floats, faces: Indices) -> Indices | None:
+def intersecting_faces(vertices: Floats, faces: Indices) -> Indices | None:
     """Find pairs (P, 2) of intersecting faces without common vertex; None if the mesh is too large.
     The broad phase cuts faces into small pieces, and keeps faces whose pieces' balls and whose boxes overlap. The
     narrow phase keeps pairs in which an edge of one face passes through the interior of the other."""
@@ -42,7 +42,7 @@ def crossings(vertices: Floats, faces: Indices) -> Indices | None:
         return None
     corners = vertices[faces]
     # Pieces may be much longer than the edges of an even mesh of so many faces: only long faces are cut.
-    centres, radius, owner = small_pieces(corners, 4, max(len(faces), 2000))
+    centres, radius, owner = subdivide_triangles(corners, 4, max(len(faces), 2000))
     tree = cKDTree(centres)
     if tree.count_neighbors(tree, 2 * radius) > 2 * MAX_PAIRS:
         return None
@@ -106,8 +106,8 @@ def untangle(vertices: Floats, faces: Indices) -> Mesh | None:
         return None
     united = mesh_geometry.from_manifold(manifold3d.Manifold.batch_boolean(pieces, manifold3d.OpType.Add))
     extent = float(np.ptp(vertices, axis=0).max())
-    united = topology.compact(*topology.merge_vertices(*united, 1e-9 * extent))
-    left = crossings(*united) if topology.is_closed(united[1]) else None
+    united = topology.drop_unused_vertices(*topology.merge_vertices(*united, 1e-9 * extent))
+    left = intersecting_faces(*united) if topology.is_closed(united[1]) else None
     if left is None or len(left) or not 0 < signed_volume(*united) <= signed_volume(vertices, faces):
         return None
     strayed = MeshDistance(vertices, faces).largest(surface_points(*united, _SAMPLES))
@@ -119,7 +119,7 @@ def _split_recursively(piece: Any, halvings: int) -> list[Any] | None:
     parts: list[Any] = []
     for part in piece.decompose():
         mesh = mesh_geometry.from_manifold(part)
-        crossed = crossings(*mesh)
+        crossed = intersecting_faces(*mesh)
         if crossed is None or part.volume() <= 0:
             return None
         if not len(crossed):

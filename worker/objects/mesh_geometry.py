@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from graspd.service.model.transforms import Floats, quat_rotate
-from graspd.worker.grasps import moved
+from graspd.worker.grasps import move_poses
 from graspd.worker.objects.model import Ints
 from graspd.worker.objects.topology import FaceIndices, Indices, face_vectors, parts_of_graph
 
@@ -79,7 +79,7 @@ def corner_normals(vertices: Floats, faces: Ints, crease_deg: float = CREASE_DEG
     return normals.reshape(-1, 3, 3)
 
 
-def points_in(corners: Floats, u: Floats, v: Floats) -> Floats:
+def points_on_triangles(corners: Floats, u: Floats, v: Floats) -> Floats:
     """Return points (n, 3) of triangles (n, 3, 3), uniform for uniform numbers u, v (n, 1) in [0, 1)."""
     u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
     return corners[:, 0] + u * (corners[:, 1] - corners[:, 0]) + v * (corners[:, 2] - corners[:, 0])
@@ -131,13 +131,13 @@ def union(solids: list[Any]) -> Any:
     return manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Add)
 
 
-def groups(pieces: list[Any], gap: float) -> list[list[Any]]:
+def group_solids(pieces: list[Any], gap: float) -> list[list[Any]]:
     """Group solids connected over gaps of at most `gap`, the group of the largest volume first."""
     low, high = np.moveaxis(np.reshape([piece.bounding_box() for piece in pieces], (-1, 2, 3)), 1, 0)
     pairs = [
         (i, j)
         for i, piece in enumerate(pieces)
-        for j in (i + 1 + np.flatnonzero(_apart(low, high, i) <= gap * (1 + _ROUNDING))).tolist()
+        for j in (i + 1 + np.flatnonzero(_box_separation(low, high, i) <= gap * (1 + _ROUNDING))).tolist()
         if piece.min_gap(pieces[j], 2 * gap) <= gap * (1 + _ROUNDING) and not _nested(piece, pieces[j])
     ]
     one, other = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
@@ -152,7 +152,7 @@ def _nested(a: Any, b: Any) -> bool:
     return bool((small - large).is_empty())
 
 
-def _apart(low: Floats, high: Floats, i: int) -> Floats:
+def _box_separation(low: Floats, high: Floats, i: int) -> Floats:
     return np.asarray(np.linalg.norm(np.maximum(0, np.maximum(low[i] - high[i + 1 :], low[i + 1 :] - high[i])), axis=1))
 
 
@@ -174,7 +174,7 @@ class CentredMesh:
     """Spacing of the file's numbers at the mesh's position."""
 
 
-def centred(points: Floats) -> CentredMesh:
+def centre_points(points: Floats) -> CentredMesh:
     """Centre points (V, 3), rounded so that they do not depend on the origin.
     If all coordinates are decimals within the precision of the file's numbers, they become these decimals. A mesh of
     decimals is then identical at every distance that the numbers resolve."""
@@ -204,12 +204,12 @@ def shift_frame(pose: ArrayLike, by: ArrayLike) -> Floats:
     return pose
 
 
-def to_centre(pose: ArrayLike, centre: ArrayLike) -> Floats:
+def to_centred_frame(pose: ArrayLike, centre: ArrayLike) -> Floats:
     """Convert poses (..., 7) of the file's frame to the centred frame, whose origin is `centre` (3,).
     The result is on a grid, so that the round trip gives the same bits."""
-    return moved(shift_frame(pose, centre), np.zeros(3))
+    return move_poses(shift_frame(pose, centre), np.zeros(3))
 
 
-def to_file(pose: ArrayLike, centre: ArrayLike) -> Floats:
+def to_file_frame(pose: ArrayLike, centre: ArrayLike) -> Floats:
     """Convert poses (..., 7) of the centred frame to the file's frame."""
     return shift_frame(pose, -np.asarray(centre, float))

@@ -68,7 +68,7 @@ class ObjectModel:
         vertices, hull, mass = self.about_centre[:count], self.about_centre[count:-1], self.about_centre[-1]
         return self._in_frame(vertices, hull, mass, (0.0, 0.0, 0.0), None)
 
-    def at(self, centre: tuple[float, float, float]) -> ObjectModel:
+    def place_at(self, centre: tuple[float, float, float]) -> ObjectModel:
         """Return a centred object in a frame in which the object's middle is at `centre` [m]."""
         if not any(centre):
             return self

@@ -45,7 +45,7 @@ def stated_options(files: Mapping[str, bytes], error: type[AssetError]) -> dict[
     return stated
 
 
-def for_request(obj: ObjectModel, request: JobOptions) -> ObjectModel:
+def apply_request(obj: ObjectModel, request: JobOptions) -> ObjectModel:
     """Return the object with the job's mass and friction; at level dexgraspbench, with the protocol's.
     Raises MeshError: the mass would exceed 100 kg."""
     if request.validation == "dexgraspbench":

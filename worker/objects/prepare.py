@@ -77,11 +77,11 @@ def main_file(files: Mapping[str, bytes], options: ObjectOptions) -> str:
 def _prepared(main: str, data: bytes, options_json: str, face_error_m: float) -> ObjectModel:
     """Prepare an object; cached in memory and on disk for batches of a job and repeated commands."""
     terms = [Path(main).suffix.lower(), options_json, repr(face_error_m), hashlib.sha256(data).hexdigest(), revision()]
-    file = user_cache.folder("objects") / f"{digest_json(terms)}.npz"
+    file = user_cache.cache_folder("objects") / f"{digest_json(terms)}.npz"
     if (held := user_cache.load(file)) is not None:
         with suppress(ValueError, KeyError, TypeError, OSError, EOFError, zipfile.BadZipFile):
             return from_bytes(held, name="", digest="")
-    obj = build(repaired_mesh(main, data, ObjectOptions.model_validate_json(options_json)), face_error_m)
+    obj = build_model(repaired_mesh(main, data, ObjectOptions.model_validate_json(options_json)), face_error_m)
     user_cache.store(file, to_bytes(obj))
     return obj
 
@@ -101,7 +101,7 @@ def _repaired(main: str, data: bytes, options_json: str) -> RepairedMesh:
         raise MeshError(f"{main}: {error}", facts=error.facts) from None
 
 
-def build(mesh: RepairedMesh, face_error_m: float) -> ObjectModel:
+def build_model(mesh: RepairedMesh, face_error_m: float) -> ObjectModel:
     vertices, faces, error = simplify(mesh.vertices, mesh.faces, face_error_m, closed=mesh.watertight)
     hull_vertices, hull_faces = convex_hull(vertices)
     solid = (vertices, faces.astype(np.int32)) if mesh.watertight else (hull_vertices, hull_faces)
@@ -122,7 +122,7 @@ def build(mesh: RepairedMesh, face_error_m: float) -> ObjectModel:
         deviation_m=error,
         repairs=mesh.repairs,
     )
-    return middle.at(mesh.centre)
+    return middle.place_at(mesh.centre)
 
 
 def convex_hull(points: Floats) -> tuple[Floats, Ints]:
@@ -257,7 +257,7 @@ class ReferenceMesh:
             and mesh_geometry.to_manifold(*mesh) is not None
         )
 
-    def within(self, mesh: Mesh, limit: float) -> bool:
+    def is_within(self, mesh: Mesh, limit: float) -> bool:
         """Check whether a mesh and the original lie within `limit` [m] at vertices and even samples."""
         back, own = MeshDistance(*mesh), surface_points(*mesh, SAMPLES)
         # A few points reject most meshes that are too coarse. All points are checked only if these pass.
@@ -275,7 +275,7 @@ def _simplified(original: ReferenceMesh, target: int, error_m: float) -> Mesh | 
         mesh = _collapse(original.vertices, original.faces, count)
         if mesh is None or not original.accepts(mesh):
             continue
-        return mesh if original.within(mesh, error_m) else None
+        return mesh if original.is_within(mesh, error_m) else None
     return None
 
 
@@ -291,10 +291,10 @@ def _collapse(vertices: Floats, faces: Indices, target: int) -> Mesh | None:
     )[:2]
     triangles = np.asarray(triangles, dtype=np.int64).reshape(-1, 3)
     triangles = triangles[(triangles != np.roll(triangles, 1, axis=1)).all(axis=1)]
-    triangles = triangles[~topology.repeated(triangles)] if len(triangles) else triangles
+    triangles = triangles[~topology.repeated_faces(triangles)] if len(triangles) else triangles
     if len(triangles) < 4:
         return None
-    mesh = topology.compact(np.asarray(points, dtype=float) * scale + middle, triangles)
+    mesh = topology.drop_unused_vertices(np.asarray(points, dtype=float) * scale + middle, triangles)
     if (topology.edge_faces(mesh[1])[1] > 2).any():
         # A tunnel that collapsed to an edge is closed by splitting the edge.
         mesh = topology.part_double_edges(*topology.split_edges(*mesh))
@@ -307,7 +307,7 @@ def _thin_variants(original: ReferenceMesh, error_m: float) -> list[Mesh]:
         return []
     for share in (0.9, 0.5, 0.2):
         mesh = mesh_geometry.from_manifold(whole.simplify(share * error_m))
-        if len(mesh[1]) < len(original.faces) and original.accepts(mesh) and original.within(mesh, error_m):
+        if len(mesh[1]) < len(original.faces) and original.accepts(mesh) and original.is_within(mesh, error_m):
             return [mesh]
     return []
 
@@ -332,4 +332,4 @@ def from_bytes(data: bytes, *, name: str, digest: str) -> ObjectModel:
         arrays = {field: stored[field] for field in _ARRAYS}
     x, y, z = plain.pop("centre")
     middle = ObjectModel(name=name, digest=digest, **arrays, **plain | {"repairs": tuple(plain["repairs"])})
-    return middle.at((x, y, z))
+    return middle.place_at((x, y, z))

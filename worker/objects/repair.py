@@ -13,12 +13,12 @@ import numpy as np
 from graspd.service.model.errors import MeshError
 from graspd.service.model.object_options import ObjectOptions
 from graspd.service.model.transforms import Floats
-from graspd.worker.grasps import on_grid
+from graspd.worker.grasps import round_to_grid
 from graspd.worker.objects import mesh_geometry, topology
 from graspd.worker.objects.distance import MeshDistance, surface_points
 from graspd.worker.objects.formats import Soup
-from graspd.worker.objects.intersections import crossings, untangle
-from graspd.worker.objects.mesh_geometry import CentredMesh, centred, signed_volume
+from graspd.worker.objects.intersections import intersecting_faces, untangle
+from graspd.worker.objects.mesh_geometry import CentredMesh, centre_points, signed_volume
 from graspd.worker.objects.options import UNITS
 from graspd.worker.objects.topology import Indices
 
@@ -73,7 +73,7 @@ def repair(soup: Soup, options: ObjectOptions) -> RepairedMesh:
         given = _to_metres(soup, options)
         mesh = _solid(given, options)
     except MeshError as error:
-        found, unit = centred(soup.vertices[np.unique(soup.faces)]), UNITS[options.units]
+        found, unit = centre_points(soup.vertices[np.unique(soup.faces)]), UNITS[options.units]
         if found.resolution * unit <= max(COARSE_M, 1e-3 * unit * float(np.ptp(found.points, axis=0).max())):
             raise
         raise MeshError(f"{error}; {_resolution_note(found, unit)}", facts=error.facts) from None
@@ -98,7 +98,7 @@ def _solid(mesh: RepairedMesh, options: ObjectOptions) -> RepairedMesh:
 
 def _to_metres(soup: Soup, options: ObjectOptions) -> RepairedMesh:
     used, inverse = np.unique(soup.faces, return_inverse=True)
-    given, faces, unit = centred(soup.vertices[used]), inverse.reshape(-1, 3), UNITS[options.units]
+    given, faces, unit = centre_points(soup.vertices[used]), inverse.reshape(-1, 3), UNITS[options.units]
     extents = np.ptp(given.points, axis=0) * unit
     extent = float(extents.max())
     if float(extents.min()) <= 1e-7 * extent:
@@ -117,7 +117,7 @@ def _to_metres(soup: Soup, options: ObjectOptions) -> RepairedMesh:
             lengths_m=fitting,
         )
     notes = (_resolution_note(given, unit),) if given.resolution * unit > COARSE_M else ()
-    x, y, z = (float(value) for value in on_grid(given.centre * unit))
+    x, y, z = (float(value) for value in round_to_grid(given.centre * unit))
     return RepairedMesh(given.points * unit, faces, notes=notes, centre=(x, y, z))
 
 
@@ -147,11 +147,11 @@ def _clean(mesh: RepairedMesh) -> RepairedMesh:
     vertices, faces = topology.merge_vertices(mesh.vertices, mesh.faces, MERGE * extent)
     collapsed = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
     faces = faces[~collapsed]
-    doubled = topology.repeated(faces) if len(faces) else np.zeros(0, dtype=bool)
+    doubled = topology.repeated_faces(faces) if len(faces) else np.zeros(0, dtype=bool)
     faces = faces[~doubled]
-    slivers = topology.degenerate(vertices, faces) if len(faces) else np.zeros(0, dtype=bool)
+    slivers = topology.degenerate_faces(vertices, faces) if len(faces) else np.zeros(0, dtype=bool)
     # A face without area may join a long edge with two short ones. It is dropped only if no edge opens.
-    if slivers.any() and topology.open_edges(faces[~slivers]) <= topology.open_edges(faces):
+    if slivers.any() and topology.count_open_edges(faces[~slivers]) <= topology.count_open_edges(faces):
         faces = faces[~slivers]
     else:
         slivers[:] = False
@@ -159,12 +159,14 @@ def _clean(mesh: RepairedMesh) -> RepairedMesh:
         raise MeshError("the mesh encloses no volume: its faces have no area or cover each other; give it a thickness")
     mesh = replace(mesh, vertices=vertices, faces=faces)
     if dropped := int(collapsed.sum() + doubled.sum() + slivers.sum()):
-        mesh = mesh.with_faces(*topology.compact(vertices, faces), f"dropped {dropped} degenerate or duplicate faces")
+        mesh = mesh.with_faces(
+            *topology.drop_unused_vertices(vertices, faces), f"dropped {dropped} degenerate or duplicate faces"
+        )
     return mesh
 
 
 def _close(mesh: RepairedMesh) -> RepairedMesh:
-    if topology.open_edges(mesh.faces):
+    if topology.count_open_edges(mesh.faces):
         mesh = _weld(mesh)
     faces, orientable = topology.unify_winding(mesh.faces)
     if not orientable:
@@ -174,9 +176,9 @@ def _close(mesh: RepairedMesh) -> RepairedMesh:
     crowded = int((topology.edge_faces(mesh.faces)[1] > 2).sum())
     if crowded:
         split = topology.part_double_edges(*topology.split_edges(mesh.vertices, mesh.faces))
-        if not topology.open_edges(split[1]) > topology.open_edges(mesh.faces):
+        if not topology.count_open_edges(split[1]) > topology.count_open_edges(mesh.faces):
             mesh = mesh.with_faces(*split, f"split {crowded} non-manifold edges")
-    if topology.open_edges(mesh.faces):
+    if topology.count_open_edges(mesh.faces):
         mesh = _fill_pinholes(mesh)
     return mesh
 
@@ -192,10 +194,10 @@ def _weld(mesh: RepairedMesh) -> RepairedMesh:
     _, first = np.unique(label, return_index=True)
     faces = label[mesh.faces].astype(np.int64)
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
-    if not len(faces) or topology.open_edges(faces) >= topology.open_edges(mesh.faces):
+    if not len(faces) or topology.count_open_edges(faces) >= topology.count_open_edges(mesh.faces):
         return mesh
     return mesh.with_faces(
-        *topology.compact(mesh.vertices[first], faces), f"welded {len(pairs)} pairs of vertices at a seam"
+        *topology.drop_unused_vertices(mesh.vertices[first], faces), f"welded {len(pairs)} pairs of vertices at a seam"
     )
 
 
@@ -231,7 +233,7 @@ def _rims(faces: Indices) -> list[list[int]] | None:
 
 
 def _accept_open(mesh: RepairedMesh, options: ObjectOptions) -> RepairedMesh:
-    holes = topology.open_edges(mesh.faces)
+    holes = topology.count_open_edges(mesh.faces)
     if options.allow_open:
         note = f"not watertight: {holes} open edges; volume, centre of mass and inertia are those of the convex hull"
         return replace(mesh, watertight=False, notes=(*mesh.notes, note))
@@ -246,7 +248,7 @@ def _accept_open(mesh: RepairedMesh, options: ObjectOptions) -> RepairedMesh:
 def _resolve_components(mesh: RepairedMesh, options: ObjectOptions) -> RepairedMesh:
     """Drop debris, orient components outward, and unite overlapping ones; options select among several."""
     shells = topology.components(mesh.faces)
-    parts = [topology.compact(mesh.vertices, mesh.faces[shells == k]) for k in range(shells.max() + 1)]
+    parts = [topology.drop_unused_vertices(mesh.vertices, mesh.faces[shells == k]) for k in range(shells.max() + 1)]
     volumes = np.array([signed_volume(*part) for part in parts])
     largest = int(np.argmax(np.abs(volumes)))
     solid_parts = np.abs(volumes) > DEBRIS * abs(volumes[largest])
@@ -292,7 +294,7 @@ def _unite(
         mesh = replace(mesh, repairs=(*mesh.repairs, f"winding of {turned_parts} components turned outward"))
     # A cavity is its own shell, of negative volume.
     pieces = [piece for piece in united.decompose() if piece.volume() > 0]
-    groups = mesh_geometry.groups(pieces, JOINED_M)
+    groups = mesh_geometry.group_solids(pieces, JOINED_M)
     if len(groups) > 1 and not options.compound:
         if not options.keep_largest:
             raise MeshError.with_fixes(
@@ -318,7 +320,7 @@ def _unite(
 
 def _resolve_self_intersections(mesh: RepairedMesh) -> RepairedMesh:
     """Count doubly enclosed volume once if the outer surface stays unchanged; else add a note."""
-    found = crossings(mesh.vertices, mesh.faces)
+    found = intersecting_faces(mesh.vertices, mesh.faces)
     if found is None or not len(found):
         return replace(mesh, self_intersections=None if found is None else 0)
     united = untangle(mesh.vertices, mesh.faces)

@@ -38,7 +38,7 @@ def face_vectors(vertices: Floats, faces: FaceIndices) -> Floats:
     return np.cross(b - a, c - a)
 
 
-def on_faces(corners: Floats, u: Floats, v: Floats) -> Floats:
+def points_on_faces(corners: Floats, u: Floats, v: Floats) -> Floats:
     """Return area-uniform points (N, 3) on triangles (N, 3, 3) for numbers (N, 1) of the unit interval."""
     a, b, c = np.moveaxis(corners, 1, 0)
     root = np.sqrt(u)
@@ -51,18 +51,18 @@ def face_areas(vertices: Floats, faces: FaceIndices) -> Floats:
 
 def outward_hull(points: Floats, simplices: NDArray[Any], normals: Floats) -> tuple[Floats, NDArray[np.int32]]:
     """Return corners (H, 3) and outward triangles (G, 3) from qhull's simplices and outward normals."""
-    corners, faces = compact(points, simplices)
+    corners, faces = drop_unused_vertices(points, simplices)
     inward = np.einsum("ij,ij->i", face_vectors(corners, faces), normals) < 0
     faces[inward] = faces[inward][:, ::-1]
     return corners, faces.astype(np.int32)
 
 
-def compact(vertices: Floats, faces: FaceIndices) -> tuple[Floats, Indices]:
+def drop_unused_vertices(vertices: Floats, faces: FaceIndices) -> tuple[Floats, Indices]:
     used, inverse = np.unique(faces, return_inverse=True)
     return vertices[used], inverse.reshape(-1, 3)
 
 
-def degenerate(vertices: Floats, faces: Indices) -> Mask:
+def degenerate_faces(vertices: Floats, faces: Indices) -> Mask:
     """Return a mask (F,) of faces that repeat a vertex or are thinner than 1e-6 of their longest side."""
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     sides = np.stack([b - a, c - b, a - c])
@@ -72,7 +72,7 @@ def degenerate(vertices: Floats, faces: Indices) -> Mask:
     return repeats | (height <= 1e-6 * longest)
 
 
-def repeated(faces: Indices) -> Mask:
+def repeated_faces(faces: Indices) -> Mask:
     """Return a mask (F,) of faces to drop so that each set of three vertices is used at most once.
     Two coincident faces of opposite winding enclose nothing: both are dropped if the surface stays closed."""
     key = np.sort(faces, axis=1)
@@ -126,7 +126,7 @@ def is_closed(faces: Indices) -> bool:
     return bool(len(faces) and (counts == 1).all() and (both == 2).all())
 
 
-def open_edges(faces: Indices) -> int:
+def count_open_edges(faces: Indices) -> int:
     """Return the number of edges with an odd number of faces: the rims of holes."""
     return int((edge_faces(faces)[1] % 2 == 1).sum())
 

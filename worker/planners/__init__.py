@@ -20,7 +20,7 @@ from graspd.worker.planners.port import (
     PlanRequest,
     Rollout,
 )
-from graspd.worker.planners.registry import GROUP, PLANNERS, joined, method, method_names, planner
+from graspd.worker.planners.registry import GROUP, PLANNERS, batch_planner, method, method_names, planner
 
 __all__ = [
     "GROUP",
@@ -67,7 +67,7 @@ def synthesize_batches(
     options: Mapping[str, Any] | None = None,
 ) -> list[GraspSet | Exception]:
     """Plan batches of one job, in one launch if the method supports it; see `BatchPlanner`."""
-    if (together := joined(method, options)) is not None:
+    if (together := batch_planner(method, options)) is not None:
         return together(hand, obj, asked)
     found: list[GraspSet | Exception] = []
     for one in asked:

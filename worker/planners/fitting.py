@@ -15,7 +15,7 @@ from graspd.service.model.transforms import Floats
 from graspd.worker.hands.jaws import jaws_of
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.memory_cache import cached_by_content
-from graspd.worker.objects.mesh_geometry import points_in
+from graspd.worker.objects.mesh_geometry import points_on_triangles
 from graspd.worker.objects.model import ObjectModel
 
 #: Clearance between the opening and the object on each side [m].
@@ -95,7 +95,7 @@ def even_points(obj: ObjectModel, count: int, rng: np.random.Generator) -> tuple
     face = np.searchsorted(sums, (np.arange(count) + rng.random(count)) / count)
     face = np.minimum(face, len(sums) - 1)
     u, v = rng.random((2, count, 1))
-    return points_in(corners[face], u, v), face
+    return points_on_triangles(corners[face], u, v), face
 
 
 def _exits(start: Floats, way: Floats, corners: Floats, normal: Floats) -> tuple[NDArray[np.intp], Floats]:

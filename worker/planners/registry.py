@@ -67,7 +67,7 @@ def planner(name: str, options: Mapping[str, Any] | None = None, *, in_scenes: b
     return known.planner(_options(name, options))
 
 
-def joined(name: str, options: Mapping[str, Any] | None = None) -> BatchPlanner | None:
+def batch_planner(name: str, options: Mapping[str, Any] | None = None) -> BatchPlanner | None:
     """Return a method's planner of several batches in one launch; None if it plans them one by one."""
     make = method(name).joined
     return make(_options(name, options)) if make is not None else None

@@ -36,10 +36,10 @@ _LOOK_S: Final = 0.1
 _OF_THE_TASK: Final = (InputError, TaskRefused, DamagedError)
 
 
-def first_loss(task: str) -> bool:
+def is_first_loss(task: str) -> bool:
     """Check whether a task loses a GPU or pool process for the first time on this machine.
     The first loss is no failed attempt of the task. Later losses count, so that a task that causes them ends."""
-    file = user_cache.folder("gpus") / f"{hashlib.sha256(task.encode()).hexdigest()[:32]}.lost"
+    file = user_cache.cache_folder("gpus") / f"{hashlib.sha256(task.encode()).hexdigest()[:32]}.lost"
     if user_cache.load(file) is not None:
         return False
     user_cache.store(file, b"", limit_bytes=_LOSSES_BYTES)

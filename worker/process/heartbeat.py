@@ -15,7 +15,7 @@ from graspd.service.model.clock import timestamp
 from graspd.service.model.messages import WorkerBeat
 from graspd.service.queue.connection import connect
 from graspd.service.queue.port import Event, EventKind
-from graspd.service.queue.rq_queue import list_worker, unlist_worker
+from graspd.service.queue.rq_queue import register_worker, unregister_worker
 from graspd.service.telemetry import HeartbeatFile
 
 log = logging.getLogger(__name__)
@@ -64,7 +64,7 @@ class Heartbeat:
         self._thread.join(2 * _ANSWER_S)
         try:
             left = Event(kind=EventKind.LEFT, at=timestamp(), worker=self._facts["name"])
-            unlist_worker(self._connection, left)
+            unregister_worker(self._connection, left)
         except (RedisError, OSError) as error:
             log.warning("Redis was unavailable when the worker ended: %s", error)
         self._connection.close()
@@ -81,7 +81,7 @@ class Heartbeat:
     def _send(self) -> None:
         away, self._away = self._away, True
         try:
-            list_worker(self._connection, self._facts | {"seen": timestamp()}, self._lease_s)
+            register_worker(self._connection, self._facts | {"seen": timestamp()}, self._lease_s)
             self._away = False
         except (RedisError, OSError) as error:
             if not away:

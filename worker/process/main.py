@@ -193,7 +193,7 @@ class GraspWorker(SimpleWorker):  # type: ignore[misc]
             try:
                 found = super().dequeue_job_and_maintain_ttl(*args, **options)
                 self.found_none = found is None
-                return found and (entries.allowed_job(*found), found[1])
+                return found and (entries.checked_job(*found), found[1])
             except TaskRefused as error:
                 log.warning("%s", error)
                 self.connection.delete(found[0].key)

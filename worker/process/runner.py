@@ -37,10 +37,10 @@ from graspd.service.model.states import Stage
 from graspd.service.queue.port import Event, EventKind, Message
 from graspd.service.store.manifests import ShardManifest, load_manifest, publish_shard, shard_exists
 from graspd.service.store.records import put_record
-from graspd.service.telemetry import bind
+from graspd.service.telemetry import bind_subjects
 from graspd.worker.engines.devices import DeviceLost, check_device
 from graspd.worker.pool.pool import ProcessLost
-from graspd.worker.process.fitness import Fitness, first_loss
+from graspd.worker.process.fitness import Fitness, is_first_loss
 from graspd.worker.stages.context import StageFunction, StopReason, TaskContext, shard_of
 
 log = logging.getLogger(__name__)
@@ -72,7 +72,7 @@ class Runner:
         """Run a task; return the event for the controller, None if the task no longer belongs to this worker.
         Raises TaskRefused: the message cannot be read, so there is no task that could fail."""
         message = parse_message(raw)
-        with bind(**_subjects(message)):
+        with bind_subjects(**_subjects(message)):
             return self._run(message, raw, context)
 
     def _run(self, message: Message, raw: Mapping[str, Any], context: TaskContext) -> Event | None:
@@ -91,7 +91,7 @@ class Runner:
                 return self._event(
                     EventKind.DEFERRED, message, message=f"{os.strerror(errno.ENOSPC)}: {_one_line(error)}"
                 )
-            if (why := self._loss(error, context)) and first_loss(message.task_id):
+            if (why := self._loss(error, context)) and is_first_loss(message.task_id):
                 log.error("the task is returned to the queue: %s", why, exc_info=True)
                 return self._event(EventKind.RETURNED, message, message=why)
             if not why and self._fitness is not None and (why := self._fitness.diagnose(message, error)):
@@ -141,9 +141,9 @@ class Runner:
 
     def _is_done(self, message: Message, context: TaskContext) -> bool:
         if isinstance(message, IngestMessage):
-            return context.store.exists(names.asset_check(message.kind, message.digest))
+            return context.store.exists(names.asset_check_key(message.kind, message.digest))
         is_there = shard_exists(context.store, message.stage, message.output)
-        return is_there and context.store.exists(names.shard_file(message.stage, message.output))
+        return is_there and context.store.exists(names.shard_file_key(message.stage, message.output))
 
     def _lost_manifest(self, message: Message, context: TaskContext) -> ShardManifest | None:
         """Return the manifest of a shard that was made before but has lost its file."""
@@ -176,7 +176,7 @@ class Runner:
             if isinstance(message, TaskMessage) and _has_manifest(message, context):
                 # The task has already succeeded: another worker was faster, or a lost file could not be made again.
                 return self._event(EventKind.CANCELLED, message, message=attempt.reason)
-            put_record(context.store, names.attempt(attempt.task_id, attempt.number), attempt)
+            put_record(context.store, names.attempt_key(attempt.task_id, attempt.number), attempt)
         except UnavailableError as error:
             return self._event(EventKind.DEFERRED, message, message=f"{attempt.reason}; {error}")
         return self._event(EventKind.FAILED, message, message=attempt.reason, last=attempt.last)

@@ -68,7 +68,7 @@ def least_distance(points: Floats) -> float | None:
     return min(bound, *distances(points, pairs[:, 0], pairs[:, 1]).tolist()) if len(pairs) else bound
 
 
-def distinct(points: Floats, least: float, *, given: int = 0) -> NDArray[np.bool_]:
+def distinct_mask(points: Floats, least: float, *, given: int = 0) -> NDArray[np.bool_]:
     """Return a mask (N,) of grasps at least `least` [m] apart, by their `points` (N, P, 3).
     Earlier grasps take precedence; the first `given` are always selected. `least` 0 selects all."""
     kept = np.ones(len(points), bool)

@@ -29,7 +29,7 @@ def failed_gate(quality: Mapping[str, NDArray[Any]]) -> list[str]:
     return [GATES[0 if one else 1 if two else 2] for one, two in zip(deep, itself, strict=True)]
 
 
-def passes(quality: Mapping[str, NDArray[Any]]) -> NDArray[np.uint8]:
+def passes_gate(quality: Mapping[str, NDArray[Any]]) -> NDArray[np.uint8]:
     """Return 1 for each of N grasps that passes, else 0; a grasp with a nan does not pass."""
     ok = (
         (quality["quality/penetration_depth_mm"] <= MAX_PENETRATION_MM)

@@ -103,6 +103,6 @@ def _points(probe: Probe) -> Any:
 
 
 @cached_by_content(8)
-def posing_of(hand: HandModel, obj: ObjectModel, *, points: int, device: str) -> PostureData:
+def posture_data_of(hand: HandModel, obj: ObjectModel, *, points: int, device: str) -> PostureData:
     """Return the data of the pair on a device, with `points` hand points; cached in memory."""
     return PostureData(probe_of(hand, obj, hand_points=points, object_points=64, device=device))

@@ -107,7 +107,7 @@ def measure(
     terms = _Terms(hand, obj, friction, tuple(thresholds.tolist()), every_volume)
     chunks = [slice(i, min(i + CHUNK, len(grasps))) for i in range(0, len(grasps), CHUNK)]
     postures = [Posture(grasps.grasp.hand_pose[chunk], grasps.grasp.joint_positions[chunk]) for chunk in chunks]
-    parts = _measured(terms, postures, Count(len(grasps), run, "quality"), run)
+    parts = _measure_chunks(terms, postures, Count(len(grasps), run, "quality"), run)
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]} if parts else terms.empty()
     columns["quality/thresholds_m"] = thresholds
     columns["quality/stability_loss"] = np.asarray(grasps.stability_loss, float)
@@ -136,7 +136,7 @@ class _Terms:
         return {f"quality/{name}": np.zeros((0, len(self.thresholds)) if name in swept else 0) for name in MEASURES}
 
 
-def _measured(terms: _Terms, postures: Sequence[Posture], done: Count, run: ExecutionContext) -> list[Columns]:
+def _measure_chunks(terms: _Terms, postures: Sequence[Posture], done: Count, run: ExecutionContext) -> list[Columns]:
     if run.pool is not None:
         return run.pool.map(
             _columns,
@@ -184,7 +184,7 @@ class _Chunk:
     def shared_volume(self) -> Floats:
         # A face may enter a piece between object points, but a point is within half a diagonal of their grid.
         near = self.found.piece_distance < self.pair.probe.sample_spacing
-        if self.pair.volume.exact:
+        if self.pair.volume.is_exact:
             near = self.pair.overlap.of(self.found, near)
         return self.pair.volume.of(self.found.bodies, near)
 

@@ -41,7 +41,7 @@ class SharedVolume:
         self._object = _solid(obj.vertices - obj.centre_of_mass, obj.faces)
 
     @property
-    def exact(self) -> bool:
+    def is_exact(self) -> bool:
         return self._object is not None
 
     def of(self, bodies: Floats, near: NDArray[np.bool_]) -> Floats:
@@ -53,7 +53,7 @@ class SharedVolume:
         if not len(pieces):
             return 0.0
         if self._object is None:
-            return self.by_voxels(bodies, pieces)
+            return self.voxel_volume(bodies, pieces)
         matrices = pose_to_matrix(bodies[self._body[pieces]])[:, :3]
         matrices[..., 3] = (matrices[..., 3] - self.obj.centre_of_mass) * _UNIT
         posed = [self._pieces[p].transform(matrix) for p, matrix in zip(pieces, matrices, strict=True)]
@@ -68,7 +68,7 @@ class SharedVolume:
     def _probe(self) -> Probe:
         return Probe(self.hand, self.obj, hand_points=self.hand.bodies * 16, object_points=64)
 
-    def by_voxels(self, bodies: Floats, pieces: NDArray[np.intp]) -> float:
+    def voxel_volume(self, bodies: Floats, pieces: NDArray[np.intp]) -> float:
         """Return the volume of the voxels with centres inside both the object and the pieces [cm^3]."""
         matrices = pose_to_matrix(bodies[self._body[pieces]])
         solids = [self.hand.pieces[p] for p in pieces]

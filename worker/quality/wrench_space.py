@@ -171,12 +171,12 @@ def measure_hulls(clouds: Floats, count: NDArray[np.integer], whole: NDArray[np.
     corners, flat = _simplices(points, own, number)
     firm = np.flatnonzero(~flat)
     if len(firm):
-        found = _grown(points[firm], number[firm], np.asarray(whole)[some][firm], corners[firm], scale[firm])
+        found = _grow_hulls(points[firm], number[firm], np.asarray(whole)[some][firm], corners[firm], scale[firm])
         radius[some[firm]], volume[some[firm]] = found
     return radius, volume
 
 
-def _grown(
+def _grow_hulls(
     points: Floats, count: NDArray[Any], whole: NDArray[np.bool_], corners: NDArray[np.intp], scale: Floats
 ) -> tuple[Floats, Floats]:
     """Grow hulls from simplices (H, 7); return radius and volume (H,), nan where a hull fails."""

@@ -64,7 +64,7 @@ def intrinsics(width: int, height: int, field_of_view: float = FIELD_OF_VIEW) ->
     return np.array([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1.0]])
 
 
-def narrow_field(k: Floats, width: int, height: int) -> float:
+def inscribed_field_of_view(k: Floats, width: int, height: int) -> float:
     """Return the opening angle of the widest cone around the optical axis within the picture [rad].
     Raises InputError: the principal point lies outside the picture."""
     slopes = [k[0, 2] / k[0, 0], (width - k[0, 2]) / k[0, 0], k[1, 2] / k[1, 1], (height - k[1, 2]) / k[1, 1]]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from graspd.service.model.colours import hexadecimal
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, quat_rotate
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
-from graspd.worker.grasps import moved
+from graspd.worker.grasps import move_poses
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
@@ -59,7 +59,7 @@ def grasp_pictures(
     """Render hands at root poses (N, 7) in the object frame from A sides; return sRGB (N, A, H, W, 3).
     Azimuths [rad] are about the object's z axis; 0 looks across the direction in which the palm approaches. Object and
     hand fill the picture of `size` [px]. Raises TaskCancelled: `run.cancelled()` returned True."""
-    hand_pose = moved(np.atleast_2d(np.asarray(hand_pose, float)), np.negative(obj.centre))
+    hand_pose = move_poses(np.atleast_2d(np.asarray(hand_pose, float)), np.negative(obj.centre))
     obj = obj.centred
     joints = np.atleast_2d(np.asarray(joint_positions, float))
     thing = Solid(obj.vertices, obj.faces, obj.corner_normals)
@@ -95,9 +95,9 @@ def _shoot(
     k = intrinsics(*size, FIELD_OF_VIEW)
     sides = []
     for azimuth in azimuths:
-        angles = np.array([side_of(hand, world) + azimuth for world in bodies])
+        angles = np.array([side_azimuth(hand, world) + azimuth for world in bodies])
         cameras = np.stack([_camera(obj, points[w], angles[w], k, size) for w in range(worlds)])
-        sides.append(stage.shoot(studio_shot(cameras, k, size, angles, samples), run.quiet()).rgb)
+        sides.append(stage.shoot(studio_shot(cameras, k, size, angles, samples), run.without_progress()).rgb)
     return np.stack(sides, axis=1)
 
 
@@ -133,7 +133,7 @@ def studio_shot(
     )
 
 
-def side_of(hand: HandModel, bodies: Floats) -> float:
+def side_azimuth(hand: HandModel, bodies: Floats) -> float:
     """Return the azimuth of a camera that looks across the palm's direction of approach [rad]."""
     towards = quat_rotate(bodies[0, 3:], hand.palm.approach)
     # For a vertical approach of the palm, the x axis of the hand's root is used.

@@ -83,7 +83,7 @@ def object_portrait(obj: ObjectModel) -> Image.Image:
 def write_png(image: Image.Image, path: Path) -> None:
     """Write a PNG; raise InputError if the file cannot be written."""
     try:
-        path.write_bytes(sheets.png(image))
+        path.write_bytes(sheets.png_bytes(image))
     except OSError as error:
         raise InputError(f"{path} cannot be written: {error.strerror}") from None
 
@@ -109,7 +109,7 @@ def _page(pictures: NDArray[np.uint8], captions: Sequence[str]) -> Image.Image:
     for number, (picture, caption) in enumerate(zip(pictures, captions, strict=True)):
         row, column = divmod(number, _COLUMNS)
         page.paste(Image.fromarray(picture), (column * width, row * height))
-        sheets.text(draw, (column * width + 12, row * height + SIZE[1] + 21), caption, 15, sheets.INK)
+        sheets.draw_text(draw, (column * width + 12, row * height + SIZE[1] + 21), caption, 15, sheets.INK)
     return page.quantize(192, dither=Image.Dither.NONE)
 
 

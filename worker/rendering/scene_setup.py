@@ -21,8 +21,8 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.rendering.cameras import (
     SAMPLED,
     GivenCameras,
+    inscribed_field_of_view,
     intrinsics,
-    narrow_field,
     sample_hemisphere,
     stereo_pair,
 )
@@ -92,7 +92,7 @@ class CameraPlan:
         if self.given.extrinsics is not None:
             middles = list(self.given.extrinsics)
         else:
-            cone = narrow_field(self.intrinsics, self.width, self.height)
+            cone = inscribed_field_of_view(self.intrinsics, self.width, self.height)
             middles = _unobstructed_cameras(
                 lambda: sample_hemisphere(centre, radius, views=self.views, field_of_view=cone, rng=rng),
                 supports,
@@ -186,14 +186,14 @@ class _Scene:
         centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
         radius = float(np.linalg.norm(points - centre, axis=1).max())
         self.extrinsics = plan.extrinsics(centre, radius, rng, supports, points)
-        table, thing = table_look(rng), object_look(rng)
-        self.lamp = lamp(rng)
+        table, thing = draw_table_look(rng), draw_object_look(rng)
+        self.lamp = draw_lamp(rng)
         self.turn = float(rng.uniform(0, 2 * np.pi))
         yaw = rng.uniform(0, 2 * np.pi)
         self.poses = np.concatenate([slab_poses(supports, centre, yaw), poses])
         # Random draws for neighbours and walls come last, so that they do not change the appearance of the rest.
-        others = [object_look(rng) for _ in objects[1:]]
-        walls = table_look(rng) if len(supports) > 1 else table
+        others = [draw_object_look(rng) for _ in objects[1:]]
+        walls = draw_table_look(rng) if len(supports) > 1 else table
         self.looks: list[Appearance] = [
             *(table if k == 0 or isinstance(s, HalfSpace) else walls for k, s in enumerate(supports)),
             thing,
@@ -231,7 +231,7 @@ def hsv(hue: float, saturation: float, value: float) -> Colour:
     return linear(*colorsys.hsv_to_rgb(hue % 1.0, saturation, value))
 
 
-def table_look(rng: np.random.Generator) -> Appearance:
+def draw_table_look(rng: np.random.Generator) -> Appearance:
     """Draw wood, stone, tiles or a plain cloth."""
     kind = int(rng.integers(4))
     scale = float(rng.uniform(0.7, 1.5))
@@ -247,7 +247,7 @@ def table_look(rng: np.random.Generator) -> Appearance:
     return Appearance(hexadecimal(base), pattern=PLAIN, roughness=float(rng.uniform(0.7, 0.95)))
 
 
-def object_look(rng: np.random.Generator) -> Appearance:
+def draw_object_look(rng: np.random.Generator) -> Appearance:
     """Draw a glazed, painted, brushed or speckled material of any hue."""
     hue, kind = float(rng.uniform()), int(rng.integers(4))
     base = hsv(hue, float(rng.uniform(0.3, 0.75)), float(rng.uniform(0.5, 0.9)))
@@ -261,7 +261,7 @@ def object_look(rng: np.random.Generator) -> Appearance:
     return Appearance(base, roughness=float(rng.uniform(0.5, 0.8)))
 
 
-def lamp(rng: np.random.Generator) -> Lamp:
+def draw_lamp(rng: np.random.Generator) -> Lamp:
     """Draw warm to cool light of random strength before a soft backdrop."""
     warmth, strength = float(rng.uniform(-1, 1)), float(rng.uniform(0.85, 1.15))
     tint = hsv(float(rng.uniform()), 0.12, float(rng.uniform(0.45, 0.8)))

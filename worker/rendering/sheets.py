@@ -31,13 +31,13 @@ _EDGES: Final = [(a, a | bit) for a in range(8) for bit in (1, 2, 4) if not a & 
 Arrays = Mapping[str, NDArray[np.generic]]
 
 
-def best(quality: Arrays, count: int, among: NDArray[np.bool_]) -> NDArray[np.intp]:
+def best_rows(quality: Arrays, count: int, among: NDArray[np.bool_]) -> NDArray[np.intp]:
     """Return the `count` best rows by epsilon among those of a mask (N,)."""
     rows = np.flatnonzero(among)
     return rows[np.argsort(-metric_at_threshold(quality, "quality/epsilon")[rows], kind="stable")][:count]
 
 
-def best_kept(scene: Arrays, base: Arrays) -> NDArray[np.int32]:
+def best_transferred_rows(scene: Arrays, base: Arrays) -> NDArray[np.int32]:
     """Return the row (S,) of each scene's valid grasp with the largest epsilon; -1 if it has none."""
     epsilon = metric_at_threshold(base, "quality/epsilon")[np.asarray(scene["grasp/base_index"])]
     return _best_of_scenes(scene, np.where(np.asarray(scene["grasp/valid"], bool), epsilon, -np.inf))
@@ -59,7 +59,7 @@ def _best_of_scenes(columns: Arrays, score: Floats) -> NDArray[np.int32]:
     return rows
 
 
-def figures(quality: Arrays, rows: NDArray[np.intp]) -> list[list[tuple[str, str]]]:
+def caption_entries(quality: Arrays, rows: NDArray[np.intp]) -> list[list[tuple[str, str]]]:
     """Return caption entries, label and value, for each row of a base shard."""
     epsilon, area = (
         metric_at_threshold(quality, "quality/epsilon"),
@@ -95,7 +95,7 @@ def contact_sheet(
         y = top + (k // columns) * (height + _CAPTION + GAP)
         page.paste(Image.fromarray(picture), (x, y))
         _caption(draw, (x, y + height), width, k + 1, captions[k] if k < len(captions) else ())
-    return png(page)
+    return png_bytes(page)
 
 
 def three_sides_sheet(
@@ -146,14 +146,14 @@ def label_page(
     line = height + (_NAME if names else 0)
     page, draw, top = _page(len(heads), len(rows), width, line, title, subtitle, head=_HEAD + 24)
     for column, head in enumerate(heads):
-        text(draw, (MARGIN + column * (width + GAP), top - 10), head, 15, QUIET)
+        draw_text(draw, (MARGIN + column * (width + GAP), top - 10), head, 15, QUIET)
     for row, (cells, below) in enumerate(zip(rows, names or [()] * len(rows), strict=True)):
         y = top + row * (line + GAP)
         for column, cell in enumerate(cells):
             page.paste(cell, (MARGIN + column * (width + GAP), y))
         for column, name in enumerate(below):
-            text(draw, (MARGIN + column * (width + GAP), y + line - 4), name, 14, INK)
-    return png(page)
+            draw_text(draw, (MARGIN + column * (width + GAP), y + line - 4), name, 14, INK)
+    return png_bytes(page)
 
 
 def _page(
@@ -163,8 +163,8 @@ def _page(
     size = (2 * MARGIN + columns * (width + GAP) - GAP, MARGIN + head + rows * (height + GAP) - GAP + MARGIN)
     page = Image.new("RGB", size, PAPER)
     draw = ImageDraw.Draw(page)
-    text(draw, (MARGIN, MARGIN + 20), title, 26, INK)
-    text(draw, (MARGIN, MARGIN + 46), subtitle, 15, QUIET)
+    draw_text(draw, (MARGIN, MARGIN + 20), title, 26, INK)
+    draw_text(draw, (MARGIN, MARGIN + 46), subtitle, 15, QUIET)
     return page, draw, MARGIN + head
 
 
@@ -173,12 +173,12 @@ def _caption(
 ) -> None:
     x, y = at
     draw.line([(x, y + 1), (x + width - 1, y + 1)], fill=RULE)
-    text(draw, (x, y + 26), str(rank), 17, ACCENT)
+    draw_text(draw, (x, y + 26), str(rank), 17, ACCENT)
     # Space for ranks of up to three digits, then equal columns.
     left, step = x + 34, (width - 34) / max(1, len(pairs))
     for k, (label, value) in enumerate(pairs):
-        text(draw, (left + k * step, y + 18), label, 11, QUIET)
-        text(draw, (left + k * step, y + 35), value, 14, INK)
+        draw_text(draw, (left + k * step, y + 18), label, 11, QUIET)
+        draw_text(draw, (left + k * step, y + 35), value, 14, INK)
 
 
 def _colours(views: Arrays, path: str, view: int) -> Image.Image:
@@ -209,8 +209,8 @@ def _scale_bar(image: Image.Image, near: float, far: float) -> None:
     draw.rectangle([x - before, y - 7, image.width, image.height], fill=PAPER)
     colours = depth_colours(np.linspace(near, far, ramp, dtype=np.float32)[None].repeat(thick, 0), near, far)
     image.paste(Image.fromarray(colours), (x, y))
-    text(draw, (x - before + 6, y + thick + 1), f"{near:.2f}", 11, INK)
-    text(draw, (x + ramp + 6, y + thick + 1), f"{far:.2f} m", 11, INK)
+    draw_text(draw, (x - before + 6, y + thick + 1), f"{near:.2f}", 11, INK)
+    draw_text(draw, (x + ramp + 6, y + thick + 1), f"{far:.2f} m", 11, INK)
 
 
 def _segments(views: Arrays, view: int) -> Image.Image:
@@ -259,7 +259,7 @@ def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
     return ImageFont.load_default(size)
 
 
-def text(
+def draw_text(
     draw: ImageDraw.ImageDraw, at: tuple[float, float], words: str, size: int, fill: tuple[int, int, int]
 ) -> float:
     """Write words with the baseline at `at`; `^2` is set as an exponent. Return the x of their end."""
@@ -284,7 +284,7 @@ def depth_colours(depth: NDArray[np.float32], near: float, far: float) -> NDArra
     return np.where(np.isfinite(depth)[..., None], mixed, 214.0).round().astype(np.uint8)
 
 
-def png(image: Image.Image) -> bytes:
+def png_bytes(image: Image.Image) -> bytes:
     """Return PNG bytes."""
     buffer = io.BytesIO()
     image.save(buffer, "PNG", optimize=True)
@@ -293,4 +293,4 @@ def png(image: Image.Image) -> bytes:
 
 def with_palette(page: bytes) -> bytes:
     """Return the PNG in 256 colours, for documentation: a third of the bytes."""
-    return png(Image.open(io.BytesIO(page)).convert("RGB").quantize(256, method=Image.Quantize.MEDIANCUT))
+    return png_bytes(Image.open(io.BytesIO(page)).convert("RGB").quantize(256, method=Image.Quantize.MEDIANCUT))

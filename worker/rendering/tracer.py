@@ -49,7 +49,7 @@ class Tracer:
 
     def __init__(self, solids: Sequence[Solid | Box], device: str) -> None:
         """`solids`: the P solids that every world has; `device`: name of the Warp device."""
-        backend.start()
+        backend.start_warp()
         self.device = device
         shapes: NDArray[Any] = np.zeros(len(solids), _PLACED.numpy_dtype())
         corners = list[Floats]()

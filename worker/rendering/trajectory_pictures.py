@@ -17,10 +17,10 @@ from graspd.service.model.scene_spec import HalfSpace
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply, compose
 from graspd.service.readers.trajectories import Waypoint
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
-from graspd.worker.grasps import moved
+from graspd.worker.grasps import move_poses
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
-from graspd.worker.objects.mesh_geometry import to_centre
+from graspd.worker.objects.mesh_geometry import to_centred_frame
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.rendering.cameras import intrinsics, look_at
 from graspd.worker.rendering.hands import drawn_bodies, drawn_parts, drawn_poses
@@ -35,7 +35,7 @@ from graspd.worker.rendering.pictures import (
     fit_camera,
     floor_pose,
     hand_points,
-    side_of,
+    side_azimuth,
     studio_shot,
 )
 from graspd.worker.rendering.scenery import Appearance, Box, Solid, Supports, slab_poses, slabs, visible_share
@@ -73,7 +73,7 @@ class PictureScenes:
         if not self.supports:
             return self  # a free object is about the origin, where the tracer is most exact
         beside = None if self.neighbours is None else self.neighbours.centred
-        return replace(self, object_pose=to_centre(self.object_pose, obj.centre), neighbours=beside)
+        return replace(self, object_pose=to_centred_frame(self.object_pose, obj.centre), neighbours=beside)
 
     def scene(self, number: int) -> int:
         return 0 if self.index is None else int(self.index[number])
@@ -130,7 +130,7 @@ class _Stage:
         """Render one grasp (A, F, H, W, 3)."""
         scene = self.around.scene(number)
         rest = np.asarray(self.around.object_pose[scene], float)
-        roots = compose(rest, moved(np.stack([point.hand_pose for point in way]), -self.centre))
+        roots = compose(rest, move_poses(np.stack([point.hand_pose for point in way]), -self.centre))
         joints, wrist = np.stack([point.joint_positions for point in way]), self.around.wrist
         bodies = body_poses(self.hand, roots, joints)
         drawn = drawn_poses(self.hand, roots, joints, None if wrist is None else np.tile(wrist[number], (len(way), 1)))
@@ -147,10 +147,10 @@ class _Stage:
         grasp = next((k for k, point in enumerate(way) if point.name == "grasp"), 0)
         k = intrinsics(*size, FIELD_OF_VIEW)
         pictures = []
-        for angle, height in self._best_sides(grasp, near, side_of(self.hand, bodies[grasp]), sides):
+        for angle, height in self._best_sides(grasp, near, side_azimuth(self.hand, bodies[grasp]), sides):
             cameras = np.stack([fit_camera(near, angle, k, size, elevation=height)] * self.frames)
             shot = studio_shot(cameras, k, size, np.full(self.frames, angle), samples, toward_lamp=lamp)
-            pictures.append(self.tracer.shoot(shot, self.run.quiet()).rgb)
+            pictures.append(self.tracer.shoot(shot, self.run.without_progress()).rgb)
         return np.stack(pictures)
 
     def _place(self, scene: int, things: Floats, drawn: Floats, floor: Floats, middle: Floats) -> None:
@@ -172,7 +172,7 @@ class _Stage:
         cameras = np.stack([look_at(eye, centre) for eye in eyes])
         k, size, worlds = intrinsics(_GLANCE, _GLANCE, FIELD_OF_VIEW), (_GLANCE, _GLANCE), np.full(len(sides), world)
         glance = studio_shot(cameras, k, size, np.full(self.frames, first), 1, world=worlds)
-        seen = self.tracer.shoot(replace(glance, shaded=False), self.run.quiet()).shape
+        seen = self.tracer.shoot(replace(glance, shaded=False), self.run.without_progress()).shape
         thing = len(self.boxes)
         first_of_hand = thing + 1 + len(self.others)
         # Links above the hand's root, such as a forearm, do not count.
@@ -206,21 +206,21 @@ def animation_kind(suffix: str) -> str:
     return small
 
 
-def animation(pictures: NDArray[np.uint8], seconds: Sequence[float], suffix: str) -> bytes:
+def encode_animation(pictures: NDArray[np.uint8], seconds: Sequence[float], suffix: str) -> bytes:
     """Encode a looping animation of pictures (F, H, W, 3) sRGB; `suffix` is one of `KINDS`.
     Durations [s] are stored in milliseconds, in a GIF in hundredths of a second.
     Raises InputError: no animation format has this suffix."""
     kind = animation_kind(suffix)
     images = [Image.fromarray(picture) for picture in pictures]
     if kind == ".gif":
-        images = _in_one_palette(pictures)
+        images = _quantise_together(pictures)
     buffer = io.BytesIO()
     durations = [round(1000 * shown) for shown in seconds]
     images[0].save(buffer, save_all=True, append_images=images[1:], duration=durations, loop=0, **KINDS[kind])
     return buffer.getvalue()
 
 
-def _in_one_palette(pictures: NDArray[np.uint8]) -> list[Image.Image]:
+def _quantise_together(pictures: NDArray[np.uint8]) -> list[Image.Image]:
     """Quantise without dither, so that static parts stay identical between pictures."""
     some = np.unique(np.linspace(0, len(pictures) - 1, _PALETTE_OF).round().astype(int))
     palette = Image.fromarray(np.concatenate(pictures[some])).quantize(256, method=Image.Quantize.MEDIANCUT)

@@ -13,7 +13,7 @@ from graspd.service.model.errors import InputError
 from graspd.service.model.pinhole import pixel_rays
 from graspd.service.model.transforms import Floats, apply
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
-from graspd.worker.objects.mesh_geometry import to_centre
+from graspd.worker.objects.mesh_geometry import to_centred_frame
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.rendering.annotate import box_corners, occlusion_ratio, tight_boxes
 from graspd.worker.rendering.cameras import BASELINE_M, SAMPLED, Cameras, GivenCameras
@@ -81,16 +81,16 @@ def render(
             f"got {len(poses)} scenes, {views} views, {width} x {height} px, {samples} samples"
         )
     beside = (extras.neighbours or Neighbours((), np.zeros((len(poses), 0, 7)))).centred
-    obj, poses = obj.centred, to_centre(poses, obj.centre)
+    obj, poses = obj.centred, to_centred_frame(poses, obj.centre)
     placed = np.concatenate([poses[:, None], beside.poses], axis=1)
     setting = Setting([obj, *beside.objects], placed, plan, seed=seed, samples=samples, supports=extras.supports)
     pictures = setting.shoot(run, normals="normals" in extras.channels)
     result = annotate(setting, pictures, obj, extras.channels)
     if "occlusion" in extras.channels:
-        alone = setting.shoot_alone(run.quiet()).shape == 1
+        alone = setting.shoot_alone(run.without_progress()).shape == 1
         result["box/occlusion_ratio"] = occlusion_ratio(np.asarray(result["image/segmentation"], np.uint8), alone)
     if extras.drawn is not None:
-        seen = setting.shoot_with(extras.drawn, run.quiet())
+        seen = setting.shoot_with(extras.drawn, run.without_progress())
         result["image/rgb_hand"] = seen.rgb
         result["camera/hand_grasp"] = extras.drawn.grasp[setting.shot.world].astype(np.int32)
     return result

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from graspd.worker.scenes.clearance import transfer
+from graspd.worker.scenes.clearance import transfer_grasps
 from graspd.worker.scenes.neighbours import Neighbours, drop_together
 from graspd.worker.scenes.simulate import drop
 
-__all__ = ["Neighbours", "drop", "drop_together", "transfer"]
+__all__ = ["Neighbours", "drop", "drop_together", "transfer_grasps"]

@@ -36,7 +36,7 @@ class Rejection(IntEnum):
     NEIGHBOUR_ON_APPROACH = 4
 
 
-def transfer(
+def transfer_grasps(
     hand: HandModel, grasp: Posture, pregrasp: Posture, object_pose: Floats, neighbours: Neighbours | None = None
 ) -> dict[str, NDArray[np.generic]]:
     """Transfer every grasp to every scene and compute the clearance of the hand and its mounting.
@@ -89,7 +89,7 @@ def count_rejections(rejection: NDArray[np.uint8]) -> dict[str, int]:
     return {r.name.lower(): int((rejection == r).sum()) for r in Rejection if r is not Rejection.NONE}
 
 
-def approach(grasp: Posture, pregrasp: Posture, postures: int = PATH_POSTURES) -> Posture:
+def approach_postures(grasp: Posture, pregrasp: Posture, postures: int = PATH_POSTURES) -> Posture:
     """Return (N * postures) postures on the straight trajectory from each pregrasp to its grasp.
     Positions and joints move linearly, orientations along the shorter arc (normalised linear interpolation)."""
     t = np.linspace(0.0, 1.0, postures)[None, :, None]
@@ -107,7 +107,7 @@ def _neighbour_clearance(
 ) -> Floats:
     """Return clearances (S, N, 2) of hands and mountings from neighbours: at contact and on the approach.
     Mountings are at wrist angles (S, N, K)."""
-    path = approach(grasp, pregrasp)
+    path = approach_postures(grasp, pregrasp)
     distance = neighbour_clearance(hand, path, poses, neighbours)
     if hand.mounting is not None:
         for s, angles in enumerate(wrist):
@@ -121,7 +121,7 @@ def _neighbour_clearance(
 
 def _clearance(hand: HandModel, grasp: Posture, pregrasp: Posture, object_pose: Floats) -> Floats:
     """Return heights (S, N, 2) of the hand's lowest point at contact and on approach, table frame [m]."""
-    features = PosedFeatures.of(hand, approach(grasp, pregrasp))
+    features = PosedFeatures.of(hand, approach_postures(grasp, pregrasp))
     on_path = np.array([features.distance(_TABLE.in_frame(pose)).min(axis=1) for pose in object_pose])
     on_path = on_path.reshape(len(object_pose), len(grasp), -1)
     return np.stack([on_path[..., -1], on_path.min(axis=2)], axis=-1)
@@ -132,7 +132,7 @@ def _mounting_clearance(
 ) -> tuple[Floats, Floats]:
     """Return wrist angles (S, N, K) and lowest heights (S, N, 2) of the mounting [m]; inf without it.
     The heights are those at contact and on the approach, as in `_clearance`."""
-    path = approach(grasp, pregrasp).hand_pose.reshape(len(grasp), PATH_POSTURES, 7)
+    path = approach_postures(grasp, pregrasp).hand_pose.reshape(len(grasp), PATH_POSTURES, 7)
     angles, heights = [], []
     for pose in object_pose:
         table = [Environment((_TABLE.in_frame(pose),), UP)]

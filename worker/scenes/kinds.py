@@ -10,7 +10,7 @@ import numpy as np
 from graspd.service.model.errors import SceneError
 from graspd.service.model.scene_spec import BIN_SIZE, MOST_TOUCH, SHELF_SIZE, Box, SceneSpec, supports_in
 from graspd.service.model.transforms import Floats, compose, quat_from_axis_angle, quat_rotate
-from graspd.worker.grasps import moved
+from graspd.worker.grasps import move_poses
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.scenes.rest import lay_flat, resting_faces
 from graspd.worker.scenes.simulate import drop, reference_share, rest_probability
@@ -60,7 +60,7 @@ def rest_poses(spec: SceneSpec, obj: ObjectModel, *, count: int, seed: int) -> d
         poses = np.array(
             [move_inside(obj, pose, size, np.random.default_rng([seed, i])) for i, pose in enumerate(poses)]
         )
-    poses = poses if spec.target is not None else moved(poses, np.zeros(3))
+    poses = poses if spec.target is not None else move_poses(poses, np.zeros(3))
     check_free(obj, poses, supports)
     return {**found, "scene/object_pose": poses}
 
@@ -69,12 +69,12 @@ def _each_face(obj: ObjectModel, seed: int) -> dict[str, Floats]:
     """Return one scene per stable face on which at least `LEAST_PROBABILITY` of drops end.
     Faces on which the object rolls are used only if there are no others."""
     faces = resting_faces(obj)
-    stable = faces.stable
+    stable = faces.stable_faces
     share = reference_share(obj, stable.tolist())
     kept = stable[share >= LEAST_PROBABILITY]
     if not len(kept):
         kept = stable[[int(np.argmax(share))]]
-    chosen = [face for face in kept.tolist() if not faces.rolls(face)] or kept.tolist()
+    chosen = [face for face in kept.tolist() if not faces.can_roll(face)] or kept.tolist()
     poses = []
     for number, face in enumerate(chosen):
         turn = np.random.default_rng([seed, number]).uniform(0, 2 * np.pi)

@@ -16,10 +16,10 @@ import numpy as np
 from graspd.service.model.errors import InputError, MeshError, SceneError
 from graspd.service.model.transforms import Floats, compose, quat_rotate
 from graspd.worker.engines.mujoco_warnings import is_invalid
-from graspd.worker.grasps import Posture, moved
+from graspd.worker.grasps import Posture, move_poses
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import ConvexPiece, HandModel
-from graspd.worker.objects.mesh_geometry import to_centre, to_file
+from graspd.worker.objects.mesh_geometry import to_centred_frame, to_file_frame
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.scenes.kinds import GAP, SUNK, rotate_about_vertical
 from graspd.worker.scenes.rest import lay_flat, resting_faces, settle
@@ -63,7 +63,7 @@ class Neighbours:
     def centred(self) -> Neighbours:
         poses = np.array(self.poses, float)
         for number, obj in enumerate(self.objects):
-            poses[:, number] = to_centre(poses[:, number], obj.centre)
+            poses[:, number] = to_centred_frame(poses[:, number], obj.centre)
         return Neighbours([obj.centred for obj in self.objects], poses)
 
 
@@ -80,9 +80,9 @@ def drop_together(obj: ObjectModel, neighbours: Sequence[ObjectModel], *, count:
         )
     heap = _Heap([one.centred for one in (obj, *neighbours)])
     found = [heap.redo_until_rest((seed, scene)) for scene in range(count)]
-    poses = moved(np.array([poses for poses, _, _ in found]).reshape(count, 1 + len(neighbours), 7), np.zeros(3))
+    poses = move_poses(np.array([poses for poses, _, _ in found]).reshape(count, 1 + len(neighbours), 7), np.zeros(3))
     for number, one in enumerate((obj, *neighbours)):
-        poses[:, number] = to_file(poses[:, number], one.centre)
+        poses[:, number] = to_file_frame(poses[:, number], one.centre)
     return {
         "scene/object_pose": poses[:, 0],
         "scene/neighbour_pose": poses[:, 1:],
@@ -159,7 +159,7 @@ class _Heap:
             middle = laid[:3] + quat_rotate(laid[3:], obj.centre_of_mass)
             lift = abs(float(middle[2] - (pose[:3] + quat_rotate(pose[3:], obj.centre_of_mass))[2]))
             away = np.hypot(*middle[:2]) > (NEIGHBOUR_REACH if k else REACH)
-            if away or angle > MAX_SETTLE_ANGLE or lift > MAX_LIFT or self.faces[k].topples(face):
+            if away or angle > MAX_SETTLE_ANGLE or lift > MAX_LIFT or self.faces[k].can_topple(face):
                 return None
             face, laid = settle_on_face(obj, self.faces[k], face, laid, rng)
             flat.append(laid)
@@ -249,7 +249,7 @@ def place_neighbours(
                 f"there is no room for {len(others)} neighbours beside {obj.name} in scene {scene}: none of {_DRAWS} "
                 f"draws left {1e3 * BETWEEN:.0f} mm between all of them; take fewer or smaller ones, or a wider scene"
             )
-    poses = moved(poses, np.zeros(3))
+    poses = move_poses(poses, np.zeros(3))
     return poses[:, 0], poses[:, 1:]
 
 
@@ -263,13 +263,13 @@ def _draw_poses(
         far = reach * (hulls.objects[0].radius + hulls.objects[number].radius)
         for _ in range(_PLACES):
             pose = rotate_about_vertical(rest, rng.uniform(0, 2 * np.pi))
-            low, high = hulls.room(number, pose)
+            low, high = hulls.shift_range(number, pose)
             centre = hulls.middle(number, pose)
             low, high = np.maximum(low, middle - far - centre), np.minimum(high, middle + far - centre)
             if (low > high).any():
                 continue
             pose[:2] += rng.uniform(low, high)
-            if hulls.clear(number, pose) and hulls.apart([*placed, pose]):
+            if hulls.is_clear(number, pose) and hulls.is_apart([*placed, pose]):
                 placed.append(pose)
                 break
         else:
@@ -293,12 +293,12 @@ class _Hulls:
     def middle(self, number: int, pose: Floats) -> Floats:
         return np.asarray((quat_rotate(pose[3:], self.objects[number].centre_of_mass) + pose[:3])[:2])
 
-    def room(self, number: int, pose: Floats) -> tuple[Floats, Floats]:
+    def shift_range(self, number: int, pose: Floats) -> tuple[Floats, Floats]:
         """Return the least and largest shift (2,), (2,) along x and y that keeps an object inside the walls."""
         corners = self._corners(number, pose)[:, :2]
         return -self._room - corners.min(axis=0), self._room - corners.max(axis=0)
 
-    def clear(self, number: int, pose: Floats) -> bool:
+    def is_clear(self, number: int, pose: Floats) -> bool:
         """Check whether an object is `GAP` away from every support except the one it stands on."""
         corners = self._corners(number, pose)
         return all(_is_separated(support, corners) for support in self._supports)
@@ -306,7 +306,7 @@ class _Hulls:
     def _corners(self, number: int, pose: Floats) -> Floats:
         return quat_rotate(pose[3:], self.objects[number].hull_vertices) + pose[:3]
 
-    def apart(self, poses: Sequence[Floats]) -> bool:
+    def is_apart(self, poses: Sequence[Floats]) -> bool:
         """Check whether the object of the last pose is `BETWEEN` away from the objects of the other poses."""
         last = len(poses) - 1
         self._data.mocap_pos[: last + 1] = [pose[:3] for pose in poses]

@@ -17,7 +17,7 @@ from graspd.service.model.transforms import Floats
 from graspd.worker.hands.primitives import convex_edges
 from graspd.worker.objects.convex import union_volume
 from graspd.worker.objects.memory_cache import cached_by_content
-from graspd.worker.objects.mesh_geometry import to_centre, to_file
+from graspd.worker.objects.mesh_geometry import to_centred_frame, to_file_frame
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.topology import outward_hull
 from graspd.worker.scenes.kinds import SUNK, check_free, move_inside, rest_poses, supports_of, walled_area
@@ -47,12 +47,12 @@ def _neighbour(obj: ObjectModel) -> Neighbour:
         pieces = decompose(obj).vertices
     except MeshError:
         pieces = (obj.hull_vertices,)  # an obstacle may be larger than the object
-    pieces = joined_pieces(pieces)
+    pieces = merge_pieces(pieces)
     solids = [enclosing_solid(piece) for piece in pieces]
     return Neighbour(obj, pieces, tuple(solid for solid, _ in solids), max(error for _, error in solids))
 
 
-def joined_pieces(pieces: Sequence[Floats], most: int = MOST_PIECES) -> tuple[Floats, ...]:
+def merge_pieces(pieces: Sequence[Floats], most: int = MOST_PIECES) -> tuple[Floats, ...]:
     """Merge pieces until at most `most` remain.
     Each step joins the two pieces whose common hull adds the least volume."""
     left = list(pieces)
@@ -84,12 +84,12 @@ def scenes_of(
     whole, poses = _scenes_of(
         _centred_spec(spec, obj, others), obj.centred, [other.centred for other in others], count=count, seed=seed
     )
-    poses["scene/object_pose"] = to_file(poses["scene/object_pose"], obj.centre)
+    poses["scene/object_pose"] = to_file_frame(poses["scene/object_pose"], obj.centre)
     if not others:
         return replace(whole, object_pose=poses["scene/object_pose"]), poses
     beside = poses["scene/neighbour_pose"]
     for number, other in enumerate(others):
-        beside[:, number] = to_file(beside[:, number], other.centre)
+        beside[:, number] = to_file_frame(beside[:, number], other.centre)
     neighbours = tuple(neighbour_of(other) for other in others)
     return Scenes(whole.supports, poses["scene/object_pose"], neighbours, beside), poses
 
@@ -98,7 +98,7 @@ def _centred_spec(spec: SceneSpec, obj: ObjectModel, others: Sequence[ObjectMode
     """Return the specification with poses of the objects' centres instead of their mesh origins."""
 
     def told(pose: Any, thing: ObjectModel) -> Any:
-        return None if pose is None else tuple(to_centre(pose, thing.centre).tolist())
+        return None if pose is None else tuple(to_centred_frame(pose, thing.centre).tolist())
 
     beside = [
         one.model_copy(update={"pose": told(one.pose, other)})

@@ -49,7 +49,7 @@ class RestingFaces:
     """(E,) width of the face across each edge [m]."""
 
     @property
-    def stable(self) -> Ints:
+    def stable_faces(self) -> Ints:
         return np.flatnonzero(self.successor == np.arange(len(self.successor))).astype(np.int32)
 
     def looseness(self, face: int) -> tuple[float, float]:
@@ -67,11 +67,11 @@ class RestingFaces:
         cosine = float((self.normal[reached] @ self.normal[face]).min())
         return float(np.arccos(np.clip(cosine, -1.0, 1.0))), float(self.height[face] - self.height[reached].min())
 
-    def topples(self, face: int) -> bool:
+    def can_topple(self, face: int) -> bool:
         """Check whether a change of the surface by `CHANGE_M` lets the object fall to a lower face."""
         return self.looseness(face)[1] > CHANGE_M
 
-    def rolls(self, face: int) -> bool:
+    def can_roll(self, face: int) -> bool:
         """Check whether a change of the surface by `CHANGE_M` may turn the object by more than `ROLLS`."""
         return self.looseness(face)[0] > ROLLS
 
@@ -80,7 +80,7 @@ def rolling_poses(obj: ObjectModel, poses: Floats) -> int:
     """Count the rest poses (S, 7) on a table in which the object may roll, because it is round there.
     A change of its surface by `CHANGE_M` may then turn it by more than `ROLLS`."""
     faces = resting_faces(obj.centred)
-    return sum(faces.rolls(settle(faces, pose[3:])[0]) for pose in np.asarray(poses, float))
+    return sum(faces.can_roll(settle(faces, pose[3:])[0]) for pose in np.asarray(poses, float))
 
 
 def rolling_note(rolling: int, scenes: int) -> str | None:
@@ -170,6 +170,6 @@ def lay_flat(faces: RestingFaces, face: int, pose: Floats) -> Floats:
     return np.concatenate([pose[:2], [faces.offset[face]], quaternion])
 
 
-def same_face(faces: RestingFaces, face: int, others: Ints) -> Ints:
+def same_face_mask(faces: RestingFaces, face: int, others: Ints) -> Ints:
     """Return a mask of the `others` that are the same resting face, within `SAME_FACE_ANGLE`."""
     return faces.normal[np.asarray(others, int)] @ faces.normal[face] > np.cos(SAME_FACE_ANGLE)

@@ -172,7 +172,7 @@ def scene_verdicts(
     wrist = way.wrist if way.wrist.shape[1] else None
     grasps = replace(grasps, approach=way.approach, coming=way.open, lift=way.lift, wrist=wrist)
     count, clear = len(grasps), np.flatnonzero(way.clear)
-    columns: Arrays = {"quality/clearance_m": np.minimum(way.least, FARTHEST_M)}
+    columns: Arrays = {"quality/clearance_m": np.minimum(way.least_clearance, FARTHEST_M)}
     success = np.where(way.clear, 0, -1).astype(np.int8)
     columns["quality/success"] = success
     if pieces is None:

@@ -17,13 +17,13 @@ from graspd.service.model.errors import InputError, MeshError
 from graspd.service.model.libraries import version_of
 from graspd.service.model.transforms import Floats, quat_rotate
 from graspd.worker.engines.mujoco_warnings import is_invalid
-from graspd.worker.grasps import moved
+from graspd.worker.grasps import move_poses
 from graspd.worker.objects.disk_cache import cached_arrays
 from graspd.worker.objects.memory_cache import cached_by_content
-from graspd.worker.objects.mesh_geometry import to_file
+from graspd.worker.objects.mesh_geometry import to_file_frame
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.scenes import rest as resting
-from graspd.worker.scenes.rest import RestingFaces, lay_flat, resting_faces, same_face, settle
+from graspd.worker.scenes.rest import RestingFaces, lay_flat, resting_faces, same_face_mask, settle
 
 #: Density of the object; its value has no effect on the motion of a free body on a plane [kg/m^3].
 DENSITY: Final = 500.0
@@ -79,9 +79,9 @@ def drop(obj: ObjectModel, *, count: int, seed: int) -> dict[str, Floats]:
         rest, rng = _redo_until_rest(table, (seed, scene)), np.random.default_rng([seed, scene, MAX_ATTEMPTS])
         face, pose = settle_on_face(obj.centred, table.faces, rest.face, rest.pose, rng)
         rests.append(RestPose(pose, face, rest.seconds))
-    poses = moved(np.array([rest.pose for rest in rests]).reshape(count, 7), np.zeros(3))
+    poses = move_poses(np.array([rest.pose for rest in rests]).reshape(count, 7), np.zeros(3))
     return {
-        "scene/object_pose": to_file(poses, obj.centre),
+        "scene/object_pose": to_file_frame(poses, obj.centre),
         "scene/rest_probability": rest_probability(obj, [rest.face for rest in rests]),
         "scene/drop_seconds": np.array([rest.seconds for rest in rests]),
     }
@@ -93,7 +93,7 @@ def settle_on_face(
     """Return the face on which a centred object stays after coming to rest on `face`, and its pose (7,).
     If it may roll there, a steady face (on which it does not roll) is drawn from the reference drops. If the object
     is round on all of these faces, its pose is unchanged."""
-    if not faces.rolls(face) or not (steady := _steady_faces(obj)):
+    if not faces.can_roll(face) or not (steady := _steady_faces(obj)):
         return face, pose
     chosen = int(rng.choice(steady))
     return chosen, lay_flat(faces, chosen, pose)
@@ -110,7 +110,7 @@ def reference_share(obj: ObjectModel, faces: Sequence[int]) -> Floats:
         return np.zeros(0)
     obj = obj.centred
     known, reference = resting_faces(obj), np.array(_reference_faces(obj))
-    return np.array([same_face(known, face, reference).sum() for face in faces]) / REFERENCE_DROPS
+    return np.array([same_face_mask(known, face, reference).sum() for face in faces]) / REFERENCE_DROPS
 
 
 @cached_by_content(64)
@@ -135,7 +135,7 @@ def _reference_faces(obj: ObjectModel) -> tuple[int, ...]:
 @cached_by_content(64)
 def _steady_faces(obj: ObjectModel) -> tuple[int, ...]:
     faces = resting_faces(obj)
-    return tuple(face for face in _reference_faces(obj) if not faces.rolls(face))
+    return tuple(face for face in _reference_faces(obj) if not faces.can_roll(face))
 
 
 def model_above_table(objects: Sequence[ObjectModel]) -> Any:
@@ -199,7 +199,7 @@ def _drop_once(table: _Table, rng: np.random.Generator) -> RestPose | None:
         return None
     quaternion = data.qpos[3:] / np.linalg.norm(data.qpos[3:])
     face, angle = settle(table.faces, quaternion)
-    if angle > MAX_SETTLE_ANGLE or table.faces.topples(face):
+    if angle > MAX_SETTLE_ANGLE or table.faces.can_topple(face):
         return None
     pose = lay_flat(table.faces, face, np.concatenate([data.qpos[:3], quaternion]))
     away = float(np.hypot(*(pose[:3] + quat_rotate(pose[3:], table.obj.centre_of_mass))[:2]))

@@ -18,13 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, quat_from_axis_angle, quat_rotate
-from graspd.worker.control.postures import wide_open
-from graspd.worker.grasps import GraspSet, Posture, moved
+from graspd.worker.control.postures import wide_open_joints
+from graspd.worker.grasps import GraspSet, Posture, move_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.quality.contact import finger_of_body
 from graspd.worker.quality.probe import Probe, probe_of
-from graspd.worker.scenes.clearance import MARGIN_M, PATH_POSTURES, approach
+from graspd.worker.scenes.clearance import MARGIN_M, PATH_POSTURES, approach_postures
 from graspd.worker.simulation.environment import RISE_M, STANDOFF_M, Environment, PlacedGrasps
 from graspd.worker.simulation.mounting import choose_wrist, wrist_clearance
 from graspd.worker.simulation.obstacles import obstacle_clearance
@@ -64,7 +64,7 @@ class Trajectory:
     On the approach the mounting counts as part of the hand."""
 
     @property
-    def least(self) -> Floats:
+    def least_clearance(self) -> Floats:
         """(N,) least clearance from obstacles on the whole trajectory [m]."""
         parts = (self.contact, self.closing, self.coming, self.lifting, self.mounting)
         return np.asarray(np.minimum.reduce(parts))
@@ -72,7 +72,7 @@ class Trajectory:
     @property
     def clear(self) -> NDArray[np.bool_]:
         """(N,) whether the whole trajectory is clear."""
-        return np.asarray((self.least >= MARGIN_M) & ~self.touching)
+        return np.asarray((self.least_clearance >= MARGIN_M) & ~self.touching)
 
 
 def plan_trajectory(hand: HandModel, obj: ObjectModel, grasps: GraspSet, placed: PlacedGrasps) -> Trajectory:
@@ -81,27 +81,27 @@ def plan_trajectory(hand: HandModel, obj: ObjectModel, grasps: GraspSet, placed:
     probe = probe_of(hand, obj, hand_points=_POINTS, object_points=64)
     count, scenes, which = len(grasps), placed.scenes, np.asarray(placed.index, np.intp)
     rise = RISE_M * np.array([scene.up for scene in scenes])[which]
-    wide = wide_open(hand, obj, grasps.pregrasp, placed)
+    wide = wide_open_joints(hand, obj, grasps.pregrasp, placed)
 
     def room(postures: Posture, steps: int = PATH_POSTURES) -> Floats:
         return obstacle_clearance(hand, postures, scenes, np.repeat(which, steps)).reshape(count, steps)
 
-    closing_hand = approach(grasps.grasp, grasps.pregrasp)
+    closing_hand = approach_postures(grasps.grasp, grasps.pregrasp)
     between = room(closing_hand)
     lifted = np.repeat(grasps.grasp.hand_pose[:, None], WAYPOINTS, axis=1)
     lifted[..., :3] += np.linspace(0, 1, WAYPOINTS)[:, None] * rise[:, None]
     taken = np.concatenate([closing_hand.hand_pose.reshape(count, PATH_POSTURES, 7)[:, ::4], lifted], axis=1)
     wrist, mounting = choose_wrist(hand, taken, scenes, which)
     path, came, coming, touching = open_approach(probe, grasps.pregrasp, wide, wrist, placed)
-    before = room(approach(grasps.pregrasp, Posture(grasps.pregrasp.hand_pose, came)))
+    before = room(approach_postures(grasps.pregrasp, Posture(grasps.pregrasp.hand_pose, came)))
     joints = np.repeat(grasps.grasp.joint_positions, WAYPOINTS, axis=0)
     lifting = room(Posture(lifted.reshape(-1, 7), joints), WAYPOINTS).min(axis=1)
     contact, closing = between[:, -1], np.minimum(between.min(axis=1), before.min(axis=1))
     raised = np.array(grasps.squeeze.hand_pose, float)
     raised[:, :3] += rise
-    lift = Posture(moved(raised, np.zeros(3)), np.array(grasps.squeeze.joint_positions, float))
+    lift = Posture(move_poses(raised, np.zeros(3)), np.array(grasps.squeeze.joint_positions, float))
     return Trajectory(
-        moved(path, np.zeros(3)), came, lift, contact, closing, coming, lifting, touching, wrist, mounting
+        move_poses(path, np.zeros(3)), came, lift, contact, closing, coming, lifting, touching, wrist, mounting
     )
 
 
@@ -112,7 +112,7 @@ def plan_free_trajectory(hand: HandModel, obj: ObjectModel, grasps: GraspSet) ->
     hand_points, object_points = _FREE_POINTS
     probe = probe_of(hand, obj, hand_points=hand_points, object_points=object_points)
     nowhere = PlacedGrasps((), IDENTITY_POSE[None], np.zeros(len(grasps), np.intp))
-    wide = _open_pregrasps(probe, grasps.pregrasp, wide_open(hand, obj, grasps.pregrasp, nowhere))
+    wide = _open_pregrasps(probe, grasps.pregrasp, wide_open_joints(hand, obj, grasps.pregrasp, nowhere))
     pointing = quat_rotate(wide.hand_pose[:, 3:], hand.palm.approach)
     ways = [-pointing, *(_tilted(-pointing, tilt, side) for tilt in TILTS for side in range(SIDES))]
     path, _, touching, chosen = _plan_approach(probe, wide, nowhere.scenes[0], ways)

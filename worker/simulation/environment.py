@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import Floats, compose, invert, quat_conjugate, quat_rotate, quat_to_matrix
-from graspd.worker.objects.mesh_geometry import to_centre
+from graspd.worker.objects.mesh_geometry import to_centred_frame
 from graspd.worker.objects.model import ObjectModel
 
 UP: Final = np.array([0.0, 0.0, 1.0])  # direction against gravity in the scene frame
@@ -112,9 +112,9 @@ class Scenes:
         """Return the scenes with the frames of the object `obj` and of all neighbours moved to their centres."""
         poses = np.array(self.neighbour_pose, float)
         for number, one in enumerate(self.neighbours):
-            poses[:, number] = to_centre(poses[:, number], one.obj.centre)
+            poses[:, number] = to_centred_frame(poses[:, number], one.obj.centre)
         neighbours = tuple(one.about_centre or one for one in self.neighbours)
-        return Scenes(self.supports, to_centre(self.object_pose, obj.centre), neighbours, poses)
+        return Scenes(self.supports, to_centred_frame(self.object_pose, obj.centre), neighbours, poses)
 
     def placed(self, index: NDArray[np.intp]) -> PlacedGrasps:
         """Return N grasps in these scenes; `index` (N,) has the scene number of each grasp."""

@@ -36,7 +36,7 @@ def _sampled(obj: ObjectModel, count: int, seed: int) -> Floats:
     area = np.linalg.norm(cross, axis=1)
     faces = rng.choice(len(area), size=candidates, p=area / area.sum())
     u, v = rng.random((2, candidates, 1))
-    inner = mesh_geometry.points_in(corners[faces], u, v)
+    inner = mesh_geometry.points_on_triangles(corners[faces], u, v)
     edges = _edge_samples(obj, cross / area[:, None].clip(1e-18), count, rng)
     points = np.concatenate([edges, inner])
     return points[farthest_points(points, count)]

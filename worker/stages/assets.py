@@ -31,10 +31,10 @@ from graspd.worker.files.provenance import NEIGHBOUR_FACE_ERROR_M
 from graspd.worker.hands.load import load_hand, main_file
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.options import parse_options
-from graspd.worker.hands.xacro import expand
+from graspd.worker.hands.xacro import expand_xacro
 from graspd.worker.objects import prepare
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.objects.options import for_request
+from graspd.worker.objects.options import apply_request
 from graspd.worker.objects.prepare import load_object
 from graspd.worker.planners.network_cache import store_network
 from graspd.worker.stages.context import TaskContext
@@ -61,15 +61,15 @@ def object_of(store: Store, message: TaskMessage) -> ObjectModel:
     """Load the object of a task, simplified within the tolerance of its fidelity."""
     request, digest = message.request, message.object_digest
     name, error = request.object, request.knobs.face_error_m
-    terms = (error, request.validation == "dexgraspbench", *request.matter.items())
+    terms = (error, request.validation == "dexgraspbench", *request.object_properties.items())
 
     def load() -> ObjectModel:
         obj = prepared_object(store, digest, name=name, face_error_m=error)
-        if not store.exists(names.asset_model(AssetKind.OBJECT, digest)):
+        if not store.exists(names.asset_model_key(AssetKind.OBJECT, digest)):
             # The model does not depend on which fidelity comes first.
             shown = prepared_object(store, digest, name=name, face_error_m=SHOWN_ERROR_M)
             publish_model(store, AssetKind.OBJECT, shown)
-        return for_request(obj, request)
+        return apply_request(obj, request)
 
     return _cached((store.url, AssetKind.OBJECT, name, digest, *terms), load)
 
@@ -124,7 +124,7 @@ def prepared_object(store: Store, digest: str, *, name: str, face_error_m: float
     Raises MeshError: the mesh cannot be used. StoreUnavailable."""
     # A change of a prepared mesh changes its grasps, and with them the revision of their stage.
     terms = {"face_error_m": face_error_m, "revision": STAGE_REVISIONS["synthesize"]}
-    key = names.object_prepared(digest, digest_json(terms))
+    key = names.prepared_object_key(digest, digest_json(terms))
     try:
         return prepare.from_bytes(get_sealed(store, key), name=name, digest=digest)
     except NotFoundError:
@@ -149,7 +149,7 @@ def pieces_of(store: Store, obj: ObjectModel) -> ConvexPieces:
     """Return an object's pieces from this machine's cache or the store, else compute and store them.
     Raises MeshError: the object has no usable pieces. StoreUnavailable."""
     file = piece_file(obj)
-    key = names.object_pieces(obj.digest, file.stem)
+    key = names.object_pieces_key(obj.digest, file.stem)
     with _pieces_lock:  # tasks of one object start at once: one of them makes the pieces
         if not file.is_file():
             _fetch(store, key, file)
@@ -182,7 +182,7 @@ def load_hand_files(store: Store, digest: str) -> dict[str, bytes]:
     main = main_file(files, settings)
     if format_of(main, files[main]) != "xacro":
         return files
-    key = names.hand_expanded(digest)
+    key = names.expanded_hand_key(digest)
     if not store.exists(key):
-        put_document(store, key, {"urdf": expand(files, main, settings.xacro).decode()})
+        put_document(store, key, {"urdf": expand_xacro(files, main, settings.xacro).decode()})
     return {**files, main: str(get_document(store, key)["urdf"]).encode()}

@@ -20,7 +20,7 @@ from graspd.service.model.transforms import IDENTITY_POSE, Floats, apply
 from graspd.worker.control.postures import squeeze
 from graspd.worker.execution_context import DEFAULT_CONTEXT, ExecutionContext
 from graspd.worker.generation import ValidatedBatch, validated_grasps
-from graspd.worker.grasps import Posture, joined
+from graspd.worker.grasps import Posture, join_grasp_sets
 from graspd.worker.hands.jaws import fingertip_pad, jaws_of
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
@@ -150,7 +150,7 @@ def self_test(
     table = sum(planned * share for planned, share, _ in lifted) / max(tried, 1)
     limit = _join_limits([limit for _, _, limit in lifted if limit is not None])
     return SelfTest(
-        float(np.mean(every)), len(every), width, by_object, table, tried, best, slack, _drive_compliance(hand), limit
+        float(np.mean(every)), len(every), width, by_object, table, tried, best, slack, _drive_deflection(hand), limit
     )
 
 
@@ -168,7 +168,7 @@ def _lost_in_closing(batch: ValidatedBatch) -> NDArray[np.bool_]:
     return np.asarray((outcome == Outcome.LOST_WHILE_CLOSING).any(axis=1))
 
 
-def _drive_compliance(hand: HandModel) -> float:
+def _drive_deflection(hand: HandModel) -> float:
     """Return the least fingertip motion [m] that raises a closing dof's torque from zero to its limit."""
     if jaws_of(hand) is not None:
         return math.inf
@@ -202,10 +202,10 @@ def _test_lifts(
     found = validated_grasps(hand, obj, _request(count), count=count, scenes=scenes, run=run)
     grasps, about = found.grasps.moved(np.negative(obj.centre)), obj.centred
     strong = replace(grasps, squeeze=squeeze(hand, about, grasps.grasp, total_normal_force=STRONG_N))
-    both = joined([grasps, strong])
+    both = join_grasp_sets([grasps, strong])
     assert both.scene is not None
     placed, pieces = scenes.centred(obj).placed(both.scene), decompose(about)
-    limit = limit_of(hand, about, both, pieces=pieces, placed=placed, least=1, run=run.quiet())
+    limit = limit_of(hand, about, both, pieces=pieces, placed=placed, least=1, run=run.without_progress())
     return found.planned, found.shares["lift_share"], limit and replace(limit, grasps=count)
 
 

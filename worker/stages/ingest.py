@@ -52,8 +52,8 @@ def run(message: IngestMessage, context: TaskContext) -> None:
         load = partial(load_hand, files, name=message.name, digest=message.digest)
         found["facts"]["self_test"] = self_test_facts(load, context.run)
     if model:
-        put_sealed(context.store, names.asset_model(message.kind, message.digest), model)
-    put_document(context.store, names.asset_check(message.kind, message.digest), found)
+        put_sealed(context.store, names.asset_model_key(message.kind, message.digest), model)
+    put_document(context.store, names.asset_check_key(message.kind, message.digest), found)
 
 
 def _files(message: IngestMessage, context: TaskContext) -> dict[str, bytes]:

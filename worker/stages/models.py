@@ -29,7 +29,7 @@ from graspd.worker.hands.model import HandModel, JointType
 from graspd.worker.hands.robot import Ints
 from graspd.worker.hands.surface import sample_surface
 from graspd.worker.hands.visuals import VisualMesh, thin_mesh
-from graspd.worker.objects.glb_document import Document, plain
+from graspd.worker.objects.glb_document import Document, rounded_values
 from graspd.worker.objects.mesh_geometry import corner_normals
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import load_object
@@ -49,7 +49,7 @@ def model_of(kind: AssetKind, name: str, files: dict[str, bytes]) -> bytes:
 
 def publish_model(store: Store, kind: AssetKind, model: HandModel | ObjectModel) -> None:
     """Store the glTF of a loaded hand or object unless it exists."""
-    key = names.asset_model(kind, model.digest)
+    key = names.asset_model_key(kind, model.digest)
     if not store.exists(key):
         put_sealed(store, key, hand_glb(model) if isinstance(model, HandModel) else object_glb(model))
 
@@ -77,34 +77,34 @@ def hand_glb(hand: HandModel) -> bytes:
     for body in range(hand.bodies):
         node: dict[str, Any] = {"name": hand.body_names[body], "extras": {"fingertip": body in hand.fingertips}}
         if body:
-            node["translation"] = plain(hand.origin[body, :3])
-            node["rotation"] = plain(np.roll(hand.origin[body, 3:], -1))  # glTF: x y z w
+            node["translation"] = rounded_values(hand.origin[body, :3])
+            node["rotation"] = rounded_values(np.roll(hand.origin[body, 3:], -1))  # glTF: x y z w
             kind = "prismatic" if hand.joint_type[body] == JointType.PRISMATIC else "revolute"
-            node["extras"] |= {"joint": joint_of_body[body], "type": kind, "axis": plain(hand.axis[body])}
+            node["extras"] |= {"joint": joint_of_body[body], "type": kind, "axis": rounded_values(hand.axis[body])}
         primitives = _body_primitives(document, hand, body, visuals)
         if any(mesh.body == body for mesh in visuals) and (pieces := _piece_primitive(document, hand, body)):
-            node["extras"]["collision"] = document.mesh([pieces])
+            node["extras"]["collision"] = document.add_mesh([pieces])
         if (on_body := points.position[points.body == body]).size:
-            primitives.append(document.points(on_body))
+            primitives.append(document.add_points(on_body))
         if primitives:
-            node["mesh"] = document.mesh(primitives)
+            node["mesh"] = document.add_mesh(primitives)
         if children := [child for child in range(1, hand.bodies) if hand.parent[child] == body]:
             node["children"] = children
         nodes.append(node)
-    preshape = dict(zip(hand.joint_names, plain(hand.expand(hand.preshape)), strict=True))
-    palm = {"centre": plain(hand.palm.centre), "approach": plain(hand.palm.approach)}
+    preshape = dict(zip(hand.joint_names, rounded_values(hand.expand(hand.preshape)), strict=True))
+    palm = {"centre": rounded_values(hand.palm.centre), "approach": rounded_values(hand.palm.approach)}
     extras = {"kind": "hand", "name": hand.name, "preshape": preshape, "palm": palm, **_found(hand)}
-    return document.bytes(nodes, extras)
+    return document.to_bytes(nodes, extras)
 
 
 def object_glb(obj: ObjectModel) -> bytes:
     """Return the prepared mesh as glTF [m] in the object's own frame.
     The node's translation is the middle of the mesh, since glTF coordinates have 32 bits."""
     document = Document()
-    primitive = document.triangles(obj.centred.vertices, obj.faces, obj.corner_normals)
-    extras = {"kind": "object", "name": obj.name, "centre_of_mass": plain(obj.centre_of_mass)}
-    node = {"name": obj.name, "mesh": document.mesh([primitive]), "translation": list(obj.centre)}
-    return document.bytes([node], extras)
+    primitive = document.add_triangles(obj.centred.vertices, obj.faces, obj.corner_normals)
+    extras = {"kind": "object", "name": obj.name, "centre_of_mass": rounded_values(obj.centre_of_mass)}
+    node = {"name": obj.name, "mesh": document.add_mesh([primitive]), "translation": list(obj.centre)}
+    return document.to_bytes([node], extras)
 
 
 def _found(hand: HandModel) -> dict[str, Any]:
@@ -119,8 +119,10 @@ def _found(hand: HandModel) -> dict[str, Any]:
     pads = []
     for pad in pads_of(hand):
         few = pad.points[:: max(1, -(-len(pad.points) // PAD_POINTS))]
-        pads.append({"body": pad.body, "normal": plain(pad.normal), "points": [plain(point) for point in few]})
-    links = {link: {"body": body, "pose": plain(pose)} for link, (body, pose) in hand.frames.items()}
+        pads.append(
+            {"body": pad.body, "normal": rounded_values(pad.normal), "points": [rounded_values(point) for point in few]}
+        )
+    links = {link: {"body": body, "pose": rounded_values(pose)} for link, (body, pose) in hand.frames.items()}
     return {"facts": model_facts(hand), "links": links, "drives": drives, "pads": pads}
 
 
@@ -146,7 +148,7 @@ def _joined(document: Document, meshes: list[tuple[Floats, Ints, Colour | None]]
     colours = None
     if any(colour for _, _, colour in meshes):
         colours = np.concatenate([np.tile(linear(*(colour or _GREY)), (len(faces), 1)) for _, faces, colour in meshes])
-    return document.triangles(
+    return document.add_triangles(
         np.concatenate([vertices for vertices, _, _ in meshes]),
         np.concatenate([faces + start for (_, faces, _), start in zip(meshes, starts, strict=False)]),
         np.concatenate([corner_normals(vertices, faces) for vertices, faces, _ in meshes]),

@@ -28,7 +28,7 @@ def sizes_of(message: TaskMessage) -> list[int]:
     return [min(BATCH_SIZE, message.count - first) for first in range(0, message.count, BATCH_SIZE)]
 
 
-def batches_of(message: TaskMessage) -> list[TaskMessage]:
+def split_into_batches(message: TaskMessage) -> list[TaskMessage]:
     """Split a task into tasks of one batch each."""
     return [
         message.model_copy(update={"batch": message.batch + number, "count": size})
@@ -36,7 +36,7 @@ def batches_of(message: TaskMessage) -> list[TaskMessage]:
     ]
 
 
-def joined(message: TaskMessage, made: Sequence[Output], *, base_rows: Sequence[range] = ()) -> Output:
+def join_outputs(message: TaskMessage, made: Sequence[Output], *, base_rows: Sequence[range] = ()) -> Output:
     """Join the outputs of batches; their columns are equal except for rechecks. One output is unchanged.
     Columns that refer to rows of the base shard follow `base_rows`, the rows of each batch in it."""
     if len(made) == 1:

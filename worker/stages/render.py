@@ -33,9 +33,9 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
     if request.in_scene:
         others = neighbours_of(context.store, message)
         beside = Neighbours(others, np.asarray(shard["scene/neighbour_pose"], float)) if others else None
-        drawn = _drawn(shard, message, context)
+        drawn = _select_drawn_hand(shard, message, context)
         extras = replace(extras, supports=supports_in(request.place), drawn=drawn, neighbours=beside)
-        said = {"base_shard": message.inputs[0], "scene": json_attribute(request.place.told())}
+        said = {"base_shard": message.inputs[0], "scene": json_attribute(request.place.to_attribute())}
         said |= neighbour_attributes(message)
     context.check()
     pictures = render(
@@ -52,10 +52,10 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
     return Output(pictures, said)
 
 
-def _drawn(base: Shard, message: TaskMessage, context: TaskContext) -> DrawnHand | None:
+def _select_drawn_hand(base: Shard, message: TaskMessage, context: TaskContext) -> DrawnHand | None:
     """Select the best valid grasp of each scene; return None if the shard has no grasps."""
     hand = hand_of(context.store, message)
-    among = validity.selection(base.arrays, unvalidated=message.request.validation == "none")
+    among = validity.selection_mask(base.arrays, unvalidated=message.request.validation == "none")
     rows = best_in_scenes(base.arrays, among)
     if not len(among):
         return None

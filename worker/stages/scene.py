@@ -14,12 +14,12 @@ from graspd.service.store.columns import Attribute
 from graspd.service.store.shards import Shard, json_attribute
 from graspd.worker.files.provenance import wrist_attributes
 from graspd.worker.grasps import Posture
-from graspd.worker.scenes import drop, transfer
+from graspd.worker.scenes import drop, transfer_grasps
 from graspd.worker.scenes.clearance import count_rejections
 from graspd.worker.scenes.placement import scenes_of
 from graspd.worker.stages.assets import hand_of, load_input, neighbour_attributes, neighbours_of, object_of
 from graspd.worker.stages.context import Output, TaskContext, batch_seed
-from graspd.worker.stages.ranges import base_rows, batches_of, joined
+from graspd.worker.stages.ranges import base_rows, join_outputs, split_into_batches
 
 #: Empty grasp columns of a scene shard in which grasps are yet to be planned.
 _NO_GRASPS: Final[dict[str, NDArray[Any]]] = {
@@ -33,7 +33,7 @@ _NO_GRASPS: Final[dict[str, NDArray[Any]]] = {
 
 def run(message: TaskMessage, context: TaskContext) -> Output:
     """Make the scenes of each batch."""
-    parts = batches_of(message)
+    parts = split_into_batches(message)
 
     def told(number: int) -> TaskContext:
         context.check()
@@ -41,14 +41,14 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
         return context
 
     if message.request.in_scene:
-        return joined(message, [_before_grasps(part, told(number)) for number, part in enumerate(parts)])
+        return join_outputs(message, [_make_scenes(part, told(number)) for number, part in enumerate(parts)])
     base = load_input(message, context, Stage.SYNTHESIZE)
     rows = base_rows(base, message)
-    made = [_after_grasps(part, told(number), base, rows[number]) for number, part in enumerate(parts)]
-    return joined(message, made, base_rows=rows)
+    made = [_transfer_to_scenes(part, told(number), base, rows[number]) for number, part in enumerate(parts)]
+    return join_outputs(message, made, base_rows=rows)
 
 
-def _before_grasps(message: TaskMessage, context: TaskContext) -> Output:
+def _make_scenes(message: TaskMessage, context: TaskContext) -> Output:
     """Place the object and its neighbours in `request.scenes` scenes.
     Raises SceneError: they do not fit, penetrate each other, or do not come to rest."""
     hand, obj = hand_of(context.store, message), object_of(context.store, message)
@@ -62,14 +62,14 @@ def _before_grasps(message: TaskMessage, context: TaskContext) -> Output:
     except MeshError as error:
         raise SceneError(str(error)) from None
     said: dict[str, Attribute] = {
-        "scene": json_attribute(place.told()),
+        "scene": json_attribute(place.to_attribute()),
         "root_link": hand.root_link,
         **neighbour_attributes(message),
     }
     return Output({**scenes, **_NO_GRASPS}, said)
 
 
-def _after_grasps(message: TaskMessage, context: TaskContext, base: Shard, rows: range) -> Output:
+def _transfer_to_scenes(message: TaskMessage, context: TaskContext, base: Shard, rows: range) -> Output:
     """Drop the object `request.scenes` times; transfer the base shard's grasps `rows`, numbered from 0."""
     hand, obj = hand_of(context.store, message), object_of(context.store, message)
     context.check()
@@ -78,7 +78,7 @@ def _after_grasps(message: TaskMessage, context: TaskContext, base: Shard, rows:
     grasp, pregrasp = (
         Posture.from_columns(base.arrays, name).take(np.array(rows, int)) for name in ("grasp", "pregrasp")
     )
-    placed = transfer(hand, grasp, pregrasp, scenes["scene/object_pose"])
+    placed = transfer_grasps(hand, grasp, pregrasp, scenes["scene/object_pose"])
     attributes: dict[str, Attribute] = {"base_shard": message.inputs[0], "root_link": hand.root_link}
     attributes |= wrist_attributes(hand)
     rejected = count_rejections(np.asarray(placed["grasp/rejection"], np.uint8))

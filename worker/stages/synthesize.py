@@ -33,7 +33,7 @@ from graspd.worker.stages.assets import (
     pieces_of,
 )
 from graspd.worker.stages.context import Output, TaskContext
-from graspd.worker.stages.ranges import joined, sizes_of
+from graspd.worker.stages.ranges import join_outputs, sizes_of
 
 #: Columns of the scene shard that the base shard repeats, so that it can be used alone.
 _OF_SCENES: Final = ("scene/object_pose", "scene/rest_probability", "scene/neighbour_pose")
@@ -77,7 +77,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
         outcomes=sum_outcomes(one.outcomes for one in found),
     )
     of_scenes: dict[str, Attribute] = {"scene_shard": message.inputs[0]} if scenes else {}
-    whole = joined(message, made)
+    whole = join_outputs(message, made)
     return replace(whole, attributes={**whole.attributes, **said, **of_scenes, **neighbour_attributes(message)})
 
 
@@ -118,7 +118,7 @@ def _stop_if_empty(message: TaskMessage, batch: int, found: ValidatedBatch, *, i
     if batch or request.want == "candidates" or len(found.grasps):
         return
     none = f"none of {found.planned} candidates is {request.counted}"
-    if limit is not None and limit.is_unreachable:
+    if limit is not None and limit.is_far_exceeded:
         raise LoadError(f"{none}: {limit.line}")
     if in_scenes:
         reasons = [format_outcomes(found.outcomes), found.narrow, limit.line if limit is not None else ""]

@@ -20,7 +20,7 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.validation.decomposition import ConvexPieces
 from graspd.worker.validation.key import Level
 from graspd.worker.validation.validator import Verdicts, validate
-from graspd.worker.validation.variant import nearest
+from graspd.worker.validation.variant import nearest_feasible_joints
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ def transfer_grasps(same: HandMatch, grasps: GraspSet) -> GraspSet:
     def posture(part: Posture) -> Posture:
         pose, joints = compose(part.hand_pose, same.base), part.joint_positions[:, same.joints]
         free = same.theirs.dofs == len(same.theirs.joint_names)
-        return Posture(pose, joints if free else nearest(same.theirs, joints))
+        return Posture(pose, joints if free else nearest_feasible_joints(same.theirs, joints))
 
     loss = np.asarray(grasps.stability_loss, float)
     return GraspSet(posture(grasps.grasp), posture(grasps.pregrasp), posture(grasps.squeeze), loss)

@@ -125,7 +125,7 @@ class Lift(Test):
     def _put(self, hand_pose: Floats, joints: Floats) -> None:
         self.scene.place(self.data, hand_pose, joints)
         self.data.mocap_pos[1], self.data.mocap_quat[1] = self._scene_pose[:3], self._scene_pose[3:]
-        self.data.xfrc_applied[self.scene.object_body, :3] = -self.scene.push * self._up
+        self.data.xfrc_applied[self.scene.object_body, :3] = -self.scene.push_force * self._up
         for free, pose in zip(self.scene.neighbours, self._beside, strict=True):
             centre = pose[:3] + quat_rotate(pose[3:], free.centre)
             self.data.qpos[free.qpos : free.qpos + 7] = [*centre, *pose[3:]]
@@ -182,17 +182,17 @@ class Lift(Test):
 
     def _offset(self) -> Floats:
         """Return the displacement (3,) of the object's frame from its commanded position [m]."""
-        at, yielded = super()._offset(), self._root_yield()
+        at, yielded = super()._offset(), self._root_deviation()
         if yielded is not None:
             root, turn = yielded
             at = self.data.mocap_pos[0] + quat_rotate(quat_conjugate(turn), at - root)
         return np.asarray(at - self._goal)
 
     def _turned(self) -> Floats:
-        turned, yielded = super()._turned(), self._root_yield()
+        turned, yielded = super()._turned(), self._root_deviation()
         return turned if yielded is None else quat_multiply(quat_conjugate(yielded[1]), turned)
 
-    def _root_yield(self) -> tuple[Floats, Floats] | None:
+    def _root_deviation(self) -> tuple[Floats, Floats] | None:
         """Return the root's position (3,) and its rotation (4,) relative to the command.
         None if the root is fixed, or motion is measured in the world. Unlike an arm, the protocol's weld yields by 10
         degrees under the weight of a hammer. An object that only follows this deviation has not moved in the hand."""

@@ -18,7 +18,7 @@ from graspd.worker.engines.mujoco_warnings import ARENA
 from graspd.worker.grasps import Posture
 from graspd.worker.hands.jaws import jaws_of
 from graspd.worker.hands.model import ConvexPiece, HandModel, JointType
-from graspd.worker.hands.tendons import Tendon, actuators
+from graspd.worker.hands.tendons import Tendon, actuator_matrix
 from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.environment import CLEAR_M, Neighbour, Obstacle
@@ -110,7 +110,7 @@ class Scene:
     """(G,) allowed depth of fingertips in each geom on the approach [m]; above 0 where contact is allowed."""
 
     @property
-    def push(self) -> float:
+    def push_force(self) -> float:
         """Force of a push, and weight of the object [N]."""
         return ACCELERATION * self.mass
 
@@ -167,7 +167,7 @@ def build(
         joint_qpos=np.array([int(model.joint(f"joint{b}").qposadr[0]) for b in hand.joint_body], np.intp),
         dof_gain=hand.multiplier[lead],
         dof_shift=hand.offset[lead],
-        pulls=actuators(hand.tendons, hand.dofs) if hand.tendons else None,
+        pulls=actuator_matrix(hand.tendons, hand.dofs) if hand.tendons else None,
         centre=obj.centre_of_mass,
         mass=obj.mass,
         support_geoms=np.asarray(support),

@@ -35,7 +35,7 @@ from graspd.worker.hands.kinematics import generalized_forces
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.quality.contact import spread_contacts
-from graspd.worker.quality.posed import posing_of
+from graspd.worker.quality.posed import posture_data_of
 from graspd.worker.quality.wrench_space import EDGES, cone_edges
 from graspd.worker.simulation.environment import PlacedGrasps
 from graspd.worker.validation.decomposition import ConvexPieces
@@ -45,7 +45,7 @@ from graspd.worker.validation.protocol import DIRECTIONS, LOST, Outcome, Test
 
 #: Ratio of upper to lower bound at which the search ends; the payload is the lower bound.
 TOLD: Final = 1.03
-#: First mass as a share of `_bound` (median over the grasps of `benchmarks.payload`), and first ratio of masses.
+#: First mass as a share of `_bearable_mass` (median in `benchmarks.payload`), and first ratio of masses.
 FIRST: Final = 0.75
 STEP: Final = math.sqrt(2)
 #: Largest number of stages of simulation per load.
@@ -60,7 +60,7 @@ class _WeightTest(Test):
         self._own = scene.mass
         self._inertia = np.array(scene.model.body_inertia[scene.object_body])
 
-    def _weigh(self, mass: float) -> None:
+    def _set_mass(self, mass: float) -> None:
         model, body = self.scene.model, self.scene.object_body
         self.scene = replace(self.scene, mass=mass)
         model.body_mass[body] = mass
@@ -69,7 +69,7 @@ class _WeightTest(Test):
         # `data`; the next restored state or the start of a grasp resets this state.
         mujoco.mj_setConst(model, self.data)
 
-    def _bound(self, against: Floats) -> float:
+    def _bearable_mass(self, against: Floats) -> float:
         """Return the mass [kg] whose weight along -`against` (3,) the contacts of the closed hand bear.
         The estimate uses present normal forces and friction, which a load changes."""
         contact, model = self.data.contact, self.scene.model
@@ -108,7 +108,7 @@ class LiftPayload(_WeightTest, FixedRootScene):
 
     def payload(self, grasps: GraspSet, row: int) -> float:
         """Return the payload [kg]; nan if the grasp does not lift the object."""
-        self._weigh(self._own)
+        self._set_mass(self._own)
         if not self._closed(grasps, row):
             return math.nan
         self._save()
@@ -116,7 +116,7 @@ class LiftPayload(_WeightTest, FixedRootScene):
 
         def bears(mass: float) -> bool:
             nonlocal borne
-            self._weigh(mass)
+            self._set_mass(mass)
             self._restore()
             self._hang(borne, mass)
             if self._extrapolate(WATCHED) >= 1.0:
@@ -125,7 +125,7 @@ class LiftPayload(_WeightTest, FixedRootScene):
             borne = mass
             return True
 
-        return self._heaviest(bears, FIRST * self._bound(self._up))
+        return self._heaviest(bears, FIRST * self._bearable_mass(self._up))
 
 
 class PushPayload(_WeightTest):
@@ -135,17 +135,17 @@ class PushPayload(_WeightTest):
 
     def payload(self, grasps: GraspSet, row: int) -> float:
         """Return the payload [kg]; nan if the grasp does not hold the object under the pushes."""
-        self._weigh(self._own)
+        self._set_mass(self._own)
         if self._start(grasps, row).outcomes[0] is Outcome.PENETRATION:
             return math.nan
         if not self._close(grasps, row, give_up=True, stages=HANGING_CLOSING) or is_invalid(self.data):
             return math.nan
         self._save()
-        bounds = [self._bound(-np.array(direction, float)) for direction in DIRECTIONS]
+        bounds = [self._bearable_mass(-np.array(direction, float)) for direction in DIRECTIONS]
         weakest_first = np.argsort(bounds).tolist()
 
         def bears(mass: float) -> bool:
-            self._weigh(mass)
+            self._set_mass(mass)
             for direction in weakest_first:
                 self._restore()
                 self._push(direction)
@@ -204,7 +204,7 @@ class Limit:
     wanted_kg: float | None = None
 
     @property
-    def is_unreachable(self) -> bool:
+    def is_far_exceeded(self) -> bool:
         """Whether the wanted payload is so far above the limit that no more grasps are tested."""
         return self.grasps >= ENOUGH and self.wanted_kg is not None and self.wanted_kg > HOPELESS * self.lifts_kg
 
@@ -310,7 +310,7 @@ _UNBOUNDED: Final = 3
 def capacities(hand: HandModel, obj: ObjectModel, grasp: Posture, against: Floats) -> Floats:
     """Compute load capacities (N,) [kg]; 0 without contact, inf if neither drives nor friction limit it.
     `against` (N, K, 3) are unit vectors against the weight; the least of the K capacities is returned."""
-    probe = posing_of(hand, obj, points=_POINTS, device="cpu").probe
+    probe = posture_data_of(hand, obj, points=_POINTS, device="cpu").probe
     found = probe.touch(grasp)
     facing = (found.distance < WITHIN_M) & probe.facing(found)
     spread, count = spread_contacts(facing[:, None], found.closest, found.normal, scale=obj.radius, limit=MOST)

@@ -94,7 +94,7 @@ class LiftRollout(Lift):
         """Return the ratio of motion to its limit, extrapolated to `HOLD_S` after removal of the supports.
         As soon as the present ratio reaches `enough`, return it without extrapolation."""
         self.data.mocap_pos[1] = self._scene_pose[:3] - AWAY_M * self._up
-        self.data.xfrc_applied[self.scene.object_body, :3] = -weights * self.scene.push * self._up
+        self.data.xfrc_applied[self.scene.object_body, :3] = -weights * self.scene.push_force * self._up
         return self._extrapolate(HANGING, enough)
 
 
@@ -128,7 +128,7 @@ class PushRollout(Test):
         worst = 0.0
         for corner in CORNERS:
             self._restore()
-            self.data.xfrc_applied[self.scene.object_body, :3] = PULL * self.scene.push * corner
+            self.data.xfrc_applied[self.scene.object_body, :3] = PULL * self.scene.push_force * corner
             self._run(PUSHED * STAGE_S)
             worst = max(worst, LOST if is_invalid(self.data) else self._excess())
             if worst >= enough:

@@ -200,7 +200,7 @@ class Test:
 
     def _push(self, direction: int) -> None:
         self.data.xfrc_applied[:] = 0.0
-        self.data.xfrc_applied[self.scene.object_body, :3] = self.scene.push * np.array(DIRECTIONS[direction])
+        self.data.xfrc_applied[self.scene.object_body, :3] = self.scene.push_force * np.array(DIRECTIONS[direction])
 
     def _hold(self, rollout: Rollout) -> Outcome:
         """Simulate a push: reject once a limit is exceeded, accept once faster motion would stay below it."""

@@ -26,7 +26,7 @@ from graspd.worker.simulation.environment import PlacedGrasps
 from graspd.worker.validation.decomposition import ConvexPieces, decompose
 from graspd.worker.validation.lifting import LiftLevel, require_approaches
 from graspd.worker.validation.model import MujocoOptions
-from graspd.worker.validation.variant import Models, Variant, draw, first_axes
+from graspd.worker.validation.variant import Models, Variant, draw_variant, first_axes
 
 NOT_VALIDATED: Final = -1
 #: Numerical tolerance of wanted shares: 0.9 of 10 models is exactly 9.
@@ -49,7 +49,7 @@ class Robustness:
         After an early end the share is a lower bound if the wanted share was reached, else an upper bound."""
         models = self.held.shape[1]
         held, failed = (self.held == 1).sum(axis=1), (self.held == 0).sum(axis=1)
-        reached = held >= needed(self.wanted, models)
+        reached = held >= needed_models(self.wanted, models)
         share = np.where(reached, held, models - failed) / models
         return np.where((self.held == NOT_VALIDATED).all(axis=1), np.nan, share)
 
@@ -74,17 +74,17 @@ class Robustness:
         return counts
 
 
-def needed(wanted: float, models: int) -> int:
+def needed_models(wanted: float, models: int) -> int:
     """Return the number of models in which a grasp must hold for a wanted share; all of them for share 0."""
     return math.ceil(wanted * models - _EXACT) if wanted > 0 else models
 
 
-def reaches(share: Floats, wanted: float) -> NDArray[np.bool_]:
+def reaches_share(share: Floats, wanted: float) -> NDArray[np.bool_]:
     """Return a mask (N,) of shares (N,) that reach the wanted one; nan does not."""
     return np.asarray(np.nan_to_num(share, nan=-1.0) >= wanted - _EXACT)
 
 
-def robust(
+def validate_robustness(
     hand: HandModel,
     obj: ObjectModel,
     grasps: GraspSet,
@@ -121,7 +121,7 @@ def robust(
     physics = MujocoOptions().hardened() if hard else MujocoOptions()
     beside = (placed.supports, placed.neighbours) if placed is not None else ()
     around = Models(hand, obj, pieces or decompose(obj), physics, *beside)
-    least, done = needed(wanted, models), Count(len(tried), run, "robustness")
+    least, done = needed_models(wanted, models), Count(len(tried), run, "robustness")
 
     def holds(row: int, variant: Variant) -> bool:
         if placed is None:
@@ -146,7 +146,7 @@ def robust(
 def models_of(hand: HandModel, grasps: GraspSet, row: int, models: int, seed: int) -> list[tuple[Axis, Variant]]:
     words = (seed, *_digest_words(grasps, row))
     axes = first_axes(hand, models, words)
-    return [(axis, draw(axis, hand, np.random.default_rng((*words, k)))) for k, axis in enumerate(axes)]
+    return [(axis, draw_variant(axis, hand, np.random.default_rng((*words, k)))) for k, axis in enumerate(axes)]
 
 
 def _digest_words(grasps: GraspSet, row: int) -> tuple[int, ...]:

@@ -102,7 +102,7 @@ def validate(
         hard: sliding friction halved, torsional friction a tenth.
         pieces: convex pieces of the object; by default its CoACD pieces.
         known: finished CPU rollouts with the same terms; they are reused, and new rollouts are added.
-        prefilter: result of `prefiltered` on these grasps with the same terms; computed if None.
+        prefilter: result of `prefilter_grasps` on these grasps with the same terms; computed if None.
         run: receives the number of finished grasps; polled for cancellation between grasps."""
     if level not in LEVELS:
         raise InputError(f"unknown level {level!r}; choose one of {', '.join(LEVELS)}")
@@ -122,7 +122,7 @@ def validate(
     _run_tests(case, grasps, [row for row in left if row not in rollouts], rollouts, run)
     if known is not None:
         known |= {key: rollouts[row] for row, key in keys.items()}
-    contradicted = first.contradicted(rollouts)
+    contradicted = first.count_contradicted(rollouts)
     if not first.is_trusted(contradicted):
         log.warning(
             "%d of %d rechecked verdicts are wrong: the CPU validates all grasps", contradicted, len(first.rechecked)
@@ -150,7 +150,7 @@ def validate(
     )
 
 
-def prefiltered(
+def prefilter_grasps(
     hand: HandModel, obj: ObjectModel, grasps: GraspSet, *, level: Level, pieces: ConvexPieces, run: ExecutionContext
 ) -> PrefilterVerdicts:
     """Run the GPU prefilter for `validate` beforehand, in the thread that owns the device."""

@@ -1,6 +1,6 @@
 """Variants of the validator's model: other plausible shapes, drives, tendons, masses and poses.
 
-A `Variant` describes how a model departs from the nominal one. `draw` draws a variant, and `Models` validates in it:
+A `Variant` describes how a model departs from the nominal one. `draw_variant` draws one, and `Models` validates in it:
 new shapes are recompiled, other numbers are changed in a copy."""
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ def first_axes(hand: HandModel, models: int, seed: tuple[int, ...]) -> list[Axis
     return [axes[i] for k in rounds for i in np.random.default_rng((*seed, k)).permutation(len(axes))][:models]
 
 
-def draw(axis: Axis, hand: HandModel, rng: np.random.Generator) -> Variant:
+def draw_variant(axis: Axis, hand: HandModel, rng: np.random.Generator) -> Variant:
     """Draw a variant of a hand along one axis.
     Directions are uniform on the sphere, sizes uniform in their range, factors log-uniform. Raises ValueError: no axis
     is given, or the hand has no couplings."""
@@ -195,7 +195,7 @@ def replace_coupling(hand: HandModel, coupling: Coupling) -> HandModel:
     )
 
 
-def nearest(hand: HandModel, joints: Floats) -> Floats:
+def nearest_feasible_joints(hand: HandModel, joints: Floats) -> Floats:
     """Return the nearest joint positions (N, J) that are feasible for a hand with fewer dofs."""
     dof, rate = hand.dof[hand.joint_body], hand.multiplier[hand.joint_body]
     drive = np.zeros((len(dof), hand.dofs))
@@ -256,9 +256,9 @@ class Models:
         """Project the grasp onto the postures of a hand with fewer dofs."""
         if scene.hand.dofs < self.hand.dofs:
             for part in (one.grasp, one.pregrasp, one.squeeze):
-                part.joint_positions = nearest(scene.hand, part.joint_positions)
+                part.joint_positions = nearest_feasible_joints(scene.hand, part.joint_positions)
             if one.coming is not None:
-                one.coming = nearest(scene.hand, one.coming)
+                one.coming = nearest_feasible_joints(scene.hand, one.coming)
         return one
 
     def scene(self, variant: Variant) -> Scene:

@@ -29,7 +29,15 @@ from graspd.service.index.tables import (
 from graspd.service.model.domain import Asset, JobOptions
 from graspd.service.model.errors import LoadError, SceneError
 from graspd.service.model.messages import WorkerBeat
-from graspd.service.model.planning import TaskFacts, batch_ready, batch_states, job_state, plan, ranges_of, stages_of
+from graspd.service.model.planning import (
+    TaskFacts,
+    count_ranges,
+    job_state,
+    plan_tasks,
+    range_ready_mask,
+    range_states,
+    stages_of,
+)
 from graspd.service.model.records import (
     AttemptRecord,
     DatasetEvent,
@@ -86,7 +94,7 @@ _UNSTARTED: Final = {
 
 def task_rows(record: JobRecord, ranges: range | None = None) -> Iterator[Row]:
     order = stages_of(record.request)
-    for task in plan(record, ranges):
+    for task in plan_tasks(record, ranges):
         yield {
             "id": task.id,
             "job_id": record.id,
@@ -175,10 +183,12 @@ _WHOSE: Final = (jobs.c.project, jobs.c.owner)
 
 def derive_states(connection: Connection, job_id: str, batches: Collection[int] | None = None) -> State:
     """Derive the states of a job's tasks, in all or some batches, and of the job; return the job's state."""
-    return derive_batch_states(connection, {job_id: batches})[job_id]
+    return derive_task_and_job_states(connection, {job_id: batches})[job_id]
 
 
-def derive_batch_states(connection: Connection, touched: Mapping[str, Collection[int] | None]) -> dict[str, State]:
+def derive_task_and_job_states(
+    connection: Connection, touched: Mapping[str, Collection[int] | None]
+) -> dict[str, State]:
     """Derive the states of tasks in some batches (None: all) and of their jobs; return the jobs' states.
 
     If a job's first batch fails because of its scenes or the object's weight, the other batches are cancelled.
@@ -208,7 +218,7 @@ def _derive_task_states(connection: Connection, touched: Mapping[str, Collection
         rows += connection.execute(query).mappings()
     changes: defaultdict[tuple[str, bool], list[str]] = defaultdict(list)
     for (job, _), chain in groupby(rows, key=lambda row: (row["job_id"], row["batch"])):
-        for task, state, ready in _changes(list(chain), cancelled=job in cancelled):
+        for task, state, ready in _changed_tasks(list(chain), cancelled=job in cancelled):
             changes[state, ready].append(task)
     for (state, ready), ids in changes.items():
         for some in chunks(ids):
@@ -229,13 +239,13 @@ def _first_batch_failed() -> ColumnElement[bool]:
     )
 
 
-def _changes(chain: Sequence[Any], *, cancelled: bool) -> list[tuple[str, str, bool]]:
+def _changed_tasks(chain: Sequence[Any], *, cancelled: bool) -> list[tuple[str, str, bool]]:
     """Return the changed tasks of a batch, each with its new state and readiness."""
     facts = [TaskFacts(running=row["state"] == State.RUNNING, **{name: row[name] for name in _FACTS}) for row in chain]
-    states = batch_states(facts, job_cancelled=cancelled)
+    states = range_states(facts, job_cancelled=cancelled)
     return [
         (row["id"], state.value, ready)
-        for row, state, ready in zip(chain, states, batch_ready(states), strict=True)
+        for row, state, ready in zip(chain, states, range_ready_mask(states), strict=True)
         if (row["state"], row["ready"]) != (state.value, ready)
     ]
 
@@ -283,7 +293,7 @@ class Changes(IndexPart):
 
     def add_job(self, record: JobRecord, *, within: Connection | None = None) -> State:
         """Add a job with all its tasks; tasks whose shard exists have succeeded."""
-        with self.database.writing(within) as connection:
+        with self.database.write_transaction(within) as connection:
             self._upsert_job(connection, record)
             self._upsert_tasks(connection, list(task_rows(record)))
             return derive_states(connection, record.id)
@@ -294,14 +304,14 @@ class Changes(IndexPart):
         self._upsert_job(within, record)
         self._enter(within, record, 0, goes_on=is_new)
 
-    def entering(self) -> list[str]:
+    def partly_entered_jobs(self) -> list[str]:
         """Return the ids of jobs with tasks that are not yet in the index."""
         query = select(notes.c.name).where(notes.c.name.startswith(ENTERING)).order_by(notes.c.name)
         return [name.removeprefix(ENTERING) for name in self.database.column(query)]
 
     def enter_more(self, job_id: str, record: JobRecord | None) -> None:
         """Add the next tasks of a large job; add no more if its record was deleted (None)."""
-        with self.database.writing() as connection:
+        with self.database.write_transaction() as connection:
             is_there = connection.scalar(select(jobs.c.id).where(jobs.c.id == job_id)) is not None
             note: Any = connection.scalar(select(notes.c.value).where(notes.c.name == ENTERING + job_id))
             if record is None or not is_there:
@@ -315,7 +325,7 @@ class Changes(IndexPart):
         """Add shards with their grasps, and mark their tasks as succeeded; return the states of their jobs."""
         new = {manifest.shard_id: manifest for manifest in manifests}
         touched: defaultdict[str, set[int]] = defaultdict(set)
-        with self.database.writing(within) as connection:
+        with self.database.write_transaction(within) as connection:
             charged = self._requesting_projects(connection, list(new))
             rows = [shard_row(manifest) | {"charged": charged.get(shard, "")} for shard, manifest in new.items()]
             upsert(connection, shards, rows, keep=("charged",))
@@ -325,13 +335,13 @@ class Changes(IndexPart):
                 made = made.values(_outcome(*_OUTCOME)).returning(tasks.c.job_id, tasks.c.batch)
                 for job, batch in connection.execute(made):
                     touched[job].add(batch)
-            return derive_batch_states(connection, touched)
+            return derive_task_and_job_states(connection, touched)
 
     def add_attempt(
         self, attempt: AttemptRecord, *, not_before: float = 0.0, within: Connection | None = None
     ) -> State | None:
         """Add a failed attempt; the next is due at `not_before` [s]. Return the job's state, if it changed."""
-        with self.database.writing(within) as connection:
+        with self.database.write_transaction(within) as connection:
             if connection.scalar(select(tasks.c.id).where(tasks.c.id == attempt.task_id)) is None:
                 return None  # The job is deleted, or the attempt is forged.
             upsert(connection, attempts, [row_from(attempts, attempt, stage=attempt.stage.value)])
@@ -352,7 +362,7 @@ class Changes(IndexPart):
     def set_job_events(self, job_id: str, events: Sequence[JobEvent], *, within: Connection | None = None) -> State:
         """Apply all events of a job so far, the oldest first, to the job and its tasks."""
         cancelled = bool(events) and events[-1].what == "cancelled"
-        with self.database.writing(within) as connection:
+        with self.database.write_transaction(within) as connection:
             connection.execute(update(jobs).where(jobs.c.id == job_id).values(cancelled=cancelled))
             for event in events:
                 for task_id, upto in event.retried.items():
@@ -364,7 +374,7 @@ class Changes(IndexPart):
 
     def add_asset(self, asset: Asset, check: Mapping[str, Any] | None, *, within: Connection | None = None) -> None:
         """Add an asset with the result of its check, None while the check is pending."""
-        with self.database.writing(within) as connection:
+        with self.database.write_transaction(within) as connection:
             upsert(connection, assets, [asset_row(asset, check)], keep=("last_attempt", "queued", "not_before"))
 
     def _upsert_job(self, connection: Connection, record: JobRecord) -> None:
@@ -379,7 +389,7 @@ class Changes(IndexPart):
 
     def _enter(self, connection: Connection, record: JobRecord, first: int, *, goes_on: bool) -> None:
         """Add up to `RANGES_AT_ONCE` ranges, starting at `first`; a note stores the next range, if any."""
-        number = ranges_of(record.request.grasps, record.span)
+        number = count_ranges(record.request.grasps, record.span)
         some = range(first, min(number, first + RANGES_AT_ONCE))
         self._upsert_tasks(connection, list(task_rows(record, some)))
         if goes_on and some.stop < number:
@@ -438,7 +448,7 @@ class DatasetChanges(IndexPart):
             }
             for cell in record.cells()
         ]
-        with self.database.writing(within) as connection:
+        with self.database.write_transaction(within) as connection:
             upsert(connection, datasets, [row], keep=("cancelled", "events", "applied", "planned"))
             upsert(connection, dataset_cells, cells)
 
@@ -447,23 +457,23 @@ class DatasetChanges(IndexPart):
         cancelled = bool(events) and events[-1].what == "cancelled"
         number = max((event.number for event in events), default=0)
         values = {"cancelled": cancelled, "events": number, "planned": False}
-        with self.database.writing(within) as connection:
+        with self.database.write_transaction(within) as connection:
             connection.execute(update(datasets).where(datasets.c.name == name).values(**values))
 
     def add_snapshot(self, snapshot: Snapshot, *, within: Connection | None = None) -> None:
         plain = ("dataset", "digest", "created", "complete", "grasps", "valid", "size_bytes")
         row = {name: getattr(snapshot, name) for name in plain} | {"shards": len(snapshot.shards)}
-        with self.database.writing(within) as connection:
+        with self.database.write_transaction(within) as connection:
             upsert(connection, dataset_snapshots, [row])
 
     def add_object_set(self, found: ObjectSet, *, within: Connection | None = None) -> None:
         row = {name: getattr(found, name) for name in ("name", "digest", "created", "project")}
         row |= {"objects": list(found.objects)}
-        with self.database.writing(within) as connection:
+        with self.database.write_transaction(within) as connection:
             upsert(connection, object_sets, [row])
 
     def set_progress(self, name: str, **values: int) -> None:
-        with self.database.writing() as connection:
+        with self.database.write_transaction() as connection:
             connection.execute(update(datasets).where(datasets.c.name == name).values(**values))
 
 
@@ -474,7 +484,7 @@ class Live(IndexPart):
     def set_running(self, workers: Mapping[str, str]) -> dict[str, State]:
         """Mark queued tasks as running; `workers` maps tasks to workers. Return the states of their jobs."""
         running = State.RUNNING.value
-        with self.database.writing() as connection:
+        with self.database.write_transaction() as connection:
             waiting = select(tasks.c.id, tasks.c.job_id).where(tasks.c.state == State.QUEUED.value)
             jobs_of = {row.id: row.job_id for row in rows_in(connection, waiting, tasks.c.id, workers)}
             started = {"state": running, "queued": True, "progress_done": 0.0, "progress_total": 0.0}
@@ -492,11 +502,11 @@ class Live(IndexPart):
             {"id": task, "progress_done": done, "progress_total": total, "progress_message": sanitize(message)}
             for task, (done, total, message) in progress.items()
         ]
-        with self.database.writing() as connection:
+        with self.database.write_transaction() as connection:
             update_rows(connection, tasks, rows, state=State.RUNNING.value)
 
     def set_queued(self, task_ids: Sequence[str]) -> None:
-        with self.database.writing() as connection:
+        with self.database.write_transaction() as connection:
             for some in chunks(task_ids):
                 connection.execute(update(tasks).where(tasks.c.id.in_(some), _UNFINISHED).values(queued=True))
 
@@ -507,7 +517,7 @@ class Live(IndexPart):
         values = {"queued": False, "not_before": not_before, "state": State.QUEUED.value, "worker": None}
         values |= {**NO_PROGRESS, "progress_message": message and sanitize(message)}
         touched: set[str] = set()
-        with self.database.writing() as connection:
+        with self.database.write_transaction() as connection:
             for some in chunks(task_ids):
                 statement = update(tasks).where(tasks.c.id.in_(some), _UNFINISHED).values(**values)
                 touched |= set(connection.scalars(statement.returning(tasks.c.job_id)))
@@ -520,7 +530,7 @@ class Live(IndexPart):
         values: dict[str, Any] = {"queued": queued, "not_before": not_before}
         if message is not None:
             values["message"] = sanitize(message)
-        with self.database.writing() as connection:
+        with self.database.write_transaction() as connection:
             connection.execute(update(assets).where(assets.c.digest.in_(list(digests))).values(**values))
 
     def set_workers(self, beats: Sequence[WorkerBeat], *, forget_before: str, lost_before: str = "9999") -> None:
@@ -529,7 +539,7 @@ class Live(IndexPart):
             row_from(workers, beat, stages=[stage.value for stage in beat.stages], task_id=beat.task_id or None)
             for beat in beats
         ]
-        with self.database.writing() as connection:
+        with self.database.write_transaction() as connection:
             upsert(connection, workers, rows)
             living = {beat.name for beat in beats}
             known = connection.execute(select(workers.c.name, workers.c.seen, workers.c.state)).all()
@@ -541,12 +551,12 @@ class Live(IndexPart):
             self.forget_workers([row.name for row in gone if row.seen < forget_before], within=connection)
 
     def forget_workers(self, names: Sequence[str], *, within: Connection | None = None) -> None:
-        with self.database.writing(within) as connection:
+        with self.database.write_transaction(within) as connection:
             for some in chunks(names):
                 connection.execute(delete(workers).where(workers.c.name.in_(some)))
 
     def add_asset_attempt(self, digest: str, number: int, *, not_before: float) -> None:
         values = {"last_attempt": number, "queued": False, "not_before": not_before}
-        with self.database.writing() as connection:
+        with self.database.write_transaction() as connection:
             earlier = (assets.c.digest == digest, assets.c.last_attempt < number)
             connection.execute(update(assets).where(*earlier).values(**values))

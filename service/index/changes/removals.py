@@ -28,7 +28,7 @@ from graspd.service.model.states import AssetKind, Priority, State
 class Removals(IndexPart):
     """`within` makes a read or write part of a larger transaction, so that checks still hold at the write."""
 
-    def user_of_asset(self, asset: AssetView, *, within: Connection) -> str:
+    def reason_to_keep_asset(self, asset: AssetView, *, within: Connection) -> str:
         """Return what needs a hand, object or network, in a few words; empty if nothing needs it."""
         kind, digest = asset.kind, asset.digest
         column = f"{kind.value}_digest"
@@ -39,7 +39,7 @@ class Removals(IndexPart):
         if dataset := within.scalar(select(name).where(name.table.c[column] == digest).limit(1)):
             return f"dataset {dataset!r}"
         if kind is AssetKind.OBJECT:
-            if user := _user_of_neighbour(digest, within):
+            if user := _reason_to_keep_neighbour(digest, within):
                 return user
             newest = select(object_sets).order_by(object_sets.c.name, object_sets.c.created, object_sets.c.digest)
             rows = {row["name"]: row for row in within.execute(newest).mappings()}
@@ -49,7 +49,7 @@ class Removals(IndexPart):
                 return f"the set of objects {found!r}"
         return ""
 
-    def user_of_job(self, job_id: str, *, within: Connection) -> str:
+    def reason_to_keep_job(self, job_id: str, *, within: Connection) -> str:
         """Return why a job cannot be deleted, as words that follow `job ID`; empty if nothing prevents it."""
         state = within.scalar(select(jobs.c.state).where(jobs.c.id == job_id))
         if state is None:
@@ -63,11 +63,11 @@ class Removals(IndexPart):
         query = select(attempts.c.task_id, attempts.c.number).where(attempts.c.job_id == job_id)
         return tuple((row.task_id, row.number) for row in within.execute(query))
 
-    def snapshots_of(self, dataset: str, *, within: Connection) -> int:
+    def count_snapshots(self, dataset: str, *, within: Connection) -> int:
         query = select(func.count()).where(dataset_snapshots.c.dataset == dataset)
         return int(within.scalar(query) or 0)
 
-    def planned_only(self, ids: Sequence[str]) -> list[str]:
+    def orphaned_dataset_jobs(self, ids: Sequence[str]) -> list[str]:
         """Return the given jobs that were made for a dataset and are in no dataset now."""
         planned = (jobs.c.priority == Priority.BULK.value, jobs.c.origin.is_(None))
         needed = exists().where(dataset_cells.c.job_id == jobs.c.id)
@@ -80,11 +80,11 @@ class Removals(IndexPart):
         return set(self.database.column(query))
 
     def remove_asset(self, kind: AssetKind, digest: str, *, within: Connection | None = None) -> None:
-        with self.database.writing(within) as connection:
+        with self.database.write_transaction(within) as connection:
             connection.execute(delete(assets).where(assets.c.kind == kind.value, assets.c.digest == digest))
 
     def remove_job(self, job_id: str, *, within: Connection | None = None) -> None:
-        with self.database.writing(within) as connection:
+        with self.database.write_transaction(within) as connection:
             of_job = select(tasks.c.id).where(tasks.c.job_id == job_id)
             gone = or_(attempts.c.job_id == job_id, attempts.c.task_id.in_(of_job))
             connection.execute(delete(attempts).where(gone))
@@ -92,7 +92,7 @@ class Removals(IndexPart):
             connection.execute(delete(jobs).where(jobs.c.id == job_id))
 
     def remove_dataset(self, name: str, *, within: Connection | None = None) -> None:
-        with self.database.writing(within) as connection:
+        with self.database.write_transaction(within) as connection:
             connection.execute(delete(dataset_snapshots).where(dataset_snapshots.c.dataset == name))
             connection.execute(delete(dataset_cells).where(dataset_cells.c.dataset == name))
             connection.execute(delete(datasets).where(datasets.c.name == name))
@@ -121,7 +121,7 @@ def _remember_cost(shard: str, connection: Connection) -> None:
         connection.execute(insert(spent).values(**key, **more))
 
 
-def _user_of_neighbour(digest: str, connection: Connection) -> str:
+def _reason_to_keep_neighbour(digest: str, connection: Connection) -> str:
     """Return which job or dataset has an object among its neighbours, in a few words; empty if none has."""
     among = f"%{digest}%"
     # The first condition uses the index `jobs_beside`, so only jobs with neighbours are read.

@@ -6,7 +6,14 @@ from collections.abc import Collection
 
 from sqlalchemy import ColumnElement, Connection, and_, case, or_, select
 
-from graspd.service.index.database import IndexPart, assets_in_scope, in_scope, nearest_asset, page_rows, rows_in
+from graspd.service.index.database import (
+    IndexPart,
+    asset_scope_conditions,
+    asset_scope_order,
+    page_rows,
+    rows_in,
+    scope_conditions,
+)
 from graspd.service.index.tables import assets, object_sets
 from graspd.service.index.views import AssetView, ObjectSetView, Page
 from graspd.service.model.errors import SEARCHED, NotFoundError, available_names
@@ -25,10 +32,10 @@ class Assets(IndexPart):
         scope: ProjectScope = EVERYTHING,
     ) -> Page[AssetView]:
         """Return a page of hands or objects, all versions, newest first; refused ones only on request."""
-        query = select(assets).where(assets.c.kind == kind.value, *assets_in_scope(scope))
+        query = select(assets).where(assets.c.kind == kind.value, *asset_scope_conditions(scope))
         if not refused:
             query = query.where(_not_refused())
-        with self.database.reading() as connection:
+        with self.database.read_transaction() as connection:
             key = assets.c.created, assets.c.digest
             rows, following = page_rows(connection, query, *key, limit=limit, cursor=cursor)
         return Page(items=[AssetView(**row) for row in rows], next=following)
@@ -38,17 +45,19 @@ class Assets(IndexPart):
         named = and_(assets.c.kind == kind.value, assets.c.name == name_or_digest)
         by_digest = and_(assets.c.kind == kind.value, assets.c.digest == name_or_digest)
         refused_last = case((assets.c.verdict == "refuse", 1), else_=0)
-        query = select(assets).where(named | by_digest, *assets_in_scope(scope))
-        order = (refused_last, nearest_asset(scope), assets.c.created.desc(), assets.c.digest.desc())
+        query = select(assets).where(named | by_digest, *asset_scope_conditions(scope))
+        order = (refused_last, asset_scope_order(scope), assets.c.created.desc(), assets.c.digest.desc())
         if found := self.database.rows(query.order_by(*order).limit(1)):
             return AssetView(**found[0])
-        known = select(assets.c.name).where(assets.c.kind == kind.value, _not_refused(), *assets_in_scope(scope))
+        known = select(assets.c.name).where(assets.c.kind == kind.value, _not_refused(), *asset_scope_conditions(scope))
         names = self.database.column(known.distinct().order_by(assets.c.name).limit(SEARCHED))
         raise NotFoundError(f"there is no {kind.value} {name_or_digest!r}{available_names(name_or_digest, names)}")
 
     def sizes(self, kind: AssetKind, wanted: Collection[str], *, scope: ProjectScope = EVERYTHING) -> dict[str, int]:
         """Return the sizes [bytes] of the named hands or objects; unknown names are omitted."""
-        query = select(assets.c.name, assets.c.size_bytes).where(assets.c.kind == kind.value, *assets_in_scope(scope))
+        query = select(assets.c.name, assets.c.size_bytes).where(
+            assets.c.kind == kind.value, *asset_scope_conditions(scope)
+        )
         sizes = {row["name"]: row["size_bytes"] for row in self.database.rows(query.order_by(assets.c.created))}
         return {name: sizes[name] for name in wanted if name in sizes}
 
@@ -66,11 +75,11 @@ def _not_refused() -> ColumnElement[bool]:
 
 class ObjectSets(IndexPart):
     def newest(self, *, scope: ProjectScope = EVERYTHING) -> list[ObjectSetView]:
-        query = select(object_sets).where(*in_scope(scope, object_sets))
+        query = select(object_sets).where(*scope_conditions(scope, object_sets))
         query = query.order_by(object_sets.c.name, object_sets.c.created, object_sets.c.digest)
         return list({row["name"]: ObjectSetView(**row) for row in self.database.rows(query)}.values())
 
-    def named(self, name: str) -> ObjectSetView | None:
+    def newest_version(self, name: str) -> ObjectSetView | None:
         """Return the newest set of this name in any project; None if there is none."""
         query = select(object_sets).where(object_sets.c.name == name)
         rows = self.database.rows(query.order_by(object_sets.c.created.desc(), object_sets.c.digest.desc()).limit(1))

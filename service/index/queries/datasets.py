@@ -8,13 +8,13 @@ from typing import Any, Final
 
 from sqlalchemy import ColumnElement, Connection, Float, case, cast, func, literal, select
 
-from graspd.service.index.database import IndexPart, in_scope, page_rows
+from graspd.service.index.database import IndexPart, page_rows, scope_conditions
 from graspd.service.index.queries.jobs import SHARE_DONE, outcomes_of
 from graspd.service.index.tables import attempts, dataset_cells, dataset_snapshots, datasets, jobs, shards, tasks
 from graspd.service.index.views import CellView, DatasetView, Page, SnapshotView
 from graspd.service.model.domain import JobOptions
 from graspd.service.model.errors import SEARCHED, NotFoundError, available_names
-from graspd.service.model.planning import job_state, ranges_of, shortfall, stages_of
+from graspd.service.model.planning import count_ranges, explain_shortfall, job_state, stages_of
 from graspd.service.model.projects import EVERYTHING, ProjectScope
 from graspd.service.model.records import SnapshotShard
 from graspd.service.model.states import Stage, State
@@ -26,13 +26,13 @@ class Datasets(IndexPart):
     def page(
         self, *, limit: int = 50, cursor: str | None = None, scope: ProjectScope = EVERYTHING
     ) -> Page[DatasetView]:
-        query, key = select(datasets).where(*in_scope(scope, datasets)), (datasets.c.created, datasets.c.name)
-        with self.database.reading() as connection:
+        query, key = select(datasets).where(*scope_conditions(scope, datasets)), (datasets.c.created, datasets.c.name)
+        with self.database.read_transaction() as connection:
             rows, following = page_rows(connection, query, *key, limit=limit, cursor=cursor)
             return Page(items=[_dataset_view(connection, row) for row in rows], next=following)
 
     def get(self, name: str, *, scope: ProjectScope = EVERYTHING) -> DatasetView:
-        with self.database.reading() as connection:
+        with self.database.read_transaction() as connection:
             view = _dataset_view(connection, _dataset_row(connection, name, scope))
             if view.reason is None:
                 return view
@@ -41,11 +41,11 @@ class Datasets(IndexPart):
 
     def unfinished(self, names: Collection[str]) -> set[str]:
         query = select(datasets).where(datasets.c.name.in_(sorted(names)))
-        with self.database.reading() as connection:
+        with self.database.read_transaction() as connection:
             rows = connection.execute(query).mappings().all()
             return {row["name"] for row in rows if not _state(row, _states(connection, row)).is_final}
 
-    def ended(self, *, within: Connection) -> dict[str, int]:
+    def ended_event_counts(self, *, within: Connection) -> dict[str, int]:
         rows = self.database.rows(select(datasets), within)
         return {row["name"]: row["events"] for row in rows if _state(row, _states(within, row)).is_final}
 
@@ -58,7 +58,7 @@ class Datasets(IndexPart):
         cursor: str | None = None,
         scope: ProjectScope = EVERYTHING,
     ) -> Page[CellView]:
-        with self.database.reading() as connection:
+        with self.database.read_transaction() as connection:
             dataset = _dataset_row(connection, name, scope)
             now = _cell_state(dataset["cancelled"])
             planned = jobs.c.id.is_not(None).label("planned")
@@ -84,7 +84,7 @@ class Datasets(IndexPart):
             .where(dataset_cells.c.dataset == name)
             .order_by(dataset_cells.c.position, tasks.c.batch, tasks.c.position)
         )
-        with self.database.reading() as connection:
+        with self.database.read_transaction() as connection:
             _dataset_row(connection, name)
             return [SnapshotShard(**row) for row in connection.execute(query).mappings()]
 
@@ -93,17 +93,17 @@ class Datasets(IndexPart):
     ) -> Page[SnapshotView]:
         query = select(dataset_snapshots).where(dataset_snapshots.c.dataset == name)
         key = (dataset_snapshots.c.created, dataset_snapshots.c.digest)
-        with self.database.reading() as connection:
+        with self.database.read_transaction() as connection:
             _dataset_row(connection, name, scope)
             rows, following = page_rows(connection, query, *key, limit=limit, cursor=cursor)
         return Page(items=[SnapshotView(**row) for row in rows], next=following)
 
 
 def _dataset_row(connection: Connection, name: str, scope: ProjectScope = EVERYTHING) -> Any:
-    query = select(datasets).where(datasets.c.name == name, *in_scope(scope, datasets))
+    query = select(datasets).where(datasets.c.name == name, *scope_conditions(scope, datasets))
     row = connection.execute(query).mappings().first()
     if row is None:
-        known = select(datasets.c.name).where(*in_scope(scope, datasets)).order_by(datasets.c.created.desc())
+        known = select(datasets.c.name).where(*scope_conditions(scope, datasets)).order_by(datasets.c.created.desc())
         names = list(connection.scalars(known.limit(SEARCHED)))
         raise NotFoundError(f"there is no dataset {name!r}{available_names(name, names)}")
     return row
@@ -122,7 +122,7 @@ def _dataset_view(connection: Connection, row: Any) -> DatasetView:
     state = _state(row, states)
     work = _task_counts(connection, dataset_cells.c.dataset == row["name"])
     made = _grasp_counts(connection, dataset_cells.c.dataset == row["name"])
-    tasks_asked = max(work["tasks"], _tasks_of_dataset(connection, row["name"], options))
+    tasks_asked = max(work["tasks"], _count_tasks_of_dataset(connection, row["name"], options))
     left = tasks_asked - work["share"]
     pace = made["seconds"] / work["done"] if work["done"] else None
     return DatasetView(
@@ -165,16 +165,16 @@ def _states(connection: Connection, row: Any) -> dict[State, int]:
     return {state: found.get(state, 0) for state in State}
 
 
-def _tasks_of_cell(options: JobOptions, span: int | None) -> int:
+def _count_tasks_of_cell(options: JobOptions, span: int | None) -> int:
     """Return the number of tasks of a cell; `span` is batches per task, None (used as 1) without a job."""
-    return ranges_of(options.grasps, span or 1) * len(stages_of(options))
+    return count_ranges(options.grasps, span or 1) * len(stages_of(options))
 
 
-def _tasks_of_dataset(connection: Connection, name: str, options: JobOptions) -> int:
+def _count_tasks_of_dataset(connection: Connection, name: str, options: JobOptions) -> int:
     query = select(jobs.c.span, func.count()).select_from(dataset_cells)
     query = query.outerjoin(jobs, jobs.c.id == dataset_cells.c.job_id).where(dataset_cells.c.dataset == name)
     found = connection.execute(query.group_by(jobs.c.span))
-    return sum(count * _tasks_of_cell(options, span) for span, count in found)
+    return sum(count * _count_tasks_of_cell(options, span) for span, count in found)
 
 
 def _task_counts(connection: Connection, where: ColumnElement[bool]) -> dict[str, Any]:
@@ -215,13 +215,13 @@ def _cell_views(connection: Connection, rows: Sequence[Any], options: JobOptions
     for row in rows:
         job = row["job_id"]
         count = work[job]
-        total = max(count["tasks"], _tasks_of_cell(options, row["span"]))
+        total = max(count["tasks"], _count_tasks_of_cell(options, row["span"]))
         yields = made.get(job, {"seconds": 0.0})
         found = yields.get("valid" if options.counted == "valid" else "grasps", 0)
         reason = row["reason"]
         if row["state"] == State.SUCCEEDED.value and options.want == "valid" and found < options.grasps:
             lost = outcomes_of(connection, tasks.c.job_id == job)
-            reason = shortfall(
+            reason = explain_shortfall(
                 found, options.grasps, options.counted, yields.get("candidates", 0), options.budget, lost
             )
         views.append(
@@ -270,7 +270,7 @@ def _count(condition: ColumnElement[bool]) -> ColumnElement[int]:
     return func.coalesce(func.sum(case((condition, 1), else_=0)), 0)
 
 
-def _base(column: ColumnElement[int]) -> ColumnElement[int]:
+def _sum_over_base(column: ColumnElement[int]) -> ColumnElement[int]:
     return func.coalesce(func.sum(case((_IS_BASE, column), else_=0)), 0)
 
 
@@ -278,8 +278,8 @@ _MADE: Final = (
     func.count().label("shards"),
     func.coalesce(func.sum(shards.c.size_bytes), 0).label("size_bytes"),
     func.coalesce(func.sum(shards.c.seconds), 0.0).label("seconds"),
-    _base(shards.c.count).label("grasps"),
-    _base(shards.c.valid).label("valid"),
-    _base(shards.c.candidates).label("candidates"),
-    _base(shards.c.validated).label("validated"),
+    _sum_over_base(shards.c.count).label("grasps"),
+    _sum_over_base(shards.c.valid).label("valid"),
+    _sum_over_base(shards.c.candidates).label("candidates"),
+    _sum_over_base(shards.c.validated).label("validated"),
 )

@@ -12,7 +12,7 @@ from sqlalchemy import Column, ColumnElement, exists, or_, select
 from graspd.service.index.database import IndexPart
 from graspd.service.index.tables import assets, dataset_cells, datasets, jobs, tasks
 from graspd.service.model.domain import JobOptions
-from graspd.service.model.planning import MAX_BACKOFF_S, PlannedTask, RoundRobin, WaitingJob, interleave, share_of
+from graspd.service.model.planning import MAX_BACKOFF_S, PlannedTask, RoundRobin, WaitingJob, interleave, queue_owner
 from graspd.service.model.records import Cell, Choice, JobRecord, Member
 from graspd.service.model.states import AssetKind, Priority, Stage, State
 
@@ -50,18 +50,20 @@ class Feed(IndexPart):
             .order_by(jobs.c.created, jobs.c.id)
         )
         rows = self.database.rows(query)
-        return [WaitingJob(row["id"], share_of(row["project"], (row["origin"] or {}).get("key", ""))) for row in rows]
+        return [
+            WaitingJob(row["id"], queue_owner(row["project"], (row["origin"] or {}).get("key", ""))) for row in rows
+        ]
 
     def ready_tasks(self, priority: Priority, turns: RoundRobin, *, now: float, limit: int) -> list[ReadyTask]:
         """Return at most `limit` tasks to queue: round-robin over projects or keys, then over their jobs."""
         of_key: dict[str, list[list[tuple[WaitingJob, ReadyTask]]]] = defaultdict(list)
         for job, share in turns.order(self.waiting_jobs(priority, now=now), limit):
-            of_key[job.key].append([(job, task) for task in self.ready_of_job(job.id, limit=share, now=now)])
+            of_key[job.key].append([(job, task) for task in self.ready_tasks_of_job(job.id, limit=share, now=now)])
         chosen = interleave([interleave(of_jobs) for of_jobs in of_key.values()])[:limit]
-        turns.served([job for job, _ in chosen])
+        turns.record_served([job for job, _ in chosen])
         return [task for _, task in chosen]
 
-    def ready_of_job(self, job_id: str, *, limit: int, now: float | None = None) -> list[ReadyTask]:
+    def ready_tasks_of_job(self, job_id: str, *, limit: int, now: float | None = None) -> list[ReadyTask]:
         """Return the first tasks of one job that are ready to queue; without `now`, ignore back-offs."""
         due = () if now is None else (_due(tasks.c.not_before, now),)
         query = (
@@ -73,7 +75,7 @@ class Feed(IndexPart):
         )
         rows = self.database.rows(query)
         record = _record(rows[0]) if rows else None
-        return [_ready(row, record) for row in rows if record is not None]
+        return [_ready_task(row, record) for row in rows if record is not None]
 
     def ready_checks(self, *, now: float, limit: int) -> list[ReadyCheck]:
         open_ = (assets.c.verdict.is_(None), assets.c.queued.is_(False), _due(assets.c.not_before, now))
@@ -83,22 +85,22 @@ class Feed(IndexPart):
             for row in self.database.rows(query)
         ]
 
-    def believed_queued(self) -> tuple[set[str], set[tuple[AssetKind, str]]]:
+    def queued_tasks_and_checks(self) -> tuple[set[str], set[tuple[AssetKind, str]]]:
         """Return unfinished tasks and checks of assets that the index marks as queued."""
         unfinished = tasks.c.state.in_((State.QUEUED.value, State.RUNNING.value))
         of_tasks = select(tasks.c.id).where(tasks.c.ready.is_(True), tasks.c.queued.is_(True), unfinished)
         of_checks = select(assets.c.kind, assets.c.digest).where(assets.c.queued.is_(True), assets.c.verdict.is_(None))
-        with self.database.reading() as connection:
+        with self.database.read_transaction() as connection:
             checks = {(AssetKind(kind), digest) for kind, digest in connection.execute(of_checks)}
             return set(connection.scalars(of_tasks)), checks
 
     def outputs(self, task_ids: Collection[str]) -> dict[str, tuple[str, str]]:
         query = select(tasks.c.id, tasks.c.stage, tasks.c.shard_id)
-        return {task: (stage, shard) for task, stage, shard in self.database.among(query, tasks.c.id, task_ids)}
+        return {task: (stage, shard) for task, stage, shard in self.database.matching_rows(query, tasks.c.id, task_ids)}
 
     def cancelled(self, task_ids: Collection[str]) -> set[str]:
         query = select(tasks.c.id).where(tasks.c.state == State.CANCELLED.value)
-        return {row.id for row in self.database.among(query, tasks.c.id, task_ids)}
+        return {row.id for row in self.database.matching_rows(query, tasks.c.id, task_ids)}
 
     def failed_tasks(self, job_id: str) -> dict[str, int]:
         """Return failed and cancelled tasks of a job with the number of their last attempt."""
@@ -126,7 +128,7 @@ def _record(row: Any) -> JobRecord:
     )
 
 
-def _ready(row: Any, record: JobRecord) -> ReadyTask:
+def _ready_task(row: Any, record: JobRecord) -> ReadyTask:
     task = PlannedTask(
         row["id"], Stage(row["stage"]), row["batch"], row["count"], tuple(row["inputs"]), row["shard_id"]
     )
@@ -146,7 +148,7 @@ class DatasetWork:
 
 
 class DatasetFeed(IndexPart):
-    def in_work(self) -> list[DatasetWork]:
+    def pending_datasets(self) -> list[DatasetWork]:
         """Return datasets with cells to plan or with events for their jobs, the oldest first."""
         query = (
             select(datasets)

@@ -35,13 +35,20 @@ from sqlalchemy import (
 )
 from sqlalchemy.sql.operators import in_op, is_
 
-from graspd.service.index.database import IndexPart, chunks, decode, encode, page_size, shards_in_scope
+from graspd.service.index.database import (
+    IndexPart,
+    chunks,
+    decode_cursor,
+    encode_cursor,
+    page_size,
+    shard_scope_conditions,
+)
 from graspd.service.index.tables import dataset_cells, grasps, jobs, shards, tagged, tasks
 from graspd.service.index.views import GraspView, Page
 from graspd.service.model.base import Model
 from graspd.service.model.errors import InputError
 from graspd.service.model.metric_fields import SortedName
-from graspd.service.model.metrics import indexed
+from graspd.service.model.metrics import indexed_metrics
 from graspd.service.model.projects import EVERYTHING, ProjectScope
 from graspd.service.model.records import Grasp
 from graspd.service.model.states import Stage
@@ -70,23 +77,23 @@ class Grasps(IndexPart):
         cursor: str | None = None,
     ) -> Page[GraspView]:
         size = page_size(limit)
-        start = None if cursor is None else decode(cursor, (float, int, str, type(None)), str, int)
-        with self.database.reading() as connection:
+        start = None if cursor is None else decode_cursor(cursor, (float, int, str, type(None)), str, int)
+        with self.database.read_transaction() as connection:
             rows = search(connection, where, sort, size + 1, start)
         views = [GraspView(**row) for row in rows[:size]]
         last = rows[size - 1] if len(rows) > size else None
-        return Page(items=views, next=last and encode(last[sort.by], last["shard_id"], last["row"]))
+        return Page(items=views, next=last and encode_cursor(last[sort.by], last["shard_id"], last["row"]))
 
     def get(self, shard_id: str, row: int, *, scope: ProjectScope = EVERYTHING) -> GraspView:
         query = select(grasps).where(grasps.c.shard_id == shard_id, grasps.c.row == row)
-        query = query.where(*shards_in_scope(scope, grasps.c.shard_id))
+        query = query.where(*shard_scope_conditions(scope, grasps.c.shard_id))
         return GraspView(**self.database.one(query, f"grasp {row} in shard {shard_id!r}"))
 
     def members(self, where: GraspFilter, *, limit: int) -> list[Grasp]:
         query = select(grasps.c.shard_id, grasps.c.row).order_by(grasps.c.shard_id, grasps.c.row).limit(limit)
         return [(found["shard_id"], found["row"]) for found in self.database.rows(query.where(*sql_conditions(where)))]
 
-    def listed(self, wanted: Sequence[Grasp]) -> Iterator[GraspView]:
+    def get_many(self, wanted: Sequence[Grasp]) -> Iterator[GraspView]:
         """Yield the given grasps, ordered by shard and row; missing grasps are omitted."""
         for some in chunks(sorted(wanted)):
             query = select(grasps).where(tuple_(grasps.c.shard_id, grasps.c.row).in_(some))
@@ -100,7 +107,7 @@ SORTED_AT_ONCE: Final = 40_000
 LOOKED_AT: Final = (1000, 20_000)
 #: Columns by name, of the table of grasps or of a subquery.
 Columns = Any
-_METRICS: Final = frozenset(metric.name for metric in indexed())
+_METRICS: Final = frozenset(metric.name for metric in indexed_metrics())
 _OPERATORS: Final[dict[str, Callable[[Any, Any], ColumnElement[bool]]]] = {
     "<": operator.lt,
     "<=": operator.le,
@@ -132,7 +139,7 @@ class Condition:
         """Return the test, without use of an index if its group is not in `groups` (None means all groups)."""
         return self._of(self.column if groups is None or self.group in groups else _without_index(self.column))
 
-    def on(self, rows: Subquery) -> ColumnElement[bool]:
+    def sql_for_rows(self, rows: Subquery) -> ColumnElement[bool]:
         return self._of(rows.c[str(self.column.key)])
 
     def _of(self, column: ColumnElement[Any]) -> ColumnElement[bool]:
@@ -151,7 +158,7 @@ class Tagged:
         those = select(tagged.c.shard_id, tagged.c.row).where(tagged.c.tag == self.tag)
         return tuple_(grasps.c.shard_id, grasps.c.row).in_(those)
 
-    def on(self, rows: Subquery) -> ColumnElement[bool]:
+    def sql_for_rows(self, rows: Subquery) -> ColumnElement[bool]:
         return self._of(rows.c)
 
     def _of(self, columns: Any) -> ColumnElement[bool]:
@@ -169,7 +176,7 @@ class ExpressionCondition:
     def sql(self, groups: Sequence[str] | None) -> ColumnElement[bool]:
         return sql_condition(self.node, grasps.c)
 
-    def on(self, rows: Subquery) -> ColumnElement[bool]:
+    def sql_for_rows(self, rows: Subquery) -> ColumnElement[bool]:
         return sql_condition(self.node, rows.c)
 
 
@@ -184,14 +191,14 @@ def conditions(where: GraspFilter | None) -> list[Test]:
         of_job = (tasks.c.job_id == where.job, tasks.c.stage == Stage.SYNTHESIZE.value)
         found.append(Condition("job", grasps.c.shard_id, in_op, select(tasks.c.shard_id).where(*of_job)))
     if where.dataset is not None:
-        made = _of_dataset(where.dataset).with_only_columns(tasks.c.shard_id)
+        made = _tasks_of_dataset(where.dataset).with_only_columns(tasks.c.shard_id)
         found.append(Condition("dataset", grasps.c.shard_id, in_op, made))
     if where.tag is not None:
         found.append(Tagged(where.tag))
     if where.where is not None:
         found.append(ExpressionCondition(parse_where(where.where)))
     if where.project is not None:
-        made = _of_project(where.project).with_only_columns(tasks.c.shard_id)
+        made = _tasks_of_project(where.project).with_only_columns(tasks.c.shard_id)
         found.append(Condition("project", grasps.c.shard_id, in_op, made))
     for name, wanted in (("hand", where.hand), ("object", where.object)):
         if wanted is not None:
@@ -258,7 +265,7 @@ def _with_metric(
         return list(connection.execute(_slice(ordered, key, sort, size, start)).mappings())
     for number in LOOKED_AT:
         looked = _slice(ordered, key, sort, number, start).subquery()
-        query = select(looked).where(*(c.on(looked) for c in outside))
+        query = select(looked).where(*(c.sql_for_rows(looked) for c in outside))
         same_key = tuple(looked.c[str(column.key)] for column in key)
         rows = list(connection.execute(_slice(query, same_key, sort, size, None)).mappings())
         if len(rows) >= size or _count(connection, looked) < number:
@@ -286,12 +293,12 @@ def _selective_group(connection: Connection, where: GraspFilter | None, wanted: 
     numbers: dict[str, int] = {}
     for group in dict.fromkeys(condition.group for condition in wanted):
         if group != "flag":
-            numbers[group] = number_of(connection, where or GraspFilter(), group, wanted)
+            numbers[group] = estimate_row_count(connection, where or GraspFilter(), group, wanted)
     few = min(numbers, key=lambda name: numbers[name], default=None)
     return few if few is not None and numbers[few] <= SORTED_AT_ONCE else None
 
 
-def number_of(connection: Connection, where: GraspFilter, group: str, wanted: Sequence[Test] = ()) -> int:
+def estimate_row_count(connection: Connection, where: GraspFilter, group: str, wanted: Sequence[Test] = ()) -> int:
     """Estimate the rows that match a group of conditions; for metrics, count at most `SORTED_AT_ONCE` + 1."""
     query: Select[Any]
     if group == "job":
@@ -299,9 +306,9 @@ def number_of(connection: Connection, where: GraspFilter, group: str, wanted: Se
             tasks.c.job_id == where.job, tasks.c.stage == Stage.SYNTHESIZE.value
         )
     elif group == "project":
-        query = _of_project(where.project or "").with_only_columns(func.sum(tasks.c.count))
+        query = _tasks_of_project(where.project or "").with_only_columns(func.sum(tasks.c.count))
     elif group == "dataset":
-        query = _of_dataset(where.dataset or "").with_only_columns(func.sum(tasks.c.count))
+        query = _tasks_of_dataset(where.dataset or "").with_only_columns(func.sum(tasks.c.count))
     elif group == "tag":
         query = select(func.count()).where(tagged.c.tag == where.tag)
     elif group == "pair":
@@ -314,12 +321,12 @@ def number_of(connection: Connection, where: GraspFilter, group: str, wanted: Se
     return int(connection.scalar(query) or 0)
 
 
-def _of_project(project: str) -> Select[Any]:
+def _tasks_of_project(project: str) -> Select[Any]:
     joined = select(tasks.c.id).join(jobs, jobs.c.id == tasks.c.job_id)
     return joined.where(jobs.c.project == project, tasks.c.stage == Stage.SYNTHESIZE.value)
 
 
-def _of_dataset(dataset: str) -> Select[Any]:
+def _tasks_of_dataset(dataset: str) -> Select[Any]:
     joined = select(tasks.c.id).join(dataset_cells, dataset_cells.c.job_id == tasks.c.job_id)
     return joined.where(dataset_cells.c.dataset == dataset, tasks.c.stage == Stage.SYNTHESIZE.value)
 

@@ -8,10 +8,17 @@ from typing import Any, Final, Literal
 
 from sqlalchemy import Column, ColumnElement, Connection, Float, and_, case, cast, func, select
 
-from graspd.service.index.database import IndexPart, in_scope, in_scope_by_job, page_rows, page_size, shards_in_scope
+from graspd.service.index.database import (
+    IndexPart,
+    page_rows,
+    page_size,
+    scope_conditions,
+    scope_conditions_by_job,
+    shard_scope_conditions,
+)
 from graspd.service.index.tables import attempts, jobs, shards, tasks
 from graspd.service.index.views import AttemptView, JobView, Page, ShardView, StageProgress, TaskView
-from graspd.service.model.planning import ranges_of, sum_outcomes
+from graspd.service.model.planning import count_ranges, sum_outcomes
 from graspd.service.model.projects import EVERYTHING, ProjectScope
 from graspd.service.model.states import Stage, State
 
@@ -37,15 +44,15 @@ class Jobs(IndexPart):
     ) -> Page[JobView]:
         """Return a page of jobs, the newest first; `prefix` is the beginning of their ids."""
         same = _equality_conditions({jobs.c.state: state, jobs.c.hand: hand, jobs.c.object: object})
-        query, key = select(jobs).where(*in_scope(scope, jobs), *same), (jobs.c.created, jobs.c.id)
+        query, key = select(jobs).where(*scope_conditions(scope, jobs), *same), (jobs.c.created, jobs.c.id)
         query = query.where(jobs.c.id.startswith(prefix, autoescape=True)) if prefix else query
-        with self.database.reading() as connection:
+        with self.database.read_transaction() as connection:
             rows, following = page_rows(connection, query, *key, limit=limit, cursor=cursor)
             return Page(items=_job_views(connection, rows), next=following)
 
     def get(self, job_id: str, *, scope: ProjectScope = EVERYTHING) -> JobView:
-        with self.database.reading() as connection:
-            query = select(jobs).where(jobs.c.id == job_id, *in_scope(scope, jobs))
+        with self.database.read_transaction() as connection:
+            query = select(jobs).where(jobs.c.id == job_id, *scope_conditions(scope, jobs))
             (view,) = _job_views(connection, [self.database.one(query, f"job {job_id!r}", connection)])
             if view.note is None:
                 return view
@@ -53,22 +60,22 @@ class Jobs(IndexPart):
 
     def unfinished(self, ids: Collection[str]) -> set[str]:
         query = select(jobs.c.id).where(jobs.c.finished.is_(None))
-        return {row.id for row in self.database.among(query, jobs.c.id, ids)}
+        return {row.id for row in self.database.matching_rows(query, jobs.c.id, ids)}
 
     def tasks(self, *, job: str, state: State | None = None, limit: int = 50) -> Page[TaskView]:
         query = select(tasks).where(tasks.c.job_id == job, *_equality_conditions({tasks.c.state: state}))
         key = (tasks.c.job_id, tasks.c.batch, tasks.c.position)
-        with self.database.reading() as connection:
+        with self.database.read_transaction() as connection:
             rows, following = page_rows(connection, query, *key, limit=limit, cursor=None, descending=False)
         return Page(items=[_task_view(row) for row in rows], next=following)
 
     def task(self, task_id: str, *, scope: ProjectScope = EVERYTHING) -> TaskView:
-        query = select(tasks).where(tasks.c.id == task_id, *in_scope_by_job(scope, tasks))
+        query = select(tasks).where(tasks.c.id == task_id, *scope_conditions_by_job(scope, tasks))
         return _task_view(self.database.one(query, f"task {task_id!r}"))
 
     def out_of_scope(self, task_ids: Collection[str], scope: ProjectScope) -> set[str]:
         query = select(tasks.c.id).join(jobs, jobs.c.id == tasks.c.job_id).where(jobs.c.project != scope.project)
-        return {row.id for row in self.database.among(query, tasks.c.id, task_ids)}
+        return {row.id for row in self.database.matching_rows(query, tasks.c.id, task_ids)}
 
     def attempts(self, *, job: str | None = None, limit: int = 50) -> list[AttemptView]:
         query = select(attempts).where(*_equality_conditions({attempts.c.job_id: job}))
@@ -87,7 +94,7 @@ def _job_views(connection: Connection, rows: Sequence[Any]) -> list[JobView]:
     views = []
     for row in rows:
         view = JobView(**row, stages=progress[row["id"]], **made.get(row["id"], {}))
-        number = ranges_of(view.request.grasps, row["span"])
+        number = count_ranges(view.request.grasps, row["span"])
         views.append(view.model_copy(update={"stages": [_with_pending_tasks(one, number) for one in view.stages]}))
     return views
 
@@ -171,10 +178,12 @@ class Shards(IndexPart):
         scope: ProjectScope = EVERYTHING,
     ) -> Page[ShardView]:
         """Return a page of shards, newest first, without their manifests."""
-        query = select(shards).where(*shards_in_scope(scope, shards.c.id), *_equality_conditions({shards.c.kind: kind}))
+        query = select(shards).where(
+            *shard_scope_conditions(scope, shards.c.id), *_equality_conditions({shards.c.kind: kind})
+        )
         if job is not None:
             query = query.where(shards.c.id.in_(select(tasks.c.shard_id).where(tasks.c.job_id == job)))
-        with self.database.reading() as connection:
+        with self.database.read_transaction() as connection:
             key = shards.c.created, shards.c.id
             rows, following = page_rows(connection, query, *key, limit=limit, cursor=cursor)
         return Page(items=[ShardView.model_validate({**row, "manifest": {}}) for row in rows], next=following)
@@ -185,10 +194,12 @@ class Shards(IndexPart):
 
     def job_of(self, shard_id: str, *, scope: ProjectScope = EVERYTHING) -> str | None:
         """Return a job in scope that requested this shard; None if the index has none."""
-        query = select(tasks.c.job_id).where(tasks.c.shard_id == shard_id, *in_scope_by_job(scope, tasks)).limit(1)
+        query = (
+            select(tasks.c.job_id).where(tasks.c.shard_id == shard_id, *scope_conditions_by_job(scope, tasks)).limit(1)
+        )
         found: str | None = self.database.value(query)
         return found
 
     def get(self, shard_id: str, *, scope: ProjectScope = EVERYTHING) -> ShardView:
-        query = select(shards).where(shards.c.id == shard_id, *shards_in_scope(scope, shards.c.id))
+        query = select(shards).where(shards.c.id == shard_id, *shard_scope_conditions(scope, shards.c.id))
         return ShardView(**self.database.one(query, f"shard {shard_id!r}"))

@@ -10,7 +10,14 @@ from typing import Any, Final
 
 from sqlalchemy import ColumnElement, Connection, Select, Table, case, func, select
 
-from graspd.service.index.database import Database, IndexPart, in_scope, in_scope_by_job, page_size, shards_in_scope
+from graspd.service.index.database import (
+    Database,
+    IndexPart,
+    page_size,
+    scope_conditions,
+    scope_conditions_by_job,
+    shard_scope_conditions,
+)
 from graspd.service.index.tables import attempts, damage, jobs, shards, spent, tasks, workers
 from graspd.service.index.views import FailureGroup, MatrixCell, Stats, UsageDay, WorkerView
 from graspd.service.model.clock import age_of
@@ -28,10 +35,12 @@ class Overview(IndexPart):
     def stats(self, *, scope: ProjectScope = EVERYTHING) -> Stats:
         alive = select(func.count()).select_from(workers).where(workers.c.state != "lost")
         sums = (func.count(), *_MADE, func.sum(shards.c.size_bytes))
-        by_kind = select(shards.c.kind, *sums).where(*shards_in_scope(scope, shards.c.id)).group_by(shards.c.kind)
-        with self.database.reading() as connection:
-            of_jobs = _by_state(connection, jobs, *in_scope(scope, jobs))
-            of_tasks = _by_state(connection, tasks, *in_scope_by_job(scope, tasks))
+        by_kind = (
+            select(shards.c.kind, *sums).where(*shard_scope_conditions(scope, shards.c.id)).group_by(shards.c.kind)
+        )
+        with self.database.read_transaction() as connection:
+            of_jobs = _counts_by_state(connection, jobs, *scope_conditions(scope, jobs))
+            of_tasks = _counts_by_state(connection, tasks, *scope_conditions_by_job(scope, tasks))
             of_shards = {kind: tuple(map(int, row)) for kind, *row in connection.execute(by_kind)}
             living = connection.scalar(alive)
         _, made, valid, candidates, validated, _ = of_shards.get("base", (0,) * 6)
@@ -51,14 +60,16 @@ class Overview(IndexPart):
         """Return the number of valid grasps per minute (2026-11-22T08:30) since a time, without empty minutes."""
         minute = func.substr(shards.c.created, 1, 16)
         query = select(minute, func.sum(shards.c.valid)).group_by(minute)
-        query = query.where(shards.c.kind == "base", shards.c.created >= since, *shards_in_scope(scope, shards.c.id))
-        with self.database.reading() as connection:
+        query = query.where(
+            shards.c.kind == "base", shards.c.created >= since, *shard_scope_conditions(scope, shards.c.id)
+        )
+        with self.database.read_transaction() as connection:
             return {start: int(valid) for start, valid in connection.execute(query)}
 
     def failures(self, *, limit: int = 20, scope: ProjectScope = EVERYTHING) -> list[FailureGroup]:
         """Return failed attempts by stage and error, the most frequent first."""
         count, newest = func.count(), func.max(attempts.c.ended)
-        in_scope = in_scope_by_job(scope, attempts)
+        in_scope = scope_conditions_by_job(scope, attempts)
         of_tasks = func.count(attempts.c.task_id.distinct())
         query = (
             select(
@@ -74,7 +85,7 @@ class Overview(IndexPart):
             .limit(page_size(limit))
         )
         groups = []
-        with self.database.reading() as connection:
+        with self.database.read_transaction() as connection:
             for row in connection.execute(query).mappings().all():
                 same = (attempts.c.stage == row["stage"], attempts.c.kind == row["kind"])
                 example = select(attempts.c.reason.label("example"), attempts.c.task_id)
@@ -86,13 +97,13 @@ class Overview(IndexPart):
         of_tasks = select(tasks.c.job_id, tasks.c.state, func.count()).group_by(tasks.c.job_id, tasks.c.state)
         made = (
             select(shards.c.hand, shards.c.object, *_MADE)
-            .where(shards.c.kind == "base", *shards_in_scope(scope, shards.c.id))
+            .where(shards.c.kind == "base", *shard_scope_conditions(scope, shards.c.id))
             .group_by(shards.c.hand, shards.c.object)
         )
         cells: dict[tuple[str, str], dict[str, int]] = {}
-        with self.database.reading() as connection:
+        with self.database.read_transaction() as connection:
             pairs = {}
-            of_jobs = select(jobs.c.id, jobs.c.hand, jobs.c.object).where(*in_scope(scope, jobs))
+            of_jobs = select(jobs.c.id, jobs.c.hand, jobs.c.object).where(*scope_conditions(scope, jobs))
             for job, hand, obj in connection.execute(of_jobs):
                 pairs[job] = cells.setdefault((hand, obj), dict.fromkeys(_CELL, 0))
                 pairs[job]["jobs"] += 1
@@ -114,7 +125,7 @@ _MADE = (
 )
 
 
-def _by_state(connection: Connection, table: Table, *tests: ColumnElement[bool]) -> dict[State, int]:
+def _counts_by_state(connection: Connection, table: Table, *tests: ColumnElement[bool]) -> dict[State, int]:
     query = select(table.c.state, func.count()).where(*tests).group_by(table.c.state)
     found = {State(state): int(count) for state, count in connection.execute(query)}
     return {state: found.get(state, 0) for state in State}
@@ -141,27 +152,27 @@ def read_index(database: Database) -> IndexStatus:
     """Count unfinished jobs, grasps of the last minute and damage; find the oldest job of each state."""
     since = datetime.now(UTC) - timedelta(seconds=RATE_WINDOW_S)
     counted, oldest = {}, {}
-    with database.reading() as connection:
+    with database.read_transaction() as connection:
         for state in UNFINISHED:
-            counted[state] = int(connection.scalar(count_jobs(state)) or 0)
-            first = connection.scalar(oldest_job(state))
+            counted[state] = int(connection.scalar(job_count_query(state)) or 0)
+            first = connection.scalar(oldest_job_query(state))
             oldest[state] = (first and age_of(first)) or 0.0
         some = select(damage.c.key).limit(MOST_JOBS).subquery()
         damaged = int(connection.scalar(select(func.count()).select_from(some)) or 0)
-        made, valid = connection.execute(valid_since(since)).one()
+        made, valid = connection.execute(grasp_count_query(since)).one()
     return IndexStatus(counted, oldest, int(made or 0) / RATE_WINDOW_S, int(valid or 0) / RATE_WINDOW_S, damaged)
 
 
-def count_jobs(state: State) -> Select[Any]:
+def job_count_query(state: State) -> Select[Any]:
     some = select(jobs.c.id).where(jobs.c.state == state.value).limit(MOST_JOBS).subquery()
     return select(func.count()).select_from(some)
 
 
-def oldest_job(state: State) -> Select[Any]:
+def oldest_job_query(state: State) -> Select[Any]:
     return select(jobs.c.created).where(jobs.c.state == state.value).order_by(jobs.c.created).limit(1)
 
 
-def valid_since(when: datetime) -> Select[Any]:
+def grasp_count_query(when: datetime) -> Select[Any]:
     text = when.isoformat(timespec="milliseconds").replace("+00:00", "Z")
     base = (shards.c.kind == "base", shards.c.created >= text)
     return select(func.sum(shards.c.count), func.sum(shards.c.valid)).where(*base)
@@ -171,14 +182,19 @@ class Usage(IndexPart):
     def days(self, since: str, until: str, *, scope: ProjectScope = EVERYTHING) -> list[UsageDay]:
         """Return the usage of each project by day (2026-11-22), without empty days, newest first."""
         day = func.substr(shards.c.created, 1, 10).label("day")
-        sums = (_base(shards.c.count), _base(shards.c.valid), func.count(), func.sum(shards.c.seconds))
+        sums = (
+            _sum_over_base(shards.c.count),
+            _sum_over_base(shards.c.valid),
+            func.count(),
+            func.sum(shards.c.seconds),
+        )
         made = select(shards.c.charged, day, shards.c.device, *sums)
         made = made.where(shards.c.created >= since, shards.c.created < f"{until}T99")
-        gone = select(spent).where(spent.c.day >= since, spent.c.day <= until, *in_scope(scope, spent))
+        gone = select(spent).where(spent.c.day >= since, spent.c.day <= until, *scope_conditions(scope, spent))
         if not scope.everything:
             made = made.where(shards.c.charged == scope.project)
         days: dict[tuple[str, str], dict[str, Any]] = defaultdict(lambda: dict.fromkeys(_USED, 0))
-        with self.database.reading() as connection:
+        with self.database.read_transaction() as connection:
             live = connection.execute(made.group_by(shards.c.charged, day, shards.c.device)).all()
             for project, when, device, grasps, valid, tasks, seconds in [*live, *connection.execute(gone).all()]:
                 found = days[when, project]
@@ -199,7 +215,7 @@ class Usage(IndexPart):
         return sum(one.gpu_seconds for one in self.days(day, day, scope=ProjectScope(project, everything=False)))
 
 
-def _base(column: ColumnElement[Any]) -> ColumnElement[Any]:
+def _sum_over_base(column: ColumnElement[Any]) -> ColumnElement[Any]:
     return func.sum(case((shards.c.kind == "base", column), else_=0))
 
 
@@ -226,7 +242,7 @@ class BatchCost:
     batches: int = 1
 
     @property
-    def kept(self) -> int:
+    def counted_grasps(self) -> int:
         """Grasps that count towards the request: valid ones, or all stored ones if validation is off."""
         return self.valid if self.request.counted == "valid" else self.count
 
@@ -236,7 +252,7 @@ class Costs(IndexPart):
         columns = [shards.c[name] for name in BatchCost.__dataclass_fields__ if name != "request"]
         query = (
             select(*columns, shards.c.manifest["request"].label("request"))
-            .where(shards.c.kind == SHARD_KINDS[stage], *shards_in_scope(scope, shards.c.id))
+            .where(shards.c.kind == SHARD_KINDS[stage], *shard_scope_conditions(scope, shards.c.id))
             .order_by(shards.c.created.desc(), shards.c.id.desc())
             .limit(limit)
         )

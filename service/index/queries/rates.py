@@ -51,7 +51,7 @@ class Machine:
         low, high = SCALED_SPREAD if self.batches else STORED_SPREAD
         return low * self.spread[0], high * self.spread[1]
 
-    def scaled(self, origin: str) -> str:
+    def scaled_origin(self, origin: str) -> str:
         if not self.batches:
             return origin
         return f"{origin}, x {self.factor:.2g}, measured here (batches: {self.batches})"
@@ -134,7 +134,7 @@ class Rates:
             devices = ", ".join(sorted({batch.device for batch in batches}))
             self._known[key] = Rate(
                 seconds_per_try=sum(batch.seconds for batch in batches) / candidates,
-                valid_yield=sum(batch.kept for batch in batches) / candidates,
+                valid_yield=sum(batch.counted_grasps for batch in batches) / candidates,
                 bytes_per_grasp=sum(b.size_bytes for b in batches) / max(1, sum(b.count for b in batches)),
                 origin=f"measured here: {words}, {devices}",
                 batches=len(batches),
@@ -143,12 +143,14 @@ class Rates:
         return self._known[key]
 
     def _stored_rate(self) -> Rate:
-        seconds, share, origin = _stored_of(self._options)
+        seconds, share, origin = _stored_rates(self._options)
         machine = self.machine
-        return Rate(seconds * machine.factor, share, _BYTES_PER_GRASP, machine.scaled(origin), 0, machine.stored_spread)
+        return Rate(
+            seconds * machine.factor, share, _BYTES_PER_GRASP, machine.scaled_origin(origin), 0, machine.stored_spread
+        )
 
 
-def candidates(rate: Rate, options: JobOptions) -> float:
+def expected_candidates(rate: Rate, options: JobOptions) -> float:
     """Return the expected number of candidates of a job."""
     if options.want == "candidates":
         return float(options.grasps)
@@ -156,14 +158,14 @@ def candidates(rate: Rate, options: JobOptions) -> float:
     return min(most, options.grasps / rate.valid_yield) if rate.valid_yield > 0 else most
 
 
-def _stored_of(options: JobOptions) -> tuple[float, float, str]:
+def _stored_rates(options: JobOptions) -> tuple[float, float, str]:
     """Return the stored seconds per candidate, yield and origin."""
     if options.models:
         plain = options.model_copy(update={"robust": 0.0, "robust_models": 0})
-        seconds, share, origin = _stored_of(plain)
+        seconds, share, origin = _stored_rates(plain)
         return seconds + share * options.models * STORED_MODEL_S, share, f"{origin}, and {options.models} models"
     if options.in_scene:
-        seconds, _, origin = _stored_of(
+        seconds, _, origin = _stored_rates(
             options.model_copy(update={"scene": "free", "faces": "drawn", "touch": TOUCH, "neighbours": ()})
         )
         longer, share = STORED_IN_SCENE
@@ -181,7 +183,7 @@ def machine_of(batches: Iterable[BatchCost]) -> Machine:
     """Compare the times of these `synthesize` batches with the stored numbers of the same options."""
     comparable = [batch for batch in batches if batch.candidates and _is_stored(batch.request)]
     ratios = [
-        batch.seconds / batch.candidates / _stored_of(batch.request)[0]
+        batch.seconds / batch.candidates / _stored_rates(batch.request)[0]
         for batch in _large_batches(comparable)
         if batch.seconds > 0
     ]
@@ -225,7 +227,7 @@ def recipe_of(options: JobOptions) -> Hashable:
 
 def _rate_on_machine(machine: Machine, stored: StageRate) -> StageRate:
     seconds = stored.seconds * machine.factor
-    return replace(stored, seconds=seconds, origin=machine.scaled(stored.origin), spread=machine.stored_spread)
+    return replace(stored, seconds=seconds, origin=machine.scaled_origin(stored.origin), spread=machine.stored_spread)
 
 
 def scene_rate(batches: Iterable[BatchCost], options: JobOptions, machine: Machine) -> StageRate:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sqlalchemy import ColumnElement, Connection, Integer, cast, func, select
 
 from graspd.service.index.database import IndexPart
-from graspd.service.index.queries.grasps import GraspFilter, Metric, conditions, number_of, sql_conditions
+from graspd.service.index.queries.grasps import GraspFilter, Metric, conditions, estimate_row_count, sql_conditions
 from graspd.service.index.tables import grasps
 
 
@@ -49,7 +49,7 @@ class Statistics(IndexPart):
         columns = [
             function(grasps.c[metric]) for metric in metrics for function in (func.count, func.avg, func.min, func.max)
         ]
-        with self.database.reading() as connection:
+        with self.database.read_transaction() as connection:
             row = connection.execute(select(*columns).where(*sql_conditions(where))).one()
         parts = {metric: row[4 * i : 4 * i + 4] for i, metric in enumerate(metrics)}
         return {
@@ -63,7 +63,7 @@ class Statistics(IndexPart):
         counts = [0] * bins
         value = grasps.c[metric]
         width = (high - low) / bins
-        with self.database.reading() as connection:
+        with self.database.read_transaction() as connection:
             place: ColumnElement[Any] = (value - low) / width if width > 0 else value * 0
             if connection.dialect.name == "postgresql":
                 # A cast to integer rounds in PostgreSQL and truncates in SQLite; some versions of SQLite lack floor().
@@ -74,7 +74,7 @@ class Statistics(IndexPart):
                 counts[min(int(at), bins - 1)] += int(count)
         return counts
 
-    def side_by_side(
+    def compare_distributions(
         self, filters: Sequence[GraspFilter], metrics: Sequence[Metric], *, bins: int = 20, at_most: int = 20_000
     ) -> dict[Metric, list[Distribution | None]]:
         """Return one distribution per metric and filter in common bins; None without grasps.
@@ -93,15 +93,15 @@ class Statistics(IndexPart):
         return found
 
     def _values(self, where: GraspFilter, metrics: Sequence[Metric], at_most: int) -> NDArray[np.float64]:
-        with self.database.reading() as connection:
+        with self.database.read_transaction() as connection:
             query = select(*(grasps.c[metric] for metric in metrics)).where(*_sample(connection, where, at_most))
             rows = [tuple(row) for row in connection.execute(query)]
         return np.array(rows, float).reshape(-1, len(metrics))
 
     def kinds(self, where: GraspFilter, *, at_most: int = 20_000) -> GraspKinds:
-        """Count types and approach cells of about `at_most` grasps, sampled as in `side_by_side`."""
+        """Count types and approach cells of about `at_most` grasps, sampled as in `compare_distributions`."""
         columns = grasps.c.grasp_type, grasps.c.approach_cell
-        with self.database.reading() as connection:
+        with self.database.read_transaction() as connection:
             query = select(*columns, func.count()).where(*_sample(connection, where, at_most)).group_by(*columns)
             rows = connection.execute(query).all()
         found = GraspKinds({}, {})
@@ -115,7 +115,7 @@ class Statistics(IndexPart):
 def _sample(connection: Connection, where: GraspFilter, at_most: int) -> list[ColumnElement[bool]]:
     """Return the conditions of a filter, restricted to a share of shards with about `at_most` grasps."""
     group = "job" if where.job is not None else "dataset" if where.dataset is not None else "pair"
-    share = min(1.0, at_most / max(1, number_of(connection, where, group)))
+    share = min(1.0, at_most / max(1, estimate_row_count(connection, where, group)))
     tests = [c.sql(["job", "dataset"]) for c in conditions(where)]
     return [*tests, grasps.c.shard_id < f"{round(share * 16**8):08x}"] if share < 1.0 else tests
 

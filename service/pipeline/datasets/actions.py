@@ -25,9 +25,9 @@ from graspd.service.model.records import DatasetRecord, Member, ObjectSet, Snaps
 from graspd.service.model.scene_spec import NamedNeighbour, SceneDocument
 from graspd.service.model.states import AssetKind, State
 from graspd.service.pipeline import job_actions
-from graspd.service.pipeline.backends import Services, recording
+from graspd.service.pipeline.backends import Services, record_transaction
 from graspd.service.pipeline.datasets.cost import objects_of
-from graspd.service.pipeline.datasets.spec import DatasetRequest, Matrix, describe
+from graspd.service.pipeline.datasets.spec import DatasetRequest, Matrix, create_record
 from graspd.service.pipeline.fidelity_choice import Resolver
 from graspd.service.pipeline.job_actions import TaskRanges, refuse_deleted, usable_asset, with_neighbours, with_network
 from graspd.service.store.records import (
@@ -38,7 +38,7 @@ from graspd.service.store.records import (
     load_dataset,
     load_snapshot,
     read_record,
-    refuse_pending,
+    refuse_pending_deletion,
 )
 
 log = logging.getLogger(__name__)
@@ -64,16 +64,18 @@ def create(
     shared, beside = with_neighbours(services, request.shared, scope)
     shared = with_network(services, shared, hands, scope)
     services.queue.ping()
-    key = names.dataset_record(request.name)
+    key = names.dataset_record_key(request.name)
     # An existing dataset stays unchanged: a later chart changes none of its fidelities.
     found = None
     if not services.store.exists(key):
-        found = describe(request.name, hands, objects, shared, Resolver(services.store).choose, owner, scope.project)
+        found = create_record(
+            request.name, hands, objects, shared, Resolver(services.store).choose, owner, scope.project
+        )
     wanted = [(AssetKind.HAND, one.digest) for one in hands]
     wanted += [(AssetKind.OBJECT, one.digest) for one in objects]
     wanted += [(AssetKind.OBJECT, one.digest) for one in beside]
     wanted += [(AssetKind.NETWORK, shared.network)] if shared.network else []
-    with recording(services) as (connection, put):
+    with record_transaction(services) as (connection, put):
         new = found is not None and put(key, found)
         record = found if found is not None and new else _load_existing(services, request.name)
         if record.project != scope.project:
@@ -82,7 +84,7 @@ def create(
         # Options are compared, not digests: a newer graspd adds options, and older records imply their defaults.
         if not new and (other := _difference(record, hands, objects, shared)):
             raise ConflictError(f"there is another dataset named {record.name!r} ({other}); take another name")
-        refuse_pending(services.store, "dataset", record.name)
+        refuse_pending_deletion(services.store, "dataset", record.name)
         refuse_deleted(services, wanted, connection)
         services.index.write_dataset.add(record, within=connection)
     return services.index.datasets.get(record.name), new
@@ -94,7 +96,7 @@ def cancel(services: Services, name: str) -> DatasetView:
     A job continues if another dataset needs it or another key submitted it. Raises NotFoundError for an unknown
     dataset, ConflictError for a finished or cancelled one.
     """
-    with recording(services) as (connection, put):
+    with record_transaction(services) as (connection, put):
         dataset = services.index.datasets.get(name)
         if dataset.cancelled or dataset.state.is_final:
             raise ConflictError(f"dataset {name!r} is {dataset.state} already; there is nothing to cancel")
@@ -104,7 +106,7 @@ def cancel(services: Services, name: str) -> DatasetView:
 
 def retry(services: Services, name: str) -> DatasetView:
     """Restart a dataset's failed and cancelled cells with fresh attempts; ConflictError if it has none."""
-    with recording(services) as (connection, put):
+    with record_transaction(services) as (connection, put):
         dataset = services.index.datasets.get(name)
         if not dataset.cancelled and not dataset.states[State.FAILED] and not dataset.states[State.CANCELLED]:
             raise ConflictError(f"dataset {name!r} is {dataset.state}, and no cell failed; there is nothing to retry")
@@ -112,7 +114,7 @@ def retry(services: Services, name: str) -> DatasetView:
     return services.index.datasets.get(name)
 
 
-def snapshot(services: Services, name: str) -> tuple[Snapshot, bool]:
+def take_snapshot(services: Services, name: str) -> tuple[Snapshot, bool]:
     """Record the present shards; return the snapshot, and whether it is new; ConflictError without shards."""
     dataset = services.index.datasets.get(name)
     held = tuple(services.index.datasets.shards(name))
@@ -130,10 +132,10 @@ def snapshot(services: Services, name: str) -> tuple[Snapshot, bool]:
         created=timestamp(),
         shards=held,
     )
-    with recording(services) as (connection, put):
+    with record_transaction(services) as (connection, put):
         if services.index.datasets.get(name).digest != dataset.digest:
             raise ConflictError(f"dataset {name!r} was deleted just now, and there is another one; try again")
-        new = put(names.dataset_snapshot(name, taken.digest), taken)
+        new = put(names.dataset_snapshot_key(name, taken.digest), taken)
         if not new:
             taken = load_snapshot(services.store, name, taken.digest)
         services.index.write_dataset.add_snapshot(taken, within=connection)
@@ -159,23 +161,23 @@ def add_object_set(
     if not wanted:
         raise InputError(f"the set {name!r} holds no object; name at least one")
     # Of two concurrent requests for one name, the later one must see the set of the earlier one.
-    with recording(services) as (connection, put):
+    with record_transaction(services) as (connection, put):
         after, project = "", scope.project
-        if (present := services.index.object_sets.named(name)) is not None:
-            if not scope.sees(present.project):
+        if (present := services.index.object_sets.newest_version(name)) is not None:
+            if not scope.can_see(present.project):
                 raise ConflictError(f"the name {name!r} is taken; take another name")
             if set(present.objects) == set(wanted):
                 return present
             after = present.digest
-            known = read_record(ObjectSet, services.store, names.object_set(name, after))
+            known = read_record(ObjectSet, services.store, names.object_set_key(name, after))
             owner, project = known.owner, known.project
             may_follow(owner, project)
         refuse_deleted(services, [(AssetKind.OBJECT, one.digest) for one in assets], connection)
         found = object_set_of(name, wanted, after=after, owner=owner, project=project)
-        if not put(key := names.object_set(name, found.digest), found):
+        if not put(key := names.object_set_key(name, found.digest), found):
             # An earlier request ended before it wrote the row.
             found = read_record(ObjectSet, services.store, key)
-            if not scope.sees(found.project):
+            if not scope.can_see(found.project):
                 raise ConflictError(f"the name {name!r} is taken; take another name")
         services.index.write_dataset.add_object_set(found, within=connection)
     return services.index.object_sets.get(name)
@@ -241,7 +243,7 @@ class DatasetRounds:
     def advance(self, budget_s: float = BUDGET_S) -> bool:
         """Work for at most `budget_s`; return whether work is left."""
         deadline = self._clock() + budget_s
-        for work in self._services.index.dataset_feed.in_work():
+        for work in self._services.index.dataset_feed.pending_datasets():
             if not self._apply_event(work, deadline) or not self._plan(work, deadline):
                 return True
         return False
@@ -255,7 +257,7 @@ class DatasetRounds:
                 if self._clock() > deadline:
                     return False
                 job = job_of(cell, work.options, work.revisions, work.owner, work.project)
-                job_actions.enter(self._services, self._ranges.sized(job, among=len(cells)), keeps_assets=True)
+                job_actions.enter_job(self._services, self._ranges.with_span(job, among=len(cells)), keeps_assets=True)
                 after = cell.position
             if not cells:
                 break

@@ -20,7 +20,15 @@ from typing import Final
 
 from graspd.service.index.index import Index
 from graspd.service.index.queries.overview import BatchCost
-from graspd.service.index.queries.rates import Machine, Rate, Rates, StageRate, candidates, picture_rate, scene_rate
+from graspd.service.index.queries.rates import (
+    Machine,
+    Rate,
+    Rates,
+    StageRate,
+    expected_candidates,
+    picture_rate,
+    scene_rate,
+)
 from graspd.service.model.domain import BATCH_SIZE, JobOptions, JobRequest
 from graspd.service.model.errors import LimitError
 from graspd.service.model.planning import stages_of
@@ -96,7 +104,7 @@ def objects_of(index: Index, matrix: Matrix, scope: ProjectScope) -> list[str]:
 
 
 def _add_cell(sums: _Sums, hand: str, rate: Rate, options: JobOptions) -> None:
-    number = candidates(rate, options)
+    number = expected_candidates(rate, options)
     valid = number * rate.valid_yield
     kept = min(valid, options.grasps) if options.want == "valid" else options.grasps
     sums.candidates += number

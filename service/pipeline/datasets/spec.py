@@ -60,7 +60,7 @@ class DatasetRequest(Matrix):
         return value
 
 
-def describe(
+def create_record(
     name: str,
     hands: Sequence[Member],
     objects: Sequence[Member],

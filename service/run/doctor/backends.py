@@ -28,7 +28,7 @@ from graspd.service.model.errors import (
     QueueUnavailable,
     UnavailableError,
 )
-from graspd.service.pipeline.identity import Identity, recorded, service_ids
+from graspd.service.pipeline.identity import Identity, recorded_service, service_ids
 from graspd.service.queue.connection import connect, redis_url, socket_path
 from graspd.service.queue.rq_queue import open_queue
 from graspd.service.run.doctor.checks import Finding, bad, good, skipped, warning
@@ -46,7 +46,7 @@ _LOCAL: Final = ("127.0.0.1", "localhost", "::1")
 _START: Final = "start it, or set GRASPD_REDIS_URL=redis://:PASSWORD@HOST:6379/0"
 
 
-def is_expected(settings: Settings) -> bool:
+def is_redis_expected(settings: Settings) -> bool:
     """Check whether a Redis is configured or may be running; False on a machine where nothing was started."""
     return settings.redis_url is not None or socket_path(settings.data_dir).exists()
 
@@ -55,9 +55,9 @@ def redis_connection(settings: Settings) -> AbstractContextManager[Redis]:
     return closing(connect(redis_url(settings), patience=0, timeout_s=_TIMEOUT_S))
 
 
-def redis(settings: Settings) -> Finding:
+def check_redis(settings: Settings) -> Finding:
     """Check the Redis of `GRASPD_REDIS_URL` or of the data folder."""
-    if not is_expected(settings):
+    if not is_redis_expected(settings):
         try:
             _, rung = find_server()
         except QueueUnavailable as error:
@@ -85,7 +85,7 @@ def _check_redis(settings: Settings, client: Redis, info: Mapping[str, Any]) -> 
         return bad(
             f"{used >> 20} of {most >> 20} MiB are used", "increase maxmemory, or find other users of this Redis"
         )
-    seconds = _write(client)
+    seconds = _time_write(client)
     line = f"Redis {version} at {_masked_url(settings)}, {1000 * seconds:.1f} ms, {used >> 20} MiB"
     if tuple(int(part) for part in version.split(".")[:2]) < _OLDEST:
         return warning(f"{line}: older than 6.2, the oldest tested version", "install Redis 6.2 or newer, or Valkey")
@@ -101,7 +101,7 @@ def _check_redis(settings: Settings, client: Redis, info: Mapping[str, Any]) -> 
     return good(line)
 
 
-def _write(client: Redis) -> float:
+def _time_write(client: Redis) -> float:
     """Return the mean duration of a write and a read [s]; RedisError if writes are refused."""
     key, value = f"graspd:doctor:{secrets.token_hex(8)}", secrets.token_bytes(8)
     start = time.perf_counter()
@@ -114,9 +114,9 @@ def _write(client: Redis) -> float:
     return seconds
 
 
-def persistence(settings: Settings) -> Finding:
+def check_persistence(settings: Settings) -> Finding:
     """Check whether Redis restores its tasks after a crash."""
-    if not is_expected(settings):
+    if not is_redis_expected(settings):
         return skipped("no service runs on this data folder; the Redis of `graspd up` keeps a log of writes")
     try:
         with redis_connection(settings) as client:
@@ -168,7 +168,7 @@ _ALL_SHARDS: Final = 2000
 _SETTLES_S: Final = 3.0
 
 
-def index(settings: Settings) -> Finding:
+def check_index(settings: Settings) -> Finding:
     try:
         found = read_condition(settings.resolved_index_url)
     except IndexDamaged as error:
@@ -225,7 +225,7 @@ def _index_problem(settings: Settings) -> str:
     return "" if folder is None or folder.exists() else "there is no store yet"
 
 
-def index_identity(settings: Settings) -> Finding:
+def check_index_identity(settings: Settings) -> Finding:
     folder = local_store(settings)
     if folder is not None and not folder.exists():
         return skipped("there is no store yet")
@@ -234,14 +234,16 @@ def index_identity(settings: Settings) -> Finding:
     if not _index_problem(settings):
         with closing(Index(settings.resolved_index_url)) as opened:
             said = opened.notes.service()
-    if is_expected(settings):
+    if is_redis_expected(settings):
         try:
             with closing(open_queue(settings, patience=0)) as queue:
                 redis = queue.service()
         except QueueUnavailable:
             if said is None:
                 return skipped("there is no index here, and Redis does not answer")
-    found = Identity(service_ids(store), said, redis, recorded(settings.data_dir.resolve()), settings.store_url is None)
+    found = Identity(
+        service_ids(store), said, redis, recorded_service(settings.data_dir.resolve()), settings.store_url is None
+    )
     if why := found.refusal(store.url):
         return bad(why, "see the message, and GRASPD_STORE_URL, GRASPD_INDEX_URL, GRASPD_REDIS_URL")
     if not found.chain:
@@ -249,7 +251,7 @@ def index_identity(settings: Settings) -> Finding:
     return good("store, index and Redis belong to one service" if said else "store and Redis belong to one service")
 
 
-def index_is_store(settings: Settings, *, full: bool = False, settles_s: float = _SETTLES_S) -> Finding:
+def compare_index_with_store(settings: Settings, *, full: bool = False, settles_s: float = _SETTLES_S) -> Finding:
     """Compare rows with the store; a difference in only one of two comparisons is an event in progress."""
     if why := _index_problem(settings):
         return skipped(why)
@@ -260,7 +262,7 @@ def index_is_store(settings: Settings, *, full: bool = False, settles_s: float =
             return warning(
                 "the index is new, and lacks records of the store", "start graspd controller: it fills the index"
             )
-        with opened.database.reading() as connection:
+        with opened.database.read_transaction() as connection:
             count = int(connection.scalar(select(func.count()).select_from(shards)) or 0)
         whole = full or count <= _ALL_SHARDS
         compared = differences if whole else missing_names
@@ -277,12 +279,12 @@ def index_is_store(settings: Settings, *, full: bool = False, settles_s: float =
     return good(f"{what} match the store")
 
 
-def store_damage(settings: Settings) -> Finding:
+def check_store_damage(settings: Settings) -> Finding:
     """Report the findings of the controller's integrity scan, or of `graspd admin store verify`."""
     if why := _index_problem(settings):
         return skipped(why)
     with closing(Index(settings.resolved_index_url)) as opened:
-        count, known = opened.damage.known(limit=1)
+        count, known = opened.damage.summary(limit=1)
         note, made = opened.notes.scan_note(), opened.notes.completeness()
     if count:
         return bad(
@@ -316,7 +318,7 @@ _CREDENTIALS: Final = (
 )
 
 
-def store(settings: Settings) -> Finding:
+def check_configured_store(settings: Settings) -> Finding:
     """Try every operation that graspd uses, on an object with a random name."""
     folder = local_store(settings)
     if folder is not None and not folder.exists():

@@ -27,7 +27,7 @@ from graspd.service.model.version import PACKAGE_VERSION
 from graspd.service.pipeline.leading import PART
 from graspd.service.queue.rq_queue import RqQueue, open_queue
 from graspd.service.run.address import local_url, recorded_address
-from graspd.service.run.doctor.backends import is_expected, redis_connection
+from graspd.service.run.doctor.backends import is_redis_expected, redis_connection
 from graspd.service.run.doctor.checks import Finding, bad, good, skipped, warning
 from graspd.service.run.doctor.machine import local_store
 from graspd.service.settings import Settings
@@ -37,7 +37,7 @@ _HTTP_S: Final = 5.0
 
 
 def _query_queue(settings: Settings, look: Callable[[RqQueue], Finding]) -> Finding:
-    if not is_expected(settings):
+    if not is_redis_expected(settings):
         return skipped("no service runs on this data folder")
     try:
         with closing(open_queue(settings, patience=0)) as queue:
@@ -46,14 +46,14 @@ def _query_queue(settings: Settings, look: Callable[[RqQueue], Finding]) -> Find
         return skipped("Redis does not answer")
 
 
-def controller(settings: Settings) -> Finding:
+def check_controller(settings: Settings) -> Finding:
     dead = bad(
         "no heartbeat from a controller: finished tasks are not indexed, and nothing is queued", "graspd controller"
     )
-    return _query_queue(settings, lambda queue: good("a controller is alive") if queue.announced(PART) else dead)
+    return _query_queue(settings, lambda queue: good("a controller is alive") if queue.is_announced(PART) else dead)
 
 
-def workers(settings: Settings) -> Finding:
+def check_workers(settings: Settings) -> Finding:
     """Check that workers are healthy, have this version and serve every stage with waiting tasks."""
     return _query_queue(settings, lambda queue: _check_workers(queue.workers(), _waiting_tasks(queue)))
 
@@ -87,7 +87,7 @@ def _check_workers(beats: list[WorkerBeat], waiting: Counter[Stage]) -> Finding:
     return good(f"{told}, on {len({beat.host for beat in beats})} machines; {sum(waiting.values())} tasks wait")
 
 
-def port(settings: Settings) -> Finding:
+def check_port(settings: Settings) -> Finding:
     url = recorded_address(settings.data_dir)
     if url is None and "api_url" in settings.model_fields_set:
         url = settings.api_url
@@ -135,7 +135,7 @@ _WRONG_S: Final = 300.0
 _FIX: Final = "timedatectl set-ntp true, or chronyd, on the machine whose clock differs from all others"
 
 
-def clocks(settings: Settings) -> Finding:
+def check_clocks(settings: Settings) -> Finding:
     offsets = dict(_offsets(settings))
     if not offsets:
         return skipped("only this machine's clock can be read")
@@ -152,7 +152,7 @@ def clocks(settings: Settings) -> Finding:
 
 def _offsets(settings: Settings) -> Iterator[tuple[str, float]]:
     """Yield name and clock offset to this machine [s]; other checks report missing parts."""
-    if is_expected(settings):
+    if is_redis_expected(settings):
         with suppress(RedisError, OSError), redis_connection(settings) as client:
             before = time.time()
             seconds, micros = client.time()

@@ -36,7 +36,7 @@ def local_store(settings: Settings) -> Path | None:
     return local_folder(settings.resolved_store_url)
 
 
-def disk(settings: Settings, *, usage: Callable[[Path], tuple[int, int, int]] = shutil.disk_usage) -> Finding:
+def check_disk(settings: Settings, *, usage: Callable[[Path], tuple[int, int, int]] = shutil.disk_usage) -> Finding:
     found = []
     for what, folder, variable in _folders(settings):
         there = existing_ancestor(folder)
@@ -59,7 +59,7 @@ def _folders(settings: Settings) -> Iterable[tuple[str, Path, str]]:
     yield "the data folder", settings.data_dir.resolve(), "GRASPD_DATA_DIR"
     if (store := local_store(settings)) is not None:
         yield "the store", store, "GRASPD_STORE_URL"
-    yield "caches", user_cache.folder("doctor").parent, "XDG_CACHE_HOME"
+    yield "caches", user_cache.cache_folder("doctor").parent, "XDG_CACHE_HOME"
     yield "scratch files", Path(tempfile.gettempdir()), "TMPDIR"
 
 
@@ -67,7 +67,7 @@ def existing_ancestor(folder: Path) -> Path:
     return next(one for one in (folder, *folder.parents) if one.exists())
 
 
-def data_folder(settings: Settings, *, mounts: Path = Path("/proc/self/mounts")) -> Finding:
+def check_data_folder(settings: Settings, *, mounts: Path = Path("/proc/self/mounts")) -> Finding:
     """Check whether the data folder is writable, private to its user, and on a local disk."""
     folder = settings.data_dir.resolve()
     there = existing_ancestor(folder)
@@ -106,7 +106,7 @@ def filesystem(folder: Path, mounts: Path = Path("/proc/self/mounts")) -> str:
     return max(found)[2] if found else ""
 
 
-def limits(*, files: int | None = None, memory: int | None = None) -> Finding:
+def check_limits(*, files: int | None = None, memory: int | None = None) -> Finding:
     """Report cores, memory and open files available to this process."""
     files = resource.getrlimit(resource.RLIMIT_NOFILE)[0] if files is None else files
     files = 2**31 if files == resource.RLIM_INFINITY else files

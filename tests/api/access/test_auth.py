@@ -17,7 +17,7 @@ from pydantic import SecretStr
 from starlette.testclient import TestClient
 
 from graspd.api.access.auth import SESSION_COOKIE, Proxy
-from graspd.api.access.doctor import keys as keys_finding
+from graspd.api.access.doctor import check_keys as keys_finding
 from graspd.api.access.keys import KeyFile, KeyLimits, Scope
 from graspd.api.app import create_app
 from graspd.client.access_commands import duration

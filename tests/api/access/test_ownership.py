@@ -8,7 +8,7 @@ import pytest
 from httpx import Response
 from starlette.testclient import TestClient
 
-from graspd.api.access.auth import ForeignResource, caller, must_own
+from graspd.api.access.auth import ForeignResource, caller, require_ownership
 from graspd.api.access.keys import Key, KeyFile, Scope
 from graspd.api.app import create_app
 from graspd.service.index.index import Index
@@ -130,7 +130,7 @@ def test_what_has_no_owner_is_changed_by_an_admin_alone(scope: Scope, passes: bo
     refused = pytest.raises(ForeignResource, match=r"hand 'mine'.*'me'.*admin")
     try:
         with nullcontext() if passes else refused:
-            must_own("", "hand 'mine'")
+            require_ownership("", "hand 'mine'")
     finally:
         caller.reset(token)
 

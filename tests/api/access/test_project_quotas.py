@@ -44,7 +44,7 @@ def limit(settings: Settings, **limits: int) -> None:
 def done(services: Services, job: str, *, seconds: float, device: str = "cuda:0", day: str = TODAY) -> None:
     (made,) = finish_all(services, record_of(services, job))
     values = {"device": device, "created": f"{day}T11:00:00.000000Z", "seconds": seconds}
-    with services.index.database.writing() as connection:
+    with services.index.database.write_transaction() as connection:
         connection.execute(update(shards).where(shards.c.id == made.shard_id).values(**values))
 
 

@@ -22,7 +22,7 @@ from graspd.api.app import create_app
 from graspd.service.index.index import Index
 from graspd.service.index.rebuild import differences, rebuild
 from graspd.service.model import names
-from graspd.service.model.planning import plan
+from graspd.service.model.planning import plan_tasks
 from graspd.service.model.states import AssetKind
 from graspd.service.pipeline.backends import Services
 from graspd.service.settings import Settings
@@ -49,8 +49,8 @@ class World:
         job = post("/v1/jobs", json=JOB).json()["id"]
         record = record_of(self.services, job)
         finish_all(self.services, record)
-        shard = next(task.output for task in plan(record))
-        views = [task.output for task in plan(record)][-1]
+        shard = next(task.output for task in plan_tasks(record))
+        views = [task.output for task in plan_tasks(record)][-1]
         failed = post("/v1/jobs", json=JOB | {"seed": 78}).json()["id"]
         fail(self.services, record_of(self.services, failed), "red-secret broke")
         waiting = post("/v1/jobs", json=JOB | {"seed": 79}).json()["id"]
@@ -280,7 +280,7 @@ def test_what_is_shared_is_used_by_all_and_deleted_by_its_own(world: World) -> N
 
 def test_an_upload_with_the_mark_of_a_project_is_not_its_own(world: World) -> None:
     made = world.services.index.assets.get(AssetKind.OBJECT, world.said["objects_digest"])
-    stored = world.services.store.get(names.asset_files(AssetKind.OBJECT, made.digest))
+    stored = world.services.store.get(names.asset_files_key(AssetKind.OBJECT, made.digest))
     with zipfile.ZipFile(io.BytesIO(stored)) as archive:
         assert "graspd-project.txt" in archive.namelist()
     for said in ({}, {"shared": "true"}):

@@ -16,7 +16,7 @@ import pytest
 from typer.testing import CliRunner
 
 from graspd import GraspdError, demo, remote
-from graspd.cli import build
+from graspd.cli import build_app
 from graspd.client.client import Client
 from graspd.service.cli import plain_console
 from graspd.service.model.states import AssetKind, State
@@ -24,7 +24,7 @@ from graspd.service.run.supervisor import Supervisor
 from graspd.service.settings import Settings
 from graspd.service.store.library import load_asset_files
 from graspd.service.store.network_file import to_bytes
-from graspd.service.store.records import publish
+from graspd.service.store.records import publish_record
 from graspd.service.store.store import open_store
 from tests import waiting
 from tests.networks import random_network
@@ -51,7 +51,7 @@ class Shell:
         if not self.in_process:
             return completed(command, env=self.environment, timeout=60)
         ours = {name: None for name in os.environ if name.startswith("GRASPD_")}
-        done = CliRunner().invoke(build(), arguments, env={**ours, **self.environment}, input=typed)
+        done = CliRunner().invoke(build_app(), arguments, env={**ours, **self.environment}, input=typed)
         return subprocess.CompletedProcess(command, done.exit_code, done.stdout, done.stderr)
 
     def json(self, *arguments: str) -> dict[str, Any]:
@@ -257,7 +257,7 @@ def test_keys_are_made_listed_and_revoked(graspd: Shell, tmp_path: Path) -> None
 
 def test_a_job_with_a_target_says_how_its_fidelity_was_chosen(graspd: Shell, service: Supervisor) -> None:
     asked = ("submit", "--hand", "allegro", "--object", "mug", "--scene", "shelf", "--fidelity", "auto", "--target")
-    key = publish(open_store(service.settings.resolved_store_url), "scene_charts/shelf", scene_chart("shelf"))
+    key = publish_record(open_store(service.settings.resolved_store_url), "scene_charts/shelf", scene_chart("shelf"))
     done = graspd(*asked, "lift>=0.8")
     assert done.returncode == 0, done.stderr
     told = f"fidelity: standard, chosen for lift>=0.8, reached 0.85 with the same hand and object in {key}"

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from graspd.client.dataset_commands import PlanRequest, plan_request, read_spec
-from graspd.service.command_options import pairs
+from graspd.service.command_options import parse_pairs
 from graspd.service.model.errors import InputError
 from graspd.service.pipeline.datasets.spec import MAX_CELLS
 
@@ -36,7 +36,7 @@ def test_a_spec_says_it_all(tmp_path: Path) -> None:
     found = asked(spec(tmp_path, TOML))
     assert (found.name, found.hands, found.objects) == ("kitchen", "allegro,barrett", "mug,block")
     assert found.options == {"scenes": 2, "stereo": True, "fidelity": "draft"}
-    assert found.shared_out({"hands": ["a", "b"]}, 3)["grasps"] == 167  # a sixth of 1000, rounded up
+    assert found.matrix_per_cell({"hands": ["a", "b"]}, 3)["grasps"] == 167  # a sixth of 1000, rounded up
 
 
 def test_json_says_the_same(tmp_path: Path) -> None:
@@ -82,17 +82,17 @@ def test_a_spec_that_cannot_be_used_says_what_is_wrong(tmp_path: Path, text: str
 )
 def test_what_is_written_as_a_number_is_one(text: str, value: object) -> None:
     """`--option keep=20` is the job that `{"keep": 20}` is over HTTP: a string would be another."""
-    found = pairs([f"keep={text}"])
+    found = parse_pairs([f"keep={text}"])
     assert found == {"keep": value} and type(found["keep"]) is type(value)
     with pytest.raises(InputError, match="name=value"):
-        pairs(["keep"])
+        parse_pairs(["keep"])
 
 
 def test_the_million_of_the_examples_is_a_spec() -> None:
     found = asked(ROOT / "examples" / "million" / "million.toml", objects="mug,block")
     hands = found.hands.split(",")
     assert found.total == 1_000_000 and len(hands) == 3
-    assert found.shared_out({"hands": hands}, 100)["grasps"] * 3 * 100 >= 1_000_000
+    assert found.matrix_per_cell({"hands": hands}, 100)["grasps"] * 3 * 100 >= 1_000_000
     assert len(hands) * 10_000 < MAX_CELLS
 
 

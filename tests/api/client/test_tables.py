@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.progress import Progress
 from typer.testing import CliRunner
 
-from graspd.cli import build
+from graspd.cli import build_app
 from graspd.client.reports import JobDisplay, print_cells, print_dataset, print_estimate
 from graspd.service.cli import plain_console
 from graspd.service.model.domain import JobOptions
@@ -68,7 +68,7 @@ def shown(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[str]]:
         monkeypatch.setattr(f"graspd.client.{module}.open_client", opened)
 
     def run(*arguments: str) -> list[str]:
-        done = CliRunner().invoke(build(), arguments, env={"COLUMNS": "80"})
+        done = CliRunner().invoke(build_app(), arguments, env={"COLUMNS": "80"})
         assert done.exit_code == 0, done.output
         return done.stdout.splitlines()
 

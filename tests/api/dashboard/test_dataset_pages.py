@@ -6,7 +6,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from graspd.api.catalog.datasets import Datasets, Pair
-from graspd.api.dashboard.figures import of_service
+from graspd.api.dashboard.figures import service_grid
 from graspd.service.index.queries.grasps import GraspFilter
 from graspd.service.index.views import MatrixCell
 from graspd.service.model.states import State
@@ -38,12 +38,12 @@ def create(services: Services, **changes: object) -> None:
     ],
 )
 def test_a_cell_tells_its_state_and_yield(counts: dict[str, int], state: str, shade: str) -> None:
-    shown = of_service([cell(**counts)], ["h"], ["o"]).rows[0][1][0]
+    shown = service_grid([cell(**counts)], ["h"], ["o"]).rows[0][1][0]
     assert shown is not None and (shown.state, shown.shade) == (state, shade)
 
 
 def test_pairs_without_work_have_a_cell_to_choose() -> None:
-    grid = of_service([cell()], ["h", "i"], ["a", "o"])
+    grid = service_grid([cell()], ["h", "i"], ["a", "o"])
     assert grid.hands == ["h", "i"]
     assert [name for name, _ in grid.rows] == ["o", "a"]  # those with work first
     assert all(shown is not None for _, cells in grid.rows for shown in cells)
@@ -210,7 +210,7 @@ def test_a_dataset_beside_itself_differs_in_nothing(http: TestClient, services: 
 def test_distributions_of_two_share_their_bins_and_count_all(services: Services) -> None:
     _two(services)
     filters = [GraspFilter(dataset="rough", valid=valid) for valid in (True, False, None)]
-    one, other, both = services.index.statistics.side_by_side(filters, ["epsilon"], bins=7)["epsilon"]
+    one, other, both = services.index.statistics.compare_distributions(filters, ["epsilon"], bins=7)["epsilon"]
     assert one is not None and other is not None and both is not None
     assert (one.low, one.high) == (other.low, other.high)
     assert [a + b for a, b in zip(one.counts, other.counts, strict=True)] == both.counts

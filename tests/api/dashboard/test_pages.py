@@ -11,7 +11,7 @@ from starlette.testclient import TestClient
 from graspd.service.index.notes import Damage
 from graspd.service.model.errors import QueueUnavailable
 from graspd.service.model.fidelity import OFFERED
-from graspd.service.model.planning import plan
+from graspd.service.model.planning import plan_tasks
 from graspd.service.model.states import State
 from graspd.service.pipeline.backends import Services
 from tests.api.factories import add_job, add_worker, fail, finish, finish_all
@@ -21,7 +21,7 @@ FORM = {"hand": "allegro", "object": "mug", "grasps": "32", "fidelity": "standar
 
 
 def test_damage_of_the_store_is_shown_while_there_is_some(http: TestClient, services: Services) -> None:
-    services.index.damage.mark([Damage(f"shards/base/{n}.h5", "its <file> is gone", f"{n}") for n in range(7)])
+    services.index.damage.update([Damage(f"shards/base/{n}.h5", "its <file> is gone", f"{n}") for n in range(7)])
     for path, words in (("/", ("shards/base/0.h5", "its &lt;file&gt; is gone", "and 2 more")), ("/workers", ())):
         page = http.get(path).text
         assert all(word in page for word in (*words, "7 objects of the store", "graspd admin store verify --repair"))
@@ -61,7 +61,7 @@ def test_a_job_that_has_not_ended_can_be_cancelled_on_its_page(http: TestClient,
     page = http.get(f"/jobs/{record.id}").text
     assert f'action="/jobs/{record.id}/cancel"' in page
     assert f'data-events="/v1/jobs/{record.id}/events"' in page
-    finish(services, record, next(plan(record)))
+    finish(services, record, next(plan_tasks(record)))
     assert "1 of 3" in http.get(f"/jobs/{record.id}").text
 
 

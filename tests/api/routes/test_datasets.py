@@ -6,7 +6,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from graspd.service.pipeline.backends import Services
-from graspd.service.store.records import publish
+from graspd.service.store.records import publish_record
 from tests.api.factories import finish_all
 from tests.fakes import plan_all, record_of
 from tests.service.pipeline.test_fidelity_choice import CHART
@@ -46,7 +46,7 @@ def test_with_auto_each_cell_says_which_fidelity_it_got(http: TestClient, servic
     for path, body in (("/v1/datasets", wanted), ("/v1/datasets/estimate", unnamed)):
         answer = http.post(path, json=body)
         assert answer.status_code == 422 and "graspd chart --publish" in answer.text
-    publish(services.store, "charts", CHART)
+    publish_record(services.store, "charts", CHART)
     assert http.post("/v1/datasets", json=wanted).status_code == 202
     cells = http.get("/v1/datasets/kitchen/cells").json()["items"]
     assert {(cell["hand"], cell["fidelity"]) for cell in cells} == {("allegro", "standard"), ("barrett", "draft")}

@@ -9,9 +9,9 @@ from starlette.testclient import TestClient
 from graspd.client.client import events_of
 from graspd.service.model.clock import timestamp
 from graspd.service.model.metrics import GraspType
-from graspd.service.model.planning import plan
+from graspd.service.model.planning import plan_tasks
 from graspd.service.pipeline.backends import Services
-from graspd.service.store.records import publish
+from graspd.service.store.records import publish_record
 from tests.api.factories import add_job, fail, finish, finish_all
 from tests.service.pipeline.test_fidelity_choice import scene_chart
 from tests.waiting import until
@@ -38,7 +38,7 @@ def test_a_job_in_a_scene_with_auto_says_how_it_was_chosen(http: TestClient, ser
     wanted = scene | {"fidelity": "auto", "target": "lift>=0.8"}
     refused = http.post("/v1/jobs", json=wanted)
     assert refused.status_code == 422 and "graspd chart --scene table --publish" in refused.text
-    key = publish(services.store, "scene_charts/table", scene_chart())
+    key = publish_record(services.store, "scene_charts/table", scene_chart())
     answer = http.post("/v1/jobs", json=wanted)
     choice = {"target": "lift>=0.8", "chart": key, "measured_on": "hand and object", "reached": 0.85}
     for job in (answer.json(), http.get(answer.headers["location"]).json()):
@@ -116,7 +116,7 @@ def test_time_that_another_job_spent_is_not_counted_twice(http: TestClient, serv
     second = add_job(services, seed=7, grasps=64)
     (stage,) = http.get(f"/v1/jobs/{second.id}").json()["stages"]
     assert (stage["succeeded"], stage["reused"], stage["seconds"]) == (1, 1, 0.0)
-    finish(services, second, list(plan(second))[1])
+    finish(services, second, list(plan_tasks(second))[1])
     (stage,) = http.get(f"/v1/jobs/{second.id}").json()["stages"]
     assert (stage["succeeded"], stage["reused"], stage["seconds"]) == (2, 1, 12.5)
     assert http.get(f"/v1/jobs/{first.id}").json()["stages"][0]["seconds"] == 12.5

@@ -17,7 +17,7 @@ from graspd.service.index.rebuild import differences, rebuild
 from graspd.service.model import names
 from graspd.service.model.records import MOST_TAGGED
 from graspd.service.pipeline.backends import Services
-from graspd.service.readers.where import parse
+from graspd.service.readers.where import compile_expression
 from graspd.service.store.manifests import ShardManifest
 from graspd.service.store.shards import Shard, read_shard
 from tests.api.factories import add_job, finish_all, people_of
@@ -85,7 +85,7 @@ def test_all_that_pass_a_filter_are_tagged(http: TestClient, made: ShardManifest
 )
 def test_index_and_shards_agree(http: TestClient, made: ShardManifest, services: Services, expression: str) -> None:
     shard = shard_of(services, made)
-    rows = np.flatnonzero(parse(expression)(shard.arrays, shard.attributes)).tolist()
+    rows = np.flatnonzero(compile_expression(expression)(shard.arrays, shard.attributes)).tolist()
     assert rows_of(http, where=expression) == rows
 
 
@@ -113,7 +113,7 @@ def test_a_tag_is_made_anew_after_its_end_even_if_that_broke_off(
     http: TestClient, made: ShardManifest, services: Services, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     give(http, "good", grasps=named(made.shard_id, 1))
-    monkeypatch.setattr("graspd.service.pipeline.tagging.drop_older", lambda *_: None)
+    monkeypatch.setattr("graspd.service.pipeline.tagging.drop_older_versions", lambda *_: None)
     http.delete("/v1/tags/good")
     rebuild(services.index, services.store)
     assert http.get("/v1/tags").json() == []

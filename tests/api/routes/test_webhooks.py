@@ -49,7 +49,7 @@ class Ear:
         return self.answer
 
     def round(self, later_s: float = 0.0) -> int:
-        self.dispatcher.tell_datasets()
+        self.dispatcher.report_dataset_ends()
         return self.deliver(now=time.time() + later_s)
 
     def deliver(self, *, now: float | None = None) -> int:
@@ -145,9 +145,9 @@ def test_webhooks_survive_a_rebuild_and_tell_nothing_old(http: TestClient, servi
     ear.round()
     with closing(Index("sqlite://")) as fresh:
         rebuild(fresh, services.store)
-        assert [one.id for one in fresh.outbox.hooks()] == [hook["id"]]
-        fresh.outbox.plan()
-        assert fresh.outbox.due(time.time()) == []
+        assert [one.id for one in fresh.outbox.webhooks()] == [hook["id"]]
+        fresh.outbox.create_deliveries()
+        assert fresh.outbox.due_deliveries(time.time()) == []
     rebuild(services.index, services.store)
     ear.round()
     assert len(ear.heard) == 1
@@ -184,7 +184,7 @@ def hooks(services: Services, count: int, project: str, host: str, created: str 
 
 def end_jobs_of(services: Services, projects: str, seq: str = "") -> None:
     ended = {"kind": "job", "state": "succeeded", "owner": ""}
-    with services.index.database.writing() as connection:
+    with services.index.database.write_transaction() as connection:
         append_ends(connection, [ended | {"subject": f"{project}{seq}", "project": project} for project in projects])
 
 

@@ -257,7 +257,7 @@ def float64_rows(network: ProposalNetwork, noise: Floats, label: float) -> Float
 @pytest.mark.parametrize("label", [1.0, 0.0])
 def test_proposals_are_those_of_definition_in_double_precision(label: float) -> None:
     network = random_network(["a", "b", "c"])
-    noise = np.random.default_rng(7).standard_normal((3, network.numbers))
+    noise = np.random.default_rng(7).standard_normal((3, network.row_size))
     expected = net.decode(float64_rows(network, noise, label), cloud()[0].mean(axis=0))
     found = proposed(network, 3, label=label)
     # Single precision: 16 steps of sums over 512 numbers of order 1, each rounded at 6e-8.
@@ -293,7 +293,7 @@ def test_a_grasp_survives_its_row_and_a_bad_row_is_a_rotation() -> None:
     found = proposed(network, 5)
     np.testing.assert_allclose(np.linalg.norm(found.hand_pose[:, 3:], axis=1), 1, atol=1e-12)
     assert_near(net.decode(net.encode(found, [0.1, 0.2, 0.3]), [0.1, 0.2, 0.3]), found, 1e-12)
-    flat = np.zeros((3, network.numbers))
+    flat = np.zeros((3, network.row_size))
     flat[1, 3:9] = [0, 2, 0, 0, -1, 0]  # columns on one line
     flat[2, 3:9] = [3, 0, 0, 1, 2, 0]
     made = net.decode(flat, np.zeros(3))

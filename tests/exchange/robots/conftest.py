@@ -14,7 +14,7 @@ TABLE = f"--hand barrett --object bottle --scene table --scenes 2 -n 6 --validat
 
 @pytest.fixture(scope="session", autouse=True)
 def engine() -> None:
-    backend.start()
+    backend.start_warp()
 
 
 def _shard(name: str, words: str):

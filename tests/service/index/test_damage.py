@@ -14,7 +14,7 @@ from graspd.service.index.index import Index
 from graspd.service.index.rebuild import differences, rebuild
 from graspd.service.model import names
 from graspd.service.model.errors import IndexUnavailable
-from graspd.service.model.planning import plan
+from graspd.service.model.planning import plan_tasks
 from graspd.service.model.states import AssetKind, Stage, State
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
@@ -56,12 +56,12 @@ def a_job(services: Services) -> str:
 
 
 def attempt_of(services: Services) -> str:
-    return fail_task(services, job := a_job(services), next(plan(record_of(services, job))), last=False)
+    return fail_task(services, job := a_job(services), next(plan_tasks(record_of(services, job))), last=False)
 
 
 def event_of(services: Services) -> str:
     event = add_job_event(services.store, a_job(services), "cancelled")
-    return names.event(names.job_events(a_job(services)), event.number, "cancelled")
+    return names.event_key(names.job_events_folder(a_job(services)), event.number, "cancelled")
 
 
 def ball(services: Services) -> tuple[AssetKind, str]:
@@ -70,16 +70,16 @@ def ball(services: Services) -> tuple[AssetKind, str]:
 
 #: Keys of records, which are there but for those of a dataset.
 RECORDS: dict[str, Callable[[Services], str]] = {
-    "job": lambda services: names.job_record(a_job(services)),
-    "manifest": lambda services: names.shard_manifest(
+    "job": lambda services: names.job_record_key(a_job(services)),
+    "manifest": lambda services: names.shard_manifest_key(
         Stage.SYNTHESIZE, make_shard(services.store, message_for()).shard_id
     ),
     "attempt": attempt_of,
     "event": event_of,
-    "asset": lambda services: names.asset_record(*ball(services)),
-    "check": lambda services: names.asset_check(*ball(services)),
-    "dataset": lambda services: names.dataset_record("kitchen"),
-    "snapshot": lambda services: names.dataset_snapshot("kitchen", "a" * 32),
+    "asset": lambda services: names.asset_record_key(*ball(services)),
+    "check": lambda services: names.asset_check_key(*ball(services)),
+    "dataset": lambda services: names.dataset_record_key("kitchen"),
+    "snapshot": lambda services: names.dataset_snapshot_key("kitchen", "a" * 32),
 }
 
 

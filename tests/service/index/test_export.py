@@ -19,7 +19,7 @@ def test_every_row_and_value_of_a_table_is_in_its_file(services: Services, tmp_p
     make(services, enter(services, "vision", 1, batches=2))
     counts = export(services.index.database, tmp_path)
     assert counts["grasps"] == 64 and counts["jobs"] == 1 and counts["shards"] == counts["tasks"] > 1
-    with services.index.database.reading() as connection:
+    with services.index.database.read_transaction() as connection:
         for name, table in TABLES.items():
             stored = [
                 {key: json.dumps(value) if isinstance(value, dict | list) else value for key, value in row.items()}

@@ -20,7 +20,7 @@ from graspd.service.index.rebuild import differences, rebuild
 from graspd.service.index.views import GraspView
 from graspd.service.model.clock import timestamp
 from graspd.service.model.errors import ConflictError, IndexUnavailable, InputError, StoreUnavailable
-from graspd.service.model.planning import OUTCOMES, RoundRobin, message_of, plan
+from graspd.service.model.planning import OUTCOMES, RoundRobin, message_of, plan_tasks
 from graspd.service.model.states import AssetKind, Priority, Stage, State
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
@@ -44,7 +44,7 @@ def fail(services: Services, job: str, batch: int, number: int, *, last: bool) -
 
 
 def test_sqlite_lets_readers_read_while_one_writes(services: Services) -> None:
-    with services.index.database.writing() as connection:
+    with services.index.database.write_transaction() as connection:
         connection.execute(update(tables.assets).values(message="half done"))
         assert {a.message for a in services.index.assets.page(AssetKind.HAND).items} == {"fine"}
 
@@ -73,7 +73,7 @@ def test_a_job_shows_progress_by_stage(services: Services) -> None:
 def test_a_job_that_found_fewer_grasps_tells_the_outcomes(services: Services) -> None:
     job, _ = job_actions.submit(services, request(grasps=64))
     record = record_of(services, job.id)
-    for task, lost in zip(plan(record), ({"slipped": 3, "turned": 1}, {"slipped": 4}), strict=True):
+    for task, lost in zip(plan_tasks(record), ({"slipped": 3, "turned": 1}, {"slipped": 4}), strict=True):
         make_task(services, record, task, outcomes=lost)
     done = services.index.jobs.get(job.id)
     assert done.valid < 64 and done.outcomes == {"turned": 1, "slipped": 7}
@@ -105,7 +105,7 @@ def test_grasps_page_through_in_the_order_of_any_metric(services: Services) -> N
     job, _ = job_actions.submit(services, request(grasps=70))
     finish(services, job.id)
     metrics = ("epsilon", "penetration_depth_mm", "stability_loss")
-    with services.index.database.writing() as connection:  # some without the metrics
+    with services.index.database.write_transaction() as connection:  # some without the metrics
         connection.execute(update(tables.grasps).where(tables.grasps.c.row < 3).values(dict.fromkeys(metrics)))
     for by, descending in itertools.product((*metrics, "created"), (True, False)):
         sort = GraspSort(by=by, descending=descending)  # type: ignore[arg-type]
@@ -230,7 +230,7 @@ def test_a_rebuild_from_the_store_gives_the_rows_that_are_there(services: Servic
 
 def test_every_kind_of_damage_to_the_index_is_seen_and_mended(services: Services) -> None:
     build_a_history(services)
-    with services.index.database.writing() as connection:
+    with services.index.database.write_transaction() as connection:
         connection.execute(delete(tables.grasps).where(tables.grasps.c.row == 0))
         connection.execute(update(tables.shards).values(seconds=99.0))
         connection.execute(update(tables.tasks).where(tables.tasks.c.done.is_(True)).values(state="failed"))
@@ -289,7 +289,7 @@ def test_valid_grasps_add_up_minute_by_minute(services: Services) -> None:
     hour = "2026-05-01T{:02}:{:02}:{:02}.123Z"
     times = [hour.format(7, 59, 59), hour.format(8, 0, 0), hour.format(8, 0, 44), hour.format(9, 30, 1)]
     base = tables.shards.c.kind == "base"
-    with services.index.database.writing() as connection:
+    with services.index.database.write_transaction() as connection:
         made = connection.execute(select(tables.shards.c.id, tables.shards.c.valid).where(base)).all()
         for (shard, _), created in zip(made, times, strict=True):
             connection.execute(update(tables.shards).where(tables.shards.c.id == shard).values(created=created))
@@ -304,7 +304,7 @@ def test_writers_at_once_leave_the_rows_of_the_store(services: Services, index_u
     """The controller indexes shards while the API of another process cancels and retries their job, over and over."""
     job, _ = job_actions.submit(services, request(grasps=32 * 6, scenes=1))
     record = record_of(services, job.id)
-    messages = [message_of(record, task, attempt=1, max_attempt=3) for task in plan(record)]
+    messages = [message_of(record, task, attempt=1, max_attempt=3) for task in plan_tasks(record)]
     other = Services(services.settings, services.store, Index(index_url), services.queue)
     done = threading.Event()
 
@@ -345,7 +345,7 @@ def test_text_that_a_database_would_refuse_stops_nothing(services: Services) -> 
 @pytest.mark.postgres
 def test_what_a_database_cannot_hold_is_not_taken_for_an_outage(postgres_server: PostgresServer) -> None:
     index = Index(postgres_server.database())
-    with pytest.raises(InputError, match="cannot store"), index.database.writing() as connection:
+    with pytest.raises(InputError, match="cannot store"), index.database.write_transaction() as connection:
         connection.execute(tables.workers.insert().values(name="x" * 999))
     index.close()
 

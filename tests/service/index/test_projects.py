@@ -4,7 +4,7 @@ from graspd.service.index.rebuild import rebuild
 from graspd.service.index.views import UsageDay
 from graspd.service.model import names
 from graspd.service.model.messages import Origin
-from graspd.service.model.planning import RoundRobin, message_of, plan
+from graspd.service.model.planning import RoundRobin, message_of, plan_tasks
 from graspd.service.model.projects import ProjectScope
 from graspd.service.model.records import JobRecord
 from graspd.service.model.states import Priority
@@ -21,13 +21,15 @@ def enter(services: Services, project: str, seed: int, *, key: str = "", batches
     record = job_actions.prepare(services, request(grasps=32 * batches, seed=seed), priority=Priority.BULK).model_copy(
         update={"id": f"{where:x}{seed:031x}", "origin": Origin(key=key or project), "project": project}
     )
-    put_record(services.store, names.job_record(record.id), record)
+    put_record(services.store, names.job_record_key(record.id), record)
     services.index.write.add_job(record)
     return record
 
 
 def make(services: Services, record: JobRecord, *, day: str = DAY, device: str = "cuda:0", seconds: float = 10) -> int:
-    made = [make_shard(services.store, message_of(record, task, attempt=1, max_attempt=3)) for task in plan(record)]
+    made = [
+        make_shard(services.store, message_of(record, task, attempt=1, max_attempt=3)) for task in plan_tasks(record)
+    ]
     told = {"created": f"{day}T12:00:00.000000Z", "device": device, "seconds": seconds}
     services.index.write.add_manifests([manifest.model_copy(update=told) for manifest in made])
     return sum(manifest.valid or 0 for manifest in made)
@@ -70,8 +72,8 @@ def test_what_was_deleted_stays_counted(services: Services) -> None:
     make(services, record)
     before = services.index.usage.days(DAY, DAY)
     services.index.removals.remove_job(record.id)
-    with services.index.database.writing() as connection:
-        gone = [services.index.removals.remove_shard(task.output, within=connection) for task in plan(record)]
+    with services.index.database.write_transaction() as connection:
+        gone = [services.index.removals.remove_shard(task.output, within=connection) for task in plan_tasks(record)]
     assert gone == [True, True]
     assert services.index.usage.days(DAY, DAY) == before
     make(services, enter(services, "red", 2))
@@ -81,7 +83,7 @@ def test_what_was_deleted_stays_counted(services: Services) -> None:
 
 def test_usage_is_the_same_after_the_index_was_made_anew(services: Services) -> None:
     for seed, project in enumerate(("red", "blue")):
-        for task in plan(record := enter(services, project, seed)):
+        for task in plan_tasks(record := enter(services, project, seed)):
             make_task(services, record, task)
     before = services.index.usage.days("2000-01-01", "2999-01-01")
     assert {day.project for day in before} == {"red", "blue"}

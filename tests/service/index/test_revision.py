@@ -14,7 +14,7 @@ from graspd.service.index.index import Index
 from graspd.service.index.queries.grasps import GraspSort
 from graspd.service.index.tables import metadata
 from graspd.service.model.errors import IndexUnavailable
-from graspd.service.model.metrics import indexed
+from graspd.service.model.metrics import indexed_metrics
 from graspd.service.run.commands import app
 from graspd.service.settings import Settings
 from graspd.service.store.store import open_store
@@ -58,7 +58,7 @@ def columns(engine: Engine) -> dict[str, set[str]]:
 
 def test_other_tables_have_another_revision() -> None:
     """Where this fails, raise `database.REVISION`, and put the new pair here. Metrics of grasps are added without."""
-    of_metrics = {metric.name for metric in indexed()}
+    of_metrics = {metric.name for metric in indexed_metrics()}
     said = [
         f"{table.name}.{column.name} {column.type} {column.nullable} {column.primary_key}"
         for table in metadata.tables.values()

@@ -28,7 +28,7 @@ def index(tmp_path: Path, values: np.ndarray) -> Iterator[Index]:
     opened = empty_index(f"sqlite:///{tmp_path / 'index.sqlite'}")
     plain = dict.fromkeys(METRICS) | {"shard_id": "a" * 32, "hand": "h", "object": "o", "created": CREATED}
     rows = [plain | {"row": row, "epsilon": value, "valid": row % 2 == 0} for row, value in enumerate(values)]
-    with opened.database.writing() as connection:
+    with opened.database.write_transaction() as connection:
         connection.execute(insert(grasps), rows)
     yield opened
     opened.close()
@@ -51,7 +51,9 @@ def test_a_histogram_counts_as_numpy_does(index: Index, values: np.ndarray) -> N
 
 
 def test_distributions_of_few_grasps_are_exact(index: Index, values: np.ndarray) -> None:
-    found = index.statistics.side_by_side([GraspFilter(valid=True)], ("epsilon", "contact_area_cm2"), bins=BINS)
+    found = index.statistics.compare_distributions(
+        [GraspFilter(valid=True)], ("epsilon", "contact_area_cm2"), bins=BINS
+    )
     passed = values[::2]
     ((one,),) = found.values()
     assert one is not None and one.counts == np.histogram(passed, BINS)[0].tolist()
@@ -59,14 +61,16 @@ def test_distributions_of_few_grasps_are_exact(index: Index, values: np.ndarray)
 
 
 def test_distributions_of_many_grasps_come_from_a_fair_sample(index: Index) -> None:
-    with index.database.writing() as connection:
+    with index.database.write_transaction() as connection:
         for number in range(400):
             shard = hashlib.sha256(str(number).encode()).hexdigest()[:32]
             made = {"shard_id": shard, "hand": "a", "object": "b", "created": CREATED, "valid": True}
             rows = [made | {"row": row, "epsilon": number / 400} for row in range(8)]
             connection.execute(insert(grasps), rows)
             connection.execute(insert(shards), _shard(shard, hand="a", object="b", count=8))
-    (found,) = index.statistics.side_by_side([GraspFilter(hand="a", object="b")], ("epsilon",), at_most=800)["epsilon"]
+    (found,) = index.statistics.compare_distributions([GraspFilter(hand="a", object="b")], ("epsilon",), at_most=800)[
+        "epsilon"
+    ]
     # 100 shards are expected; the number drawn has a standard deviation of 9, their mean one of 0.03.
     assert found is not None and 60 * 8 < found.count < 140 * 8
     assert found.mean == pytest.approx(0.5, abs=0.12)

@@ -12,12 +12,20 @@ from graspd.service.model import planning
 from graspd.service.model.digests import digest_json, job_id, shard_id
 from graspd.service.model.domain import BATCH_SIZE, RECHECKS, SCENES, JobOptions, JobRequest
 from graspd.service.model.metrics import AXIS_MEANINGS, MIN_DISTANCE_M, ROBUST_MODELS, Axis, axis_word
-from graspd.service.model.planning import MAX_BACKOFF_S, OUTCOMES, TaskFacts, message_of, plan, shortfall, sum_outcomes
+from graspd.service.model.planning import (
+    MAX_BACKOFF_S,
+    OUTCOMES,
+    TaskFacts,
+    explain_shortfall,
+    message_of,
+    plan_tasks,
+    sum_outcomes,
+)
 from graspd.service.model.records import DatasetRecord, JobRecord, Member
 from graspd.service.model.renamed import original_request
 from graspd.service.model.states import Priority, Stage, State
 from graspd.service.model.version import STAGE_REVISIONS
-from graspd.service.pipeline.datasets.spec import describe
+from graspd.service.pipeline.datasets.spec import create_record
 from graspd.worker.planners.registry import PLANNERS, method
 from tests.fakes import job_record, request
 
@@ -113,12 +121,12 @@ def test_a_job_without_a_scene_keeps_its_id_and_its_record() -> None:
     assert job.request.model_dump(mode="json") == wanted
     said = {"request": original_request(wanted), "hand": HAND, "object": OBJECT, "revisions": STAGE_REVISIONS}
     assert job.id == digest_json(said)
-    (task,) = plan(job)
+    (task,) = plan_tasks(job)
     assert message_of(job, task, attempt=1, max_attempt=3).model_dump(mode="json")["request"] == wanted
 
 
 MEMBERS = [Member(name="h", digest=HAND)], [Member(name="o", digest=OBJECT)]
-DATASET = describe("d", *MEMBERS, JobOptions(), lambda one: (one, None))
+DATASET = create_record("d", *MEMBERS, JobOptions(), lambda one: (one, None))
 
 
 def test_a_dataset_without_a_scene_keeps_its_digest() -> None:
@@ -145,7 +153,7 @@ def test_scenes_after_the_grasps_have_the_address_that_they_had() -> None:
 def test_a_job_in_a_scene_makes_its_scenes_first() -> None:
     job = record(request(scene="table", views=2))
     assert job.id != record(request(scenes=SCENES, views=2)).id
-    scene, base, views = plan(job)
+    scene, base, views = plan_tasks(job)
     assert [task.stage for task in (scene, base, views)] == [Stage.SCENE, Stage.SYNTHESIZE, Stage.RENDER]
     assert (scene.inputs, base.inputs, views.inputs) == ((), (scene.output,), (base.output,))
 
@@ -158,8 +166,8 @@ def test_a_job_in_a_scene_makes_its_scenes_first() -> None:
     ],
 )
 def test_whatever_moves_scenes_gives_them_another_address(name: str, value: Any) -> None:
-    first = next(plan(record(request(scene="table"))))
-    assert next(plan(record(request(**{"scene": "table", name: value})))).output != first.output
+    first = next(plan_tasks(record(request(scene="table"))))
+    assert next(plan_tasks(record(request(**{"scene": "table", name: value})))).output != first.output
 
 
 def test_where_no_number_of_scenes_is_named_there_are_a_few() -> None:
@@ -236,10 +244,10 @@ OVER = {"last_attempt": 3, "exhausted": True}
 
 
 def test_a_job_is_cut_into_batches_of_32_and_only_what_was_asked_for_stage_by_stage() -> None:
-    assert [(task.batch, task.count) for task in plan(record(request(grasps=70)))] == [(0, 32), (1, 32), (2, 6)]
-    (alone,) = plan(record(request()))
+    assert [(task.batch, task.count) for task in plan_tasks(record(request(grasps=70)))] == [(0, 32), (1, 32), (2, 6)]
+    (alone,) = plan_tasks(record(request()))
     assert (alone.stage, alone.inputs) == (Stage.SYNTHESIZE, ())
-    few, many = (list(plan(record(request(scenes=2, views=views)))) for views in (3, 4))
+    few, many = (list(plan_tasks(record(request(scenes=2, views=views)))) for views in (3, 4))
     assert [task.stage for task in few] == [*CHAIN]
     assert [task.inputs for task in few] == [(), (few[0].output,), (few[1].output,)]
     # More views are other pictures of the same grasps.
@@ -250,7 +258,7 @@ def test_a_job_is_cut_into_batches_of_32_and_only_what_was_asked_for_stage_by_st
 
 @given(st.integers(1, 2000), st.integers(0, 2), st.integers(0, 2))
 def test_a_plan_makes_each_grasp_once_and_names_nothing_twice(grasps: int, scenes: int, views: int) -> None:
-    tasks = list(plan(record(request(grasps=grasps, scenes=scenes, views=views if scenes else 0))))
+    tasks = list(plan_tasks(record(request(grasps=grasps, scenes=scenes, views=views if scenes else 0))))
     assert sum(task.count for task in tasks if task.stage is Stage.SYNTHESIZE) == grasps
     assert len({task.id for task in tasks}) == len({task.output for task in tasks}) == len(tasks)
 
@@ -275,9 +283,9 @@ def test_a_small_job_is_interactive_and_a_large_one_is_bulk() -> None:
 )
 def test_states_follow_from_facts(first: dict[str, Any], cancelled: bool, states: Any, ready: int | None) -> None:
     chain = [TaskFacts(stage, **(first if stage is CHAIN[0] else {})) for stage in CHAIN]
-    found = planning.batch_states(chain, job_cancelled=cancelled)
+    found = planning.range_states(chain, job_cancelled=cancelled)
     assert found == states
-    assert planning.batch_ready(found) == [place == ready for place in range(3)]
+    assert planning.range_ready_mask(found) == [place == ready for place in range(3)]
 
 
 #: Of a job, by those of its tasks.
@@ -297,18 +305,20 @@ def test_the_wait_doubles_up_to_a_bound() -> None:
 
 
 def test_why_fewer_grasps_were_found_is_told_the_most_frequent_first() -> None:
-    assert shortfall(8, 8, "valid", 12, 4, {"slipped": 4}) is None
+    assert explain_shortfall(8, 8, "valid", 12, 4, {"slipped": 4}) is None
     lost = sum_outcomes([{"slipped": 4, "no_place": 1}, {"slipped": 1, "turned": 2, "alike": 0, "fell_apart": 3}])
     assert lost == {"no_place": 1, "turned": 2, "slipped": 5, "fell_apart": 3}
-    said = str(shortfall(0, 2, "valid", 8, 4, lost))
+    said = str(explain_shortfall(0, 2, "valid", 8, 4, lost))
     known = {name: f"{count} {OUTCOMES.get(name)}" for name, count in lost.items()}
     counts = f"{known['slipped']}, 3 fell apart, {known['turned']}, {known['no_place']}"
     assert said.startswith(f"found 0 of 2 valid grasps in 8 candidates: {counts}; the budget of 4 candidates")
-    said = str(shortfall(1, 4, "valid", 7, 4, {"not_lifted": 6, "repeated": 9}))
+    said = str(explain_shortfall(1, 4, "valid", 7, 4, {"not_lifted": 6, "repeated": 9}))
     assert said.startswith("found 1 of 4 valid grasps in 16 candidates: 9 repeated attempts, 6 not lifted; the budget")
 
 
 def test_a_limit_of_the_hand_stands_where_the_budget_would() -> None:
     limit = planning.limit_text("barrett", 0.6, 16, 5.66, math.inf, 100.0)
     assert limit == "barrett lifts 5.7 kg at friction 0.6 in the best of 16 grasps; 100 kg are wanted"
-    assert str(shortfall(0, 4, "valid", 4, 4, {}, limit)) == f"found 0 of 4 valid grasps in 4 candidates; {limit}"
+    assert (
+        str(explain_shortfall(0, 4, "valid", 4, 4, {}, limit)) == f"found 0 of 4 valid grasps in 4 candidates; {limit}"
+    )

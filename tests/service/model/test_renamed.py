@@ -11,7 +11,7 @@ from graspd.service.model import renamed
 from graspd.service.model.domain import JobRequest
 from graspd.service.readers.files import open_shards
 from graspd.service.readers.grasps import Grasps
-from graspd.service.store.records import CHARTS, latest, parse_record, publish
+from graspd.service.store.records import CHARTS, latest_record, parse_record, publish_record
 from graspd.service.store.shards import read_shard, write_shard
 from graspd.service.store.store import open_store
 from tests.fakes import make_shard, message_for, request
@@ -43,8 +43,8 @@ def test_a_chart_of_0_2_has_todays_measures() -> None:
     new = {"by_hand": {"allegro": [today]}, "validation": {"level": "standard"}}
     assert renamed.convert_chart(old | others) == new | others | {"candidates_end_to_end_per_second": 2.0}
     store = open_store("memory://")
-    publish(store, CHARTS, {"created": "2026-11-25", "summary": [row]})
-    assert latest(store, CHARTS) == {"created": "2026-11-25", "summary": [today]}
+    publish_record(store, CHARTS, {"created": "2026-11-25", "summary": [row]})
+    assert latest_record(store, CHARTS) == {"created": "2026-11-25", "summary": [today]}
 
 
 def test_only_a_worker_of_0_2_gets_its_names() -> None:

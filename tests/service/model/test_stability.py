@@ -4,8 +4,16 @@ import math
 
 import pytest
 
-from graspd.service.model.studies import MapCell, Stability, StabilityMap, counts, format_short, from_json, tick
-from graspd.service.store.records import publish
+from graspd.service.model.studies import (
+    MapCell,
+    Stability,
+    StabilityMap,
+    count_outcomes,
+    format_short,
+    format_tick,
+    from_json,
+)
+from graspd.service.store.records import publish_record
 from graspd.service.store.store import open_store
 
 
@@ -22,7 +30,7 @@ TICKS = {1e-5: "1e-5", 3e-4: "3e-4", 0.001: "0.001", 30.0: "30", 1e5: "1e5", 123
 def test_numbers_on_cells_and_axes_are_short() -> None:
     assert [format_short(value) for value in SHORT] == list(SHORT.values())
     assert max(len(format_short(1.9999 * 10.0**k)) for k in range(-9, 9)) <= 5
-    assert [tick(value) for value in (*TICKS, 0.0)] == [*TICKS.values(), "0"]
+    assert [format_tick(value) for value in (*TICKS, 0.0)] == [*TICKS.values(), "0"]
 
 
 def test_what_still_breaks_are_broken_cells_in_reach_of_a_job() -> None:
@@ -34,13 +42,15 @@ def test_what_still_breaks_are_broken_cells_in_reach_of_a_job() -> None:
         MapCell("b", 2.0, "draft", 0.0, "refused", reached=True),
     )
     assert one.still_breaks() == ["a 1, 3 (draft, fine); 9 (fine)"]
-    assert counts(one.reached()) == {"good": 1, "weak": 0, "broken": 5, "refused": 1}
+    assert count_outcomes(one.reached()) == {"good": 1, "weak": 0, "broken": 5, "refused": 1}
 
 
 def test_a_record_survives_the_store_without_odd_numbers() -> None:
     cells = [MapCell("a", 1, 10.0, _INF, "broken", label="×∞"), MapCell("a", "inside out", 10.0, _NAN, "refused")]
     record = Stability("2026-11-21T12:00:00.000Z", "graspd stability", {"graspd": "0"}, [a_map(*cells)])
-    assert publish(open_store("memory://"), "stability", record.as_json()) == "stability/20261121T120000000Z.json"
+    assert (
+        publish_record(open_store("memory://"), "stability", record.as_json()) == "stability/20261121T120000000Z.json"
+    )
     found = from_json(record.as_json())
     assert [cell.text for cell in found.maps[0].cells] == ["×∞", ""]
     assert found.maps[0].lines == {"a": [(1.0, 2.0)]}

@@ -254,7 +254,7 @@ def test_a_lost_failure_event_is_made_good_from_the_store(bench: Bench) -> None:
 def test_a_damaged_manifest_fails_its_task_and_stops_no_other(bench: Bench) -> None:
     bad, _ = job_actions.submit(bench.services, request(seed=1))
     delivery = bench.take()
-    key = names.shard_manifest(delivery.message.stage, delivery.message.output)
+    key = names.shard_manifest_key(delivery.message.stage, delivery.message.output)
     bench.services.store.put(key, b'{"version": 1, "shard_id": torn')
     bench.do(delivery)
     good, _ = job_actions.submit(bench.services, request(seed=2))
@@ -277,7 +277,7 @@ def test_tasks_queued_while_the_controller_looks_are_queued_once(bench: Bench, m
 
     def beside(index: Any, *given: Any, **named: Any) -> Any:
         seen = ready(index, *given, **named)
-        mine = bench.services.index.feed.ready_of_job(job.id, limit=9)
+        mine = bench.services.index.feed.ready_tasks_of_job(job.id, limit=9)
         job_actions.queue_tasks(bench.services, mine, routes=Routes(bench.queue.workers()))
         if bench.queue.waiting():
             taken.append(bench.take())
@@ -304,7 +304,7 @@ def test_an_upload_is_checked_and_what_was_found_is_indexed(bench: Bench) -> Non
 
     def check(message: IngestMessage, context: TaskContext) -> None:
         found = {"verdict": "repair", "message": "one hole closed", "repairs": ["hole"], "facts": {"faces": 12}}
-        context.store.put(names.asset_check(message.kind, message.digest), json.dumps(found).encode())
+        context.store.put(names.asset_check_key(message.kind, message.digest), json.dumps(found).encode())
 
     bench.work_off(ingest=check)
     view = bench.services.index.assets.get(AssetKind.HAND, "upload")
@@ -338,7 +338,7 @@ def test_a_task_between_queue_and_worker_is_not_taken_for_lost(bench: Bench) -> 
 
 def test_files_below_an_asset_do_not_stop_a_controller(bench: Bench) -> None:
     (digest, *_) = [digest for kind, digest in stored_assets(bench.services.store) if kind is AssetKind.OBJECT]
-    bench.services.store.put(names.object_pieces(digest, "32"), b"pieces")
+    bench.services.store.put(names.object_pieces_key(digest, "32"), b"pieces")
     bench.controller.round()
     assert differences(bench.services.index, bench.services.store) == []
 

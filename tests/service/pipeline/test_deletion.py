@@ -19,7 +19,7 @@ from graspd.service.pipeline.datasets import actions
 from graspd.service.pipeline.datasets.spec import DatasetRequest
 from graspd.service.pipeline.deletion import GarbageCollector, delete_asset, delete_dataset, delete_job, restore
 from graspd.service.store.library import publish_asset
-from graspd.service.store.records import deletions, pending
+from graspd.service.store.records import deletions, pending_deletions
 from tests.fakes import OBJECT_FILES, finish, plan_all, record_of, request, with_settings
 from tests.service.pipeline.datasets.makers import add_asset, done, fail
 
@@ -74,7 +74,7 @@ def test_a_deleted_job_may_be_submitted_again(services: Services) -> None:
     delete_job(services, job)
     with pytest.raises(ConflictError, match="still being removed"):
         job_actions.submit(services, request())
-    assert names.job_record(job) in keys(services, "jobs")
+    assert names.job_record_key(job) in keys(services, "jobs")
     GarbageCollector(services).advance()
     again, new = job_actions.submit(services, request())
     assert (again.id, new, again.state) == (job, True, State.SUCCEEDED)
@@ -108,10 +108,10 @@ def test_a_deleted_dataset_takes_its_own_jobs_with_it(services: Services) -> Non
     own = finished(services, seed=7)
     dataset(services)
     dataset(services, "other", grasps=64)
-    actions.snapshot(services, "d")
+    actions.take_snapshot(services, "d")
     with pytest.raises(ConflictError, match=r"has 1 snapshot.*--with-snapshots"):
         delete_dataset(services, "d")
-    assert services.index.datasets.get("d").name == "d" and not pending(services.store)
+    assert services.index.datasets.get("d").name == "d" and not pending_deletions(services.store)
     delete_dataset(services, "d", with_snapshots=True)
     assert differences(services.index, services.store) == []
     with pytest.raises(ConflictError, match="still being removed"):
@@ -120,7 +120,7 @@ def test_a_deleted_dataset_takes_its_own_jobs_with_it(services: Services) -> Non
     assert {view.name for view in services.index.datasets.page().items} == {"other"}
     assert len(services.index.jobs.page().items) == 2
     assert services.index.jobs.get(own)
-    assert keys(services, "datasets") == {names.dataset_record("other")}
+    assert keys(services, "datasets") == {names.dataset_record_key("other")}
     assert differences(services.index, services.store) == []
     dataset(services, "d", grasps=96)
 
@@ -177,7 +177,7 @@ def test_the_next_controller_carries_out_a_broken_deletion(
         patch.setattr(Removals, remove, Mock(side_effect=KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             DELETE[what](services)
-    assert pending(services.store)
+    assert pending_deletions(services.store)
     real, place = type(services.store).delete, 0
     while keys(services, "deletions"):
         with monkeypatch.context() as patch, pytest.raises((KeyboardInterrupt, StopIteration)):
@@ -210,7 +210,7 @@ def all_shown(services: Services) -> object:
 def test_what_was_deleted_is_restored_as_it_was(services: Services, what: Any, collected: bool) -> None:
     MAKE[what](services)
     if what == "dataset":
-        actions.snapshot(services, "d")
+        actions.take_snapshot(services, "d")
     fail(services, job_actions.submit(services, request(seed=7))[0].id)
     before = all_shown(services)
     DELETE[what](services)
@@ -250,14 +250,14 @@ MEANWHILE: list[tuple[Act, list[Act], Act, str]] = [
     (
         finished,
         [DELETE["job"], collect_garbage],
-        lambda services: job_actions.enter(services, record_of(services, _jobs(services)[0]), keeps_assets=True),
+        lambda services: job_actions.enter_job(services, record_of(services, _jobs(services)[0]), keeps_assets=True),
         "deleted just now; submit it again",
     ),
     (tag, [DELETE["tag"]], DELETE["tag"], "there is no tag"),
     (
         dataset,
         [DELETE["dataset"], collect_garbage, ANOTHER["dataset"]],
-        lambda services: actions.snapshot(services, "d"),
+        lambda services: actions.take_snapshot(services, "d"),
         "there is another one; try again",
     ),
 ]
@@ -271,7 +271,7 @@ def test_what_changed_before_the_lock_is_told(
         monkeypatch.undo()
         for rival in rivals:
             rival(services)
-        return Database.writing(*given)
+        return Database.write_transaction(*given)
 
     make(services)
     monkeypatch.setattr(Database, "writing", after_the_rivals)

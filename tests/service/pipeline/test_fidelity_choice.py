@@ -10,8 +10,8 @@ from graspd.service.model.records import Choice
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
-from graspd.service.pipeline.fidelity_choice import cheapest
-from graspd.service.store.records import charts_of, publish, scene_kinds
+from graspd.service.pipeline.fidelity_choice import cheapest_fidelity
+from graspd.service.store.records import publish_record, scene_chart_kind, scene_kinds
 from graspd.service.store.store import open_store
 from tests.fakes import record_of, request
 
@@ -45,7 +45,7 @@ def scene_chart(kind: str = "table", *, created: str = "2026-11-21T10:00:00.000Z
 
 
 def pick(target: str, hand: str = "allegro", object_: str = "mug", chart: dict[str, Any] = CHART) -> str:
-    return cheapest(chart, target, method="fast_graspd", hand=hand, object_=object_).fidelity
+    return cheapest_fidelity(chart, target, method="fast_graspd", hand=hand, object_=object_).fidelity
 
 
 @pytest.mark.parametrize(
@@ -67,7 +67,7 @@ def pick(target: str, hand: str = "allegro", object_: str = "mug", chart: dict[s
 def test_the_fastest_fidelity_that_meets_a_target_is_taken(target: str, hand: str, object_: str, expected: Any) -> None:
     """Around free objects and, by a chart of lifts, among what was planned in the scene."""
     chart = scene_chart() if target.startswith("lift") else CHART
-    found = cheapest(chart, target, method="fast_graspd", hand=hand, object_=object_)
+    found = cheapest_fidelity(chart, target, method="fast_graspd", hand=hand, object_=object_)
     assert (found.fidelity, found.measured_on) == expected[:2] and found.reached == pytest.approx(expected[2])
 
 
@@ -108,9 +108,11 @@ def test_end_to_end_speed_counts_before_the_planners_own() -> None:
 
 
 def test_a_job_in_a_scene_is_chosen_by_the_chart_of_its_scene(services: Services) -> None:
-    publish(services.store, "charts", CHART)
-    key = publish(services.store, charts_of(SceneSpec(kind="table")), scene_chart())
-    publish(services.store, charts_of(SceneSpec(kind="bin")), scene_chart("bin") | {"runs": [lifts("fine", 1, 0.99)]})
+    publish_record(services.store, "charts", CHART)
+    key = publish_record(services.store, scene_chart_kind(SceneSpec(kind="table")), scene_chart())
+    publish_record(
+        services.store, scene_chart_kind(SceneSpec(kind="bin")), scene_chart("bin") | {"runs": [lifts("fine", 1, 0.99)]}
+    )
     wanted = request(fidelity="auto", target="lift>=0.84", scene="table")
     job, _ = job_actions.submit(services, wanted)
     choice = Choice(target="lift>=0.84", chart=key, measured_on="all", reached=0.875)
@@ -121,22 +123,22 @@ def test_a_job_in_a_scene_is_chosen_by_the_chart_of_its_scene(services: Services
 
 
 def test_a_free_chart_is_no_chart_of_scenes_nor_the_reverse(services: Services) -> None:
-    publish(services.store, charts_of(SceneSpec(kind="table")), scene_chart())
+    publish_record(services.store, scene_chart_kind(SceneSpec(kind="table")), scene_chart())
     with pytest.raises(InputError, match="run `graspd chart --publish` once"):
         job_actions.submit(services, request(fidelity="auto", target="gsr>=0.6"))
-    publish(services.store, "charts", CHART)
+    publish_record(services.store, "charts", CHART)
     with pytest.raises(InputError, match=r"have no lifts: run `graspd chart --scene shelf --publish` once"):
         job_actions.submit(services, request(fidelity="auto", target="lift>=0.6", scene="shelf"))
 
 
 def test_a_scene_file_has_charts_of_its_own_by_what_stands_there(tmp_path: Path) -> None:
     floor, box = {"kind": "half_space"}, {"kind": "box", "size": (0.1, 0.1, 0.1), "pose": (0.3, 0, 0, 1, 0, 0, 0)}
-    one = charts_of(SceneSpec(kind="file", supports=(floor, box)))
-    assert one == charts_of(SceneSpec(kind="file", supports=(floor, box), faces="all", touch=2.0))
-    assert one != charts_of(SceneSpec(kind="file", supports=(floor,)))
-    assert charts_of(SceneSpec()) == "charts"
-    assert charts_of(SceneSpec(kind="shelf", faces="all")) == "scene_charts/shelf"
+    one = scene_chart_kind(SceneSpec(kind="file", supports=(floor, box)))
+    assert one == scene_chart_kind(SceneSpec(kind="file", supports=(floor, box), faces="all", touch=2.0))
+    assert one != scene_chart_kind(SceneSpec(kind="file", supports=(floor,)))
+    assert scene_chart_kind(SceneSpec()) == "charts"
+    assert scene_chart_kind(SceneSpec(kind="shelf", faces="all")) == "scene_charts/shelf"
     store = open_store(tmp_path.as_uri())
     for kind in (one, "scene_charts/table", "charts"):
-        publish(store, kind, CHART)
+        publish_record(store, kind, CHART)
     assert scene_kinds(store) == [one, "scene_charts/table"]

@@ -140,7 +140,7 @@ LARGE = 32 * (2 * RANGES_AT_ONCE + 1)
 
 
 def entered(services: Services) -> int:
-    with services.index.database.reading() as connection:
+    with services.index.database.read_transaction() as connection:
         return int(connection.scalar(select(func.count()).select_from(tasks)) or 0)
 
 
@@ -150,7 +150,7 @@ def work_off(services: Services, controller: Controller) -> WorkOff:
 
     def enter() -> list[tuple[str, int]]:
         turns = []
-        while services.index.write.entering():
+        while services.index.write.partly_entered_jobs():
             before = entered(services)
             controller._clock.now += 10.0
             controller.round()
@@ -188,10 +188,10 @@ def test_the_same_job_again_begins_nothing_anew(services: Services, work_off: Wo
     job, _ = job_actions.submit(services, request(grasps=LARGE))
     work_off()
     again, new = job_actions.submit(services, request(grasps=LARGE))
-    assert (again.id, new, services.index.write.entering()) == (job.id, False, [])
+    assert (again.id, new, services.index.write.partly_entered_jobs()) == (job.id, False, [])
 
 
 def test_a_job_whose_record_is_gone_is_given_up(services: Services, work_off: WorkOff) -> None:
     job, _ = job_actions.submit(services, request(grasps=LARGE))
-    services.store.delete(names.job_record(job.id))
+    services.store.delete(names.job_record_key(job.id))
     assert work_off() == [(job.id, 0)]

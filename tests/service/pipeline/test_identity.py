@@ -167,27 +167,27 @@ def test_a_lease_is_renewed_while_held_and_given_back() -> None:
     mine = leadership(queue)
     assert mine.wait(stop)
     begun = queue._lease[1]
-    with mine.held(stop) as over:
+    with mine.hold(stop) as over:
         until(lambda: queue._lease[1] > begun, "it is renewed")
-        assert not queue.lead("another", 600)
+        assert not queue.renew_leadership("another", 600)
         assert not over.is_set()
         stop.set()
         assert over.wait(PATIENCE_S)
-    assert queue.lead("another", 600)
+    assert queue.renew_leadership("another", 600)
 
 
 def test_who_waits_leads_soon_after_the_other_fell_silent(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("graspd.service.pipeline.leading._RENEWALS", 3.0)
     stop = Pauses()
     queue = MemoryQueue(clock=stop.clock)
-    queue.lead("silent", LEASE_S)
+    queue.renew_leadership("silent", LEASE_S)
     assert leadership(queue).wait(stop)
     assert LEASE_S <= stop.now <= LEASE_S * 4 / 3
 
 
 def test_who_waits_lives_and_can_be_told_to_stop(tmp_path: Path) -> None:
     queue, stop = MemoryQueue(), threading.Event()
-    queue.lead("another", 600)
+    queue.renew_leadership("another", 600)
     waiting = leadership(queue, file=tmp_path / "alive")
     ended: list[bool] = []
     thread = threading.Thread(target=lambda: ended.append(waiting.wait(stop)))
@@ -202,7 +202,7 @@ def test_a_lease_that_another_has_is_over_and_is_not_given_back() -> None:
     queue, stop = MemoryQueue(), threading.Event()
     mine = leadership(queue)
     assert mine.wait(stop)
-    with mine.held(stop) as over:
+    with mine.hold(stop) as over:
         with queue._changed:
             queue._lease = ("another", queue.clock() + 600)
         assert over.wait(PATIENCE_S)
@@ -214,7 +214,7 @@ def test_while_redis_is_away_nobody_loses_the_lead(monkeypatch: pytest.MonkeyPat
     queue, stop, away = MemoryQueue(), threading.Event(), Mock(side_effect=QueueUnavailable("away"))
     mine = leadership(queue)
     assert mine.wait(stop)
-    with mine.held(stop) as over:
+    with mine.hold(stop) as over:
         with monkeypatch.context() as patch:
             patch.setattr(queue, "lead", away)
             until(lambda: away.call_count > 3, "it tries again and again")

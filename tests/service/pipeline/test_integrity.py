@@ -51,8 +51,8 @@ def harm(services: Services, shards: list[ShardManifest]) -> dict[str, str]:
     flip(services.store, shards[0].key)
     cut(services.store, shards[1].key)
     remove(services.store, shards[2].key)
-    overwrite(services.store, names.shard_manifest(shards[3].stage, shards[3].shard_id), b'{"x": 1}')
-    remove(services.store, names.shard_manifest(shards[4].stage, shards[4].shard_id))
+    overwrite(services.store, names.shard_manifest_key(shards[3].stage, shards[3].shard_id), b'{"x": 1}')
+    remove(services.store, names.shard_manifest_key(shards[4].stage, shards[4].shard_id))
     told = ("SHA-256", "bytes, expected", MISSING, BAD_MANIFEST, NO_MANIFEST)
     return {shard.shard_id: what for shard, what in zip(shards, told, strict=False)}
 
@@ -95,7 +95,7 @@ def test_a_foreign_object_is_moved_a_bad_record_needs_a_copy(services: Services,
     repair(services, found)
     assert services.store.get("damaged/shards/base/notes.txt") == b"mine"
     assert findings(services) == []
-    key = names.job_record(services.index.jobs.page().items[0].id)
+    key = names.job_record_key(services.index.jobs.page().items[0].id)
     overwrite(services.store, key, b'{"x": 1}')
     found = findings(services)
     assert [one.key for one in found] == [key]
@@ -118,6 +118,6 @@ def test_the_commands_tell_what_is_damaged_and_exit_with_1(
     said = json.loads(told.stdout.splitlines()[-1])
     assert {one["shard"] for one in said["damaged"]} | set(said["missing"]) == done.keys()
     assert said["missing"] == [shards[2].shard_id]
-    assert services.index.damage.known()[0] == 5
+    assert services.index.damage.summary()[0] == 5
     told = CliRunner().invoke(commands.app, check)
     assert told.exit_code == 1 and shards[0].key in told.output

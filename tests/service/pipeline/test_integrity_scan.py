@@ -44,8 +44,8 @@ from graspd.service.store.records import (
     DeletedJob,
     Deletion,
     add_job_event,
-    latest,
-    publish,
+    latest_record,
+    publish_record,
     put_record,
     read_record,
     removed_folder,
@@ -66,40 +66,40 @@ def full(services: Services) -> Services:
     """A store with an object of every kind."""
     store = services.store
     job, _ = job_actions.submit(services, request(grasps=96))
-    record = read_record(JobRecord, store, names.job_record(job.id))
+    record = read_record(JobRecord, store, names.job_record_key(job.id))
     lone, first, _ = tasks_of(record)
     manifest = make_shard(store, lone)
     services.index.write.add_manifests([manifest])
     add_job_event(store, job.id, "cancelled")
     attempt = {"task_id": first.task_id, "job_id": job.id, "stage": Stage.SYNTHESIZE, "number": 1, "kind": "Error"}
     failed = AttemptRecord(**attempt, reason="broke", worker="w", ended=timestamp(), last=False)
-    put_record(store, names.attempt(first.task_id, 1), failed)
+    put_record(store, names.attempt_key(first.task_id, 1), failed)
     actions.create(services, DatasetRequest(name="all", hands=["gripper"], objects=["ball"], grasps=96))
     services.index.write_dataset.set_progress("all", planned=True)
     actions.cancel(services, "all")
-    actions.snapshot(services, "all")
+    actions.take_snapshot(services, "all")
     actions.add_object_set(services, "balls", ["ball"])
     put_record(store, f"{names.DELETIONS}/job/{'e' * 32}.json", Deletion(what="job", id="e" * 32, at=timestamp()))
     put_record(store, f"{names.RELEASED}/1-{job.id}.json", DeletedJob(at=timestamp(), job=record))
     gone = Deletion(what="job", id="b" * 32, at=timestamp())
     put_record(store, f"{removed_folder(gone)}/deletion.json", gone)
-    put_record(store, f"{removed_folder(gone)}/{names.job_record(gone.id)}", record)
-    put_record(store, names.service(1), ServiceRecord(id="c" * 32, at=timestamp()))
-    put_document(store, names.mark("d" * 32), {"at": timestamp()})
+    put_record(store, f"{removed_folder(gone)}/{names.job_record_key(gone.id)}", record)
+    put_record(store, names.service_key(1), ServiceRecord(id="c" * 32, at=timestamp()))
+    put_document(store, names.mark_key("d" * 32), {"at": timestamp()})
     hand = services.index.assets.get(AssetKind.HAND, "gripper").digest
-    put_document(store, names.hand_expanded(hand), {"urdf": "<robot name='claw'/>"})
+    put_document(store, names.expanded_hand_key(hand), {"urdf": "<robot name='claw'/>"})
     hook = Webhook(id="f" * 32, url="https://example.org/", states=("succeeded",), created=timestamp())
-    put_record(store, names.webhook(hook.id), hook)
+    put_record(store, names.webhook_key(hook.id), hook)
     tag = Tag(id="a" * 32, name="good", number=1, created=timestamp(), changed=timestamp())
-    put_record(store, names.tag_version(tag.id, 1), tag)
+    put_record(store, names.tag_version_key(tag.id, 1), tag)
     for kind in ("charts", "scene_charts/table", "stability"):
-        publish(store, kind, {"created": timestamp(), "runs": [1.0, 2.0]})
+        publish_record(store, kind, {"created": timestamp(), "runs": [1.0, 2.0]})
     publish_builtins(store)
     ball = services.index.assets.get(AssetKind.OBJECT, "ball").digest
     file = io.BytesIO()
     np.savez(file, vertices=np.arange(30.0))
-    put_sealed(store, names.object_prepared(ball, "1" * 32), file.getvalue())
-    put_sealed(store, names.object_pieces(ball, "2" * 32), file.getvalue())
+    put_sealed(store, names.prepared_object_key(ball, "1" * 32), file.getvalue())
+    put_sealed(store, names.object_pieces_key(ball, "2" * 32), file.getvalue())
     return services
 
 
@@ -137,9 +137,9 @@ def test_a_damaged_manifest_is_neither_read_nor_indexed(full: Services) -> None:
 
 def test_what_an_earlier_graspd_wrote_is_read_and_counted(services: Services) -> None:
     found = ObjectSet(name="c" * 64, digest="a" * 32, objects=("ball",), created=timestamp())
-    key, without = names.object_set(found.name, found.digest), list[str]()
+    key, without = names.object_set_key(found.name, found.digest), list[str]()
     services.store.put(key, found.model_dump_json().encode())
-    zipped = names.asset_files(AssetKind.OBJECT, services.index.assets.get(AssetKind.OBJECT, "ball").digest)
+    zipped = names.asset_files_key(AssetKind.OBJECT, services.index.assets.get(AssetKind.OBJECT, "ball").digest)
     overwrite(services.store, zipped, pack_files(OBJECT_FILES))
     assert read_record(ObjectSet, services.store, key) == found
     assert [wrong for _, wrong in scan(services.store, unsealed=without.append) if wrong is not None] == []
@@ -147,14 +147,14 @@ def test_what_an_earlier_graspd_wrote_is_read_and_counted(services: Services) ->
 
 
 def test_files_of_an_earlier_upload_are_held_against_their_name(services: Services) -> None:
-    key = names.asset_files(AssetKind.HAND, services.index.assets.get(AssetKind.HAND, "gripper").digest)
+    key = names.asset_files_key(AssetKind.HAND, services.index.assets.get(AssetKind.HAND, "gripper").digest)
     overwrite(services.store, key, pack_files(HAND_FILES | {"hand.urdf": b"<robot name='other'/>"}))
     wrong = examine(services.store, key)
     assert wrong is not None and "its files do not match its name" in wrong.what
 
 
 def test_a_damaged_upload_is_replaced_by_the_same_files(services: Services) -> None:
-    key = names.asset_files(AssetKind.HAND, services.index.assets.get(AssetKind.HAND, "gripper").digest)
+    key = names.asset_files_key(AssetKind.HAND, services.index.assets.get(AssetKind.HAND, "gripper").digest)
     overwrite(services.store, key, flipped(services.store.get(key)))
     store_files(services.store, AssetKind.HAND, "gripper", HAND_FILES)
     assert examine(services.store, key) is None
@@ -163,7 +163,7 @@ def test_a_damaged_upload_is_replaced_by_the_same_files(services: Services) -> N
 @pytest.mark.parametrize("file", ["model.glb", "check.json"])
 def test_what_a_check_found_is_made_again(services: Services, file: str) -> None:
     ball = services.index.assets.get(AssetKind.OBJECT, "ball").digest
-    folder = names.asset_check(AssetKind.OBJECT, ball).rpartition("/")[0]
+    folder = names.asset_check_key(AssetKind.OBJECT, ball).rpartition("/")[0]
     put_document(services.store, f"{folder}/check.json", {"verdict": "accept"})
     put_sealed(services.store, f"{folder}/model.glb", b"glTF" + bytes(8) + b"\4\0\0\0JSON{}  ")
     overwrite(services.store, f"{folder}/{file}", flipped(services.store.get(f"{folder}/{file}")))
@@ -178,7 +178,7 @@ def test_what_a_check_found_is_made_again(services: Services, file: str) -> None
 def test_what_comes_with_graspd_is_put_again(services: Services) -> None:
     publish_builtins(services.store)
     mug = next(asset for asset in builtin_assets() if asset.kind is AssetKind.OBJECT)
-    folder = names.asset_record(mug.kind, mug.digest).rpartition("/")[0]
+    folder = names.asset_record_key(mug.kind, mug.digest).rpartition("/")[0]
     for file in ("asset.json", "files.zip", "model.glb"):
         overwrite(services.store, f"{folder}/{file}", flipped(services.store.get(f"{folder}/{file}")))
     _, left = repair(services, [wrong for _, wrong in scan(services.store) if wrong is not None])
@@ -188,9 +188,9 @@ def test_what_comes_with_graspd_is_put_again(services: Services) -> None:
 
 def test_charts_of_one_moment_are_all_kept(services: Services) -> None:
     at = timestamp()
-    keys = [publish(services.store, "charts", {"created": at, "runs": [number]}) for number in range(12)]
+    keys = [publish_record(services.store, "charts", {"created": at, "runs": [number]}) for number in range(12)]
     assert len(set(keys)) == 12
-    found = latest(services.store, "charts")
+    found = latest_record(services.store, "charts")
     assert found is not None and found["runs"] == [11]
 
 
@@ -208,12 +208,12 @@ def a_round(services: Services, stop: Pauses | None = None) -> None:
 
 
 def found(services: Services) -> dict[str, str]:
-    return {one.shard: one.what for one in services.index.damage.known()[1]}
+    return {one.shard: one.what for one in services.index.damage.summary()[1]}
 
 
 def test_a_round_notes_what_is_damaged_and_nothing_else(services: Services, shards: list[ShardManifest]) -> None:
     a_round(services)
-    assert services.index.damage.known() == (0, [])
+    assert services.index.damage.summary() == (0, [])
     services.index.notes.set_scan_note(type(services.index.notes.scan_note())())
     flip(services.store, shards[0].key)
     remove(services.store, shards[1].key)
@@ -229,17 +229,17 @@ def test_what_is_mended_or_removed_since_is_forgotten(services: Services, shards
     for manifest in shards[:3]:
         flip(services.store, manifest.key)
     a_round(services)
-    assert services.index.damage.known()[0] == 4
+    assert services.index.damage.summary()[0] == 4
     overwrite(services.store, shards[0].key, whole)
-    remove(services.store, names.shard_manifest(shards[1].stage, shards[1].shard_id))
+    remove(services.store, names.shard_manifest_key(shards[1].stage, shards[1].shard_id))
     remove(services.store, shards[1].key)
     remove(services.store, "shards/base/notes.txt")
-    IntegrityScan(services, Pauses()).look_again()
+    IntegrityScan(services, Pauses()).recheck_damage()
     assert found(services).keys() == {shards[2].shard_id}
 
 
 def test_a_file_whose_manifest_may_be_on_its_way_is_no_damage(services: Services, shards: list[ShardManifest]) -> None:
-    remove(services.store, names.shard_manifest(shards[0].stage, shards[0].shard_id))
+    remove(services.store, names.shard_manifest_key(shards[0].stage, shards[0].shard_id))
     a_round(services)
     assert NO_MANIFEST not in found(services).values()
 
@@ -254,11 +254,11 @@ def test_it_reads_no_faster_than_the_settings_say(services: Services, shards: li
 def test_a_successor_goes_on_where_it_stopped(services: Services, shards: list[ShardManifest]) -> None:
     for manifest in shards:
         flip(services.store, manifest.key)
-    ordered = sorted(names.shard_manifest(one.stage, one.shard_id) for one in shards)
+    ordered = sorted(names.shard_manifest_key(one.stage, one.shard_id) for one in shards)
     note = services.index.notes.scan_note()
     services.index.notes.set_scan_note(type(note)(started="2026-01-01T00:00:00.000Z", after=ordered[1]))
     a_round(services)
-    assert {names.shard_manifest(shards[0].stage, shard) for shard in found(services)} == set(ordered[2:])
+    assert {names.shard_manifest_key(shards[0].stage, shard) for shard in found(services)} == set(ordered[2:])
 
 
 def test_a_small_store_is_not_read_over_and_over(services: Services, shards: list[ShardManifest]) -> None:

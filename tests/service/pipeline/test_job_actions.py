@@ -10,7 +10,7 @@ from graspd.service.index.rebuild import differences
 from graspd.service.index.views import AssetView
 from graspd.service.model import names
 from graspd.service.model.errors import ConflictError, NotFoundError, QueueUnavailable, SceneError
-from graspd.service.model.planning import plan
+from graspd.service.model.planning import plan_tasks
 from graspd.service.model.records import JobRecord
 from graspd.service.model.states import AssetKind, Priority, Stage, State
 from graspd.service.pipeline import job_actions
@@ -100,11 +100,11 @@ def submit(services: Services, **changes: object) -> JobRecord:
 
 
 def make(services: Services, job: JobRecord, stage: Stage, batch: int = 0) -> None:
-    make_task(services, job, next(task for task in plan(job) if task.stage is stage and task.batch == batch))
+    make_task(services, job, next(task for task in plan_tasks(job) if task.stage is stage and task.batch == batch))
 
 
 def fail_batch(services: Services, job: JobRecord, batch: int, kind: str, number: int = 1) -> None:
-    task = next(task for task in plan(job) if task.stage is Stage.SYNTHESIZE and task.batch == batch)
+    task = next(task for task in plan_tasks(job) if task.stage is Stage.SYNTHESIZE and task.batch == batch)
     fail_task(services, job.id, task, number, kind=kind, reason="none of 128 candidates is valid in its scene")
 
 
@@ -119,7 +119,7 @@ def test_scenes_are_made_before_grasps_and_told_in_that_order(services: Services
     order = (Stage.SCENE, Stage.SYNTHESIZE, Stage.RENDER)
     assert [(stage.stage, stage.tasks) for stage in told] == [(stage, 2) for stage in order]
     make(services, job, Stage.SCENE)
-    ready = [(task.task.batch, task.task.stage) for task in services.index.feed.ready_of_job(job.id, limit=9)]
+    ready = [(task.task.batch, task.task.stage) for task in services.index.feed.ready_tasks_of_job(job.id, limit=9)]
     assert ready == [(0, Stage.SYNTHESIZE)], "the other batch's scenes are queued already"
 
 
@@ -136,7 +136,7 @@ def test_a_job_ends_when_its_first_batch_finds_nothing(services: Services, kind:
     assert found[0, Stage.SYNTHESIZE] is State.FAILED
     assert found[1, Stage.SYNTHESIZE] is State.SUCCEEDED, "what is made stays"
     assert {found[batch, stage] for batch in (2, 3) for stage in (Stage.SCENE, Stage.SYNTHESIZE)} == {State.CANCELLED}
-    assert services.index.feed.ready_of_job(job.id, limit=9) == []
+    assert services.index.feed.ready_tasks_of_job(job.id, limit=9) == []
 
 
 def test_a_retry_takes_up_the_batches_that_were_not_made(services: Services) -> None:

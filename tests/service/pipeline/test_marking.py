@@ -21,7 +21,7 @@ from graspd.service.index.rebuild import differences
 from graspd.service.model import names
 from graspd.service.model.clock import timestamp
 from graspd.service.model.errors import IndexUnavailable
-from graspd.service.model.planning import message_of, plan
+from graspd.service.model.planning import message_of, plan_tasks
 from graspd.service.model.states import AssetKind
 from graspd.service.pipeline import controller, job_actions, tagging
 from graspd.service.pipeline.backends import Services
@@ -68,7 +68,7 @@ def submit(seed: int) -> Callable[[Services], object]:
 
 def make_first_shard(services: Services) -> None:
     record = record_of(services, services.index.jobs.page().items[0].id)
-    task = next(plan(record))
+    task = next(plan_tasks(record))
     make_shard(services.store, message_of(record, task, attempt=1, max_attempt=3))
     done = Event(kind=EventKind.FINISHED, at=timestamp(), task_id=task.id, stage=task.stage, output=task.output)
     services.queue.publish(done)
@@ -142,7 +142,7 @@ def test_an_index_exchanged_meanwhile_is_made_anew(tmp_path: Path, rebuilt: list
 def test_a_controller_killed_between_index_and_store_is_harmless(
     tmp_path: Path, rebuilt: list[object], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    data, real = tmp_path / "data", Notes.set_marked
+    data, real = tmp_path / "data", Notes.set_store_mark
 
     def killed(notes: Notes, *args: object, **more: object) -> None:
         real(notes, *args, **more)  # type: ignore[arg-type]
@@ -150,7 +150,7 @@ def test_a_controller_killed_between_index_and_store_is_harmless(
 
     in_service(data, submit(1))
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(Notes, "set_marked", killed)
+        patch.setattr(Notes, "set_store_mark", killed)
         in_service(data, submit(2))
     assert in_service(data) == []
     assert rebuilt == []

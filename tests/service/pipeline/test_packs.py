@@ -174,7 +174,7 @@ def test_what_was_in_a_pack_has_a_file_of_its_own(store: Store) -> None:
     assert [manifest.shard_id for manifest in found] == [message.output for message in messages]
     for message, manifest in zip(messages, found, strict=True):
         wanted, data = made_of(message)
-        assert store.get(names.shard_file(Stage.SYNTHESIZE, message.output))[:8] == data[:8]
+        assert store.get(names.shard_file_key(Stage.SYNTHESIZE, message.output))[:8] == data[:8]
         assert load_shard(store, Stage.SYNTHESIZE, message.output).attributes["batch"] == message.batch
         assert load_manifest(store, Stage.SYNTHESIZE, message.output) == manifest
         assert (manifest.key, manifest.batches) == (wanted.key, 1)
@@ -232,7 +232,7 @@ def test_harm_moves_the_pack_aside_and_costs_no_more(store: Store, place: str) -
     assert not has_packs(store)
     wanted = {"directory": [False, False], "manifest": [False, True], "file": [True, True], "end": [True, True]}[place]
     assert there(store, messages) == wanted
-    files = [store.exists(names.shard_file(Stage.SYNTHESIZE, message.output)) for message in messages]
+    files = [store.exists(names.shard_file_key(Stage.SYNTHESIZE, message.output)) for message in messages]
     intact = {"directory": [False, False], "manifest": [False, True], "file": [False, True], "end": [False, False]}
     assert files == intact[place]
     for message, is_intact in zip(messages, files, strict=True):

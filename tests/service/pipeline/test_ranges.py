@@ -55,7 +55,7 @@ NEXT = beat(revision=REVISION + 1)
     ],
 )
 def test_a_task_goes_where_able_workers_look(present: list[WorkerBeat], need: Requirements, place: Route) -> None:
-    assert Routes(present).place(need) == place
+    assert Routes(present).route_of(need) == place
 
 
 @pytest.mark.parametrize(
@@ -68,7 +68,7 @@ def test_a_task_goes_where_able_workers_look(present: list[WorkerBeat], need: Re
     ],
 )
 def test_what_nobody_can_do_is_held_with_the_reason(present: list[WorkerBeat], need: Requirements, why: str) -> None:
-    assert why in Routes(present).place(need).held
+    assert why in Routes(present).route_of(need).held
 
 
 def test_a_task_asks_for_the_schema_of_its_newest_field() -> None:
@@ -81,11 +81,11 @@ def test_a_task_asks_for_the_schema_of_its_newest_field() -> None:
 def test_a_worker_that_does_not_say_what_it_can_is_given_no_task() -> None:
     now = beat()
     told = asdict(now)
-    assert entries.read(WorkerBeat, json.dumps(told).encode()) == now
+    assert entries.parse_entry(WorkerBeat, json.dumps(told).encode()) == now
     for name in ("schemas", "revisions"):
         del told[name]
-    old = entries.read(WorkerBeat, json.dumps(told).encode())
-    assert old is not None and Routes([old]).place(NEED).held
+    old = entries.parse_entry(WorkerBeat, json.dumps(told).encode())
+    assert old is not None and Routes([old]).route_of(NEED).held
 
 
 def test_a_worker_looks_apart_only_for_what_it_can_do() -> None:
@@ -101,7 +101,7 @@ def test_tasks_that_wait_apart_are_seen_and_leave(rq_queue: RqQueue) -> None:
     assert rq_queue.connection.llen(name) == 1
     assert rq_queue.waiting() == {message.task_id}
     assert rq_queue.depths()[Priority.BULK, Stage.SYNTHESIZE] == 1
-    assert rq_queue.now(lease_s=6).depth[Priority.BULK, Stage.SYNTHESIZE] == 1
+    assert rq_queue.status(lease_s=6).depth[Priority.BULK, Stage.SYNTHESIZE] == 1
     rq_queue.clear_untaken([beat(), NEXT])
     assert rq_queue.waiting() == {message.task_id}
     rq_queue.clear_untaken([NEXT])
@@ -214,11 +214,11 @@ def test_rates_and_workers_are_read_once_for_many_jobs(services: Services) -> No
     now = 0.0
     ranges = TaskRanges(services, clock=lambda: now)
     job = job_actions.prepare(with_settings(services, task_s=0.0), request(grasps=3200), priority=Priority.BULK)
-    assert ranges.sized(job).span == 4
+    assert ranges.with_span(job).span == 4
     measured(services, 0.01)
-    assert ranges.sized(job).span == 4
+    assert ranges.with_span(job).span == 4
     now = 60.0
-    assert ranges.sized(job).span > 4
+    assert ranges.with_span(job).span > 4
 
 
 def test_a_job_of_ranges_goes_through_its_stages(services: Services) -> None:
@@ -227,7 +227,7 @@ def test_a_job_of_ranges_goes_through_its_stages(services: Services) -> None:
     here(services, worker())
     job = job_actions.prepare(services, request(grasps=32 * 6 + 5, scenes=2), priority=Priority.BULK)
     assert job.span == 4
-    job_actions.enter(services, job)
+    job_actions.enter_job(services, job)
     bench.work_off()
     done = services.index.jobs.get(job.id)
     assert (done.state, done.grasps) == (State.SUCCEEDED, 197)
@@ -241,7 +241,7 @@ def test_large_shards_enter_the_index_in_short_turns(services: Services, monkeyp
     bench = Bench(services)
     bench.controller.round()
     record = job_actions.prepare(services, request(grasps=32 * 64 * 5), priority=Priority.BULK)
-    job, _ = job_actions.enter(services, record.model_copy(update={"span": 64}))
+    job, _ = job_actions.enter_job(services, record.model_copy(update={"span": 64}))
     turns: list[int] = []
     add = Changes.add_manifests
 

@@ -13,7 +13,7 @@ from graspd.service.index.rebuild import differences
 from graspd.service.model import names
 from graspd.service.model.errors import ConflictError, InputError, NotFoundError, SceneError
 from graspd.service.model.messages import TaskMessage
-from graspd.service.model.planning import message_of, plan
+from graspd.service.model.planning import message_of, plan_tasks
 from graspd.service.model.records import JobRecord
 from graspd.service.model.states import AssetKind, Stage
 from graspd.service.model.version import OLDEST_TASK_SCHEMA, SCHEMA_OF_NETWORKS
@@ -68,7 +68,7 @@ def dataset_of(named: Reference, **changes: Any) -> DatasetRequest:
 
 
 def grasps_of(job: JobRecord) -> str:
-    return next(task.output for task in plan(job) if task.stage is Stage.SYNTHESIZE)
+    return next(task.output for task in plan_tasks(job) if task.stage is Stage.SYNTHESIZE)
 
 
 @BOTH
@@ -112,7 +112,7 @@ def test_a_job_entered_while_it_is_deleted_is_not_kept(services: Services, named
     record = job_actions.prepare(services, request(**named.options))
     delete_asset(services, named.kind, named.name)
     with pytest.raises(NotFoundError, match=rf"{named.kind.value} .* deleted just now"):
-        job_actions.enter(services, record)
+        job_actions.enter_job(services, record)
     assert list(services.store.list(names.JOBS)) == []
 
 
@@ -157,7 +157,7 @@ NO_NEIGHBOURS = ({"object": "cup"}, {"object": "../x", "digest": "a" * 32}, {"ob
 def test_a_forged_entry_needs_a_digest(services: Services, named: Reference, forged: dict[str, Any]) -> None:
     named.add(services)
     job = named.submit(services)
-    said = message_of(job, next(plan(job)), attempt=1, max_attempt=3).model_dump(mode="json", by_alias=True)
+    said = message_of(job, next(plan_tasks(job)), attempt=1, max_attempt=3).model_dump(mode="json", by_alias=True)
     assert TaskMessage.model_validate(said).request == job.request
     with pytest.raises(ValidationError):
         TaskMessage.model_validate({**said, "request": {**said["request"], **forged}})
@@ -168,7 +168,7 @@ def test_other_neighbours_or_another_order_are_other_scenes(services: Services, 
     cup = add_cup(services)
     known = NEIGHBOUR.submit(services, neighbours=("cup", "ball"))
     assert [one.digest for one in known.request.place.neighbours] == [cup, known.object_digest]
-    assert next(plan(NEIGHBOUR.submit(services, neighbours=other))).output != next(plan(known)).output
+    assert next(plan_tasks(NEIGHBOUR.submit(services, neighbours=other))).output != next(plan_tasks(known)).output
 
 
 def test_a_document_places_its_neighbours(services: Services) -> None:
@@ -184,7 +184,7 @@ def test_a_rebuilt_index_knows_the_same_of_neighbours(services: Services) -> Non
     add_cup(services)
     job = NEIGHBOUR.submit(services)
     for stage in (Stage.SCENE, Stage.SYNTHESIZE):
-        make_task(services, job, next(task for task in plan(job) if task.stage is stage))
+        make_task(services, job, next(task for task in plan_tasks(job) if task.stage is stage))
     assert differences(services.index, services.store) == []
     found = services.index.grasps.page(GraspFilter(neighbours=True), limit=200).items
     assert len(found) == 32 and {grasp.neighbours for grasp in found} == {1}
@@ -228,7 +228,7 @@ def test_another_network_changes_the_grasps_and_not_the_scenes(services: Service
     assert NETWORK.submit(services, options={"network": net, "starts": 2}).id == job.id
     add_network(services, 1)
     later = NETWORK.submit(services, options={"network": "net", "starts": 2})
-    assert next(plan(later)).output == next(plan(job)).output and grasps_of(later) != grasps_of(job)
+    assert next(plan_tasks(later)).output == next(plan_tasks(job)).output and grasps_of(later) != grasps_of(job)
 
 
 def test_a_retried_job_sets_out_from_the_network_it_had(services: Services) -> None:
@@ -245,7 +245,7 @@ def test_a_retried_job_sets_out_from_the_network_it_had(services: Services) -> N
 def test_only_workers_that_know_networks_are_asked_for_one(services: Services) -> None:
     add_network(services)
     jobs = NETWORK.submit(services), NETWORK.submit(services, method="fast_graspd", options={})
-    asked = [message_of(job, next(plan(job)), attempt=1, max_attempt=3).schema_ for job in jobs]
+    asked = [message_of(job, next(plan_tasks(job)), attempt=1, max_attempt=3).schema_ for job in jobs]
     assert asked == [SCHEMA_OF_NETWORKS, OLDEST_TASK_SCHEMA]
 
 

@@ -13,9 +13,9 @@ import pytest
 from graspd.service.model.errors import InputError
 from graspd.service.model.webhooks import check_url
 from graspd.service.pipeline import webhook_dispatcher
-from graspd.service.pipeline.webhook_dispatcher import is_public, networks, post
+from graspd.service.pipeline.webhook_dispatcher import is_public, parse_networks, post
 
-LOOPBACK = networks("127.0.0.0/8")
+LOOPBACK = parse_networks("127.0.0.0/8")
 
 
 class Ear(http.server.BaseHTTPRequestHandler):
@@ -92,7 +92,7 @@ def test_a_name_is_looked_up_once(ear: tuple[str, list[Any]], monkeypatch: pytes
 
 def test_where_the_operator_allows_it_the_body_arrives(ear: tuple[str, list[Any]]) -> None:
     answer = post(f"{ear[0]}/in/200", b"body", {"X-Mine": "yes"}, allowed=LOOPBACK)
-    assert answer.is_taken
+    assert answer.is_accepted
     path, body, headers = ear[1][0]
     assert (path, body, headers["X-Mine"]) == ("/in/200", b"body", "yes")
 
@@ -100,7 +100,7 @@ def test_where_the_operator_allows_it_the_body_arrives(ear: tuple[str, list[Any]
 @pytest.mark.parametrize("status", [301, 302, 307, 308])
 def test_redirects_are_not_followed(ear: tuple[str, list[Any]], status: int) -> None:
     answer = post(f"{ear[0]}/in/{status}", b"body", {}, allowed=LOOPBACK)
-    assert not answer.is_taken and "not followed" in answer.detail
+    assert not answer.is_accepted and "not followed" in answer.detail
     assert [path for path, _, _ in ear[1]] == [f"/in/{status}"]
 
 
@@ -109,7 +109,7 @@ def test_an_address_that_never_answers_is_given_up() -> None:
         silent.bind(("127.0.0.1", 0))
         silent.listen()
         answer = post(f"http://127.0.0.1:{silent.getsockname()[1]}/", b"{}", {}, allowed=LOOPBACK, patience_s=0.2)
-    assert answer.status is None and not answer.is_taken
+    assert answer.status is None and not answer.is_accepted
 
 
 @pytest.mark.parametrize(

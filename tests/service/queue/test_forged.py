@@ -22,7 +22,7 @@ from graspd.service.pipeline import job_actions
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.controller import Controller
 from graspd.service.pipeline.leading import PART
-from graspd.service.queue.entries import TASK_FUNCTION, allowed_job
+from graspd.service.queue.entries import TASK_FUNCTION, checked_job
 from graspd.service.queue.port import Event, EventKind
 from graspd.service.queue.rq_queue import EVENTS, METRICS, WORKERS, RqQueue, worker_key
 from tests.fakes import beat_of, request
@@ -106,8 +106,8 @@ def test_a_forged_entry_stops_nothing(services: Services, what: str) -> None:
     queue.discard([task.id])
     assert task.id not in queue.waiting()
     page = Snapshot()
-    page.add_queue(queue.now(lease_s=6), is_kept=queue.announced(PART))
-    page.add_sums(queue.counted())
+    page.add_queue(queue.status(lease_s=6), is_kept=queue.is_announced(PART))
+    page.add_sums(queue.counter_sums())
     assert b"graspd_workers" in Metrics().render(page)
     assert [beat.name for beat in queue.workers()] == []
 
@@ -120,7 +120,7 @@ def forge(queue: RqQueue, function: str, *args: Any, serializer: Any = JSONSeria
 
 def fetch(queue: RqQueue, job: str) -> Job:
     bulk = Queue("bulk-synthesize", connection=queue.connection, serializer=JSONSerializer)
-    return allowed_job(Job.fetch(job, connection=queue.connection, serializer=JSONSerializer), bulk)
+    return checked_job(Job.fetch(job, connection=queue.connection, serializer=JSONSerializer), bulk)
 
 
 @pytest.mark.parametrize(

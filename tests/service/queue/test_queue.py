@@ -17,7 +17,7 @@ from graspd.service.model.states import Priority, Stage
 from graspd.service.queue.connection import connect
 from graspd.service.queue.entries import held_key, list_key, queue_name, queue_names
 from graspd.service.queue.port import BULK_EVERY, Event, EventKind
-from graspd.service.queue.rq_queue import EVENTS, LEAD, RqQueue, lease_state, list_worker, renew_lease, worker_key
+from graspd.service.queue.rq_queue import EVENTS, LEAD, RqQueue, lease_state, register_worker, renew_lease, worker_key
 from graspd.worker.process.heartbeat import Heartbeat
 from graspd.worker.stages.context import StopReason
 from tests.fakes import beat_of, message_for
@@ -105,7 +105,7 @@ class RqSide:
 
 
 def one_beat(connection: Any, name: str) -> None:
-    list_worker(connection, asdict(beat_of(name)), 6)
+    register_worker(connection, asdict(beat_of(name)), 6)
 
 
 @pytest.fixture(params=["memory", "redis"])
@@ -230,42 +230,42 @@ def test_any_number_of_readers_follow_the_stream(queue: RqQueue) -> None:
 
 
 def test_a_part_is_there_as_long_as_it_says_so(queue: RqQueue) -> None:
-    assert not queue.announced("controller")
+    assert not queue.is_announced("controller")
     queue.announce("controller", 600)
     queue.announce("brief", 0.05)
-    until(lambda: not queue.announced("brief"), "its time is over")
-    assert queue.announced("controller")
+    until(lambda: not queue.is_announced("brief"), "its time is over")
+    assert queue.is_announced("controller")
 
 
 def test_one_leads_until_it_is_silent_or_resigns(queue: RqQueue) -> None:
-    assert queue.lead("a", 600)
-    assert not queue.lead("b", 600)
-    assert queue.lead("a", 600), "who leads may go on"
+    assert queue.renew_leadership("a", 600)
+    assert not queue.renew_leadership("b", 600)
+    assert queue.renew_leadership("a", 600), "who leads may go on"
     queue.resign("b")
-    assert not queue.lead("b", 600), "only its holder gives it back"
+    assert not queue.renew_leadership("b", 600), "only its holder gives it back"
     queue.resign("a")
-    assert queue.lead("b", 0.05)
-    until(lambda: queue.lead("a", 600), "the lease of b is over")
-    assert not queue.lead("b", 600)
+    assert queue.renew_leadership("b", 0.05)
+    until(lambda: queue.renew_leadership("a", 600), "the lease of b is over")
+    assert not queue.renew_leadership("b", 600)
 
 
 def test_a_controller_of_graspd_0_2_holds_the_same_lease(rq_queue: RqQueue) -> None:
     rq_queue.connection.set(LEAD, "a keeper of 0.2", px=600_000)
-    assert not rq_queue.lead("a", 600)
+    assert not rq_queue.renew_leadership("a", 600)
     rq_queue.connection.delete(LEAD)
-    assert rq_queue.lead("a", 600)
+    assert rq_queue.renew_leadership("a", 600)
     assert rq_queue.connection.get(LEAD) == b"a" and rq_queue.connection.pttl(LEAD) > 0, "as it would write it"
 
 
 @pytest.mark.parametrize("forge", [lambda redis: redis.set(LEAD, "for ever"), lambda redis: redis.rpush(LEAD, "x")])
 def test_a_lease_that_is_none_keeps_nobody_from_leading(rq_queue: RqQueue, forge: Callable[[Any], None]) -> None:
     forge(rq_queue.connection)
-    assert not rq_queue.lead("a", 600)
-    assert rq_queue.lead("a", 600)
+    assert not rq_queue.renew_leadership("a", 600)
+    assert rq_queue.renew_leadership("a", 600)
 
 
 @pytest.mark.parametrize(
-    ("command", "ask"), [("smembers", RqQueue.waiting), ("set", lambda queue: queue.lead("a", 600))]
+    ("command", "ask"), [("smembers", RqQueue.waiting), ("set", lambda queue: queue.renew_leadership("a", 600))]
 )
 def test_what_redis_forbids_is_told(rq_queue: RqQueue, redis_server: str, command: str, ask: Any) -> None:
     rights = ["+@all", f"-{command}"]
@@ -278,14 +278,14 @@ def test_what_redis_forbids_is_told(rq_queue: RqQueue, redis_server: str, comman
 def test_sums_add_up_and_each_name_has_its_own(queue: RqQueue) -> None:
     queue.count({"a": 1.5, "b": 2.0})
     queue.count({"a": 1.0})
-    assert queue.counted() == {"a": 2.5, "b": 2.0}
+    assert queue.counter_sums() == {"a": 2.5, "b": 2.0}
 
 
 def test_what_waits_is_told_by_lane_and_stage(queue: RqQueue) -> None:
     queue.enqueue([task("x"), task("y"), task("z", stage=Stage.RENDER)], Priority.BULK)
     check = IngestMessage(schema_=1, task_id="i", kind="hand", name="h", digest="0" * 32)
     queue.enqueue([check], Priority.INTERACTIVE)
-    shown = queue.now(lease_s=6.0)
+    shown = queue.status(lease_s=6.0)
     assert {place: depth for place, depth in shown.depth.items() if depth} == {
         (Priority.BULK, Stage.SYNTHESIZE): 2,
         (Priority.BULK, Stage.RENDER): 1,
@@ -384,7 +384,7 @@ def test_everything_in_redis_of_no_fixed_number_has_an_end(rq_queue: RqQueue) ->
     rq_queue.enqueue([task()], Priority.BULK)
     rq_queue.discard(["0" * 32])
     rq_queue.announce("controller", 5)
-    rq_queue.lead("a", 5)
+    rq_queue.renew_leadership("a", 5)
     rq_queue.publish(Event(kind=EventKind.STARTED, at=timestamp(), task_id="a"))
     rq_queue.publish(Event(kind=EventKind.FINISHED, at=timestamp(), task_id="a"))
     fixed = ("rq:queue", "rq:job", "rq:unique", EVENTS, "graspd:workers", "graspd:tally")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from graspd.service.model.names import dataset_snapshot
+from graspd.service.model.names import dataset_snapshot_key
 from graspd.service.model.records import Snapshot
 from graspd.service.pipeline.backends import Services
 from graspd.service.readers import Shards, open_shards
@@ -32,7 +32,7 @@ def put_snapshot(store: Store, dataset: str, files: Iterable[ShardFile], *, crea
     same = ("id", "kind", "key", "sha256", "hand", "object", "batch")
     listed = [{name: getattr(file, name) for name in same} | sums | {"count": 1} for file in files]
     of = {"dataset": dataset, "dataset_digest": "a" * 32, "digest": digest, "complete": True, "grasps": 1}
-    put_record(store, dataset_snapshot(dataset, digest), Snapshot(**of, **sums, created=created, shards=listed))
+    put_record(store, dataset_snapshot_key(dataset, digest), Snapshot(**of, **sums, created=created, shards=listed))
 
 
 @pytest.fixture

@@ -49,7 +49,7 @@ def test_structured_light_has_the_published_noise() -> None:
     noise = NOISES["structured_light"]
     for z, angle in ((0.4, 0.0), (1.0, 0.3), (1.5, 1.2)):
         published = 0.0012 + 0.0019 * (z - 0.4) ** 2 + 0.0001 / np.sqrt(z) * angle**2 / (np.pi / 2 - angle) ** 2
-        assert float(noise.axial(np.array(z), np.array(angle))) == pytest.approx(published, rel=1e-12)
+        assert float(noise.axial_sigma(np.array(z), np.array(angle))) == pytest.approx(published, rel=1e-12)
 
 
 def test_depths_are_steps_of_disparity_and_the_same_for_the_same_seed() -> None:

@@ -6,7 +6,14 @@ import pytest
 from graspd.service.model.errors import InputError
 from graspd.service.model.scene_spec import SceneSpec
 from graspd.service.model.transforms import quat_from_axis_angle
-from graspd.service.readers.trajectories import Waypoint, point_at, scene_spec_of, slider_axis, trajectory_of, wrists_of
+from graspd.service.readers.trajectories import (
+    Waypoint,
+    point_at,
+    scene_spec_of,
+    slider_positions,
+    trajectory_of,
+    wrists_of,
+)
 from graspd.service.store.shards import Shard, json_attribute
 
 WAYPOINTS = 4
@@ -35,7 +42,7 @@ def test_a_way_goes_from_standoff_or_pregrasp_to_lift_or_squeeze():
     assert way[0].hand_pose[0] == 0.2
     assert all((point.joint_positions == -0.3).all() for point in way[:WAYPOINTS])
     assert way[-1].carried.tolist() == [0, 0, 0.1] and not any(point.carried.any() for point in way[:-1])
-    np.testing.assert_allclose(slider_axis(way), [0, 0.25, 0.5, 0.75, 1, 2, 3, 4])
+    np.testing.assert_allclose(slider_positions(way), [0, 0.25, 0.5, 0.75, 1, 2, 3, 4])
     assert point_at(way, 3.5).carried == pytest.approx([0, 0, 0.05]), "half way up"
 
 

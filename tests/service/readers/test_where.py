@@ -7,7 +7,7 @@ import pytest
 
 from graspd.service.model.errors import InputError
 from graspd.service.model.where import LONGEST
-from graspd.service.readers.where import parse
+from graspd.service.readers.where import compile_expression
 
 COLUMNS: dict[str, Any] = {
     "quality/thresholds_m": np.array([0.002, 0.005]),
@@ -40,7 +40,7 @@ SAID = {"hand": "allegro", "object": "006_mustard_bottle"}
     ],
 )
 def test_an_expression_chooses_what_it_says(text: str, rows: list[int]) -> None:
-    assert np.flatnonzero(parse(text)(COLUMNS, SAID)).tolist() == rows
+    assert np.flatnonzero(compile_expression(text)(COLUMNS, SAID)).tolist() == rows
 
 
 @pytest.mark.parametrize(
@@ -67,5 +67,5 @@ def test_an_expression_chooses_what_it_says(text: str, rows: list[int]) -> None:
 )
 def test_what_is_no_expression_is_refused_in_a_line(text: str, words: str) -> None:
     with pytest.raises(InputError, match=words) as refused:
-        parse(text)
+        compile_expression(text)
     assert "\n" not in str(refused.value)

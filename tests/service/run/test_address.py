@@ -13,7 +13,7 @@ import pytest
 
 from graspd.client.reports import open_client
 from graspd.service.model.errors import InputError, UnavailableError
-from graspd.service.run.address import bind, forget_address, joining, record_address, recorded_address
+from graspd.service.run.address import bind, forget_address, new_listen_address, record_address, recorded_address
 from graspd.service.run.children import Child, kill_leftovers, start_time
 from graspd.service.run.supervisor import Supervisor
 from graspd.service.settings import Settings
@@ -96,7 +96,7 @@ def joining_settings(tmp_path: Path) -> Settings:
 
 def test_the_file_holds_what_a_shell_reads_and_nobody_else_may(joining_settings: Settings, tmp_path: Path) -> None:
     file, (port,) = tmp_path / "shared" / "join.env", free_ports(1)
-    others = joining(joining_settings, file, host="127.0.0.1", port=port)
+    others = new_listen_address(joining_settings, file, host="127.0.0.1", port=port)
     others.write(joining_settings, "http://127.0.0.1:8000")
     assert file.read_text().splitlines() == [
         f"GRASPD_REDIS_URL=redis://:{others.password}@127.0.0.1:{port}/0",
@@ -108,7 +108,7 @@ def test_the_file_holds_what_a_shell_reads_and_nobody_else_may(joining_settings:
 
 
 def test_a_service_forgets_its_own_file_and_not_its_successors(joining_settings: Settings, tmp_path: Path) -> None:
-    first, second = (joining(joining_settings, tmp_path / "join.env", host="127.0.0.1") for _ in range(2))
+    first, second = (new_listen_address(joining_settings, tmp_path / "join.env", host="127.0.0.1") for _ in range(2))
     assert first.password != second.password
     first.write(joining_settings, "http://a")
     second.write(joining_settings, "http://b")
@@ -132,13 +132,15 @@ def test_what_cannot_be_shared_is_refused_with_its_mend(
     joining_settings: Settings, tmp_path: Path, changes: dict[str, str | None], host: str, told: str
 ) -> None:
     with pytest.raises(InputError, match=told):
-        joining(joining_settings.model_copy(update=changes), tmp_path / "join.env", host=host)
+        new_listen_address(joining_settings.model_copy(update=changes), tmp_path / "join.env", host=host)
 
 
 def test_a_folder_that_cannot_be_written_is_an_error_of_ours(joining_settings: Settings, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(UnavailableError):
-        joining(joining_settings, tmp_path / "file" / "join.env", host="127.0.0.1").write(joining_settings, "http://a")
+        new_listen_address(joining_settings, tmp_path / "file" / "join.env", host="127.0.0.1").write(
+            joining_settings, "http://a"
+        )
 
 
 _WAIT = "import signal; signal.pause()"

@@ -85,7 +85,7 @@ def test_a_setting_of_0_2_is_refused_with_its_new_name(monkeypatch: pytest.Monke
 
 @pytest.mark.parametrize("command", [["store", "verify"], ["index", "rebuild", "--check"], ["index", "rebuild"]])
 def test_what_reads_a_store_makes_none_where_there_is_none(tmp_path: Path, command: list[str]) -> None:
-    shown = runner.invoke(program.build(), ["admin", *command, "--data-dir", str(tmp_path / "mistyped")])
+    shown = runner.invoke(program.build_app(), ["admin", *command, "--data-dir", str(tmp_path / "mistyped")])
     assert shown.exit_code == 2
     assert f"there is no store at {tmp_path / 'mistyped' / 'store'}" in " ".join(shown.output.split())
     assert list(tmp_path.iterdir()) == []
@@ -154,10 +154,10 @@ def test_a_wait_says_for_what_and_can_be_stopped_or_ends(tmp_path: Path, monkeyp
 def test_a_check_fails_without_process(rq_queue: RqQueue, redis_server: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GRASPD_REDIS_URL", redis_server)
     for command in ("controller", "worker"):
-        shown = runner.invoke(program.build(), [command, "--check"])
+        shown = runner.invoke(program.build_app(), [command, "--check"])
         assert (shown.exit_code, len(shown.stderr.splitlines())) == (1, 1)
     rq_queue.announce(PART, 60)
-    assert runner.invoke(program.build(), ["controller", "--check"]).exit_code == 0
+    assert runner.invoke(program.build_app(), ["controller", "--check"]).exit_code == 0
 
 
 def test_the_controller_ends_well_on_sigterm(tmp_path: Path) -> None:

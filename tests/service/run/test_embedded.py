@@ -14,7 +14,7 @@ from graspd.service.queue.connection import connect, redis_url, socket_path
 from graspd.service.queue.rq_queue import RqQueue
 from graspd.service.run import embedded
 from graspd.service.run.children import Child
-from graspd.service.run.embedded import find_server, move_broken_log, own_redis, server_command
+from graspd.service.run.embedded import find_server, lock_redis, move_broken_log, server_command
 from graspd.service.settings import Settings
 from tests.service.conftest import is_up, wait_for_redis
 from tests.waiting import until
@@ -125,18 +125,18 @@ def test_a_redis_that_ends_for_want_of_room_keeps_its_log(tmp_path: Path) -> Non
 
 def test_only_one_process_runs_the_redis_of_a_folder(tmp_path: Path) -> None:
     settings = Settings(data_dir=tmp_path)
-    first = own_redis(settings)
+    first = lock_redis(settings)
     with pytest.raises(BusyError, match="in use by process"):
-        own_redis(settings)
+        lock_redis(settings)
     first.close()
-    own_redis(settings).close()
+    lock_redis(settings).close()
 
 
 def test_a_folder_elsewhere_is_not_taken_for_the_services_own(tmp_path: Path) -> None:
     (tmp_path / "others").mkdir()
     (tmp_path / "redis").symlink_to(tmp_path / "others")
     with pytest.raises(BusyError, match="belongs to another user; remove it"):
-        own_redis(Settings(data_dir=tmp_path))
+        lock_redis(Settings(data_dir=tmp_path))
 
 
 def test_a_redis_that_is_not_there_is_one_clear_line(tmp_path: Path) -> None:

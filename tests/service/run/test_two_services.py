@@ -13,7 +13,7 @@ from graspd.service.model.errors import InputError
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.identity import identify
 from graspd.service.queue.rq_queue import RqQueue
-from graspd.service.run.doctor.backends import index_identity
+from graspd.service.run.doctor.backends import check_index_identity
 from graspd.service.run.doctor.checks import Condition
 from graspd.service.run.supervisor import Supervisor
 from graspd.service.settings import Settings
@@ -53,8 +53,8 @@ def test_a_command_of_a_second_service_on_a_redis_is_refused(
 def test_the_doctor_says_so(first: Services, redis_server: str, tmp_path: Path) -> None:
     (tmp_path / "second" / "store").mkdir(parents=True)
     second = Settings(data_dir=tmp_path / "second", redis_url=redis_server)
-    assert index_identity(first.settings).condition is Condition.GOOD
-    assert index_identity(second).condition is Condition.BAD
+    assert check_index_identity(first.settings).condition is Condition.GOOD
+    assert check_index_identity(second).condition is Condition.BAD
 
 
 def test_another_number_of_database_is_another_redis(first: Services, redis_server: str, tmp_path: Path) -> None:

@@ -134,8 +134,8 @@ STATUSES = [
 def test_a_verdict_counts_only_where_there_is_one(said: Any, is_valid: bool, is_unvalidated: bool) -> None:
     named = zip(("valid", "feasible", "success"), said, strict=True)
     columns = {f"quality/{name}": np.array([value]) for name, value in named if value is not None}
-    assert validity.selection(columns).tolist() == [is_valid]
-    assert validity.selection(columns, unvalidated=True).tolist() == [is_unvalidated]
+    assert validity.selection_mask(columns).tolist() == [is_valid]
+    assert validity.selection_mask(columns, unvalidated=True).tolist() == [is_unvalidated]
 
 
 POSES = "grasp/hand_pose"

@@ -26,7 +26,7 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.quality.contact import LINK_CONTACT_M, finger_of_body
-from graspd.worker.quality.posed import posing_of
+from graspd.worker.quality.posed import posture_data_of
 from graspd.worker.quality.probe import NearestPoints, Probe
 from graspd.worker.quality.wrench_space import wrenches
 from graspd.worker.simulation.environment import Obstacle, PlacedGrasps
@@ -351,7 +351,7 @@ def test_a_finger_that_stands_off_closes_until_it_touches(name: str) -> None:
     """It keeps its posture if it would meet another finger first, or move deeper into an obstacle."""
     hand = hand_from_path(name)
     grasps, (near, far), finger = around(hand, 60), postures.STANDS_OFF_M, opening.fingers_of_dofs(hand)
-    posing = posing_of(hand, OBJ, points=600, device="cpu")
+    posing = posture_data_of(hand, OBJ, points=600, device="cpu")
     gaps = posing.finger_gaps(grasps, 0.1)
     closed = postures.close_fingers(hand, OBJ, grasps, above(Obstacle.half_space([0, 0, 1], -2.0), 60))
     moved = hand.reduce(closed.joint_positions) - hand.reduce(grasps.joint_positions)

@@ -31,7 +31,7 @@ backend.compile_modules([{MODULE!r}], architectures=[90])
 
 
 def test_the_default_device_of_one_thread_is_not_that_of_another() -> None:
-    backend.start()
+    backend.start_warp()
     from warp._src.context import runtime  # noqa: TID251 (what backend.py changes)
 
     first, seen, set_, looked = runtime.default_device, [], threading.Event(), threading.Event()
@@ -108,8 +108,8 @@ def test_every_module_of_kernels_is_known() -> None:
     # Modules are found by their names: one with a kernel under another name would be compiled at first use.
     sources = [file for package in PACKAGES for file in (REPOSITORY / package).rglob("*.py")]
     having = {file for file in sources if "@wp.kernel" in file.read_text()}
-    assert {file.stem for file in having} <= {part for name in backend.modules() for part in name.split(".")}
-    assert len(having) == len(backend.modules())
+    assert {file.stem for file in having} <= {part for name in backend.kernel_modules() for part in name.split(".")}
+    assert len(having) == len(backend.kernel_modules())
 
 
 @pytest.fixture
@@ -124,7 +124,7 @@ def test_kernels_go_where_warp_has_them_or_the_user_can_write(blocked: Path, tmp
     assert kernel_cache() is None
     monkeypatch.setenv("WARP_CACHE_PATH", str(blocked))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "mine"))
-    assert kernel_cache() == tmp_path / "mine" / "graspd" / "warp" == user_cache.folder("warp")
+    assert kernel_cache() == tmp_path / "mine" / "graspd" / "warp" == user_cache.cache_folder("warp")
     assert str(blocked) in caplog.text
 
 

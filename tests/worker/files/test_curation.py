@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from graspd.commands.curate import app
-from graspd.exchange.inputs import expand
+from graspd.exchange.inputs import expand_path
 from graspd.service.model.errors import InputError
 from graspd.service.readers import Grasps, Pictures, open_shards
 from graspd.service.readers.clouds import OF_GRASPS
@@ -64,7 +64,7 @@ def test_subset_holds_what_expression_chooses_and_nothing_else(folder: Path, tmp
         assert sample["grasp/hand_pose"].tobytes() in poses and sample["quality/grasp_type"] == 2
     for beside in ("card.json", "clouds.json"):
         (out / beside).write_text("{}")
-    names = {file.name for file in expand(out)}
+    names = {file.name for file in expand_path(out)}
     assert names <= {"base-00000.h5", "base-00001.h5"}, "what tells of the subset is no file of grasps"
 
 

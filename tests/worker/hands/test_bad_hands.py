@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from graspd.cli import build
+from graspd.cli import build_app
 from graspd.commands.hands import report_hand
 from graspd.commands.objects import report_object
 from graspd.service.model.errors import InputError, LimitError
@@ -252,7 +252,7 @@ def test_a_bad_hand_is_refused_in_one_line_here_and_as_an_upload(files, says: st
     monkeypatch.chdir(folder)
     for file, data in files.items():
         (folder / file).write_bytes(data)
-    told = CliRunner().invoke(build(), ["hands", "check", next(iter(files))])
+    told = CliRunner().invoke(build_app(), ["hands", "check", next(iter(files))])
     assert told.exit_code == 2 and told.stdout == ""
     (line,) = told.stderr.splitlines()
     assert line.startswith("graspd: refused: ") and says in line and len(line) < 400

@@ -20,7 +20,7 @@ from graspd.service.store.library import publish_asset
 from graspd.service.store.store import open_store
 from graspd.worker.hands.check import check_hand
 from graspd.worker.hands.load import files_from_path, hand_from_path
-from graspd.worker.hands.xacro import expand
+from graspd.worker.hands.xacro import expand_xacro
 from graspd.worker.stages.assets import load_hand_files
 from tests.api.factories import zipped
 from tests.worker.hands.mjcfs import CLAW
@@ -331,7 +331,7 @@ def test_an_upload_of_the_package_is_the_same_hand(checkout: Path) -> None:
 def refusal(body: str, **others: bytes) -> str:
     head = '<robot name="x" xmlns:xacro="http://www.ros.org/wiki/xacro">'
     with pytest.raises(HandError) as caught:
-        expand({"x.xacro": f"{head}{body}</robot>".encode(), **others}, "x.xacro", {})
+        expand_xacro({"x.xacro": f"{head}{body}</robot>".encode(), **others}, "x.xacro", {})
     message = str(caught.value)
     assert "\n" not in message and len(message) < 400
     return message
@@ -365,7 +365,7 @@ def test_what_reaches_out_or_is_wrong_is_refused_in_one_line(body: str, named: s
 
 def test_entities_are_refused_and_expansion_without_end_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(HandError, match="entities"):
-        expand({"x.xacro": b'<!DOCTYPE robot [<!ENTITY a "b">]><robot name="${1}">&a;</robot>'}, "x.xacro", {})
+        expand_xacro({"x.xacro": b'<!DOCTYPE robot [<!ENTITY a "b">]><robot name="${1}">&a;</robot>'}, "x.xacro", {})
     monkeypatch.setattr("graspd.worker.hands.xacro.CPU_LIMIT_S", 1)
     assert "takes more than" in refusal('<a b="${9**9**9}"/>')
 
@@ -380,7 +380,7 @@ def test_an_expansion_that_the_machine_ended_refuses_no_hand(code: str, monkeypa
     monkeypatch.setattr("graspd.worker.hands.xacro.subprocess.run", other)
     monkeypatch.setattr("graspd.worker.hands.xacro._WALL_LIMIT_S", 0.5 if "pause" in code else 60.0)
     with pytest.raises(OSError, match=r"x\.xacro"):
-        expand({"x.xacro": b"<robot/>"}, "x.xacro", {})
+        expand_xacro({"x.xacro": b"<robot/>"}, "x.xacro", {})
 
 
 @pytest.mark.parametrize(
@@ -432,7 +432,7 @@ def test_a_folder_of_too_many_files_is_no_hand(checkout: Path, monkeypatch: pyte
 def test_what_a_file_prints_without_end_is_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     text = MACROS.replace("</robot>", "${[xacro.warning('x' * 10**6) for i in range(300)]}</robot>")
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    assert b"<robot" in expand({**FILES, "urdf/claw.urdf.xacro": text.encode()}, "urdf/claw.urdf.xacro", {})
+    assert b"<robot" in expand_xacro({**FILES, "urdf/claw.urdf.xacro": text.encode()}, "urdf/claw.urdf.xacro", {})
     # 300 MB are printed; KiB.
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100 * 1024
 
@@ -442,16 +442,16 @@ def test_what_differs_from_expansion_to_expansion_is_refused(value: str, tmp_pat
     main = "urdf/claw.urdf.xacro"
     text = MACROS.replace("<robot", f'<robot note="${{{value}}}"', 1).encode()
     with pytest.raises(HandError, match="a new address each time"):
-        expand({**FILES, main: text}, main, {})
+        expand_xacro({**FILES, main: text}, main, {})
     monkeypatch.chdir(tmp_path)
     text = MACROS.replace("<robot", '<robot note="$(cwd)"', 1).encode()
-    assert tmp_path.name.encode() not in expand({**FILES, main: text}, main, {})
+    assert tmp_path.name.encode() not in expand_xacro({**FILES, main: text}, main, {})
 
 
 def test_a_hand_in_the_store_is_expanded_once(monkeypatch: pytest.MonkeyPatch) -> None:
     store = open_store("memory://")
     asset = publish_asset(store, AssetKind.HAND, "claw", {**FILES, "asset.json": b'{"file": "urdf/claw.urdf.xacro"}'})
     first = load_hand_files(store, asset.digest)
-    assert first["urdf/claw.urdf.xacro"] == expand(FILES, "urdf/claw.urdf.xacro", {})
-    monkeypatch.setattr("graspd.worker.stages.assets.expand", lambda *_: pytest.fail("expanded again"))
+    assert first["urdf/claw.urdf.xacro"] == expand_xacro(FILES, "urdf/claw.urdf.xacro", {})
+    monkeypatch.setattr("graspd.worker.stages.assets.expand_xacro", lambda *_: pytest.fail("expanded again"))
     assert load_hand_files(store, asset.digest) == first

@@ -15,7 +15,7 @@ from graspd.worker.hands.check import check_hand
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.load import files_from_path, hand_from_path, load_hand
 from graspd.worker.hands.model import HandModel
-from graspd.worker.hands.tendons import Tendon, actuators
+from graspd.worker.hands.tendons import Tendon, actuator_matrix
 from graspd.worker.objects.disk_cache import TOLD_IF_SET, content_of
 from tests.worker.hands.mjcfs import CLAW, FOUR_BAR, TENDON_CLAW
 
@@ -209,7 +209,7 @@ def test_a_command_of_torques_pulls_jaws_keep_their_ratio() -> None:
     tendon, stiffness = Tendon("t", (0, 2), (1.0, 0.4)), np.array([5.0, 9.0, 2.0])
     pull = 0.7
     told = pull * np.array([1.0, 0.0, 0.4]) / stiffness
-    length = actuators((tendon,), 3) @ told
+    length = actuator_matrix((tendon,), 3) @ told
     assert length.tolist() == pytest.approx([told[0] + 0.4 * told[2], told[1]])
     assert tendon.gain(stiffness) * length[0] == pytest.approx(pull)
     text = re.sub('<joint joint="left_curl" coef="0.5"/>', '<joint joint="right_slide" coef="0.5"/>', CLAW)

@@ -130,7 +130,7 @@ def test_without_opposing_digits_grasps_are_not_even_planned() -> None:
 def test_what_a_hand_can_hold_is_asked_once_on_a_machine(monkeypatch: pytest.MonkeyPatch) -> None:
     # Without the cache in memory, as a process that begins.
     assert [oppositions._can_hold.__wrapped__(hand) for hand in (gripper(), pointer())] == [True, False]
-    monkeypatch.setattr(oppositions, "opposes", lambda hand: pytest.fail("asked again"))
+    monkeypatch.setattr(oppositions, "can_oppose", lambda hand: pytest.fail("asked again"))
     assert [oppositions._can_hold.__wrapped__(hand) for hand in (gripper(), pointer())] == [True, False]
 
 
@@ -155,7 +155,7 @@ def test_the_opening_is_the_distance_of_the_pads_in_mujoco(zero_is_open: bool) -
     jaws = jaws_of(hand)
     assert jaws is not None and jaws.opening == pytest.approx(OPENING, abs=PLANE_M)
     for width in (0.0, 0.02, 0.08):
-        q, _, axis = jaws.at(np.array([width]))
+        q, _, axis = jaws.nearest_postures(np.array([width]))
         assert np.abs(axis[0]) == pytest.approx([1, 0, 0], abs=1e-9)
         # MuJoCo's distance of meshes and boxes is good to its solver's tolerance of 1e-6 m.
         assert _apart(hand, q[0]) == pytest.approx(width, abs=1e-5)

@@ -168,7 +168,7 @@ def test_an_object_keeps_its_place_and_a_scan_its_points() -> None:
     again = from_bytes(to_bytes(obj), name=obj.name, digest=obj.digest)
     assert (again.content, again.centred.content) == (obj.content, obj.centred.content)
     points = np.random.default_rng(0).uniform(-0.1, 0.1, (2000, 3)).astype(np.float32).astype(float)
-    found = mesh_geometry.centred(points)
+    found = mesh_geometry.centre_points(points)
     np.testing.assert_allclose(found.points + found.centre, points, atol=2e-9)
 
 
@@ -181,7 +181,9 @@ def test_poses_come_back_from_frame_of_file_with_the_same_bits(place: tuple[floa
     hands = GraspSet(*(Posture(pose, np.zeros((200, 1))) for _ in range(3)), np.zeros(200)).moved(np.zeros(3))
     np.testing.assert_array_equal(hands.moved(centre).moved(-centre).grasp.hand_pose, hands.grasp.hand_pose)
     lying = hands.grasp.hand_pose
-    np.testing.assert_array_equal(mesh_geometry.to_centre(mesh_geometry.to_file(lying, centre), centre), lying)
+    np.testing.assert_array_equal(
+        mesh_geometry.to_centred_frame(mesh_geometry.to_file_frame(lying, centre), centre), lying
+    )
 
 
 @pytest.mark.parametrize(("place", "says"), [((0.3, 0, 0), False), (FAR, True), (UTM, True)])

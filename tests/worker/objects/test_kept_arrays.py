@@ -19,7 +19,7 @@ from graspd.service.model.messages import TaskMessage
 from graspd.service.model.states import AssetKind, Stage
 from graspd.service.model.transforms import IDENTITY_POSE, apply
 from graspd.service.store.assets import builtin_files, builtin_model, builtin_names
-from graspd.service.store.integrity import sealed
+from graspd.service.store.integrity import add_seal
 from graspd.service.store.library import publish_asset
 from graspd.service.store.store import Store, open_store
 from graspd.worker.hands import surface
@@ -119,8 +119,8 @@ def load_balls(files: dict[str, bytes] = BALLS, error: float = 3e-4, **options) 
 @pytest.fixture
 def built(own_cache: Path, monkeypatch: pytest.MonkeyPatch) -> list[float]:
     bounds: list[float] = []
-    build = prepare.build
-    monkeypatch.setattr(prepare, "build", lambda mesh, error: bounds.append(error) or build(mesh, error))
+    build = prepare.build_model
+    monkeypatch.setattr(prepare, "build_model", lambda mesh, error: bounds.append(error) or build(mesh, error))
     return bounds
 
 
@@ -258,10 +258,10 @@ def test_a_model_is_published_once(tmp_path) -> None:
     store = open_store(tmp_path.as_uri())
     obj = object_from_path("block")
     publish_model(store, AssetKind.OBJECT, obj)
-    key = names.asset_model(AssetKind.OBJECT, obj.digest)
+    key = names.asset_model_key(AssetKind.OBJECT, obj.digest)
     assert store.get(key)[:4] == b"glTF"
     publish_model(store, AssetKind.OBJECT, obj)
-    assert store.get(key) == sealed(key, object_glb(obj))
+    assert store.get(key) == add_seal(key, object_glb(obj))
 
 
 def message(**changes) -> TaskMessage:

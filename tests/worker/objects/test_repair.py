@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from graspd.commands.objects import report_object
 from graspd.worker.objects.check import check_object
-from graspd.worker.objects.intersections import crossings, untangle
+from graspd.worker.objects.intersections import intersecting_faces, untangle
 from graspd.worker.objects.mesh_geometry import from_manifold, signed_volume
 from graspd.worker.objects.prepare import load_object
 from graspd.worker.objects.topology import is_closed
@@ -169,16 +169,16 @@ def everted_dumbbell() -> Mesh:
 
 @pytest.mark.parametrize("mesh", [box(), sphere(), cylinder(), join(box(), box(at=(0.2, 0.0, 0.0)))])
 def test_a_sound_surface_passes_through_itself_nowhere(mesh: Mesh) -> None:
-    found = crossings(*mesh)
+    found = intersecting_faces(*mesh)
     assert found is not None and not len(found)
 
 
 def test_crossings_are_faces_that_pass_through_not_that_touch() -> None:
     large, small = box(0.06, 0.06, 0.06), box(0.02, 0.02, 0.02, at=(0.03, 0.002, 0.001))
-    found = crossings(*join(large, small))
+    found = intersecting_faces(*join(large, small))
     assert found is not None and len(found)
     assert (found[:, 0] < len(large[1])).all() and (found[:, 1] >= len(large[1])).all()
-    found = crossings(*join(box(0.04, 0.04, 0.04), box(0.02, 0.02, 0.02, at=(0.03, 0.0, 0.0))))
+    found = intersecting_faces(*join(box(0.04, 0.04, 0.04), box(0.02, 0.02, 0.02, at=(0.03, 0.0, 0.0))))
     assert found is not None and not len(found)
 
 
@@ -187,7 +187,7 @@ def test_what_a_tube_encloses_twice_counts_once() -> None:
     tube = crossing_tube()
     united = untangle(*tube)
     assert signed_volume(*tube) - signed_volume(*united) == pytest.approx(SHARED, rel=ROUGHLY)
-    left = crossings(*united)
+    left = intersecting_faces(*united)
     assert left is not None and not len(left)
 
 

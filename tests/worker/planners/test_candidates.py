@@ -39,7 +39,7 @@ def plain(hand, obj, state: HandState, losses: np.ndarray, placed: PlacedGrasps,
 def taken(scores, monkeypatch, merit=None, infeasible=(), off=()) -> tuple[list[int], list[int], list[int]]:
     """Hands that are taken where hand k of grasp n scores `scores[n][k]` and is the k-th most promising; those that
     were tried, and those that were refined. Some are infeasible."""
-    monkeypatch.setattr(candidates, "with_postures", plain)
+    monkeypatch.setattr(candidates, "grasps_of_state", plain)
     n, each = np.shape(scores)
     flat, worth = np.ravel(scores), np.ravel(merit if merit is not None else np.tile(0.01 * np.arange(each), (n, 1)))
     tries: list[int] = []

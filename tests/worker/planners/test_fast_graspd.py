@@ -14,7 +14,7 @@ from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import BatchRequest, PlanRequest, synthesize
 from graspd.worker.planners.fast_graspd import pairs, planner, schedule
-from graspd.worker.planners.fast_graspd.planner import plan_joined
+from graspd.worker.planners.fast_graspd.planner import plan_batches
 from graspd.worker.quality.table import measure
 from tests.worker.models import assert_same_grasps, on_tables
 
@@ -56,7 +56,7 @@ def test_a_surface_is_tested_where_the_fidelity_says() -> None:
 
 
 def test_a_scene_takes_no_more_starts_than_a_fidelity_may() -> None:
-    most = schedule.in_scene(QUICK.model_copy(update={"starts": 60, "finalists": 40}))
+    most = schedule.fidelity_in_scenes(QUICK.model_copy(update={"starts": 60, "finalists": 40}))
     assert (most.starts, most.finalists) == (64, 64)
 
 
@@ -129,7 +129,7 @@ def pair():
 
 
 def made(pair, wanted: list[PlanRequest], *runs: ExecutionContext) -> list[GraspSet | Exception]:
-    return plan_joined(*pair, list(map(BatchRequest, wanted, [*runs, *[ONE] * (len(wanted) - len(runs))])))
+    return plan_batches(*pair, list(map(BatchRequest, wanted, [*runs, *[ONE] * (len(wanted) - len(runs))])))
 
 
 def assert_same(one: GraspSet | Exception, other: GraspSet) -> None:

@@ -28,7 +28,7 @@ from graspd.worker.planners.fast_graspd.antipodal_starts import (
     Openings,
     crossings_of,
     narrow_reason,
-    place_across,
+    place_antipodal_hands,
     select_draws,
 )
 from graspd.worker.planners.fast_graspd.candidates import posture_of
@@ -129,14 +129,14 @@ def test_all_starts_reach_around_what_pads_cannot_hold(side: float) -> None:
 def test_draws_are_those_of_each_generator_alone_and_look_at_the_object() -> None:
     hand, obj = hand_from_path("allegro"), object_from_path("mug")
     pair, seeds = starts._Pair(hand, obj), range(64)
-    state, way = starts.draw(pair, [start_generator(7, 0, i, 0) for i in seeds])
+    state, way = starts.draw_starts(pair, [start_generator(7, 0, i, 0) for i in seeds])
     np.testing.assert_allclose(quat_rotate(state.rotation, hand.palm.approach), way, atol=1e-12)
     # From a palm the surface is as far away as the gap says, straight ahead.
     near, far = (state.pivot + gap * way + pair.centre for gap in starts.GAP)
     mesh = trimesh.Trimesh(obj.vertices, obj.faces)
     assert max(mesh.nearest.on_surface((near + far) / 2)[1]) <= (starts.GAP[1] - starts.GAP[0]) / 2 + 1e-9
     for i in seeds[::16]:
-        alone, _ = starts.draw(pair, [start_generator(7, 0, i, 0)])
+        alone, _ = starts.draw_starts(pair, [start_generator(7, 0, i, 0)])
         np.testing.assert_array_equal(alone.pivot[0], state.pivot[i])
         np.testing.assert_array_equal(alone.q[0], state.q[i])
 
@@ -227,7 +227,9 @@ def test_hands_reach_across_what_lies_flat_from_above(barrett) -> None:
     opening = Openings.in_scene(barrett, flat, scene)
     assert len(opening.known) == len(flat_pinches(barrett, 0.01)) > 0
     assert len(Openings.in_scene(barrett, flat, standing).known) == len(oppositions_of(barrett))
-    found = place_across(barrett, flat, opening, np.random.default_rng(1).random((60, 6)), free_directions(scene, flat))
+    found = place_antipodal_hands(
+        barrett, flat, opening, np.random.default_rng(1).random((60, 6)), free_directions(scene, flat)
+    )
     line = np.einsum("nij,nj->ni", found.turn, opening.known.axis[found.posture])
     assert np.abs(line @ UP).max() < 1e-6 and (found.away @ UP).min() > 0.6
 
@@ -237,7 +239,7 @@ def test_hands_hold_the_middle_and_come_from_a_free_way(barrett) -> None:
     opening, known = Openings.of(oppositions_of(barrett), BLOCK, lying(BLOCK)), oppositions_of(barrett)
     uniform = rng.random((40, 6))
     uniform[:, 5] = 0.0
-    found = place_across(barrett, BLOCK, opening, uniform, np.array([[0.0, 0, 1]]))
+    found = place_antipodal_hands(barrett, BLOCK, opening, uniform, np.array([[0.0, 0, 1]]))
     # Without noise the dofs are those of one of the known postures, whose middle lies in that of a pair.
     assert np.array_equal(found.q(barrett, np.zeros((40, barrett.dofs))), known.q[found.posture])
     rotation = quat_from_matrix(found.turn)
@@ -275,7 +277,7 @@ def test_a_hand_around_an_edge_or_below_a_board_is_hindered(barrett) -> None:
 def test_how_far_pair_is_beside_pads_of_a_hand_that_was_moved(barrett) -> None:
     opening = Openings.of(oppositions_of(barrett), BLOCK, lying(BLOCK))
     uniform, ways = np.random.default_rng(0).random((30, 6)), np.array([[0.0, 0, 1]])
-    found = place_across(barrett, BLOCK, opening, uniform, ways)
+    found = place_antipodal_hands(barrett, BLOCK, opening, uniform, ways)
     assert found.deep.min() >= 0.0 and found.deep.max() > 0.02
     # Back by as much as it is deep, or less: what lies between palm and pads lies between the fingers.
     for share in (0.0, 0.5, 1.0):
@@ -294,7 +296,7 @@ def test_outlines_tell_how_far_a_hand_must_rise(barrett, tips_m) -> None:
     uniform, ways = np.random.default_rng(0).random((60, 6)), np.array([[0.0, 0, 1], [0.6, 0, 0.8]])
     table = replace(lying(BLOCK).obstacles[0], tips_m=tips_m)
     scene = Environment((table,), UP)
-    found = place_across(barrett, BLOCK, opening, uniform, ways)
+    found = place_antipodal_hands(barrett, BLOCK, opening, uniform, ways)
     centre = found.pivot + BLOCK.centre_of_mass
     known = oppositions_of(barrett).q
     outlines, again, few = (antipodal_starts.posture_outlines(barrett, q) for q in (known, known.copy(), known[:3]))

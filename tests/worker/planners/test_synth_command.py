@@ -11,7 +11,7 @@ import trimesh
 from typer.testing import CliRunner
 
 import graspd
-from graspd.cli import build
+from graspd.cli import build_app
 from graspd.commands.synth import _format_summary
 from graspd.service.cli import write_output
 from graspd.service.model.errors import ConflictError, NotFoundError
@@ -150,7 +150,7 @@ def test_every_command_finds_hand_and_object_of_a_file_by_itself(of_own_mesh: Pa
 
 def test_fewer_grasps_than_asked_are_told_with_the_reason_and_exit_code_3(folder: Path, monkeypatch) -> None:
     out = folder / "few.h5"
-    monkeypatch.setattr(generation, "passes", lambda columns: np.zeros(len(columns["quality/success"]), np.uint8))
+    monkeypatch.setattr(generation, "passes_gate", lambda columns: np.zeros(len(columns["quality/success"]), np.uint8))
     said = graspd_command(f"synth --hand barrett --object block -n 2 --budget 1 {DRAFT} -o", out, code=3)
     assert (said["grasps"], said["valid"], said["wanted"]) == (0, 0, 2)
     assert sum(said["outcomes"].values()) == said["candidates"] == 2
@@ -176,7 +176,7 @@ def test_who_stops_it_keeps_what_was_validated(folder: Path, monkeypatch, asked:
     before = signal.getsignal(asked)
     monkeypatch.setattr(synthesis, "synthesize_grasps", stopped)
     words = f"synth --hand barrett --object block -n 64 --budget 1 --validation none --json {DRAFT} -o"
-    done = CliRunner().invoke(build(), [*words.split(), str(out)])
+    done = CliRunner().invoke(build_app(), [*words.split(), str(out)])
     shard = read_shard(out, kind="base")
     kept = len(shard["quality/valid"])
     assert done.exit_code == 128 + asked and 0 < kept <= 32

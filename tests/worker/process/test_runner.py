@@ -173,7 +173,7 @@ def test_a_stage_that_ignores_the_stop_still_writes_nothing(bench: Bench) -> Non
 
     message = message_for()
     assert bench.run(message, deaf).kind is EventKind.CANCELLED
-    assert not bench.store.exists(names.shard_file(Stage.SYNTHESIZE, message.output))
+    assert not bench.store.exists(names.shard_file_key(Stage.SYNTHESIZE, message.output))
 
 
 @pytest.mark.parametrize(

@@ -23,8 +23,8 @@ from graspd.worker.objects import disk_cache
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.quality import diversity, probe
 from graspd.worker.quality.contact import contact_distance_consistency_mm, finger_of_body, spread_contacts
-from graspd.worker.quality.diversity import cells_of, distances, distinct, hand_points, least_distance
-from graspd.worker.quality.gate import MAX_PENETRATION_MM, MAX_SELF_PENETRATION_MM, MIN_CONTACT_LINKS, passes
+from graspd.worker.quality.diversity import cells_of, distances, distinct_mask, hand_points, least_distance
+from graspd.worker.quality.gate import MAX_PENETRATION_MM, MAX_SELF_PENETRATION_MM, MIN_CONTACT_LINKS, passes_gate
 from graspd.worker.quality.intervals import wilson, wilson_of_mean
 from graspd.worker.quality.probe import HAND_POINTS, REACH_M, Probe
 from graspd.worker.quality.table import measure
@@ -81,7 +81,7 @@ def test_voxels_agree_with_the_exact_volume() -> None:
     bodies = Probe(hand, BOX).measure(closed_on_box(0.004)).bodies[0]
     surface_cm2 = 2 * (2 * 9 + 4 * 3 * 0.4)
     bound = surface_cm2 * VOXEL_M * 100 / 2
-    assert SharedVolume(hand, BOX).by_voxels(bodies, np.array([1, 2])) == pytest.approx(7.2, abs=bound)
+    assert SharedVolume(hand, BOX).voxel_volume(bodies, np.array([1, 2])) == pytest.approx(7.2, abs=bound)
     # Pieces that overlap are counted once.
     twice = dataclasses.replace(hand, pieces=(*hand.pieces, hand.pieces[1]))
     once = SharedVolume(hand, BOX).of(bodies[None], np.ones((1, 3), bool))
@@ -212,7 +212,7 @@ def test_contacts_of_many_sets_are_those_chosen_one_set_at_time() -> None:
 
 
 def gate(**changes: float) -> bool:
-    return bool(passes({f"quality/{name}": np.array([value]) for name, value in (GOOD | changes).items()})[0])
+    return bool(passes_gate({f"quality/{name}": np.array([value]) for name, value in (GOOD | changes).items()})[0])
 
 
 @pytest.mark.parametrize(
@@ -323,7 +323,7 @@ def test_shifted_hand_is_off_by_the_shift_a_joint_by_its_points() -> None:
 def test_of_grasps_that_are_near_the_first_is_kept() -> None:
     rng = np.random.default_rng(11)
     points = rng.normal(0, 0.02, (200, 1, 3)) + rng.normal(0, 0.002, (200, 8, 3))
-    kept = distinct(points, 0.01)
+    kept = distinct_mask(points, 0.01)
     apart = np.linalg.norm(points[:, None] - points[None], axis=3).mean(axis=2)
     among = apart[np.ix_(kept, kept)] + np.eye(int(kept.sum()))
     assert among.min() >= 0.01 and kept[0]
@@ -333,8 +333,8 @@ def test_of_grasps_that_are_near_the_first_is_kept() -> None:
 
 def test_distinct_grasps_keep_the_given_nearest_sees_all_pairs() -> None:
     points = np.zeros((3, 4, 3))
-    assert distinct(points, 0.0).all() and distinct(points, 0.005).tolist() == [True, False, False]
-    assert distinct(points, 0.005, given=2).tolist() == [True, True, False]
+    assert distinct_mask(points, 0.0).all() and distinct_mask(points, 0.005).tolist() == [True, False, False]
+    assert distinct_mask(points, 0.005, given=2).tolist() == [True, True, False]
     rng = np.random.default_rng(17)
     # Turned about their middles too, so that near middles are no near grasps.
     points = rng.normal(0, 0.05, (60, 1, 3)) + rng.normal(0, 0.03, (60, 8, 3))

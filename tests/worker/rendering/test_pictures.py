@@ -22,7 +22,7 @@ from graspd.worker.rendering import Extras, render, sheets
 from graspd.worker.rendering.hands import DrawnHand, drawn_bodies, hand_parts, without_visuals
 from graspd.worker.rendering.pictures import THREE_SIDES, grasp_pictures
 from graspd.worker.rendering.scenery import TABLE, TABLE_SIZE, slab_poses, slabs, visible_share
-from graspd.worker.rendering.trajectory_pictures import KINDS, PictureScenes, animation, trajectory_pictures
+from graspd.worker.rendering.trajectory_pictures import KINDS, PictureScenes, encode_animation, trajectory_pictures
 from graspd.worker.stages.models import hand_glb
 from tests.worker.hands.urdfs import joint, link, robot
 from tests.worker.models import object_from_mesh, two_finger_hand
@@ -84,9 +84,9 @@ def quality(count: int) -> dict[str, np.ndarray]:
 
 def test_best_have_the_largest_epsilon_and_captions_quote_5_mm() -> None:
     chosen = np.array([True, True, True, True, False])
-    assert sheets.best(quality(5), 3, chosen).tolist() == [3, 2, 1]
-    assert sheets.best(quality(5), 9, chosen).tolist() == [3, 2, 1, 0]
-    (told,) = sheets.figures(quality(5), np.array([3]))
+    assert sheets.best_rows(quality(5), 3, chosen).tolist() == [3, 2, 1]
+    assert sheets.best_rows(quality(5), 9, chosen).tolist() == [3, 2, 1, 0]
+    (told,) = sheets.caption_entries(quality(5), np.array([3]))
     assert told == [("epsilon", "30.000"), ("contact", "30.0 cm^2"), ("depth", "0.25 mm")]
 
 
@@ -198,14 +198,14 @@ def colours() -> np.ndarray:
 def test_every_picture_is_shown_for_its_time_and_again(suffix):
     if suffix == ".webp" and not features.check("webp"):
         pytest.skip("this Pillow writes no WebP")
-    with Image.open(io.BytesIO(animation(colours(), SECONDS, suffix))) as film:
+    with Image.open(io.BytesIO(encode_animation(colours(), SECONDS, suffix))) as film:
         assert film.n_frames == 3 and film.info.get("loop") == 0
         for frame, wanted, shown in zip(ImageSequence.Iterator(film), colours(), [500, 50, 1200], strict=True):
             # WebP is lossy: a plain colour comes back within a few of 256 steps.
             assert np.abs(np.asarray(frame.convert("RGB")).astype(int) - wanted).max() <= 6
             assert frame.info["duration"] == shown
     with pytest.raises(InputError, match="not as a file without suffix"):
-        animation(colours(), SECONDS, "")
+        encode_animation(colours(), SECONDS, "")
 
 
 def test_the_object_is_carried_with_the_hand_from_where_it_rests():

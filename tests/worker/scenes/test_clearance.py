@@ -9,7 +9,7 @@ from graspd.service.model.transforms import apply, compose, invert, quat_from_ax
 from graspd.worker.grasps import Posture
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.scenes import Neighbours, drop_together, transfer
-from graspd.worker.scenes.clearance import MARGIN_M, Rejection, approach
+from graspd.worker.scenes.clearance import MARGIN_M, Rejection, approach_postures
 from graspd.worker.scenes.neighbours import FARTHEST_M, neighbour_clearance
 from tests.worker.models import object_from_mesh, two_finger_hand, unit_vectors
 
@@ -39,7 +39,7 @@ def test_clearance_agrees_with_all_corners_of_all_pieces_on_way():
     grasp, pregrasp = postures(rng, 5), postures(rng, 5)
     scenes = postures(rng, 3).hand_pose
     found = transfer(HAND, grasp, pregrasp, scenes)["grasp/table_clearance_m"].reshape(3, 5)
-    path = approach(grasp, pregrasp)
+    path = approach_postures(grasp, pregrasp)
     expected = np.array([lowest_vertex(path, scene).reshape(5, -1).min(axis=1) for scene in scenes])
     assert np.all(found <= expected + 1e-12)
     np.testing.assert_allclose(found, expected, atol=TESSELLATION_M)

@@ -27,9 +27,9 @@ from graspd.worker.planners.fast_graspd.pairs import pair_of
 from graspd.worker.planners.fast_graspd.scene_starts import clear_scene_starts, free_directions
 from graspd.worker.planners.fast_graspd.starts import CLEAR, start_generator
 from graspd.worker.planners.port import PlanRequest
-from graspd.worker.scenes.clearance import MARGIN_M, approach, transfer
+from graspd.worker.scenes.clearance import MARGIN_M, approach_postures, transfer_grasps
 from graspd.worker.scenes.kinds import supports_of
-from graspd.worker.scenes.placement import joined_pieces, scenes_of
+from graspd.worker.scenes.placement import merge_pieces, scenes_of
 from graspd.worker.scenes.rollout import scene_verdicts
 from graspd.worker.scenes.trajectory import plan_trajectory
 from graspd.worker.simulation.environment import STANDOFF_M, PlacedGrasps, Scenes
@@ -82,8 +82,8 @@ def test_fingertips_keep_what_the_scene_says_and_no_less() -> None:
 def least_room(hand, way, grasps, row: int, scene) -> float:
     """Least distance of a hand from the obstacles on its whole way, by MuJoCo, at a hundred postures [m]."""
     one, wide = grasps.take(slice(row, row + 1)), way.open[row : row + 1]
-    coming = approach(Posture(way.approach[row, -1:], wide), Posture(way.approach[row, :1], wide), 40)
-    closing = approach(one.grasp, one.pregrasp, 30)
+    coming = approach_postures(Posture(way.approach[row, -1:], wide), Posture(way.approach[row, :1], wide), 40)
+    closing = approach_postures(one.grasp, one.pregrasp, 30)
     lifting = Posture(np.repeat(one.grasp.hand_pose, 30, axis=0), np.repeat(one.grasp.joint_positions, 30, axis=0))
     lifting.hand_pose[:, :3] += np.linspace(0, 0.1, 30)[:, None] * scene.up
     parts, table = (coming, closing, lifting), scene.obstacles[0]
@@ -171,7 +171,7 @@ def test_hulls_are_joined_where_that_fills_least() -> None:
     """Eight cubes in a row and one apart: the row becomes one piece."""
     corners = np.asarray(trimesh.creation.box((0.01, 0.01, 0.01)).vertices)
     row = [corners + np.array([0.01 * k, 0, 0]) for k in range(8)]
-    pieces = joined_pieces([*row, corners + np.array([0.09, 0, 0.02])], most=2)
+    pieces = merge_pieces([*row, corners + np.array([0.09, 0, 0.02])], most=2)
     assert sorted(round(float(np.ptp(piece[:, 0])), 3) for piece in pieces) == [0.01, 0.08]
 
 
@@ -306,7 +306,7 @@ def test_free_grasps_do_not_depend_on_the_mounting(shadow: HandModel) -> None:
 
 def test_grasps_carried_over_keep_their_forearms_off_the_table(shadow: HandModel, table: Scenes, mounted) -> None:
     hands = (shadow, replace(shadow, mounting=None))
-    ours, bare = (transfer(hand, mounted.grasp, mounted.pregrasp, table.object_pose) for hand in hands)
+    ours, bare = (transfer_grasps(hand, mounted.grasp, mounted.pregrasp, table.object_pose) for hand in hands)
     assert "grasp/wrist_positions" not in bare and ours["grasp/wrist_positions"].shape == (16, 2)
     postures = zip(ours["grasp/hand_pose"], ours["grasp/wrist_positions"], strict=True)
     height = [lowest(shadow.mounting, pose[None], wrist) for pose, wrist in postures]

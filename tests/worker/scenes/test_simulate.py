@@ -82,9 +82,9 @@ def test_stable_faces_agree_with_trimeshs():
     transforms, _ = trimesh.poses.compute_stable_poses(mesh, sigma=0.0, n_samples=1)
     expected = -transforms[:, 2, :3]
     found = resting_faces(obj)
-    assert len(found.stable) == len(expected)
+    assert len(found.stable_faces) == len(expected)
     # Each face of ours has a partner of theirs.
-    np.testing.assert_allclose((found.normal[found.stable] @ expected.T).max(axis=1), 1.0, atol=1e-9)
+    np.testing.assert_allclose((found.normal[found.stable_faces] @ expected.T).max(axis=1), 1.0, atol=1e-9)
 
 
 def hull_of(points) -> trimesh.Trimesh:
@@ -171,8 +171,8 @@ def test_plate_topples_from_an_edge_whose_tilt_passes_its_middle() -> None:
     # Height 30 mm, half the thickness t / 2 inside: 1 mm of change tilts by 1 / t, so t t / 2 must pass 30 mm^2.
     for thickness, falls in ((0.0074, True), (0.0080, False)):
         faces = resting_faces(box(0.06, 0.06, thickness))
-        assert faces.topples(face_along(faces, (1, 0, 0))) is falls
-        assert not faces.topples(face_along(faces, (0, 0, 1)))
+        assert faces.can_topple(face_along(faces, (1, 0, 0))) is falls
+        assert not faces.can_topple(face_along(faces, (0, 0, 1)))
 
 
 def test_a_can_rolls_on_its_side_and_stands_on_its_bottom() -> None:

@@ -14,7 +14,7 @@ from graspd.service.model.digests import digest_bytes, job_id
 from graspd.service.model.domain import Asset, JobOptions, JobRequest
 from graspd.service.model.errors import DamagedShard, TaskCancelled
 from graspd.service.model.messages import IngestMessage
-from graspd.service.model.planning import message_of, plan
+from graspd.service.model.planning import message_of, plan_tasks
 from graspd.service.model.records import AttemptRecord, JobRecord
 from graspd.service.model.scene_spec import has_table, scene_of, supports_in
 from graspd.service.model.states import AssetKind, Stage
@@ -42,7 +42,7 @@ from graspd.worker.scenes.kinds import supports_of
 from graspd.worker.stages import assets, ingest, render, scene, synthesize
 from graspd.worker.stages.assets import object_of
 from graspd.worker.stages.context import StopReason, TaskContext, batch_seed
-from graspd.worker.stages.ranges import base_rows, batches_of
+from graspd.worker.stages.ranges import base_rows, split_into_batches
 from tests.fakes import job_record, message_for
 from tests.networks import LEARNED, network_files, random_network
 
@@ -63,13 +63,13 @@ def job_of(store: Store, span: int = 1, **request) -> JobRecord:
     wanted = JobRequest(hand="barrett", object="block", **request)
     digests = {"hand_digest": hand.digest, "object_digest": obj.digest}
     job = job_record(wanted, job_id(wanted, *digests.values())).model_copy(update={**digests, "span": span})
-    put_record(store, names.job_record(job.id), job)
+    put_record(store, names.job_record_key(job.id), job)
     return job
 
 
 def end_of(store: Store, job: JobRecord) -> Event:
     runner = Runner(STAGES, worker="w", publish=lambda event: None)
-    for task in plan(job):
+    for task in plan_tasks(job):
         message = message_of(job, task, attempt=1, max_attempt=3).model_dump(mode="json", by_alias=True)
         event = runner.run(message, TaskContext(store, ExecutionContext(threads=2)))
         if event.kind is not EventKind.FINISHED:
@@ -94,11 +94,11 @@ class Bench:
         return end.kind, end.message
 
     def last_attempt(self) -> tuple[str, bool]:
-        attempt = read_record(AttemptRecord, self.store, names.attempt(list(plan(self.job))[-1].id, 1))
+        attempt = read_record(AttemptRecord, self.store, names.attempt_key(list(plan_tasks(self.job))[-1].id, 1))
         return attempt.kind, attempt.last
 
     def made(self, stage: Stage) -> Shard:
-        return load_shard(self.store, stage, next(task for task in plan(self.job) if task.stage is stage).output)
+        return load_shard(self.store, stage, next(task for task in plan_tasks(self.job) if task.stage is stage).output)
 
 
 @pytest.fixture(scope="module")
@@ -153,14 +153,14 @@ def test_neighbours_in_a_bin_stand_in_scenes_grasps_and_pictures(table: Bench) -
     assert base["scene/neighbour_pose"].shape == (1, 2, 7)
     np.testing.assert_array_equal(base["scene/neighbour_pose"], first["scene/neighbour_pose"])
     assert len(scenes_of_shard(base).neighbours) == 2
-    assert table.store.exists(names.asset_model(AssetKind.OBJECT, beside[0]["digest"])), "viewers show it"
+    assert table.store.exists(names.asset_model_key(AssetKind.OBJECT, beside[0]["digest"])), "viewers show it"
     alone = render_alone(bench, base)
     assert (views["image/depth"] != alone["image/depth"]).any(), "they are in the picture"
     assert set(np.unique(views["image/segmentation"])) - {0, 1, 2}
 
 
 def render_alone(bench: Bench, base: Shard) -> dict:
-    message = message_of(bench.job, list(plan(bench.job))[-1], attempt=1, max_attempt=3)
+    message = message_of(bench.job, list(plan_tasks(bench.job))[-1], attempt=1, max_attempt=3)
     request, obj = bench.job.request, object_of(bench.store, message)
     options = {"views": 1, "stereo": False, "width": request.width, "height": request.height}
     extras = Extras(supports=supports_in(request.place))
@@ -219,7 +219,7 @@ def made(store: Store, span: int, **request) -> tuple[JobRecord, list[tuple]]:
     job = job_of(store, span, fidelity="draft", seed=3, **request)
     end = end_of(store, job)
     assert end.kind is EventKind.FINISHED, end
-    tasks = [(task.stage, task.output) for task in plan(job)]
+    tasks = [(task.stage, task.output) for task in plan_tasks(job)]
     return job, [(stage, load_shard(store, stage, out), load_manifest(store, stage, out)) for stage, out in tasks]
 
 
@@ -262,7 +262,7 @@ def test_a_base_shard_of_other_batches_is_refused() -> None:
     base = Shard("base", {"batch_rows": f"[{SIZE}, {SIZE}]"}, {"grasp/hand_pose": np.zeros((2 * SIZE, 7))})
     message = message_for(Stage.SCENE, scenes=1).model_copy(update={"count": 2 * SIZE})
     assert base_rows(base, message) == [range(SIZE), range(SIZE, 2 * SIZE)]
-    assert [(one.batch, one.count) for one in batches_of(message)] == [(0, SIZE), (1, SIZE)]
+    assert [(one.batch, one.count) for one in split_into_batches(message)] == [(0, SIZE), (1, SIZE)]
     with pytest.raises(DamagedShard, match="2 batches"):
         base_rows(base, message.model_copy(update={"count": 3 * SIZE}))
 
@@ -272,7 +272,7 @@ def test_range_tells_how_far_it_is_and_stops_where_it_is_told_to(monkeypatch: py
     monkeypatch.setattr("graspd.worker.stages.context.REPORT_EVERY_S", 0.0)
     store = open_store("memory://")
     job, _ = made(store, 2, grasps=2 * SIZE, want="candidates")
-    message = message_of(job, next(plan(job)), attempt=1, max_attempt=1)
+    message = message_of(job, next(plan_tasks(job)), attempt=1, max_attempt=1)
     told: list[float] = []
 
     def tell(done: float, total: float, _: str) -> None:
@@ -339,7 +339,7 @@ def test_the_grasps_of_a_job_are_those_of_synth_with_the_file(store: Store, netw
     job = job_of(store, **LEARNED, options={"network": network.digest, "starts": 2})
     end = end_of(store, job)
     assert end.kind is EventKind.FINISHED, end
-    made = load_shard(store, Stage.SYNTHESIZE, list(plan(job))[-1].output)
+    made = load_shard(store, Stage.SYNTHESIZE, list(plan_tasks(job))[-1].output)
     (tmp_path / "net.npz").write_bytes(files[NETWORK_FILE])
     own = local_options("learned", {"network": str(tmp_path / "net.npz"), "starts": 2})
     assert own["network"] == digest_bytes(files[NETWORK_FILE]) != network.digest
@@ -354,7 +354,7 @@ def test_the_grasps_of_a_job_are_those_of_synth_with_the_file(store: Store, netw
 
 
 def test_files_that_are_not_what_their_digest_says_fail_the_job(store: Store, network: Asset, files) -> None:
-    key = names.asset_files(AssetKind.NETWORK, network.digest)
+    key = names.asset_files_key(AssetKind.NETWORK, network.digest)
     store.delete(key)
     store.put(key, pack(files | {NETWORK_FILE: files[NETWORK_FILE][:-1]}))
     for digest, told in ((network.digest, f"network {network.digest} in the store is damaged"), ("e" * 32, "e" * 32)):
@@ -364,7 +364,7 @@ def test_files_that_are_not_what_their_digest_says_fail_the_job(store: Store, ne
 
 def test_a_worker_reads_a_network_once(store: Store, network: Asset, monkeypatch: pytest.MonkeyPatch) -> None:
     job = job_of(store, **LEARNED, options={"network": network.digest})
-    message = message_of(job, next(plan(job)), attempt=1, max_attempt=3)
+    message = message_of(job, next(plan_tasks(job)), attempt=1, max_attempt=3)
     assets.cache_network(store, message)
     monkeypatch.setattr(assets, "load_asset_files", None)
     assets.cache_network(store, message)
@@ -376,7 +376,7 @@ def test_a_network_whose_finding_was_lost_is_checked_by_a_worker(store: Store, n
     ingest.run(message, TaskContext(store))
     found = load_check(store, AssetKind.NETWORK, network.digest)
     assert found == json.loads(json.dumps(check_network(files, "net")))
-    assert not store.exists(names.asset_model(AssetKind.NETWORK, network.digest))
+    assert not store.exists(names.asset_model_key(AssetKind.NETWORK, network.digest))
 
 
 @pytest.mark.parametrize(

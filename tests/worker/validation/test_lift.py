@@ -14,7 +14,7 @@ from graspd.service.model.errors import InputError
 from graspd.service.model.matter import ACCELERATION
 from graspd.service.model.transforms import quat_from_axis_angle, quat_multiply, quat_rotate
 from graspd.worker.execution_context import ExecutionContext
-from graspd.worker.grasps import GraspSet, Posture, joined
+from graspd.worker.grasps import GraspSet, Posture, join_grasp_sets
 from graspd.worker.scenes import rollout as rollouts
 from graspd.worker.scenes.rollout import BEST, FALLS, TOUCHES, hold_rollout, lift_rollout, scene_verdicts
 from graspd.worker.simulation.environment import Neighbour, Obstacle, PlacedGrasps
@@ -26,7 +26,7 @@ from graspd.worker.validation.lifting import KnownLifts, LiftLevel, lift_key, va
 from graspd.worker.validation.model import FRICTION, HARD, MujocoOptions, build
 from graspd.worker.validation.prescreening import PHYSICS, SLIPS, ShortTests
 from graspd.worker.validation.protocol import MAX_DISPLACEMENT_M, STAGE_S, Test
-from graspd.worker.validation.robust import robust
+from graspd.worker.validation.robust import validate_robustness
 from graspd.worker.validation.validator import KnownRollouts, validate
 from graspd.worker.validation.variant import (
     NOMINAL,
@@ -180,7 +180,7 @@ def test_a_neighbour_that_leans_or_slides_has_moved() -> None:
 
 
 def scores(*squeezes: float, threads: int = 1) -> np.ndarray:
-    grasps = joined([grasp(squeeze) for squeeze in squeezes])
+    grasps = join_grasp_sets([grasp(squeeze) for squeeze in squeezes])
     return ShortTests(HAND, BOX, lambda: WHOLE, threads=threads).scores(grasps, placed(len(squeezes)))
 
 
@@ -194,7 +194,7 @@ def test_the_box_falls_by_what_friction_does_not_carry() -> None:
 
 
 def test_half_friction_needs_twice_the_squeeze_unless_beaten() -> None:
-    grasps = joined([grasp(share * LEAST_AT_HALF) for share in (0.9, 1.1, 0.9)])
+    grasps = join_grasp_sets([grasp(share * LEAST_AT_HALF) for share in (0.9, 1.1, 0.9)])
     found = ShortTests(HAND, BOX, lambda: WHOLE).scores(grasps, placed(3), np.array([1.5, 1.5, np.inf]))
     assert found[0] == 1.5 and found[1] < 0.05 and SLIPS <= found[2] < SLIPS + 0.05
 
@@ -214,7 +214,7 @@ def test_threads_and_the_other_grasps_change_no_score() -> None:
 
 
 def pushed(*squeezes: float) -> np.ndarray:
-    return ShortTests(HAND, BOX, lambda: WHOLE).scores(joined([grasp(squeeze) for squeeze in squeezes]), None)
+    return ShortTests(HAND, BOX, lambda: WHOLE).scores(join_grasp_sets([grasp(squeeze) for squeeze in squeezes]), None)
 
 
 def test_free_box_is_pushed_away_the_less_the_firmer_it_is_held() -> None:
@@ -229,7 +229,7 @@ def test_free_box_is_pushed_away_the_less_the_firmer_it_is_held() -> None:
 
 def test_pushes_that_cannot_beat_a_score_end_early() -> None:
     rollout, squeeze = ShortTests(HAND, BOX, lambda: WHOLE).scores, ACROSS * LEAST_PUSHED
-    hands = joined([grasp(0.8 * squeeze), grasp(2.4 * squeeze)])
+    hands = join_grasp_sets([grasp(0.8 * squeeze), grasp(2.4 * squeeze)])
     slips, holds = rollout(hands, None)
     assert holds < 1.0 < SLIPS + 1.0 < slips
     # Only half friction would beat a grasp that holds at full friction.
@@ -247,7 +247,7 @@ def test_a_free_box_that_nothing_holds_flies_as_far_as_pushed() -> None:
 
 #: From a pull that slips even at the nominal friction to one that holds at half of it, and one that comes from below.
 SQUEEZES = (0.0005, 0.009, 0.012, 0.015, 0.02, 0.05)
-MANY = joined([*(grasp(one) for one in SQUEEZES), grasp(0.05, np.array([0, 0, 1.0]))])
+MANY = join_grasp_sets([*(grasp(one) for one in SQUEEZES), grasp(0.05, np.array([0, 0, 1.0]))])
 WHERE = placed(len(MANY))
 
 
@@ -280,7 +280,7 @@ def test_a_heavier_object_weighs_more_and_takes_more_to_lift() -> None:
     test = VariantLift(models().scene(Variant(mass=2.0)), PLACED, Variant(mass=2.0), None)
     test._begin(MANY, 0)
     weight = test.data.xfrc_applied[test.scene.object_body, :3]
-    assert weight == pytest.approx(2.0 * test.scene.push * np.array([0, 0, 1.0]))
+    assert weight == pytest.approx(2.0 * test.scene.push_force * np.array([0, 0, 1.0]))
     lifted = [models().lift(MANY, 2, WHERE, Variant(mass=mass)).success for mass in (1.0, 2.0)]
     assert lifted == [True, False]
 
@@ -314,11 +314,11 @@ def test_a_lift_needs_a_scene_and_a_way_of_each_grasp() -> None:
     without, few = replace(MANY, approach=None), WHERE.take(slice(0, 2))
     for grasps, where, level in ((MANY, few, "lift"), (without, WHERE, "lift"), (MANY, WHERE, "no")):
         with pytest.raises(InputError):
-            robust(HAND, BOX, grasps, placed=where, level=level, pieces=WHOLE)  # type: ignore[arg-type]
+            validate_robustness(HAND, BOX, grasps, placed=where, level=level, pieces=WHOLE)  # type: ignore[arg-type]
 
 
 SQUEEZES = (-0.005, 1.3 * LEAST, 4 * LEAST)
-THREE = joined([grasp(squeeze) for squeeze in SQUEEZES])
+THREE = join_grasp_sets([grasp(squeeze) for squeeze in SQUEEZES])
 THREE_PLACES = placed(3)
 
 
@@ -354,7 +354,7 @@ def test_a_lift_of_anything_else_is_not_known(lifts: list[int], other: str) -> N
     validate_lifts(HAND, BOX, THREE, THREE_PLACES, pieces=WHOLE, known=known)
     grasps, where = THREE, THREE_PLACES
     if other == "squeeze":
-        grasps = joined([grasp(squeeze + 1e-6) for squeeze in SQUEEZES])
+        grasps = join_grasp_sets([grasp(squeeze + 1e-6) for squeeze in SQUEEZES])
     if other == "scene":
         where = replace(THREE_PLACES, object_pose=PLACED.object_pose + np.array([1e-6, 0, 0, 0, 0, 0, 0]))
     validate_lifts(HAND, BOX, grasps, where, pieces=WHOLE, hard=other == "friction", known=known)

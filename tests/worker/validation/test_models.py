@@ -30,7 +30,7 @@ from graspd.worker.validation.model import MujocoOptions, Scene, build
 from graspd.worker.validation.prefilter.prefilter import prefilter_key_terms
 from graspd.worker.validation.protocol import STAGES, Outcome, Rollout, Test
 from graspd.worker.validation.refit import fits_of, offset_piece, refit_hand
-from graspd.worker.validation.robust import Robustness, models_of, needed, robust
+from graspd.worker.validation.robust import Robustness, models_of, needed_models, validate_robustness
 from graspd.worker.validation.validator import validate
 from graspd.worker.validation.variant import (
     NOMINAL,
@@ -39,7 +39,7 @@ from graspd.worker.validation.variant import (
     VariantTest,
     axes_of,
     displaced_grasp,
-    draw,
+    draw_variant,
     replace_coupling,
 )
 from tests.studies.test_evaluation import HAND as PADS_HAND
@@ -65,9 +65,9 @@ def by_luck(monkeypatch: pytest.MonkeyPatch, odds: float = 0.7) -> None:
 
 
 def test_in_models_that_are_all_same_grasp_holds_in_all_or_none(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(robustness, "draw", lambda axis, hand, rng: NOMINAL)
+    monkeypatch.setattr(robustness, "draw_variant", lambda axis, hand, rng: NOMINAL)
     grasps = many_grasps()
-    found = robust(PADS, BOX, grasps, models=3, pieces=WHOLE)
+    found = validate_robustness(PADS, BOX, grasps, models=3, pieces=WHOLE)
     verdicts = validate(PADS, BOX, grasps, pieces=WHOLE)
     assert found.share.tolist() == verdicts.success.tolist() and {0.0, 1.0} == set(found.share)
     assert ((found.weakest == Axis.NONE) == (verdicts.success == 1)).all()
@@ -76,7 +76,7 @@ def test_in_models_that_are_all_same_grasp_holds_in_all_or_none(monkeypatch: pyt
 def test_only_what_holds_in_the_nominal_model_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:
     by_luck(monkeypatch)
     held = np.array([1, 0, 1, -1, 0, 1, 1, 1])
-    found = robust(PADS, BOX, many_grasps(), held=held, models=4, pieces=WHOLE)
+    found = validate_robustness(PADS, BOX, many_grasps(), held=held, models=4, pieces=WHOLE)
     assert (np.isfinite(found.share) == (held == 1)).all() and (found.weakest[held != 1] == Axis.NONE).all()
 
 
@@ -85,8 +85,8 @@ def test_only_what_holds_in_the_nominal_model_is_tried(monkeypatch: pytest.Monke
 def test_judging_that_ends_early_says_of_the_share_what_all_say(monkeypatch, models: int, wanted: float) -> None:
     by_luck(monkeypatch)
     grasps = many_grasps(24)
-    whole = robust(PADS, BOX, grasps, models=models, pieces=WHOLE)
-    early = robust(PADS, BOX, grasps, models=models, wanted=wanted, pieces=WHOLE)
+    whole = validate_robustness(PADS, BOX, grasps, models=models, pieces=WHOLE)
+    early = validate_robustness(PADS, BOX, grasps, models=models, wanted=wanted, pieces=WHOLE)
     assert ((early.share >= wanted - 1e-9) == (whole.share >= wanted - 1e-9)).all()
     reached = whole.share >= wanted - 1e-9
     # What is told of a share is a bound on its right side.
@@ -99,10 +99,10 @@ def test_judging_that_ends_early_says_of_the_share_what_all_say(monkeypatch, mod
 
 def test_no_model_is_validated_after_the_share_is_sure(monkeypatch: pytest.MonkeyPatch) -> None:
     by_luck(monkeypatch, odds=0.0)
-    found = robust(PADS, BOX, many_grasps(), models=8, wanted=0.9, pieces=WHOLE)
+    found = validate_robustness(PADS, BOX, many_grasps(), models=8, wanted=0.9, pieces=WHOLE)
     assert ((found.held >= 0).sum(axis=1) == 1).all()
     by_luck(monkeypatch, odds=1.0)
-    found = robust(PADS, BOX, many_grasps(), models=8, wanted=0.5, pieces=WHOLE)
+    found = validate_robustness(PADS, BOX, many_grasps(), models=8, wanted=0.5, pieces=WHOLE)
     assert ((found.held >= 0).sum(axis=1) == 4).all() and (found.share == 0.5).all()
 
 
@@ -120,7 +120,7 @@ def test_the_weakest_axis_is_that_of_the_first_model_that_fails() -> None:
     ("wanted", "models", "least"), [(0.9, 8, 8), (0.75, 8, 6), (0.9, 10, 9), (1.0, 3, 3), (0.1, 4, 1)]
 )
 def test_so_many_models_make_a_share(wanted: float, models: int, least: int) -> None:
-    assert needed(wanted, models) == least
+    assert needed_models(wanted, models) == least
 
 
 def test_a_grasp_meets_the_same_models_each_axis_once() -> None:
@@ -136,7 +136,7 @@ def test_a_grasp_meets_the_same_models_each_axis_once() -> None:
 
 def test_it_stops_when_it_is_told_to() -> None:
     with pytest.raises(TaskCancelled):
-        robust(PADS, BOX, many_grasps(), pieces=WHOLE, run=ExecutionContext(cancelled=lambda: True))
+        validate_robustness(PADS, BOX, many_grasps(), pieces=WHOLE, run=ExecutionContext(cancelled=lambda: True))
 
 
 def models(hand: HandModel = PADS, friction: tuple[float, float] = (0.6, 0.02)) -> Models:
@@ -246,7 +246,7 @@ def test_variants_reach_engine_and_leave_nominal_model_as_it_was() -> None:
     assert other.body_invweight0[thing, 0] == pytest.approx(own.body_invweight0[thing, 0] / 1.5)
     before = copy.copy(around.scene(NOMINAL).model)
     for axis in axes_of(PADS):
-        around.scene(draw(axis, PADS, np.random.default_rng(1)))
+        around.scene(draw_variant(axis, PADS, np.random.default_rng(1)))
     after = around.scene(NOMINAL).model
     for name in ("dof_damping", "dof_armature", "actuator_gainprm", "geom_friction", "body_mass", "geom_size"):
         assert np.array_equal(getattr(before, name), getattr(after, name)), name
@@ -326,7 +326,7 @@ def test_a_compliant_coupling_gives_way_under_load() -> None:
 def test_a_draw_stays_in_the_range_of_its_axis(axis: Axis) -> None:
     rng = np.random.default_rng(5)
     hand = on_one_dof(two_finger_hand()) if axis is Axis.COUPLINGS else PADS
-    drawn = [draw(axis, hand, rng) for _ in range(60)]
+    drawn = [draw_variant(axis, hand, rng) for _ in range(60)]
     for one in drawn:
         assert 0.5 <= min(one.gain, one.damping, one.mass) <= max(one.gain, one.damping, one.mass) <= 2
         assert 0.4 - 1e-9 <= 0.6 * one.friction <= 0.8 + 1e-9
@@ -369,7 +369,7 @@ def test_a_ratio_keeps_what_both_can_do() -> None:
     hand = replace_coupling(tied(), "ratio")
     assert (hand.dofs, hand.tendons) == (1, ()) and (hand.lower[0], hand.upper[0]) == (-0.2, 1.1)
     assert hand.expand(np.array([0.4])) == pytest.approx([0.4, 0.4])
-    assert variants.nearest(hand, np.array([[0.1, 0.5]]))[0] == pytest.approx([0.3, 0.3])
+    assert variants.nearest_feasible_joints(hand, np.array([[0.1, 0.5]]))[0] == pytest.approx([0.3, 0.3])
     turned = replace_coupling(tied(-1.0), "ratio")
     assert turned.expand(np.array([0.15])) == pytest.approx([0.15, -0.15])
     assert (turned.lower[0], turned.upper[0]) == (-0.3, 0.2), "the second joint turns the other way"

@@ -19,7 +19,7 @@ from graspd.service.model.fidelity import FIDELITIES
 from graspd.service.store.columns import SCHEMAS
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.generation import score_grasps
-from graspd.worker.grasps import GraspSet, joined
+from graspd.worker.grasps import GraspSet, join_grasp_sets
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.objects.prepare import object_from_path
 from graspd.worker.planners import synthesize
@@ -29,7 +29,7 @@ from graspd.worker.validation.model import MujocoOptions, build
 from graspd.worker.validation.prefilter import prefilter as screening
 from graspd.worker.validation.prefilter.prefilter import ROWS, PrefilterOutcomes, WorldPool
 from graspd.worker.validation.protocol import Outcome, ValidatedBy
-from graspd.worker.validation.validator import Verdicts, prefiltered, validate
+from graspd.worker.validation.validator import Verdicts, prefilter_grasps, validate
 from tests.worker.quality.helpers import BOX, PADS, WHOLE, grasp_of, many_grasps, posture
 
 ON = ExecutionContext(prefilter="on", threads=1)
@@ -115,7 +115,7 @@ def every_kind() -> GraspSet:
     inside = GraspSet(deep, deep, deep, np.full(1, np.nan))
     open_, shut = posture(((0, 0, 0), (0.05, 0.0))), posture(((0, 0, 0), (0.15, 0.0)))
     kicked = GraspSet(open_, open_, shut, np.full(1, np.nan))
-    return joined([many_grasps(), inside, kicked, grasp_of(contact=away), grasp_of(force=10.0)])
+    return join_grasp_sets([many_grasps(), inside, kicked, grasp_of(contact=away), grasp_of(force=10.0)])
 
 
 def pool(monkeypatch: pytest.MonkeyPatch, engine: Stand, size: int) -> WorldPool:
@@ -300,8 +300,8 @@ def test_a_shard_tells_of_each_grasp_who_validated_it(mode) -> None:
 
 
 def test_verdicts_that_were_asked_before_are_not_asked_twice(stand_in: Stand) -> None:
-    run, made = ON.quiet(), verdicts(ON, "fast")
-    known = prefiltered(PADS, BOX, every_kind(), level="fast", pieces=WHOLE, run=run)
+    run, made = ON.without_progress(), verdicts(ON, "fast")
+    known = prefilter_grasps(PADS, BOX, every_kind(), level="fast", pieces=WHOLE, run=run)
     launched = stand_in.steps
     again = validate(PADS, BOX, every_kind(), level="fast", pieces=WHOLE, prefilter=known, run=run)
     assert stand_in.steps == launched > 0

@@ -197,7 +197,9 @@ class AntipodalHands:
         return np.linalg.norm(off - np.minimum(along, 0.0)[..., None] * away, axis=-1)
 
 
-def place_across(hand: HandModel, obj: ObjectModel, opening: Openings, uniform: Floats, ways: Floats) -> AntipodalHands:
+def place_antipodal_hands(
+    hand: HandModel, obj: ObjectModel, opening: Openings, uniform: Floats, ways: Floats
+) -> AntipodalHands:
     """Place hands across pairs by random numbers (n, 6); `ways` (K, 3) are free directions of retreat."""
     known = opening.known
     if opening.upright and (upright := ways @ opening.up > UPRIGHT).any():
@@ -213,7 +215,9 @@ def place_across(hand: HandModel, obj: ObjectModel, opening: Openings, uniform: 
     tried = ways[(share * len(ways)).astype(int)]
     best = np.abs(np.einsum("nki,ni->nk", tried, axis)).argmin(axis=1)
     palm = np.tile(hand.palm.approach, (len(pair), 1))
-    turn = frames(axis, -tried[np.arange(len(tried)), best]) @ np.swapaxes(frames(known.axis[posture], palm), -1, -2)
+    turn = frames_from_axes(axis, -tried[np.arange(len(tried)), best]) @ np.swapaxes(
+        frames_from_axes(known.axis[posture], palm), -1, -2
+    )
     away = -np.einsum("nij,nj->ni", turn, palm)
     reach = known.middle[posture] - hand.palm.centre
     # The depth ranges from a fingertip grasp to a palm in contact with the object.
@@ -235,18 +239,18 @@ def select_draws(
 ) -> tuple[NDArray[np.intp], Floats]:
     """Select `keep` of C draws per hand: those with pads nearest to the pair after rising off obstacles.
     Return their indices and the distance of the pair from the pads (n, keep) [m]. Draws below `NEAR_M` keep their
-    order. For `uniform` (n, C, 6) and `ways` see `place_across`; `room` is clearance in addition to the margin [m]."""
+    order. For `uniform` (n, C, 6) and `ways` see `place_antipodal_hands`; `room` [m] adds to the margin."""
     count, draws, _ = uniform.shape
     outlines, off = posture_outlines(hand, opening.known.q), np.zeros((count, draws))
     for rows in np.array_split(np.arange(count), 1 + count // AT_ONCE):
-        found = place_across(hand, obj, opening, uniform[rows].reshape(-1, 6), ways)
+        found = place_antipodal_hands(hand, obj, opening, uniform[rows].reshape(-1, 6), ways)
         lack = outlines.missing_clearance(found.posture, found.turn, found.pivot + obj.centre_of_mass, scene, room=room)
         off[rows] = found.pad_distance(lack[:, None] * scene.up).reshape(-1, draws)
     order = np.argsort(np.maximum(off, NEAR_M), axis=1, kind="stable")[:, :keep]
     return order, np.take_along_axis(off, order, axis=1)
 
 
-def frames(first: Floats, second: Floats) -> Floats:
+def frames_from_axes(first: Floats, second: Floats) -> Floats:
     """Return rotations (n, 3, 3) with first column `first` (n, 3) and second column closest to `second`."""
     y = second - np.einsum("ni,ni->n", first, second)[:, None] * first
     helper = np.eye(3)[np.argmin(np.abs(first), axis=1)]
@@ -435,7 +439,7 @@ def _grips(hand: HandModel, obj: ObjectModel, device: str) -> tuple[Any, bool] |
     points = sample_surface(hand, BALLS)
     pose = body_poses(hand, np.tile(IDENTITY_POSE, (len(known), 1)), hand.expand(known.q))[:, points.body]
     balls = quat_rotate(pose[..., 3:], points.position - BALL_M * points.normal) + pose[..., :3] - hand.palm.centre
-    own = quat_from_matrix(frames(known.axis, np.tile(hand.palm.approach, (len(known), 1))))
+    own = quat_from_matrix(frames_from_axes(known.axis, np.tile(hand.palm.approach, (len(known), 1))))
     with wp.ScopedDevice(device):
         out.middle, out.axis = wp.array(middle, dtype=wp.vec3), wp.array(pairs.axis[kept], dtype=wp.vec3)
         out.width = wp.array(pairs.width[kept], dtype=wp.float32)

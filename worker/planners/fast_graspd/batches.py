@@ -15,7 +15,7 @@ from graspd.service.model.transforms import Floats
 from graspd.worker.grasps import GraspSet
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners.fast_graspd.scene_starts import free_directions
-from graspd.worker.planners.fast_graspd.schedule import WarmStart, in_scene
+from graspd.worker.planners.fast_graspd.schedule import WarmStart, fidelity_in_scenes
 from graspd.worker.planners.fast_graspd.starts import start_generator
 from graspd.worker.planners.port import BatchRequest
 from graspd.worker.planners.threads import StepCounter
@@ -34,7 +34,7 @@ class Batches:
         wanted = [one.wanted for one in asked]
         self.fidelity = wanted[0].fidelity
         if wanted[0].placed is not None:
-            self.fidelity = in_scene(self.fidelity)
+            self.fidelity = fidelity_in_scenes(self.fidelity)
         elif self.has_rollout:
             # Retries replace half of the initial starts.
             self.fidelity = self.fidelity.model_copy(update={"starts": -(-self.fidelity.starts // 2)})
@@ -50,7 +50,7 @@ class Batches:
         self.errors: dict[int, Exception] = {}
         """Errors of the batches that stopped."""
         known = self.fidelity
-        hands = known.starts * known.coarse_iterations + finalists(known) * known.fine_iterations
+        hands = known.starts * known.coarse_iterations + finalist_count(known) * known.fine_iterations
         self._steps = [StepCounter(one.wanted.count * (hands + 1), one.run) for one in asked]
         placed = [one.placed for one in wanted if one.placed is not None]
         self.placed: PlacedGrasps | None = join_placed(placed) if placed else None
@@ -126,6 +126,6 @@ class Batches:
         return scores
 
 
-def finalists(fidelity: Fidelity) -> int:
+def finalist_count(fidelity: Fidelity) -> int:
     """Return the number of hands per grasp that enter the fine phase, at most the number of starts."""
     return min(fidelity.finalists, fidelity.starts)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from graspd.service.model.transforms import Floats, quat_rotate
 from graspd.worker.control.postures import hold_forces, normal_force, pregrasp, squeeze
-from graspd.worker.grasps import GraspSet, Posture, joined
+from graspd.worker.grasps import GraspSet, Posture, join_grasp_sets
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.data import HandState
@@ -41,7 +41,7 @@ BEST_OFF: Final = 0.999
 HOPELESS: Final = 1e9
 
 
-def with_postures(
+def grasps_of_state(
     hand: HandModel,
     obj: ObjectModel,
     state: HandState,
@@ -86,13 +86,13 @@ class Selection:
     grasps: dict[int, GraspSet]
 
     @classmethod
-    def none(cls, beat: Floats, dofs: int) -> Selection:
+    def empty(cls, beat: Floats, dofs: int) -> Selection:
         """Return a selection without candidates; its scores are `beat` (n,)."""
         count = len(beat)
         empty = HandState(np.zeros((count, 3)), np.zeros((count, 4)), np.zeros((count, dofs)))
         return cls(empty, np.zeros(count), beat.copy(), {})
 
-    def has(self, which: NDArray[np.intp]) -> NDArray[np.bool_]:
+    def has_candidates(self, which: NDArray[np.intp]) -> NDArray[np.bool_]:
         return np.array([int(grasp) in self.grasps for grasp in which], bool)
 
     def take(
@@ -100,7 +100,7 @@ class Selection:
     ) -> None:
         """Store candidates `rows` (k,) of the grasps `which` (k,) that are better or a grasp's first."""
         state, losses = refined.state[rows], refined.losses[rows]
-        for k in np.flatnonzero((score < self.score[which]) | ~self.has(which)):
+        for k in np.flatnonzero((score < self.score[which]) | ~self.has_candidates(which)):
             grasp = int(which[k])
             self.grasps[grasp] = found.take(slice(k, k + 1))
             self.score[grasp], self.losses[grasp] = min(score[k], self.score[grasp]), losses[k]
@@ -108,7 +108,7 @@ class Selection:
                 getattr(self.state, name)[grasp] = getattr(state, name)[k]
 
     def joined(self) -> GraspSet:
-        return joined([self.grasps[k] for k in range(len(self.score))])
+        return join_grasp_sets([self.grasps[k] for k in range(len(self.score))])
 
 
 def select_by_rollout(
@@ -129,19 +129,19 @@ def select_by_rollout(
     such hands gets its first hand. Scores `beat` (n,) of earlier attempts change only if a candidate is better."""
     good = GOOD if placed is None else GOOD_IN_SCENES
     beat = np.full(len(order), np.inf) if beat is None else beat
-    taken, left = Selection.none(beat, hand.dofs), np.arange(len(order))
+    taken, left = Selection.empty(beat, hand.dofs), np.arange(len(order))
     for wave in np.split(order, range(together, order.shape[1], together), axis=1):
         if not len(left):
             break
         refined = refine(wave[left], left)
         for rows in rank_hands(refined.merit + STANDING_OFF * refined.off, len(left)).T:
             worth = (refined.merit[rows] < HOPEFUL) | (taken.score[left] > POOR)
-            open_ = ~(taken.score[left] < good) & (worth & ~refined.infeasible[rows] | ~taken.has(left))
+            open_ = ~(taken.score[left] < good) & (worth & ~refined.infeasible[rows] | ~taken.has_candidates(left))
             if not open_.any():
                 continue
             which = left[open_]
             where = placed.take(which) if placed is not None else None
-            found = with_postures(
+            found = grasps_of_state(
                 hand, obj, refined.state[rows[open_]], refined.losses[rows[open_]], where, device=device
             )
             hopeless = refined.infeasible[rows[open_]] | ~worth[open_]

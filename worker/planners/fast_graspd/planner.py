@@ -19,11 +19,11 @@ from graspd.service.model.fidelity import Fidelity
 from graspd.service.model.transforms import Floats
 from graspd.worker.control.postures import close_fingers, fingers_off_object, touching_links
 from graspd.worker.execution_context import ExecutionContext
-from graspd.worker.grasps import GraspSet, joined
+from graspd.worker.grasps import GraspSet, join_grasp_sets
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners.fast_graspd import scene_starts, starts
-from graspd.worker.planners.fast_graspd.batches import Batches, finalists
+from graspd.worker.planners.fast_graspd.batches import Batches, finalist_count
 from graspd.worker.planners.fast_graspd.candidates import (
     FRICTION,
     GOOD,
@@ -33,11 +33,11 @@ from graspd.worker.planners.fast_graspd.candidates import (
     SCENE_FRICTION,
     TOGETHER,
     Refinements,
+    grasps_of_state,
     merits,
     posture_of,
     rank_hands,
     select_by_rollout,
-    with_postures,
 )
 from graspd.worker.planners.fast_graspd.pairs import Pair, pair_of
 from graspd.worker.planners.fast_graspd.schedule import AROUND, DILATION, WarmStart, coarse_schedule, fine_schedule
@@ -110,20 +110,20 @@ class LaunchPart:
             for name in ("rows", "loss", "merit", "attempts")
         )
         state = HandState.joined([self.state, other.state])
-        return LaunchPart(rows, state, loss, merit, curve, joined(both) if both else None, attempts)
+        return LaunchPart(rows, state, loss, merit, curve, join_grasp_sets(both) if both else None, attempts)
 
 
 def plan(
     hand: HandModel, obj: ObjectModel, wanted: PlanRequest, run: ExecutionContext, *, warm: WarmStart | None = None
 ) -> GraspSet:
     """Plan one batch, see `worker.planners.Planner`; for `warm` see `Batches`."""
-    (found,) = plan_joined(hand, obj, [BatchRequest(wanted, run)], warm=warm)
+    (found,) = plan_batches(hand, obj, [BatchRequest(wanted, run)], warm=warm)
     if isinstance(found, Exception):
         raise found
     return found
 
 
-def plan_joined(
+def plan_batches(
     hand: HandModel, obj: ObjectModel, asked: Sequence[BatchRequest], *, warm: WarmStart | None = None
 ) -> list[GraspSet | Exception]:
     """Plan batches, see `worker.planners.BatchPlanner`; for `warm` see `Batches`."""
@@ -310,8 +310,8 @@ def _optimise_part(launch: _Launch, begun: _Starts, beat: Floats | None = None) 
     """Optimise hands and select one per grasp; with rollouts, `beat` (n,) are the scores to beat."""
     batches, pair, rows = launch.batches, launch.pair, begun.rows
     fidelity, placed, n = batches.fidelity, launch.placed(rows), len(rows)
-    hand, obj, last = pair.hand.model, pair.fine.obj.model, finalists(fidelity)
-    data = _in_scenes(Data(launch.coarse, n * fidelity.starts), placed, fidelity.starts)
+    hand, obj, last = pair.hand.model, pair.fine.obj.model, finalist_count(fidelity)
+    data = _set_scenes(Data(launch.coarse, n * fidelity.starts), placed, fidelity.starts)
     data.set_schedule(coarse_schedule(fidelity))
     data.set_state(begun.state, dilation=begun.touch)
     # During the coarse phase the dilation shrinks and changes the loss, so nothing converges before its end.
@@ -394,7 +394,7 @@ def _run_attempts(launch: _Launch, rows: Rows, attempt: Rows, merit: Floats, run
 def _add_postures(launch: _Launch, part: LaunchPart) -> LaunchPart:
     hand, obj, device = launch.pair_on_device()
     placed = launch.placed(part.rows)
-    return replace(part, grasps=with_postures(hand, obj, part.state, part.loss, placed, device=device))
+    return replace(part, grasps=grasps_of_state(hand, obj, part.state, part.loss, placed, device=device))
 
 
 @dataclass
@@ -412,7 +412,7 @@ class _FinePhase:
         launch, flat = self.launch, rows.ravel()
         fidelity, mine = launch.batches.fidelity, self.rows[which]
         state, losses = self.state[flat], self.losses[flat]
-        data = _in_scenes(Data(launch.fine, len(flat)), launch.placed(mine), rows.shape[1])
+        data = _set_scenes(Data(launch.fine, len(flat)), launch.placed(mine), rows.shape[1])
         data.set_schedule(fine_schedule(fidelity))
         data.set_state(state)
         launches = record_iteration(launch.fine, data, fidelity.optimizer, patience=fidelity.patience)
@@ -428,7 +428,7 @@ class _FinePhase:
         return Refinements(state, losses, merit, launch.infeasible(state, depths), launch.stand_off(state))
 
 
-def _in_scenes(data: Data, placed: PlacedGrasps | None, each: int) -> Data:
+def _set_scenes(data: Data, placed: PlacedGrasps | None, each: int) -> Data:
     if placed is not None:
         data.set_scenes(np.repeat(placed.index, each))
     return data
@@ -469,11 +469,11 @@ def grasps_of(
     curve = [np.concatenate(chunk).mean() for chunk in zip(*(part.curve for part in parts), strict=True)]
     known = [part.grasps for part in parts if part.grasps is not None]
     if len(known) == len(parts):
-        grasps = joined(known)
+        grasps = join_grasp_sets(known)
     else:
         loss = np.concatenate([part.loss for part in parts])
         state = HandState.joined([part.state for part in parts])
-        grasps = with_postures(hand, obj, state, loss, placed, device=device)
+        grasps = grasps_of_state(hand, obj, state, loss, placed, device=device)
     attempts = int(sum(part.attempts.sum() for part in parts))
     info = {"loss_curve": np.round(curve, 5).tolist(), "chunk": CHUNK}
     return replace(grasps, seconds=seconds, info=info, attempts=attempts)
@@ -483,7 +483,7 @@ METHOD: Final = Method(
     summary="gradient descent through a differentiable contact simulation",
     source="D. Turpin et al., Fast-Grasp'D, ICRA 2023",
     planner=lambda options: plan,
-    joined=lambda options: plan_joined,
+    joined=lambda options: plan_batches,
     in_scenes=True,
     in_parts=True,
     uses=tuple(name for name in Fidelity.model_fields if name != "name"),

@@ -25,13 +25,13 @@ from graspd.service.model.transforms import (
     spread_directions,
 )
 from graspd.worker.hands.model import HandModel
-from graspd.worker.objects.mesh_geometry import points_in
+from graspd.worker.objects.mesh_geometry import points_on_triangles
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners.fast_graspd.antipodal_starts import (
     NEAR_M,
     AntipodalHands,
     Openings,
-    place_across,
+    place_antipodal_hands,
     select_draws,
 )
 from graspd.worker.planners.fast_graspd.candidates import posture_of
@@ -40,8 +40,8 @@ from graspd.worker.planners.fast_graspd.starts import (
     POSTURE_NOISE,
     TILT,
     Probe,
-    at_distances,
     frames_about,
+    hands_at_distances,
     store_states,
 )
 from graspd.worker.planners.fitting import surface_of
@@ -122,7 +122,7 @@ def clear_scene_starts(
     normal = np.zeros((count, 0, 2 + hand.dofs))
     best = HandState(np.zeros((count, 3)), np.tile([1.0, 0, 0, 0], (count, 1)), np.zeros((count, hand.dofs)))
     depth, beside = np.full(count, np.inf), np.where(reaching, np.inf, 0.0)
-    order, least_beside = around.order(uniform, scene, reaching, placed)
+    order, least_beside = around.select_draws(uniform, scene, reaching, placed)
     for number in range(DRAWS):
         wanted = depth > CLEAR
         if number < REACHES:
@@ -135,7 +135,7 @@ def clear_scene_starts(
             normal = np.concatenate([normal, _normal(generators, rows, hand.dofs)], axis=1)
         reach = reaching[rows] & (number < REACHES)
         numbers = np.where(reach, order[rows, min(number, REACHES - 1)], number)
-        states, across_pairs = around.draws(uniform[rows, numbers], normal[rows, number], scene[rows], reach)
+        states, across_pairs = around.hands_of_draws(uniform[rows, numbers], normal[rows, number], scene[rows], reach)
         off = _raise_draws(states, across_pairs, np.flatnonzero(reach), placed, scene[rows], probe)
         worth = off < beside[rows, None]
         worth[~reach | (depth[rows] > CLEAR)] = True
@@ -225,7 +225,7 @@ class _SceneDraws:
     ways: Sequence[Floats]
     openings: Mapping[int, Openings]
 
-    def order(
+    def select_draws(
         self, uniform: Floats, scene: NDArray[np.intp], reaching: NDArray[np.bool_], placed: PlacedGrasps
     ) -> tuple[NDArray[np.intp], Floats]:
         """Return draws and distances (n, REACHES) of `select_draws`; 0 and inf unless `reaching`."""
@@ -238,7 +238,7 @@ class _SceneDraws:
             )
         return order, least
 
-    def draws(
+    def hands_of_draws(
         self, uniform: Floats, normal: Floats, scene: NDArray[np.intp], reach: NDArray[np.bool_]
     ) -> tuple[HandState, _AcrossPairs]:
         """Return hands (n * len(RETREATS)) drawn in scenes (n,) at all retreats, and the antipodal hands.
@@ -249,7 +249,7 @@ class _SceneDraws:
         for s in np.unique(scene):
             rows = np.flatnonzero((scene == s) & reach)
             if len(rows):
-                one = place_across(self.hand, self.obj, self.openings[s], uniform[rows, :6], self.ways[s])
+                one = place_antipodal_hands(self.hand, self.obj, self.openings[s], uniform[rows, :6], self.ways[s])
                 pivot[rows], rotation[rows], away[rows] = one.pivot, quat_from_matrix(one.turn), one.away
                 q[rows] = one.q(self.hand, normal[rows, 2:])
                 reaching.append((rows, one))
@@ -259,14 +259,14 @@ class _SceneDraws:
                     uniform[rows], normal[rows], self.ways[s]
                 )
         pivot = pivot[:, None] + np.array(RETREATS)[None, :, None] * away[:, None]
-        return at_distances(pivot, rotation, q), reaching
+        return hands_at_distances(pivot, rotation, q), reaching
 
     def _towards(self, uniform: Floats, normal: Floats, ways: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         """Place palms towards random surface points; return pivots, rotations, dofs, directions of retreat."""
         hand, obj = self.hand, self.obj
         corners, normals, sums = surface_of(obj)
         face = np.minimum(np.searchsorted(sums, uniform[:, 0]), len(sums) - 1)
-        point = points_in(corners[face], uniform[:, 1:2], uniform[:, 2:3])
+        point = points_on_triangles(corners[face], uniform[:, 1:2], uniform[:, 2:3])
         away = _tilted(normals[face], TILT * normal[:, :2])
         away = np.array([_turned(a, ways, t) for a, t in zip(away, uniform[:, 5:7], strict=True)])
         align = frames_about(-away) @ frames_about(hand.palm.approach).T
@@ -317,7 +317,7 @@ def obstruction(model: Model, state: HandState, placed: PlacedGrasps) -> Floats:
     hand, obj = model.hand.model, model.obj.model
     mounted = missing_mounting_clearance(hand, posture_of(hand, obj, state).hand_pose, placed.scenes, placed.index)
     deep = np.maximum(_retreat_obstruction(model, state, placed.index), mounted)
-    rows = np.flatnonzero(np.array([not _open_above(scene) for scene in placed.scenes])[placed.index])
+    rows = np.flatnonzero(np.array([not _is_open_above(scene) for scene in placed.scenes])[placed.index])
     if len(rows):
         deep[rows] = np.maximum(deep[rows], _lift_obstruction(model, state[rows], placed.take(rows)))
     return np.asarray(WEIGHT * np.clip(deep - TOLERATED_M, 0.0, DEEPEST_M), float)
@@ -344,7 +344,7 @@ def _retreat_obstruction(model: Model, state: HandState, scenes: NDArray[np.inte
     return np.asarray(depth.reshape(len(OUT), n).max(axis=0), float)
 
 
-def _open_above(scene: Environment) -> bool:
+def _is_open_above(scene: Environment) -> bool:
     return all(len(o.planes) == 1 and o.planes[0, :3] @ scene.up > 1 - 1e-6 for o in scene.obstacles)
 
 

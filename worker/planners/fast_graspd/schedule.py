@@ -49,7 +49,7 @@ def loss_options(fidelity: Fidelity) -> LossOptions:
     )
 
 
-def in_scene(fidelity: Fidelity) -> Fidelity:
+def fidelity_in_scenes(fidelity: Fidelity) -> Fidelity:
     """Return the fidelity for scenes. Obstacles leave fewer good approaches, so more hands are needed.
     Starts have the object between the fingers, so few iterations suffice."""
     return fidelity.model_copy(
@@ -95,7 +95,7 @@ class WarmStart(Protocol):
     """Proposes starts of grasps in scenes."""
 
     def adapted(self, fidelity: Fidelity) -> Fidelity:
-        """Return `fidelity`, a result of `in_scene`, with its numbers of starts and finalists adapted."""
+        """Return `fidelity`, a result of `fidelity_in_scenes`, with its numbers of starts and finalists adapted."""
 
     def __call__(
         self,

@@ -28,7 +28,7 @@ from graspd.service.model.transforms import (
 )
 from graspd.worker.hands.jaws import Jaws, jaws_of
 from graspd.worker.hands.model import HandModel
-from graspd.worker.objects.mesh_geometry import points_in
+from graspd.worker.objects.mesh_geometry import points_on_triangles
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners.fast_graspd.antipodal_starts import LOOKS, ReachSampling
 from graspd.worker.planners.fitting import Pairs, fitting_pairs
@@ -95,11 +95,11 @@ def _numbers(generators: list[np.random.Generator], dofs: int) -> tuple[Floats, 
     return uniform, normal
 
 
-def draw(pair: _Pair, generators: list[np.random.Generator]) -> tuple[HandState, Floats]:
+def draw_starts(pair: _Pair, generators: list[np.random.Generator]) -> tuple[HandState, Floats]:
     """Draw one start per generator, before any retreat; also return the palms' approaches (n, 3)."""
     hand, (uniform, noise) = pair.hand, _numbers(generators, pair.hand.dofs)
     face = pair.share.searchsorted(uniform[:, 0], side="right")
-    point = points_in(pair.corners[face], uniform[:, 1:2], uniform[:, 2:3])
+    point = points_on_triangles(pair.corners[face], uniform[:, 1:2], uniform[:, 2:3])
     normal = pair.across[face] / pair.area[face, None]
     tilt = np.einsum("nij,nj->ni", frames_about(normal)[..., :2], noise[:, :2])
     length = np.linalg.norm(tilt, axis=1, keepdims=True)
@@ -116,10 +116,10 @@ def draw(pair: _Pair, generators: list[np.random.Generator]) -> tuple[HandState,
 
 def _retreats(state: HandState, approach: Floats) -> HandState:
     back = np.array(RETREATS)[None, :, None]
-    return at_distances(state.pivot[:, None] - back * approach[:, None], state.rotation, state.q)
+    return hands_at_distances(state.pivot[:, None] - back * approach[:, None], state.rotation, state.q)
 
 
-def at_distances(pivot: Floats, rotation: Floats, q: Floats) -> HandState:
+def hands_at_distances(pivot: Floats, rotation: Floats, q: Floats) -> HandState:
     """Return hands (n * K) at pivots (n, K, 3), with rotations (n, 4) and dofs (n, D)."""
     each = pivot.shape[1]
     return HandState(pivot.reshape(-1, 3), np.repeat(rotation, each, axis=0), np.repeat(q, each, axis=0))
@@ -190,7 +190,7 @@ def clear_starts(model: Model, generators: list[np.random.Generator], *, each: i
 
     def drawn(rows: NDArray[np.intp]) -> HandState:
         if jaws is None:
-            return _retreats(*draw(pair, [generators[i] for i in rows]))
+            return _retreats(*draw_starts(pair, [generators[i] for i in rows]))
         return jaws.draw(np.array([generators[i].random(UNIFORM) for i in rows]))
 
     _draw_until_clear(drawn, probe, DRAWS, np.flatnonzero(deepest > CLEAR), best, deepest)
@@ -215,7 +215,7 @@ def open_further(
         pair = _Pair(wider, obj, OPENED_GAP)
 
         def drawn(rows: NDArray[np.intp], pair: _Pair = pair) -> HandState:
-            return _retreats(*draw(pair, [generators[i] for i in rows]))
+            return _retreats(*draw_starts(pair, [generators[i] for i in rows]))
 
         _draw_until_clear(drawn, probe, OPENED_DRAWS, rows[depth[rows] > CLEAR], state, depth)
     return lost
@@ -321,7 +321,7 @@ class JawStarts:
         swap = (uniform[:, 1] < 0.5)[:, None]
         start, end = np.where(swap, end, start), np.where(swap, start, end)
         room = ROOM_M[0] + (ROOM_M[1] - ROOM_M[0]) * uniform[:, 3]
-        q, middle, axis = self.jaws.at(np.minimum(self.pairs.width[pick] + 2 * room, self.jaws.opening))
+        q, middle, axis = self.jaws.nearest_postures(np.minimum(self.pairs.width[pick] + 2 * room, self.jaws.opening))
         line = (end - start) / self.pairs.width[pick][:, None]
         ahead = _across(line, uniform[:, 2])
         own = _frames(axis, np.tile(self.hand.palm.approach, (len(q), 1)))
@@ -330,7 +330,7 @@ class JawStarts:
         place = (AHEAD[0] + (AHEAD[1] - AHEAD[0]) * uniform[:, 4])[:, None] + np.array(JAW_RETREATS)[None]
         at = ((start + end) / 2)[:, None] - length * place[..., None] * ahead[:, None]
         pivot = at - self.obj.centre_of_mass + quat_rotate(rotation, self.hand.palm.centre - middle)[:, None]
-        return at_distances(pivot, rotation, q)
+        return hands_at_distances(pivot, rotation, q)
 
 
 def _across(line: Floats, turn: Floats) -> Floats:

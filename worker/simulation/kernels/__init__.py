@@ -15,7 +15,7 @@ import warp as wp
 
 from graspd.worker.engines import backend
 
-backend.start()
+backend.start_warp()
 
 MODULES: Final = (
     "kinematics",

@@ -109,7 +109,7 @@ class WorldPool:
             self._model.opt.warn_overflow = 0
             self._of_hand = wp.array(scene.hand_geoms.astype(np.int32), dtype=wp.int32)
             terms = self._terms = kernels.TestConstants()
-            terms.object_qpos, terms.object_body, terms.push = scene.object_qpos, scene.object_body, scene.push
+            terms.object_qpos, terms.object_body, terms.push = scene.object_qpos, scene.object_body, scene.push_force
             terms.centre = wp.vec3(*(float(x) for x in scene.centre))
             self._allocate()
 
@@ -122,7 +122,7 @@ class WorldPool:
                 self._doublings += 1
                 log.info("%d of %d grasps need more memory for contacts; it is doubled", len(lost), len(grasps))
                 self._allocate()
-                found = found.put(lost, self._validate(grasps.take(lost), run.quiet()))
+                found = found.put(lost, self._validate(grasps.take(lost), run.without_progress()))
                 lost = np.flatnonzero(found.overflow)
         return found
 
@@ -263,7 +263,7 @@ class PrefilterVerdicts:
     rechecked: dict[int, bool]
     """Clear verdicts that the CPU rechecks, by row; True if the prefilter held the grasp."""
 
-    def contradicted(self, rollouts: dict[int, Rollout]) -> int:
+    def count_contradicted(self, rollouts: dict[int, Rollout]) -> int:
         return sum(rollouts[row].success != held for row, held in self.rechecked.items())
 
     def is_trusted(self, contradicted: int) -> bool:
@@ -367,7 +367,7 @@ def mujoco_warp_version() -> str:
 def mujoco_warp() -> Any:
     """Initialise Warp and return the module `mujoco_warp`; raise InputError if mujoco-warp is missing."""
     mujoco_warp_version()
-    backend.start()
+    backend.start_warp()
     import mujoco_warp as engine
 
     return engine

@@ -3,7 +3,7 @@
 from typing import Any
 
 from graspd.service.index.views import CellView
-from graspd.service.model.planning import plan
+from graspd.service.model.planning import plan_tasks
 from graspd.service.model.states import AssetKind, Stage
 from graspd.service.pipeline.backends import Services
 from graspd.service.pipeline.datasets import actions
@@ -32,7 +32,7 @@ def done(services: Services, name: str = "grasps", **changes: Any) -> None:
 
 
 def fail(services: Services, job: str, reason: str = "it broke") -> None:
-    for task in plan(record_of(services, job)):
+    for task in plan_tasks(record_of(services, job)):
         if task.stage is Stage.SYNTHESIZE:
             fail_task(services, job, task, services.index.jobs.task(task.id).attempt, reason=reason)
 

@@ -26,7 +26,7 @@ from graspd.service.pipeline.datasets.cost import estimate
 from graspd.service.pipeline.datasets.export import Fetch, export_shards, path_of
 from graspd.service.pipeline.datasets.spec import DatasetRequest
 from graspd.service.pipeline.fidelity_choice import Resolver
-from graspd.service.store.records import charts_of, job_events, load_dataset, publish, put_record
+from graspd.service.store.records import job_events, load_dataset, publish_record, put_record, scene_chart_kind
 from graspd.service.store.store import open_store
 from tests.fakes import finish, plan_all, record_of
 from tests.service.pipeline.datasets.makers import add_asset, cells_of, done, fail, jobs_of, wanted
@@ -74,11 +74,11 @@ def test_a_name_stands_for_one_dataset(services: Services) -> None:
 
 def test_a_dataset_of_an_older_graspd_is_the_same(services: Services) -> None:
     actions.create(services, wanted())
-    old = json.loads(services.store.get(names.dataset_record("grasps")))
+    old = json.loads(services.store.get(names.dataset_record_key("grasps")))
     del old["checksum"]
     old["options"]["robustness"] = 0
     fresh = Services(services.settings, open_store("memory://"), services.index, services.queue)
-    fresh.store.put(names.dataset_record("grasps"), json.dumps(old | {"digest": "0" * 32}).encode())
+    fresh.store.put(names.dataset_record_key("grasps"), json.dumps(old | {"digest": "0" * 32}).encode())
     dataset, new = actions.create(fresh, wanted())
     assert not new and dataset.digest == "0" * 32
 
@@ -154,7 +154,7 @@ def test_cancel_stops_what_is_planned_and_what_is_not(services: Services) -> Non
     plan_all(services)
     assert [cell.state for cell in cells_of(services)] == ["succeeded", "cancelled", "cancelled", "cancelled"]
     assert services.index.datasets.get("grasps").state == "cancelled"
-    assert services.index.feed.believed_queued()[0] == set()
+    assert services.index.feed.queued_tasks_and_checks()[0] == set()
     with pytest.raises(errors.ConflictError, match="nothing to cancel"):
         actions.cancel(services, "grasps")
 
@@ -182,7 +182,7 @@ def test_retry_starts_failed_and_cancelled_cells_again(services: Services) -> No
     assert actions.retry(services, "grasps").state is State.QUEUED
     plan_all(services)
     assert [cell.state for cell in cells_of(services)] == ["succeeded", "running", "queued", "queued"]
-    assert len(services.index.feed.believed_queued()[0]) == 1 + 2 + 2
+    assert len(services.index.feed.queued_tasks_and_checks()[0]) == 1 + 2 + 2
     for job in jobs:
         finish(services, job)
     assert services.index.datasets.get("grasps").state == "succeeded" and services.index.datasets.get("grasps").finished
@@ -209,7 +209,7 @@ def test_the_store_alone_tells_everything(either: Services) -> None:
     done(either, "a")
     actions.create(either, wanted("b", objects=(), sets=("round",)))
     plan_all(either)
-    actions.snapshot(either, "a")
+    actions.take_snapshot(either, "a")
     actions.cancel(either, "b")
     plan_all(either)
     assert differences(either.index, either.store) == []
@@ -233,7 +233,7 @@ def test_a_set_has_versions_and_the_newest_counts(either: Services) -> None:
 
 def test_a_set_that_broke_off_keeps_its_name_in_its_project(services: Services) -> None:
     left = object_set_of("round", ["ball"], project="blue")
-    put_record(services.store, names.object_set("round", left.digest), left)
+    put_record(services.store, names.object_set_key("round", left.digest), left)
     with pytest.raises(errors.ConflictError, match="take another name"):
         actions.add_object_set(services, "round", ["ball"], scope=ProjectScope("", everything=False))
 
@@ -241,16 +241,16 @@ def test_a_set_that_broke_off_keeps_its_name_in_its_project(services: Services) 
 def test_the_same_shards_are_the_same_snapshot(services: Services) -> None:
     actions.create(services, wanted())
     with pytest.raises(errors.ConflictError, match="no shard yet"):
-        actions.snapshot(services, "grasps")
+        actions.take_snapshot(services, "grasps")
     plan_all(services)
     jobs = jobs_of(services, "grasps")
     finish(services, jobs[0])
-    first, new = actions.snapshot(services, "grasps")
+    first, new = actions.take_snapshot(services, "grasps")
     assert new and not first.complete and first.grasps == 32
-    assert actions.snapshot(services, "grasps") == (first, False)
+    assert actions.take_snapshot(services, "grasps") == (first, False)
     for job in jobs[1:]:
         finish(services, job)
-    last, new = actions.snapshot(services, "grasps")
+    last, new = actions.take_snapshot(services, "grasps")
     assert new and last.complete and last.digest != first.digest
     assert [(shard.hand, shard.object) for shard in last.shards][1:3] == [("gripper", "cube"), ("claw", "ball")]
     assert last.size_bytes == sum(services.store.size(shard.key) for shard in last.shards)
@@ -260,7 +260,7 @@ def test_the_same_shards_are_the_same_snapshot(services: Services) -> None:
 @pytest.fixture
 def snapshot(services: Services) -> Snapshot:
     done(services, scenes=1)
-    return actions.snapshot(services, "grasps")[0]
+    return actions.take_snapshot(services, "grasps")[0]
 
 
 @pytest.fixture
@@ -346,7 +346,7 @@ def test_options_of_the_method_are_those_of_each_cells_job(either: Services) -> 
 
 
 def test_with_auto_each_cell_gets_what_the_chart_promises_for_it(either: Services) -> None:
-    publish(either.store, "charts", chart())
+    publish_record(either.store, "charts", chart())
     actions.create(either, wanted(**AUTO))
     assert [(r.fidelity, r.target) for r in requests_of(either)] == [(fidelity, "") for fidelity in CHOSEN]
     assert [cell.fidelity for cell in either.index.datasets.cells("grasps").items] == CHOSEN
@@ -356,27 +356,27 @@ def test_with_auto_each_cell_gets_what_the_chart_promises_for_it(either: Service
 
 
 def test_a_later_chart_changes_nothing_of_a_dataset(services: Services) -> None:
-    publish(services.store, "charts", chart())
+    publish_record(services.store, "charts", chart())
     actions.create(services, wanted(**AUTO))
     before = jobs_of(services, "grasps")
     actions.create(services, wanted("named", fidelity="fine"))
     assert before[2:] == jobs_of(services, "named")[2:], "each is the job of that fidelity"
-    publish(services.store, "charts", chart("2026-11-21T11:00:00.000Z", claw="draft"))
+    publish_record(services.store, "charts", chart("2026-11-21T11:00:00.000Z", claw="draft"))
     _, new = actions.create(services, wanted(**AUTO))
     assert not new and jobs_of(services, "grasps") == before
-    publish(services.store, "charts", {"created": "2026-11-21T12:00:00.000Z", "runs": []})
+    publish_record(services.store, "charts", {"created": "2026-11-21T12:00:00.000Z", "runs": []})
     assert actions.create(services, wanted(**AUTO))[1] is False
 
 
 def test_a_target_out_of_reach_on_one_cell_makes_no_dataset(services: Services) -> None:
-    publish(services.store, "charts", chart())
+    publish_record(services.store, "charts", chart())
     with pytest.raises(errors.InputError, match=r"no fidelity of fast_graspd meets gsr>=0\.75"):
         actions.create(services, wanted(**AUTO | {"target": "gsr>=0.75"}))
-    assert not services.store.exists(names.dataset_record("grasps"))
+    assert not services.store.exists(names.dataset_record_key("grasps"))
 
 
 def test_the_cost_of_auto_is_that_of_the_chosen_fidelities(services: Services) -> None:
-    publish(services.store, "charts", chart())
+    publish_record(services.store, "charts", chart())
     both = estimate(services.index, wanted(hands=("gripper",), **AUTO), Resolver(services.store))
     apart = [
         estimate(services.index, wanted(hands=("gripper",), objects=(obj,), fidelity=fidelity))
@@ -387,7 +387,7 @@ def test_the_cost_of_auto_is_that_of_the_chosen_fidelities(services: Services) -
 
 def test_a_record_from_before_has_neither_and_is_read(services: Services) -> None:
     actions.create(services, wanted())
-    stored = json.loads(services.store.get(names.dataset_record("grasps")))
+    stored = json.loads(services.store.get(names.dataset_record_key("grasps")))
     stored["options"] = {k: v for k, v in stored["options"].items() if k not in ("options", "target")}
     del stored["fidelities"]
     assert DatasetRecord.model_validate(stored) == load_dataset(services.store, "grasps")
@@ -400,7 +400,7 @@ def test_each_cell_in_scenes_says_how_its_fidelity_was_chosen(either: Services) 
     runs = [lifts(name, speeds[name], lift, hand="gripper", object=obj) for name, obj, lift in of_each]
     place = SceneSpec(kind="table")
     created = {"created": "2026-11-21T10:00:00.000Z", "scene": place.model_dump(mode="json")}
-    key = publish(either.store, charts_of(place), created | {"runs": runs})
+    key = publish_record(either.store, scene_chart_kind(place), created | {"runs": runs})
     actions.create(either, wanted(fidelity="auto", target="lift>=0.9", scene="table"))
     rebuild(either.index, either.store)
     cells = either.index.datasets.cells("grasps").items

@@ -20,9 +20,9 @@ from graspd.service.pipeline.leading import PART
 from graspd.service.queue.connection import connect, redis_url
 from graspd.service.queue.rq_queue import WORKERS, RqQueue, worker_key
 from graspd.service.run.address import record_address
-from graspd.service.run.doctor.backends import persistence, redis
+from graspd.service.run.doctor.backends import check_persistence, check_redis
 from graspd.service.run.doctor.checks import Condition
-from graspd.service.run.doctor.fleet import clocks, controller, port, workers
+from graspd.service.run.doctor.fleet import check_clocks, check_controller, check_port, check_workers
 from graspd.service.run.embedded import find_server
 from graspd.service.settings import Settings
 from tests.fakes import beat_of
@@ -49,51 +49,51 @@ def client(redis_settings: Settings) -> Iterator[Redis]:
 
 
 def test_the_redis_of_graspd_up_is_good_and_keeps_its_tasks(redis_settings: Settings, client: Redis) -> None:
-    found = redis(redis_settings)
+    found = check_redis(redis_settings)
     assert found.condition is Condition.GOOD, found
     assert "Redis" in found.message and str(redis_settings.data_dir) in found.message
-    assert persistence(redis_settings).condition is Condition.GOOD
+    assert check_persistence(redis_settings).condition is Condition.GOOD
     assert client.keys("graspd:doctor:*") == [], "a probe was left behind"
 
 
 def test_a_redis_never_started_is_skipped_and_a_lost_one_bad(tmp_path: Path) -> None:
-    found = redis(Settings(data_dir=tmp_path))
+    found = check_redis(Settings(data_dir=tmp_path))
     assert found.condition is Condition.SKIPPED and "graspd up" in found.message
     away = Settings(data_dir=tmp_path, redis_url=(url := f"redis://127.0.0.1:{free_ports(1)[0]}/0"))
-    found = redis(away)
+    found = check_redis(away)
     assert not found.ok and url in found.message
-    assert persistence(away).condition is Condition.SKIPPED
+    assert check_persistence(away).condition is Condition.SKIPPED
 
 
 def test_a_policy_that_evicts_is_bad_once_memory_is_bounded(redis_settings: Settings, client: Redis) -> None:
     client.config_set("maxmemory-policy", "allkeys-lru")
-    assert redis(redis_settings).condition is Condition.GOOD, "without a bound nothing is evicted"
+    assert check_redis(redis_settings).condition is Condition.GOOD, "without a bound nothing is evicted"
     client.config_set("maxmemory", "64mb")
-    found = redis(redis_settings)
+    found = check_redis(redis_settings)
     assert not found.ok and "allkeys-lru" in found.message and "maxmemory-policy noeviction" in found.fix
 
 
 def test_a_full_memory_is_bad(redis_settings: Settings, client: Redis) -> None:
     client.config_set("maxmemory", str(client.info("memory")["used_memory"]))
-    found = redis(redis_settings)
+    found = check_redis(redis_settings)
     assert not found.ok and "MiB are used" in found.message
 
 
 def test_a_replica_is_bad(redis_settings: Settings, client: Redis) -> None:
     client.replicaof("127.0.0.1", str(free_ports(1)[0]))
-    found = redis(redis_settings)
+    found = check_redis(redis_settings)
     assert not found.ok and "primary" in found.fix
 
 
 def test_a_redis_that_returns_another_value_is_bad(redis_settings: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Redis, "get", lambda *_: b"another")
-    found = redis(redis_settings)
+    found = check_redis(redis_settings)
     assert not found.ok and "changed between write and read" in found.message
 
 
 def test_without_a_log_of_writes_a_crash_costs_a_pause(redis_settings: Settings, client: Redis) -> None:
     client.config_set("appendonly", "no")
-    found = persistence(redis_settings)
+    found = check_persistence(redis_settings)
     assert (found.ok, found.condition) == (True, Condition.WARNING) and "appendonly yes" in found.fix
 
 
@@ -105,7 +105,9 @@ def test_a_password_that_is_missing_is_named_and_never_shown(tmp_path: Path) -> 
         queue = RqQueue(connect(right, patience=0))
         wait_for_redis(queue)
         queue.close()
-        found = [redis(Settings(data_dir=tmp_path, redis_url=url)) for url in (right, f"redis://127.0.0.1:{port}/0")]
+        found = [
+            check_redis(Settings(data_dir=tmp_path, redis_url=url)) for url in (right, f"redis://127.0.0.1:{port}/0")
+        ]
         process.terminate()
     assert [one.condition for one in found] == [Condition.GOOD, Condition.BAD]
     assert "redis://:PASSWORD@" in found[1].fix and "s3cret" not in str(found)
@@ -123,17 +125,17 @@ def present(queue: RqQueue, name: str = "w", **facts: Any) -> None:
 
 
 def test_a_controller_that_lives_and_one_that_does_not(settings: Settings, rq_queue: RqQueue) -> None:
-    found = controller(settings)
+    found = check_controller(settings)
     assert not found.ok and found.fix == "graspd controller"
     rq_queue.announce(PART, 60)
-    assert controller(settings).condition is Condition.GOOD
+    assert check_controller(settings).condition is Condition.GOOD
 
 
 def test_workers_that_fit_are_counted(settings: Settings, rq_queue: RqQueue) -> None:
-    assert workers(settings).condition is Condition.WARNING, "none, and nothing waits"
+    assert check_workers(settings).condition is Condition.WARNING, "none, and nothing waits"
     present(rq_queue)
     present(rq_queue, "v", state="busy", host="node2")
-    found = workers(settings)
+    found = check_workers(settings)
     assert found.condition is Condition.GOOD and "1 busy, 1 idle, on 2 machines" in found.message
 
 
@@ -147,21 +149,21 @@ def test_workers_that_fit_are_counted(settings: Settings, rq_queue: RqQueue) -> 
 def test_unfit_workers_are_bad(settings: Settings, rq_queue: RqQueue, facts: Any, told: str, fix: str) -> None:
     present(rq_queue)
     present(rq_queue, "ill", **facts)
-    found = workers(settings)
+    found = check_workers(settings)
     assert not found.ok and told in found.message and fix in found.fix
 
 
 def test_tasks_of_a_stage_that_nobody_serves_are_bad(settings: Settings, rq_queue: RqQueue) -> None:
     present(rq_queue, stages=(Stage.INGEST, Stage.SCENE))
     rq_queue.enqueue([task("a", stage=Stage.RENDER), task("b", stage=Stage.SCENE)], Priority.BULK)
-    found = workers(settings)
+    found = check_workers(settings)
     assert not found.ok and "1 tasks wait, and no worker serves render" in found.message
     assert found.fix == "graspd worker --stages render"
 
 
 def test_where_nothing_runs_nothing_is_asked(tmp_path: Path) -> None:
     settings = Settings(data_dir=tmp_path)
-    assert {look(settings).condition for look in (controller, workers, clocks)} == {Condition.SKIPPED}
+    assert {look(settings).condition for look in (check_controller, check_workers, check_clocks)} == {Condition.SKIPPED}
 
 
 @pytest.mark.parametrize(
@@ -170,7 +172,7 @@ def test_where_nothing_runs_nothing_is_asked(tmp_path: Path) -> None:
 )
 def test_a_wrong_clock_is_named(settings: Settings, rq_queue: RqQueue, ahead_s: float, condition: Condition) -> None:
     present(rq_queue, seen=timestamp(-ahead_s))
-    found = clocks(settings)
+    found = check_clocks(settings)
     assert found.condition is condition, found
     assert ("Redis" if condition is Condition.GOOD else "node1") in found.message
 
@@ -214,16 +216,16 @@ UNREADY = json.dumps({"ok": False, "parts": {"redis": {"ok": True}, "store": {"o
 )
 def test_what_has_the_port_is_told(tmp_path: Path, status: int, body: str, ok: bool, told: str) -> None:
     with answering(status, body) as taken:
-        found = port(Settings(data_dir=tmp_path, port=taken))
+        found = check_port(Settings(data_dir=tmp_path, port=taken))
     assert found.ok is ok and told in found.message
 
 
 def test_the_service_of_the_data_folder_is_asked_at_its_address(tmp_path: Path) -> None:
     (gone,) = free_ports(1)
-    assert port(Settings(data_dir=tmp_path, port=gone)).condition is Condition.SKIPPED, "none is expected there"
+    assert check_port(Settings(data_dir=tmp_path, port=gone)).condition is Condition.SKIPPED, "none is expected there"
     record_address(tmp_path, f"http://127.0.0.1:{gone}")
-    found = port(Settings(data_dir=tmp_path))
+    found = check_port(Settings(data_dir=tmp_path))
     assert not found.ok and f"no API answers at http://127.0.0.1:{gone}" in found.message
     with answering(200, READY) as taken:
         record_address(tmp_path, f"http://127.0.0.1:{taken}")
-        assert port(Settings(data_dir=tmp_path)).condition is Condition.GOOD
+        assert check_port(Settings(data_dir=tmp_path)).condition is Condition.GOOD

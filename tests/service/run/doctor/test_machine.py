@@ -12,9 +12,9 @@ import pytest
 from obstore.store import MemoryStore
 
 from graspd.service.model.errors import StoreUnavailable
-from graspd.service.run.doctor.backends import check_store, store
+from graspd.service.run.doctor.backends import check_configured_store, check_store
 from graspd.service.run.doctor.checks import Check, Condition, Finding, good, run_checks
-from graspd.service.run.doctor.machine import data_folder, disk, filesystem, limits
+from graspd.service.run.doctor.machine import check_data_folder, check_disk, check_limits, filesystem
 from graspd.service.settings import Settings
 from graspd.service.store.store import Store, open_store
 
@@ -27,7 +27,7 @@ GIB = 2**30
 def test_room_is_validated_by_the_fullest_disk(tmp_path: Path, free: int, condition: Condition) -> None:
     settings = Settings(data_dir=tmp_path / "data", store_url=(tmp_path / "far").as_uri())
     (tmp_path / "far").mkdir()
-    found = disk(settings, usage=lambda folder: (0, 0, free if folder == tmp_path / "far" else 200 * GIB))
+    found = check_disk(settings, usage=lambda folder: (0, 0, free if folder == tmp_path / "far" else 200 * GIB))
     assert found.condition is condition
     if condition is not Condition.GOOD:
         assert str(tmp_path / "far") in found.message and "GRASPD_STORE_URL" in found.fix
@@ -35,10 +35,10 @@ def test_room_is_validated_by_the_fullest_disk(tmp_path: Path, free: int, condit
 
 def test_a_data_folder_that_others_can_read_is_told(tmp_path: Path) -> None:
     tmp_path.chmod(0o755)
-    found = data_folder(Settings(data_dir=tmp_path))
+    found = check_data_folder(Settings(data_dir=tmp_path))
     assert found.condition is Condition.WARNING and found.fix == f"chmod 700 {tmp_path}"
     tmp_path.chmod(0o700)
-    assert data_folder(Settings(data_dir=tmp_path)).condition is Condition.GOOD
+    assert check_data_folder(Settings(data_dir=tmp_path)).condition is Condition.GOOD
 
 
 def test_a_data_folder_on_a_network_is_told(tmp_path: Path) -> None:
@@ -46,10 +46,10 @@ def test_a_data_folder_on_a_network_is_told(tmp_path: Path) -> None:
     kinds = f"/dev/sda / ext4 rw 0 0\nserver:/home {tmp_path} nfs4 rw 0 0\ntmpfs {tmp_path}/tmp tmpfs rw 0 0\n"
     mounts.write_text(kinds)
     folder = tmp_path / "data"
-    found = data_folder(Settings(data_dir=folder), mounts=mounts)
+    found = check_data_folder(Settings(data_dir=folder), mounts=mounts)
     assert found.condition is Condition.WARNING and "nfs4" in found.message
     elsewhere = Settings(data_dir=folder, redis_url="redis://other", index_url="postgresql+psycopg://other/graspd")
-    assert data_folder(elsewhere, mounts=mounts).condition is Condition.GOOD
+    assert check_data_folder(elsewhere, mounts=mounts).condition is Condition.GOOD
     for path, kind in ((folder, "nfs4"), (tmp_path / "tmp" / "x", "tmpfs"), (Path("/etc"), "ext4")):
         assert filesystem(path, mounts) == kind
     assert not folder.exists()
@@ -58,13 +58,13 @@ def test_a_data_folder_on_a_network_is_told(tmp_path: Path) -> None:
 @pytest.mark.skipif(os.getuid() == 0, reason="root may write everywhere")
 def test_a_data_folder_that_cannot_be_written_is_bad(tmp_path: Path) -> None:
     tmp_path.chmod(0o500)
-    assert not data_folder(Settings(data_dir=tmp_path / "data")).ok
+    assert not check_data_folder(Settings(data_dir=tmp_path / "data")).ok
 
 
 def test_few_files_and_little_memory_are_told() -> None:
-    assert limits(files=4096, memory=16 * GIB).condition is Condition.GOOD
-    assert "ulimit" in limits(files=256, memory=16 * GIB).fix
-    assert "more memory" in limits(files=4096, memory=GIB).fix
+    assert check_limits(files=4096, memory=16 * GIB).condition is Condition.GOOD
+    assert "ulimit" in check_limits(files=256, memory=16 * GIB).fix
+    assert "more memory" in check_limits(files=4096, memory=GIB).fix
 
 
 def test_findings_come_in_order_and_one_that_hangs_is_bad() -> None:
@@ -93,17 +93,17 @@ def test_findings_come_in_order_and_one_that_hangs_is_bad() -> None:
 
 def test_a_folder_is_good_and_nothing_is_left_in_it(tmp_path: Path) -> None:
     settings = Settings(data_dir=tmp_path)
-    assert store(settings).condition is Condition.GOOD
+    assert check_configured_store(settings).condition is Condition.GOOD
     assert not (tmp_path / "store").exists(), "a look makes no store"
     (tmp_path / "store").mkdir()
-    found = store(settings)
+    found = check_configured_store(settings)
     assert found.condition is Condition.GOOD, found
     assert [path for path in (tmp_path / "store").rglob("*") if path.is_file()] == []
 
 
 @pytest.mark.s3
 def test_a_bucket_is_good_and_nothing_is_left_in_it(tmp_path: Path, s3_url: str) -> None:
-    found = store(Settings(data_dir=tmp_path, store_url=s3_url))
+    found = check_configured_store(Settings(data_dir=tmp_path, store_url=s3_url))
     assert found.ok, found
     assert "create-only writes work" in found.message
     assert list(open_store(s3_url).list("health")) == []
@@ -112,7 +112,7 @@ def test_a_bucket_is_good_and_nothing_is_left_in_it(tmp_path: Path, s3_url: str)
 @pytest.mark.s3
 def test_a_wrong_secret_names_its_variables(tmp_path: Path, s3_url: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "of-somebody-else")
-    found = store(Settings(data_dir=tmp_path, store_url=s3_url))
+    found = check_configured_store(Settings(data_dir=tmp_path, store_url=s3_url))
     assert not found.ok and "AWS_SECRET_ACCESS_KEY" in found.fix and "of-somebody-else" not in str(found)
 
 
