@@ -58,7 +58,7 @@ class Resolver:
     """Replaces `auto` by a fidelity. Each chart is read once, at the first request that needs it.
 
     Requests for a free object use the newest chart of free objects; requests with a scene use the newest chart of that
-    kind of scene (`charts_of`). A grasp that resists six pushes may fail to leave a bin.
+    kind of scene (`scene_chart_kind`). A grasp that resists six pushes may fail to leave a bin.
     """
 
     def __init__(self, store: Store) -> None:
