@@ -29,7 +29,7 @@ from graspd.worker.rendering.cameras import FIELD_OF_VIEW, GivenCameras, distanc
 from graspd.worker.rendering.hands import DrawnHand
 from graspd.worker.rendering.sheets import label_page, scene_cells, with_palette
 from graspd.worker.rendering.views import Extras, render
-from graspd.worker.scenes import Neighbours, drop, drop_together, transfer
+from graspd.worker.scenes import Neighbours, drop, drop_together, transfer_grasps
 
 #: Size of one picture [px].
 SIZE: Final = (300, 225)
@@ -97,7 +97,7 @@ def _fitting(hand: HandModel, obj: ObjectModel, device: str, seed: int) -> tuple
     kept, tried, best = 0, 0, -np.inf
     for batch in range(ROUNDS):
         found = synthesize(hand, obj, PlanRequest(GRASPS, FIDELITIES["draft"], seed, batch), ExecutionContext(device))
-        placed = transfer(hand, found.grasp, found.pregrasp, scenes)
+        placed = transfer_grasps(hand, found.grasp, found.pregrasp, scenes)
         clearance = np.asarray(placed["grasp/table_clearance_m"], float)
         kept, tried = kept + int(placed["grasp/valid"].sum()), tried + len(clearance)
         row = int(np.argmax(clearance))

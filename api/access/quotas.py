@@ -141,7 +141,7 @@ class _Holder:
 
 
 class Quotas:
-    """Counters of keys and projects; `select_unfinished` returns the ids, of those given, that have not ended."""
+    """Counters of keys and projects; `select_unfinished` selects ids of jobs that have not ended."""
 
     def __init__(
         self,

@@ -191,7 +191,7 @@ def _add_arm_keys(tree: Element, bundle: Bundle, carrier: Carrier) -> None:
 
 
 def _arm_names(bundle: Bundle, carrier: Carrier) -> dict[str, str]:
-    """Map bodies to names of arm and hand; reserved or repeated names get the prefix `arm_` or `hand_`."""
+    """Map body keys to unique names; a reserved or repeated name gets the prefix `arm_` or `hand_`."""
     found: dict[str, str] = {}
     taken = {"object", "world", "flange"}
     for prefix, model in (("arm", carrier.arm.model), ("hand", bundle.found.hand)):

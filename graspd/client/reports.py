@@ -96,7 +96,7 @@ def watch(client: Client, job_id: str) -> JobDetail:
 
 
 def show_job(job: JobDetail, *, json: bool, url: str, must_succeed: bool = True) -> None:
-    """Report the result of a job; TaskError if it failed or was cancelled and `must_succeed`."""
+    """Print a job; if `must_succeed`, raise TaskError for a failed or cancelled job."""
     if json:
         print_json(job_summary(job))
     else:

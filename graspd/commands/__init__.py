@@ -1,1 +1,1 @@
-"""Commands of the engine, one module each."""
+"""Commands for planning, validation, files and workers."""

@@ -481,7 +481,7 @@ def page_rows(
     cursor: str | None,
     descending: bool = True,
 ) -> tuple[Sequence[RowMapping], str | None]:
-    """Return a page's rows in the order of a key, and the next page's cursor; InputError as in `decode_cursor`."""
+    """Return a page's rows ordered by a key, and the next cursor; InputError as in `decode_cursor`."""
     size = page_size(limit)
     if cursor is not None:
         start = decode_cursor(cursor, *(part.type.python_type for part in key))

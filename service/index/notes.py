@@ -39,7 +39,7 @@ class StoreMark:
     mark: str = ""
     """Mark that index and store share; empty before the first mark."""
     before: str = ""
-    """Previous mark of the store during an update; otherwise equal to `update`."""
+    """Previous mark of the store during an update; otherwise equal to `mark`."""
     changes: int = 0
 
 

@@ -1,4 +1,4 @@
-"""Store, index and queue of a process; `record_transaction` writes records and their index rows together."""
+"""Store, index and queue of a process. `record_transaction` writes records and index rows together."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ class Identity:
 
     @property
     def is_same(self) -> bool:
-        """Whether the store's last service owns the index or, if that has no id, Redis or the data folder."""
+        """Whether the index, else Redis or the data folder, has the id of the store's last service."""
         if self.index is not None:
             return self.index == self.chain[-1]
         others = {self.redis, self.folder} - {None}

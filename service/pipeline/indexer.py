@@ -245,7 +245,7 @@ class Tally:
             if manifest.kind == "base":
                 self.add("graspd_grasps_total", "all", amount=manifest.count)
                 self.add("graspd_grasps_total", "valid", amount=manifest.valid)
-                self.add("graspd_grasps_total", "validated", amount=manifest.validated_candidates)
+                self.add("graspd_grasps_total", "validated", amount=manifest.validated)
 
     def count_failure(self, stage: str, kind: str) -> None:
         if (stage, kind) not in self._kinds:

@@ -91,7 +91,7 @@ def parse_events(reply: Any) -> list[tuple[str, Event | None]]:
 
 
 def remove_mistyped_keys(connection: Any, kinds: Mapping[str, str], stream: str) -> None:
-    """Remove keys whose type differs from that in `key_types`, and the event stream if it accepts no entries."""
+    """Remove keys of other types than in `key_types`, and an event stream that accepts no entries."""
     with connection.pipeline(transaction=False) as pipe:
         for name in kinds:
             pipe.type(name)

@@ -94,7 +94,7 @@ class ShardManifest(Record):
         return self
 
     @property
-    def validated_candidates(self) -> int:
+    def validated(self) -> int:
         """Number of candidates tested against the geometric limits and by a validator; 0 without validator."""
         has_verdicts = any(grasp.success is not None for grasp in self.grasps)
         return self.candidates if has_verdicts or (not self.grasps and self.request.validation != "none") else 0

@@ -110,14 +110,16 @@ def _uses_radians(root: Element) -> bool:
     if any("angle" in compiler.attrib for compiler in root.findall("compiler")):
         return False
     hinges = [e for e in root.iter("joint") if "range" in e.attrib and e.get("type", "hinge") != "slide"]
-    ranges = [value for hinge in hinges for value in _numbers(hinge.get("range", ""))]
+    ranges = [value for hinge in hinges for value in _parse_floats(hinge.get("range", ""))]
     turns = [
-        value for e in root.iter() for value in _numbers(e.get("euler", "")) + _numbers(e.get("axisangle", ""))[3:]
+        value
+        for e in root.iter()
+        for value in _parse_floats(e.get("euler", "")) + _parse_floats(e.get("axisangle", ""))[3:]
     ]
     return bool(ranges) and max(map(abs, ranges + turns)) <= 2 * math.pi
 
 
-def _numbers(text: str) -> list[float]:
+def _parse_floats(text: str) -> list[float]:
     try:
         return [float(word) for word in text.split()]
     except ValueError:

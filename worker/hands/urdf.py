@@ -141,11 +141,11 @@ def _movable_joint(element: ElementTree.Element, still: Joint, what: str, notes:
         upper=upper,
         effort=effort,
         mimic=mimic,
-        velocity=_velocity(element),
+        velocity=_velocity_limit(element),
     )
 
 
-def _velocity(element: ElementTree.Element) -> float:
+def _velocity_limit(element: ElementTree.Element) -> float:
     """Return the speed limit [rad/s or m/s]; 0 without a plausible one, since grasps do not need it."""
     limit = element.find("limit")
     try:

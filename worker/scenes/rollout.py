@@ -48,7 +48,7 @@ def rollout_on(
     known: dict[str, Any] | None = None,
     level: Level = "standard",
 ) -> Callable[[GraspSet, PlacedGrasps | None, Floats], Floats] | None:
-    """Return `run`'s rollout; None if the planner's merit decides. `known` caches verdicts of `level`.
+    """Return the rollout function for the device of `run`, or None. `known` caches verdicts of `level`.
     Around free objects a GPU has no rollouts, because it plans faster than the CPU simulates. In scenes it waits for
     the rollouts, which use all threads.
     """

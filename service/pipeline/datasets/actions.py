@@ -50,7 +50,7 @@ _CELLS_AT_ONCE: Final = 20
 def create(
     services: Services, request: DatasetRequest, *, owner: str = "", scope: ProjectScope = EVERYTHING
 ) -> tuple[DatasetView, bool]:
-    """Record a dataset; the controller plans its jobs. Equal hands, objects and options give one dataset.
+    """Record a dataset; the controller plans its jobs. An identical request returns the existing dataset.
 
     Return the dataset, and whether it is new. A failed or cancelled dataset is returned unchanged: see `retry`.
 
@@ -153,7 +153,7 @@ def add_object_set(
 ) -> ObjectSetView:
     """Name a set of objects. A change of its objects makes a new version with the same owner.
 
-    `may_follow` receives owner and project of the set before a new version, and may raise.
+    Before a new version, `may_follow` gets the set's owner and project; it may raise.
     NotFoundError: unknown object. ConflictError: another project has the name. InputError: no objects.
     """
     assets = [services.index.assets.get(AssetKind.OBJECT, one, scope=scope) for one in objects]

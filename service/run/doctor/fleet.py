@@ -136,7 +136,7 @@ _FIX: Final = "timedatectl set-ntp true, or chronyd, on the machine whose clock 
 
 
 def check_clocks(settings: Settings) -> Finding:
-    offsets = dict(_offsets(settings))
+    offsets = dict(_clock_offsets(settings))
     if not offsets:
         return skipped("only this machine's clock can be read")
     line = ", ".join(
@@ -150,7 +150,7 @@ def check_clocks(settings: Settings) -> Finding:
     return good(f"within {_OFF_S:.0f} s: {line}")
 
 
-def _offsets(settings: Settings) -> Iterator[tuple[str, float]]:
+def _clock_offsets(settings: Settings) -> Iterator[tuple[str, float]]:
     """Yield name and clock offset to this machine [s]; other checks report missing parts."""
     if is_redis_expected(settings):
         with suppress(RedisError, OSError), redis_connection(settings) as client:

@@ -115,7 +115,7 @@ def test_neighbours_are_named_in_spec_option_and_scene_file(tmp_path: Path) -> N
     (tmp_path / "shelf.yaml").write_text("supports: [{kind: half_space}]\nneighbours: [{object: block}]\n")
     document = asked(spec(tmp_path, text.replace("table", "shelf.yaml"))).options["scene"]
     assert [one["object"] for one in document["neighbours"]] == ["block"]
-    words, part = "parts/bracket.stl is a file: `graspd objects add parts/bracket.stl` first", "parts/bracket.stl"
+    words, part = "parts/bracket.stl is a file: run `graspd objects add parts/bracket.stl` first", "parts/bracket.stl"
     for file, options in ((text + f'neighbours = ["{part}"]', {}), (text, {"neighbours": [part]})):
         with pytest.raises(InputError, match=words):
             asked(spec(tmp_path, file), **options)

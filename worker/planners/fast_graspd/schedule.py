@@ -95,7 +95,7 @@ class WarmStart(Protocol):
     """Proposes starts of grasps in scenes."""
 
     def adapted(self, fidelity: Fidelity) -> Fidelity:
-        """Return `fidelity`, a result of `fidelity_in_scenes`, with its numbers of starts and finalists adapted."""
+        """Return a result of `fidelity_in_scenes` with adapted numbers of starts and finalists."""
 
     def __call__(
         self,

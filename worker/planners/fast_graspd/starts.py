@@ -172,7 +172,7 @@ def no_start_error(model: Model) -> InputError:
 
 
 def clear_starts(model: Model, generators: list[np.random.Generator], *, each: int = 1) -> tuple[HandState, Floats]:
-    """Return a start per generator and its depth (n,) [m]: the first clear draw, else the least deep one.
+    """Return each generator's first clear start, or else its least deep one, and their depths (n,) [m].
     The second, fourth, ... of the `each` starts of a grasp are antipodal if possible. All are antipodal if the object
     is too small or too wide for the hand's pads."""
     hand, obj = model.hand.model, model.obj.model

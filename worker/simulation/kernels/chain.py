@@ -7,7 +7,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Chain:
-    """A hand's joint tree (L bodies), and its features sorted by body."""
+    """A hand's joint tree (L bodies), and F balls and rims sorted by body."""
 
     parent: wp.array(dtype=wp.int32)
     turns: wp.array(dtype=wp.int32)  # 1 for revolute joints
