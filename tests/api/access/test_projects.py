@@ -262,7 +262,7 @@ def test_the_same_file_of_two_projects_is_two_assets(world: World) -> None:
     file = {"file": ("private.stl", _BALL.replace(b"ball", b"private"))}
     assert world.ask("old", "POST", "/v1/objects", files=file).status_code == 202
     answer = world.ask("bob", "POST", "/v1/objects", data={"shared": "true"}, files=file)
-    assert answer.status_code == 409 and "upload it without sharing it" in answer.json()["detail"]
+    assert answer.status_code == 409 and "private to another project" in answer.json()["detail"]
 
 
 def test_what_is_shared_is_used_by_all_and_deleted_by_its_own(world: World) -> None:

@@ -274,7 +274,7 @@ def test_what_changed_before_the_lock_is_told(
         return Database.write_transaction(*given)
 
     make(services)
-    monkeypatch.setattr(Database, "writing", after_the_rivals)
+    monkeypatch.setattr(Database, "write_transaction", after_the_rivals)
     with pytest.raises((ConflictError, NotFoundError), match=words):
         ask(services)
 

@@ -216,7 +216,7 @@ def test_while_redis_is_away_nobody_loses_the_lead(monkeypatch: pytest.MonkeyPat
     assert mine.wait(stop)
     with mine.hold(stop) as over:
         with monkeypatch.context() as patch:
-            patch.setattr(queue, "lead", away)
+            patch.setattr(queue, "renew_leadership", away)
             until(lambda: away.call_count > 3, "it tries again and again")
         begun = queue._lease[1]
         until(lambda: queue._lease[1] > begun, "it is renewed")

@@ -18,14 +18,14 @@ MODULE = "graspd.worker.simulation.kernels.optimizers"
 START = """
 import importlib, warp as wp
 from graspd.worker.engines import backend
-backend.start()
+backend.start_warp()
 print(wp.config.kernel_cache_dir)
 """
 LOAD = START + f"wp.load_module(importlib.import_module({MODULE!r}), device='cpu')"
 BAKE = f"""
 from graspd.worker.engines import backend
 from tests.conftest import PACKAGES, REPOSITORY
-backend.start()
+backend.start_warp()
 backend.compile_modules([{MODULE!r}], architectures=[90])
 """
 

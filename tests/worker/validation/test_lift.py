@@ -377,7 +377,13 @@ def lift_tests(monkeypatch: pytest.MonkeyPatch, outcomes: dict[bool, list[int]])
 
     def way(hand, obj, some, placed):
         clear, wrist = np.ones(len(some), bool), np.zeros((len(some), 0))
-        seen = {"approach": some.approach, "open": some.coming, "lift": None, "least": 1.0 * clear, "wrist": wrist}
+        seen = {
+            "approach": some.approach,
+            "open": some.coming,
+            "lift": None,
+            "least_clearance": 1.0 * clear,
+            "wrist": wrist,
+        }
         return SimpleNamespace(clear=clear, **seen)
 
     monkeypatch.setattr(rollouts, "validate_lifts", validated)
