@@ -4,6 +4,7 @@ import asyncio
 import io
 import json
 import threading
+import time
 from typing import Any
 
 import httpx
@@ -12,7 +13,7 @@ import pytest
 from fastapi import FastAPI
 from starlette.testclient import TestClient
 
-from graspd.api.routes import assets
+from graspd.api.routes import assets, dependencies
 from graspd.api.routes.dependencies import RequestLimiter
 from graspd.api.uploads import files_of_upload, name_of_upload
 from graspd.service.model import names
@@ -166,6 +167,22 @@ def test_a_turn_that_does_not_come_in_time_is_refused() -> None:
             hold.set()
         await first
         assert await turns.run(int, "7") == 7
+
+    asyncio.run(use())
+
+
+def test_only_so_many_requests_wait_for_a_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dependencies, "_MOST_WAITING", 0)
+
+    async def use() -> None:
+        turns, hold = RequestLimiter(1, patience_s=PATIENCE_S), threading.Event()
+        first = asyncio.create_task(turns.run(hold.wait, PATIENCE_S))
+        await asyncio.sleep(0)
+        began = time.monotonic()
+        with pytest.raises(UnavailableError):
+            await turns.run(int)
+        hold.set()
+        assert await first and time.monotonic() - began < PATIENCE_S / 2
 
     asyncio.run(use())
 

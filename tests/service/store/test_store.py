@@ -100,9 +100,17 @@ def test_a_folder_that_cannot_be_used_is_one_clear_line(tmp_path: Path, monkeypa
         open_store(tmp_path.as_uri())
 
 
-@pytest.mark.parametrize("url", ["ftp://x", "file://host/path", "nothing", "file:relative"])
-def test_a_url_that_names_no_store_is_refused(url: str) -> None:
-    with pytest.raises(InputError, match="store URL"):
+@pytest.mark.parametrize(
+    ("url", "words"),
+    [
+        ("ftp://x", "store URL"),
+        ("nothing", "store URL"),
+        ("file://host/path", "absolute"),
+        ("file:relative", "absolute"),
+    ],
+)
+def test_a_url_that_names_no_store_is_refused(url: str, words: str) -> None:
+    with pytest.raises(InputError, match=words):
         open_store(url)
 
 
