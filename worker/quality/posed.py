@@ -74,21 +74,20 @@ class PostureData:
     def touching_links(self, posture: Posture) -> NDArray[np.int32]:
         """Count (N,) bodies of posed hands with points closer to the object than `LINK_CONTACT_M`.
         The quality table also tests object points, so its number is at least as large."""
-        return contact_links(self._gaps(posture, LINK_CONTACT_M, self.points.body.numpy()))
+        return contact_links(self._gaps(posture, LINK_CONTACT_M, self.points.body.numpy(), self.hand.bodies))
 
     def finger_gaps(self, posture: Posture, reach: float) -> Floats:
-        """Return the least distance (N, F) of each finger's points from the object, at most `reach` [m]."""
-        return self._gaps(posture, reach, self.finger.numpy()[self.points.body.numpy()])
+        """Return the least distance (N, F) of each finger's points, at most `reach` [m], also without points."""
+        return self._gaps(posture, reach, self.finger.numpy()[self.points.body.numpy()], self.fingers)
 
-    def _gaps(self, posture: Posture, reach: float, part: NDArray[np.int32]) -> Floats:
-        """Return the least distance (N, P) of each part of the hand, at most `reach` [m].
+    def _gaps(self, posture: Posture, reach: float, part: NDArray[np.int32], count: int) -> Floats:
+        """Return the least distance (N, count) of each part of the hand, at most `reach` [m].
         `part` (points,) is the part of each hand point; points with -1 are ignored."""
-        parts = sorted(set(part[part >= 0].tolist()))
-        found = np.full((len(posture), len(parts)), reach)
+        found = np.full((len(posture), count), reach)
         for rows in self.parts(len(posture)):
             distance = self.touch(posture.take(rows), reach)[1].distance.numpy()
-            for place, one in enumerate(parts):
-                found[rows, place] = distance[:, part == one].min(axis=1)
+            for one in np.unique(part[part >= 0]):
+                found[rows, one] = distance[:, part == one].min(axis=1)
         return found
 
 

@@ -332,6 +332,12 @@ def test_a_finger_stands_off_that_is_near_and_does_not_touch() -> None:
     assert postures.fingers_off_object(PLATES, BOX, grasps).tolist() == [False, False, True, True, False]
 
 
+def test_a_finger_without_sampled_points_counts_as_far() -> None:
+    hand = hand_from_path("allegro")
+    gaps = posture_data_of(hand, OBJ, points=2, device="cpu").finger_gaps(around(hand, 3), 0.03)
+    assert gaps.shape == (3, 4) and (gaps == 0.03).all(axis=0).any()
+
+
 def around(hand: HandModel, count: int) -> Posture:
     rng = np.random.default_rng(5)
     rotation = rng.normal(size=(count, 4))

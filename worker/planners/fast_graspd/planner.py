@@ -228,7 +228,7 @@ class _Launch:
 
     def stand_off(self, state: HandState) -> NDArray[np.bool_]:
         """Return a mask (n,) of hands in scenes with a finger that stands off the object."""
-        if self.batches.placed is None:
+        if self.batches.placed is None or not self.batches.has_rollout:
             return np.zeros(len(state.pivot), bool)
         hand, obj, device = self.pair_on_device()
         return fingers_off_object(hand, obj, posture_of(hand, obj, state), device=device)
