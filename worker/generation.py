@@ -30,6 +30,7 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners import NoStartFound, PlanRequest, Rollout, fitting_pairs, method, synthesize
 from graspd.worker.planners.fast_graspd.antipodal_starts import narrow_reason
 from graspd.worker.quality.diversity import POINTS, distinct_mask, hand_points
+from graspd.worker.planners.requirements import NOTHING, Requirements
 from graspd.worker.quality.gate import GATES, failed_gate, passes_gate
 from graspd.worker.quality.table import measure
 from graspd.worker.rounds import ROUND_STRIDE, Arrays, Round, expected_need, next_round, select_rows, split_rows
@@ -48,10 +49,15 @@ from graspd.worker.validation.validator import prefilter_grasps, validate
 
 #: Reasons to reject a grasp. diverged: its numbers are not finite. blocked: an obstacle of its scene is in the way.
 #: dropped: the validator did not hold it. gate: it fails the geometric gate. not_robust: it holds in too few models.
-#: weak: its payload is too small. alike: it is a near-duplicate of a selected grasp.
-REJECTIONS: Final = ("diverged", "blocked", "dropped", "gate", "not_robust", "weak", "alike")
+#: requirements: it fails a requirement on type, digits, region or approach. weak: its payload is too small. alike: it is
+#: a near-duplicate of a selected grasp.
+REJECTIONS: Final = ("diverged", "blocked", "dropped", "gate", "requirements", "not_robust", "weak", "alike")
 #: Rejections whose names differ from the outcome's; failed pushes and lifts of the validator are `dropped`.
-_REJECTION_OF: Final = {"no_place": "blocked", **{f"gate_{name}": "gate" for name in GATES}}
+_REJECTION_OF: Final = {
+    "no_place": "blocked",
+    **{f"gate_{name}": "gate" for name in GATES},
+    **dict.fromkeys(("other_type", "other_digits", "other_approach", "outside_region"), "requirements"),
+}
 #: Names of the outcomes of failed pushes and of failed lifts.
 _PUSHED: Final = {
     Outcome.PENETRATION: "penetration",
@@ -211,6 +217,7 @@ class Scoring(AbstractContextManager["Scoring"]):
         run: ExecutionContext,
         known: Known | None = None,
         prefilter: PrefilterVerdicts | None = None,
+        required: Requirements = NOTHING,
     ) -> Round:
         """Validate and measure grasps, and select the wanted ones, near-duplicates included.
         Grasps with numbers that are not finite are rejected. `known` has verdicts on candidates, `prefilter` has
@@ -234,7 +241,8 @@ class Scoring(AbstractContextManager["Scoring"]):
         columns = {path: array[rows] for path, array in columns.items()}
         with _timed(seconds, "quality"):
             friction = self.request.friction
-            columns |= measure(self.hand, self.obj, grasps, friction=friction, run=run.part(*PARTS[1:]))
+            measured = run.part(*PARTS[1:])
+            columns |= measure(self.hand, self.obj, grasps, friction=friction, region=required.region, run=measured)
         columns["quality/feasible"] = passes_gate(columns)
         feasible = columns["quality/feasible"] == 1
         held = columns.get("quality/success", np.zeros(len(rows), np.int8)) == 1
@@ -249,6 +257,10 @@ class Scoring(AbstractContextManager["Scoring"]):
             lost = lost[fates[finite[lost]] == "kept"]
             fates[finite[lost]] = why[lost]
             fates[finite[rows[~wanted]]] = [f"gate_{name}" for name in np.asarray(failed_gate(columns))[~wanted]]
+            if required.is_set:
+                failed = required.failed(self.hand, grasps.grasp, self.placed(grasps), columns)
+                fates[finite[rows[wanted & (failed != "")]]] = failed[wanted & (failed != "")]
+                wanted &= failed == ""
             if self.request.robust:
                 enough = reaches_share(columns["quality/robust_share"], self.request.robust)
                 fates[finite[rows[wanted & ~enough]]] = "not_robust"
@@ -351,6 +363,8 @@ class Batch:
         """Begin a batch. `run` reports its progress; `scenes` is its part of the job's scenes, None for all."""
         self.scoring, self.number, self.count, self.run = scoring, number, count, run
         self.request = scoring.request
+        self.requirements = Requirements.of(self.request, number, origin=scoring.centre)
+        self.requirements.check(scoring.hand, scoring.obj)
         self.rounds: list[Round] = []
         self.candidates = self.repeated = 0
         self.limit: Limit | None = None
@@ -433,7 +447,7 @@ class Batch:
             found = synthesize(hand, obj, wanted, run, method=request.method, options=request.options)
             told = self.grasps_to_store(wanted, found)
             # Verdicts and metrics are many short tasks: they may use all cores, also while other parts run.
-            made = self.scoring.evaluate(told, replace(own, sharing=None), known)
+            made = self.scoring.evaluate(told, replace(own, sharing=None), known, required=self.requirements)
             return self.complete_round(replace(asked, rows=part), made, told)
 
         def run_part(part: range, own: ExecutionContext) -> Round | NoStartFound:
@@ -462,7 +476,8 @@ class Batch:
             mine = replace(poses, object_pose=poses.object_pose[own], neighbour_pose=beside)
             placed = mine.placed((asked.begun + np.array(rows)) % len(self._scenes))
         knobs, seed = self.request.knobs, self.request.seed
-        return PlanRequest(len(rows), knobs, seed, number, placed, rollout, rows.start, others_have_place)
+        wanted = self.requirements
+        return PlanRequest(len(rows), knobs, seed, number, placed, rollout, rows.start, wanted, others_have_place)
 
     def grasps_to_store(self, wanted: PlanRequest, planned: GraspSet) -> GraspSet:
         """Return the grasps to validate and store, with rounded positions and the job's scene numbers."""
@@ -496,6 +511,7 @@ class Batch:
         absent = {"blocked"} if scoring.scenes is None else set()
         absent |= set() if self.request.robust else {"not_robust"}
         absent |= set() if self.request.min_payload else {"weak"}
+        absent |= set() if self.requirements.is_set else {"requirements"}
         reasons = [name for name in REJECTIONS if name not in absent]
         outcomes = sum_outcomes([Counter(fate for fate in fates[:candidates].tolist() if fate != "kept")])
         rejected = dict.fromkeys(reasons, 0)

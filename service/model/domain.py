@@ -8,12 +8,14 @@ from __future__ import annotations
 import re
 import zlib
 from collections.abc import Sequence
-from typing import Annotated, Any, ClassVar, Final, Literal, Self
+from typing import Annotated, Any, ClassVar, Final, Literal, Self, get_args
 
-from pydantic import ConfigDict, Field, field_validator, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, field_validator, model_validator
 
 from graspd.service.model.base import DIGEST, Digest, Model, Name
+from graspd.service.model.contact_region import parse_cone, parse_region
 from graspd.service.model.fidelity import AUTO, OFFERED, Fidelity, resolve_fidelity
+from graspd.service.model.grasp_types import GraspTypeName
 from graspd.service.model.matter import FRICTION, MASS_KG, MOST_KG, Density, Friction, Mass
 from graspd.service.model.metrics import MIN_DISTANCE_M, MOST_ROBUST_MODELS, ROBUST_MODELS
 from graspd.service.model.options import JOB, Form, Option
@@ -58,8 +60,14 @@ _REFEREES_IN_WORDS: Final = {
 }
 _FACES_IN_WORDS: Final = {"drawn": "as dropped", "all": "every stable face"}
 _WANTS_IN_WORDS: Final = {"valid": "valid grasps", "candidates": "all candidates"}
+_TYPES_IN_WORDS: Final = {name: name.replace("_", " ") for name in get_args(GraspTypeName)}
 _SCENES_IN_WORDS: Final = {"free": "free object", "table": "table", "bin": "bin", "shelf": "shelf"}
 SHAKE_NEEDS_A_SCENE: Final = "shake needs a lift out of a scene: choose a scene, such as table"
+
+
+DigitName = Literal["thumb", "index", "middle", "ring", "little", "sixth"]
+Region = Annotated[str, Field(max_length=200), AfterValidator(lambda text: text and parse_region(text) and text)]
+Cone = Annotated[str, Field(max_length=80), AfterValidator(lambda text: text and parse_cone(text) and text)]
 
 
 def _sparse(default: Any, **facts: Any) -> Any:
@@ -146,6 +154,35 @@ class JobOptions(Model):
     )
     channels: Annotated[tuple[Literal["distance", "normals", "occlusion"], ...], Option(places=JOB)] = Field(
         (), description="image channels besides colour, depth and segmentation: distance, normals or occlusion"
+    )
+    type: Annotated[
+        GraspTypeName, Option("basic", schema=7), Form("grasps", "Grasp type", choices=_TYPES_IN_WORDS, cells=True)
+    ] = _sparse(
+        "any",
+        description="type of the grasps by contact: power, precision, pinch, lateral, or a type of the GRASP taxonomy. "
+        "balanced: power, precision, pinch and lateral in turn, one per batch",
+    )
+    digits: Annotated[
+        tuple[DigitName, ...], Option(schema=7, typed="digit that may touch, such as thumb; the others stay open")
+    ] = _sparse(
+        (), max_length=6, description="digits that may touch: thumb, index, middle, ring, little; others stay open"
+    )
+    touch_region: Annotated[
+        Region,
+        Option(schema=7),
+        Form("grasps", "Contact region", "bounds in the object's frame [m]", placeholder="z > 0.05", cells=True),
+    ] = _sparse("", description="region of all contacts: bounds in the object's frame [m], such as z > 0.05, x < 0.02")
+    avoid_region: Annotated[Region, Option(schema=7)] = _sparse(
+        "", description="region without contacts: bounds in the object's frame [m], such as z > 0.1"
+    )
+    approach_cone: Annotated[
+        Cone,
+        Option(schema=7),
+        Form("grasps", "Approach cone", "axis and angle", placeholder="0, 0, -1, 30", cells=True),
+    ] = _sparse(
+        "",
+        description="cone of the palm's approach: axis and largest angle [deg], such as 0, 0, -1, 30. The axis is in "
+        "the frame of the scene, or of a free object",
     )
     friction: Annotated[float, Option(), Form("grasps", "Friction coefficient", "Coulomb, for the metrics")] = Field(
         1.0, gt=0, le=3, description="Coulomb coefficient of the quality metrics"

@@ -8,7 +8,7 @@ PACKAGE_VERSION: Final = "0.2.0"
 
 #: Newest schema of task messages, and the oldest readable one. A message states its range of schemas, so workers of
 #: two versions may run in parallel (`service/model/messages.py`).
-TASK_SCHEMA: Final = 6
+TASK_SCHEMA: Final = 7
 OLDEST_TASK_SCHEMA: Final = 2
 #: First schema with tasks of several batches.
 SCHEMA_OF_RANGES: Final = 6

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from graspd.service.model.transforms import Floats, quat_rotate
 from graspd.worker.grasps import Posture
+from graspd.worker.hands.digits import finger_of_body
 from graspd.worker.hands.jaws import jaws_of, prismatic_dofs
 from graspd.worker.hands.model import HandModel
-from graspd.worker.quality.contact import finger_of_body
 from graspd.worker.quality.posed import PostureData
 from graspd.worker.simulation.kernels import distance, jamming, opening, optimizers
 from graspd.worker.simulation.launches import Launches, launch

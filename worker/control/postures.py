@@ -47,7 +47,7 @@ CLOSING_M: Final = 0.009
 #: Least and largest distance at which a finger stands off the object [m]. Farther fingers are not part of the grasp.
 STANDS_OFF_M: Final = (0.005, 0.02)
 #: Reach of distance measurements of such fingers [m].
-FAR_M: Final = 0.025
+FAR_M: Final = 0.065
 #: Largest number of closing steps of such fingers (`opening.dof_steps`), and their distance at the end [m]. Between two
 #: sampled points, a finger's surface is up to half a millimetre closer.
 CLOSING_STEPS: Final = 16
@@ -145,27 +145,35 @@ def fingers_off_object(hand: HandModel, obj: ObjectModel, grasp: Posture, *, dev
 
 
 def close_fingers(
-    hand: HandModel, obj: ObjectModel, grasp: Posture, placed: PlacedGrasps, *, device: str = "cpu"
+    hand: HandModel,
+    obj: ObjectModel,
+    grasp: Posture,
+    placed: PlacedGrasps | None,
+    *,
+    off_m: tuple[float, float] = STANDS_OFF_M,
+    device: str = "cpu",
 ) -> Posture:
-    """Close fingers of N grasps at a distance in `STANDS_OFF_M` until they touch the object.
+    """Close fingers of N grasps at a distance in `off_m` until they touch the object.
     A finger that would first meet another finger or an obstacle keeps its posture. Grippers are unchanged."""
     posing = posture_data_of(hand, obj, points=_POINTS, device=device)
-    off = _fingers_off_object(posing, grasp)
+    off = _fingers_off_object(posing, grasp, off_m)
     rows = np.flatnonzero(off.any(axis=1))
     if not len(rows) or jaws_of(hand) is not None:
         return grasp
     pose, finger, joints = grasp.hand_pose[rows], fingers_of_dofs(hand), np.array(grasp.joint_positions, float)
     q, moved = hand.reduce(joints[rows]), off[rows][:, finger] & (finger >= 0)
     closing = Openings(posing, pose, q, _close_until_contact(posing, pose, q, moved))
-    closed = closing.without_jams(_blocked_paths(hand, closing, placed.take(rows)))
-    reached = posing.finger_gaps(Posture(pose, hand.expand(closed)), FAR_M) < STANDS_OFF_M[0]
+    closed = closing.without_jams(_blocked_paths(hand, closing, None if placed is None else placed.take(rows)))
+    reached = posing.finger_gaps(Posture(pose, hand.expand(closed)), FAR_M) < off_m[0]
     joints[rows] = hand.expand(np.where(moved & reached[:, finger], closed, q))
     return Posture(np.array(grasp.hand_pose, float), joints)
 
 
-def _fingers_off_object(posing: PostureData, grasp: Posture) -> NDArray[np.bool_]:
-    """Return a mask (N, F) of fingers at a distance from the object in `STANDS_OFF_M`."""
-    near, far = STANDS_OFF_M
+def _fingers_off_object(
+    posing: PostureData, grasp: Posture, off_m: tuple[float, float] = STANDS_OFF_M
+) -> NDArray[np.bool_]:
+    """Return a mask (N, F) of fingers at a distance from the object in `off_m`."""
+    near, far = off_m
     gap = posing.finger_gaps(grasp, FAR_M)
     return np.asarray((gap > near) & (gap < far))
 

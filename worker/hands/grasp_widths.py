@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, quat_rotate
+from graspd.worker.hands import digits
 from graspd.worker.hands.kinematics import body_poses, generalized_forces
 from graspd.worker.hands.model import HandModel, SurfacePoints
 from graspd.worker.hands.pinch_postures import Oppositions, oppositions_of
@@ -21,6 +22,7 @@ from graspd.worker.hands.surface import sample_surface
 from graspd.worker.objects.memory_cache import cached_by_content
 
 Ints = NDArray[np.intp]
+Parts = tuple[NDArray[np.int32], NDArray[np.int32]]
 Size = Literal["small", "wide"]
 
 #: Least and largest gap for small objects [m]. Largest ratio of a gap for wide objects to the widest gap of pads.
@@ -48,6 +50,10 @@ _DENSE: Final = 4000
 GOOD_M: Final = 0.006
 #: Largest distance by which the cube extends beyond its contacts towards the palm [m].
 BEYOND_M: Final = 0.012
+#: Number of surface points in the search for two given parts, and range of their gaps [m].
+PART_POINTS: Final = 5000
+THINNEST_M: Final = 0.003
+PART_WIDTH_M: Final = 0.07
 #: Number of pairs per posture that are evaluated in detail, and number of postures evaluated at once.
 CLOSELY: Final = 8
 AT_ONCE: Final = 16
@@ -63,15 +69,30 @@ def postures_for_size(hand: HandModel, size: Size) -> Oppositions:
     )
 
 
+@cached_by_content(16)
+def postures_between(hand: HandModel, first: NDArray[np.int32], second: NDArray[np.int32]) -> Oppositions:
+    """Return postures in which two parts of a hand face each other, cached in memory and on disk.
+    Each part is given by the `digits.Part` (L,) of each body."""
+    return Oppositions.cached(
+        "parts",
+        (hand.content, str(first.tolist()), str(second.tolist())),
+        lambda: _search_postures(hand, "small", (first, second)),
+        sys.modules[__name__],
+        digits,
+    )
+
+
 def largest_width(hand: HandModel) -> float:
     """Return an upper bound of the widths in `postures_for_size` [m], from `oppositions_of` alone."""
     return WIDER * oppositions_of(hand).widest + GOOD_M
 
 
-def _search_postures(hand: HandModel, size: Size) -> Oppositions:
+def _search_postures(hand: HandModel, size: Size, parts: Parts | None = None) -> Oppositions:
     widest = oppositions_of(hand).widest
     least, most = SMALL_M if size == "small" else (widest, WIDER * widest)
-    rng, look = np.random.default_rng(0), _PairSearch(hand, size)
+    if parts is not None:
+        least, most = THINNEST_M, PART_WIDTH_M
+    rng, look = np.random.default_rng(0), _PairSearch(hand, size, parts)
     wanted = np.linspace(least, most, POSTURES)
     q = rng.uniform(hand.lower, hand.upper, (CROWD * POSTURES, hand.dofs))
     found = look.at(q, np.repeat(wanted, CROWD))
@@ -104,11 +125,14 @@ class _BestPairs:
 class _PairSearch:
     """Evaluates pairs of surface points as grips, in given postures."""
 
-    def __init__(self, hand: HandModel, size: Size) -> None:
+    def __init__(self, hand: HandModel, size: Size, parts: Parts | None = None) -> None:
         self.hand, self.facing = hand, FACING[size]
-        self.points = sample_surface(hand, POINTS[size])
+        self.points = sample_surface(hand, POINTS[size] if parts is None else PART_POINTS)
         body = self.points.body
         holds = np.ones(len(body), bool) if size == "small" else np.isin(body, hand.fingertips)
+        chosen = [digits.points_of_parts(hand, part, self.points) for part in parts or ()]
+        if parts is not None:
+            holds = chosen[0] | chosen[1]
         # Sorted by body, so that one matrix product compares a body's points with those of all later bodies.
         self.holding = np.flatnonzero(holds)[np.argsort(body[holds], kind="stable")]
         flat = _flatness(hand, self.points)[self.holding] if size == "small" else np.ones(len(self.holding))
@@ -118,6 +142,11 @@ class _PairSearch:
         self.blocks = [(slice(a, b), slice(b, count)) for a, b in zip([0, *ends[:-1]], ends, strict=True)]
         pairs = [np.mgrid[mine, later].reshape(2, -1) for mine, later in self.blocks]
         self.one, self.other = np.concatenate(pairs, axis=1)
+        self.excluded = np.zeros(len(self.one), bool)
+        if parts is not None:
+            first, second = (part[self.holding] for part in chosen)
+            between = (first[self.one] & second[self.other]) | (second[self.one] & first[self.other])
+            self.excluded = ~between
 
     def at(self, q: Floats, wanted: Floats) -> _BestPairs:
         """Return the best pair of each posture (n, D) for the widths `wanted` (n,)."""
@@ -167,7 +196,9 @@ class _PairSearch:
             cost += np.abs(width, out=width)
             cost += self.round[one, other]
             parts.append(cost.reshape(len(held), -1))
-        return np.concatenate(parts, axis=1)
+        found = np.concatenate(parts, axis=1)
+        found[:, self.excluded] = np.inf
+        return found
 
     def _closing_distance(
         self, q: Floats, bodies: Floats, axis: Floats, parts: tuple[Ints, Ints], ends: tuple[Floats, Floats]

@@ -17,7 +17,12 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.objects.mesh_geometry import points_on_triangles
 from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.region import ContactRegion
 
+#: Number of surface samples of a region; largest number on the whole object, and fewest in a region.
+SAMPLES: Final = 500
+DENSEST: Final = 50_000
+FEWEST: Final = 20
 #: Clearance between the opening and the object on each side [m].
 FIT_M: Final = 0.001
 
@@ -96,6 +101,23 @@ def even_points(obj: ObjectModel, count: int, rng: np.random.Generator) -> tuple
     face = np.minimum(face, len(sums) - 1)
     u, v = rng.random((2, count, 1))
     return points_on_triangles(corners[face], u, v), face
+
+
+def region_points(obj: ObjectModel, region: ContactRegion) -> tuple[Floats, NDArray[np.intp]]:
+    """Return about `SAMPLES` even points (P, 3) of a region of the surface, and their faces (P,).
+    Raises InputError: the region has hardly any surface."""
+    count = SAMPLES
+    while True:
+        place, face = even_points(obj, count, np.random.default_rng(0))
+        inside = np.flatnonzero(region.contains(place))
+        if len(inside) >= SAMPLES or region.is_whole or (count == DENSEST and len(inside) > FEWEST):
+            return place[inside], face[inside]
+        if count == DENSEST:
+            raise InputError(
+                f"{obj.name} has no surface in the region that grasps may touch: check the bounds, which are in metres "
+                "in the object's frame"
+            )
+        count = min(DENSEST, int(1.2 * count * SAMPLES / max(len(inside), 20)))
 
 
 def _exits(start: Floats, way: Floats, corners: Floats, normal: Floats) -> tuple[NDArray[np.intp], Floats]:

@@ -17,6 +17,7 @@ from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
+from graspd.worker.planners.requirements import NOTHING, Requirements
 from graspd.worker.simulation.environment import PlacedGrasps
 
 #: Returns scores (N,) of grasps in their scenes or, for None, around a free object. Smaller is better: below 1 a grasp
@@ -45,6 +46,7 @@ class PlanRequest:
     """Rollout that scores the candidates of a grasp; if None, the planner's own merit selects one."""
     first: int = 0
     """Number of the first grasp within its batch; above 0 only for methods with `in_parts`."""
+    requirements: Requirements = NOTHING
     others_have_place: bool = False
     """Whether other parts of the batch, planned elsewhere, have starts in their scenes.
     If so, the grasps of this part are returned as blocked even if none of them has a start."""

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graspd.service.model.transforms import Floats
+from graspd.worker.hands.digits import finger_of_body
 from graspd.worker.hands.model import HandModel
 
 #: A body closer than this is in contact [m] (DexGraspBench).
@@ -71,19 +72,6 @@ def _farthest(points: Floats, inside: NDArray[np.bool_], count: int) -> NDArray[
 def contact_links(body_distance: Floats) -> NDArray[np.int32]:
     """Count (B,) the bodies closer than `LINK_CONTACT_M`, from distances (B, L) [m]."""
     return (body_distance < LINK_CONTACT_M).sum(axis=1).astype(np.int32)
-
-
-def finger_of_body(hand: HandModel) -> NDArray[np.int32]:
-    """Return each body's finger (L,), an index into `HandModel.fingertips`; -1 for palm and shared bodies."""
-    finger = np.full(hand.bodies, -1, np.int32)
-    members = np.zeros(hand.bodies, np.int32)
-    for number, body in enumerate(hand.fingertips):
-        while body > 0:
-            finger[body] = number
-            members[body] += 1
-            body = int(hand.parent[body])
-    finger[members > 1] = -1
-    return finger
 
 
 def contact_distance_consistency_mm(hand: HandModel, body_distance: Floats) -> Floats:

@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from graspd.service.model.transforms import Floats
 from graspd.worker.grasps import Posture
+from graspd.worker.hands.digits import finger_of_body
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.quality.contact import LINK_CONTACT_M, contact_links, finger_of_body
+from graspd.worker.quality.contact import LINK_CONTACT_M, contact_links
 from graspd.worker.quality.probe import Probe, probe_of
 from graspd.worker.simulation.device import allocate_bodies, chain_of, posed_bodies, to_xyzw
 from graspd.worker.simulation.kernels import balance, jamming, opening, optimizers, touching

@@ -1,16 +1,4 @@
-"""The quality table: every metric of every grasp of one hand on one object, and the grasp types.
-
-Types are those of Napier (1956) and of the GRASP taxonomy (Feix et al., IEEE THMS 2016), by opposition (Iberall 1987):
-
-- power, palm opposition: the palm touches, or at least two digits wrap. A wrapping digit touches with more than its
-last link, and not by a side;
-- lateral, side opposition: at least half of the touching digits touch by a side;
-- precision, pad opposition: two digits touch, and neither other type applies.
-
-They are tested in this order. A *digit* is a chain of bodies that ends in a fingertip; all other bodies are palm. A
-digit touches *by a side* if most of its surface within 2 mm of the object faces along its axis of flexion. The
-tolerance is 45 degrees. A jaw has no side, so a gripper's grasps are of type precision, or power where its palm
-touches."""
+"""The quality table: every metric of every grasp of one hand on one object."""
 
 from __future__ import annotations
 
@@ -27,24 +15,19 @@ from cachetools import LRUCache
 from numpy.typing import NDArray
 
 from graspd.service.model.errors import InputError
-from graspd.service.model.metrics import GRASP_METRICS, GraspType
+from graspd.service.model.metrics import GRASP_METRICS
 from graspd.service.model.transforms import Floats
 from graspd.service.store.manifests import INDEX_THRESHOLD_M
 from graspd.worker.execution_context import DEFAULT_CONTEXT, Count, ExecutionContext
 from graspd.worker.grasps import GraspSet, Posture
-from graspd.worker.hands.model import HandModel, JointType
+from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.disk_cache import content_of
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.quality.contact import (
-    LINK_CONTACT_M,
-    MAX_CONTACTS,
-    contact_area_cm2,
-    contact_links,
-    finger_of_body,
-    spread_contacts,
-)
+from graspd.worker.objects.region import WHOLE, ContactRegion
+from graspd.worker.quality.contact import LINK_CONTACT_M, MAX_CONTACTS, contact_area_cm2, contact_links, spread_contacts
 from graspd.worker.quality.diversity import approach_cells
-from graspd.worker.quality.probe import HAND_POINTS, OBJECT_POINTS, REACH_M, Distances, Probe, probe_of
+from graspd.worker.quality.grasp_type import ContactPattern
+from graspd.worker.quality.probe import HAND_POINTS, OBJECT_POINTS, REACH_M, Distances, probe_of
 from graspd.worker.quality.volume import Overlap, SharedVolume, penetration_depth
 from graspd.worker.quality.wrench_space import measure_spaces, wrenches
 
@@ -65,12 +48,13 @@ class _Pair:
         told = int(np.argmin(np.abs(self.thresholds - INDEX_THRESHOLD_M)))
         self.with_volume = (np.arange(len(self.thresholds)) == told) | terms.every_volume
         self.probe = probe_of(hand, obj, hand_points=HAND_POINTS, object_points=OBJECT_POINTS)
+        self.region, self.measures = terms.region, terms.measures
         self.volume = SharedVolume(hand, obj)
         self.overlap = Overlap(hand, self.probe)
 
     def columns(self, posture: Posture) -> Columns:
         chunk = _Chunk(self, self.probe.measure(posture))
-        return {f"quality/{name}": measured(chunk) for name, measured in MEASURES.items()}
+        return {f"quality/{name}": measured(chunk) for name, measured in self.measures.items()}
 
 
 _pairs: LRUCache[str, _Pair] = LRUCache(4)
@@ -87,6 +71,7 @@ def measure(
     friction: float = DEFAULT_FRICTION,
     thresholds_m: Sequence[float] = DEFAULT_THRESHOLDS_M,
     every_volume: bool = False,
+    region: ContactRegion = WHOLE,
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> dict[str, NDArray[np.generic]]:
     """Compute the quality columns of a base shard for N grasps at contact.
@@ -98,13 +83,14 @@ def measure(
         thresholds_m: T contact thresholds, at most `REACH_M` [m].
         every_volume: compute the volume at all thresholds; otherwise only at the threshold nearest to
             `INDEX_THRESHOLD_M`, nan at the others. A volume takes ten times as long as an epsilon.
+        region: region whose share of the contact is measured; without one the column is missing.
         run: receives the number of finished grasps; polled for cancellation between chunks."""
     thresholds = np.asarray(thresholds_m, float)
     if thresholds.ndim != 1 or not len(thresholds) or (thresholds <= 0).any() or (thresholds > REACH_M).any():
         raise InputError(
             f"contact thresholds must be above 0 and at most {REACH_M * 1e3:g} mm; got {list(thresholds_m)}"
         )
-    terms = _Terms(hand, obj, friction, tuple(thresholds.tolist()), every_volume)
+    terms = _Terms(hand, obj, friction, tuple(thresholds.tolist()), every_volume, region)
     chunks = [slice(i, min(i + CHUNK, len(grasps))) for i in range(0, len(grasps), CHUNK)]
     postures = [Posture(grasps.grasp.hand_pose[chunk], grasps.grasp.joint_positions[chunk]) for chunk in chunks]
     parts = _measure_chunks(terms, postures, Count(len(grasps), run, "quality"), run)
@@ -121,6 +107,7 @@ class _Terms:
     friction: float
     thresholds: tuple[float, ...]
     every_volume: bool
+    region: ContactRegion
 
     @cached_property
     def pair(self) -> _Pair:
@@ -131,9 +118,15 @@ class _Terms:
                 _pairs[content] = _Pair(self)
             return _pairs[content]
 
+    @property
+    def measures(self) -> dict[str, Callable[[_Chunk], NDArray[np.generic]]]:
+        return {name: one for name, one in MEASURES.items() if name != "region_share" or not self.region.is_whole}
+
     def empty(self) -> Columns:
         swept = {metric.name for metric in GRASP_METRICS if metric.swept}
-        return {f"quality/{name}": np.zeros((0, len(self.thresholds)) if name in swept else 0) for name in MEASURES}
+        return {
+            f"quality/{name}": np.zeros((0, len(self.thresholds)) if name in swept else 0) for name in self.measures
+        }
 
 
 def _measure_chunks(terms: _Terms, postures: Sequence[Posture], done: Count, run: ExecutionContext) -> list[Columns]:
@@ -168,6 +161,14 @@ class _Chunk:
     found: Distances
 
     @cached_property
+    def body_distance(self) -> Floats:
+        return self.pair.probe.body_distance(self.found)
+
+    @cached_property
+    def pattern(self) -> ContactPattern:
+        return ContactPattern.of(self.pair.probe, self.found, self.body_distance)
+
+    @cached_property
     def spaces(self) -> tuple[Floats, Floats]:
         """Epsilon and volume (B, T) of the wrench spaces of B grasps."""
         pair, found, obj = self.pair, self.found, self.pair.obj
@@ -180,6 +181,12 @@ class _Chunk:
         wanted = np.broadcast_to(pair.with_volume, count.shape)
         epsilon, volume = measure_spaces(edges.reshape(-1, *edges.shape[2:]), count.ravel(), wanted.ravel())
         return epsilon.reshape(count.shape), volume.reshape(count.shape)
+
+    def region_share(self) -> Floats:
+        near = np.abs(self.found.distance) < LINK_CONTACT_M
+        area = np.where(near, self.pair.probe.points.area, 0.0)
+        inside = np.where(self.pair.region.contains(self.found.closest), area, 0.0).sum(axis=1)
+        return np.asarray(inside / np.maximum(area.sum(axis=1), 1e-12))
 
     def shared_volume(self) -> Floats:
         # A face may enter a piece between object points, but a point is within half a diagonal of their grid.
@@ -199,45 +206,10 @@ MEASURES: Final[dict[str, Callable[[_Chunk], NDArray[np.generic]]]] = {
     "wrench_volume": lambda chunk: chunk.spaces[1],
     "penetration_depth_mm": lambda chunk: penetration_depth(chunk.found) * 1e3,
     "self_penetration_depth_mm": lambda chunk: chunk.found.self_depth * 1e3,
-    "contact_links": lambda chunk: contact_links(chunk.pair.probe.body_distance(chunk.found)),
-    "grasp_type": lambda chunk: grasp_types(chunk.pair.probe, chunk.found),
+    "contact_links": lambda chunk: contact_links(chunk.body_distance),
+    "grasp_type": lambda chunk: chunk.pattern.types,
+    "taxonomy_type": lambda chunk: chunk.pattern.taxonomy(),
+    "digits": lambda chunk: chunk.pattern.digits,
+    "region_share": _Chunk.region_share,
     "approach_cell": lambda chunk: approach_cells(chunk.pair.probe.hand, chunk.found.bodies[:, 0, 3:]),
 }
-
-#: Cosine between a digit's surface normal and its axis of flexion above which the surface is a side: 45 degrees.
-SIDE_COS: Final = float(np.sqrt(0.5))
-#: Least number of wrapping digits of a power grasp if the palm does not touch.
-ENVELOPING: Final = 2
-
-
-def grasp_types(probe: Probe, found: Distances) -> NDArray[np.int32]:
-    hand = probe.hand
-    finger = finger_of_body(hand)
-    touching = probe.body_distance(found) < LINK_CONTACT_M
-    digits = np.array(sorted(set(finger[finger >= 0].tolist())), finger.dtype)
-    inner = np.array([body for body in np.flatnonzero(finger >= 0) if body not in hand.fingertips], np.intp)
-    palm = touching[:, finger < 0].any(axis=1)
-    touches = np.stack([touching[:, finger == digit].any(axis=1) for digit in digits], axis=1)
-    wraps = np.stack([touching[:, inner[finger[inner] == digit]].any(axis=1) for digit in digits], axis=1)
-    sides = touches & _touching_with_sides(probe, found, finger, digits)
-    count = touches.sum(axis=1)
-    lateral = sides.any(axis=1) & (2 * sides.sum(axis=1) >= count)
-    power = palm | ((wraps & ~sides).sum(axis=1) >= ENVELOPING)
-    told = np.where(lateral, GraspType.LATERAL, GraspType.PRECISION)
-    told = np.where(power, GraspType.POWER, told)
-    return np.where(count + palm < 2, GraspType.NONE, told).astype(np.int32)
-
-
-def _touching_with_sides(
-    probe: Probe, found: Distances, finger: NDArray[np.int32], digits: NDArray[np.int32]
-) -> NDArray[np.bool_]:
-    """Return a mask (B, digits) of digits with more than half of their near points on their sides."""
-    hand, points = probe.hand, probe.points
-    near = np.where(np.abs(found.distance) < LINK_CONTACT_M, points.area, 0.0)
-    # Axes about which bodies close, 0 for other bodies. The axis of a body's joint is constant in the body's frame.
-    bends = (hand.joint_type == JointType.REVOLUTE) & (hand.dof >= 0)
-    bends &= np.where(hand.dof >= 0, hand.closing[hand.dof], 0.0) != 0
-    axes = np.where(bends[:, None], hand.axis, 0.0)
-    side = np.abs(np.einsum("ni,ni->n", points.normal, axes[points.body])) > SIDE_COS
-    mine = finger[points.body][:, None] == digits
-    return np.asarray(near @ (mine & side[:, None]) > 0.5 * (near @ mine))

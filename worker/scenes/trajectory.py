@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, quat_from_axis_angle, quat_rotate
 from graspd.worker.control.postures import wide_open_joints
 from graspd.worker.grasps import GraspSet, Posture, move_poses
+from graspd.worker.hands.digits import finger_of_body
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.quality.contact import finger_of_body
 from graspd.worker.quality.probe import Probe, probe_of
 from graspd.worker.scenes.clearance import MARGIN_M, PATH_POSTURES, approach_postures
 from graspd.worker.simulation.environment import RISE_M, STANDOFF_M, Environment, PlacedGrasps

@@ -7,12 +7,15 @@ from typing import Any, Final
 
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import Floats
-from graspd.worker.hands.model import SurfacePoints
+from graspd.worker.hands.digits import points_of_parts
+from graspd.worker.hands.model import HandModel, SurfacePoints
+from graspd.worker.objects.region import WHOLE, ContactRegion
 from graspd.worker.simulation.device import DeviceHand, DeviceObject
-from graspd.worker.simulation.kernels import contact, pieces
+from graspd.worker.simulation.kernels import contact, pieces, surface
 from graspd.worker.simulation.obstacles import DeviceObstacles
 
 #: Weights of points are areas in units of 1/800 of the hand's surface: the loss is independent of the points' number.
@@ -24,6 +27,7 @@ SOLVERS: Final = {"direct": contact.direct, "jacobi": contact.jacobi, "gauss_sei
 NEAR_GAP: Final = 4e-3  # largest gap of contacts in the direct solver's near list: four steps of the object [m]
 CPU_LANE: Final = 64  # points per thread on the CPU, where starting a thread costs as much as a point; on CUDA 1
 MAX_DILATION: Final = 0.1  # largest dilation of a schedule [m]
+NO_CONTACT_M: Final = 4e-3  # clearance of points that must not touch: twice the distance that counts as contact [m]
 
 
 @dataclass(frozen=True)
@@ -52,6 +56,30 @@ class LossOptions:
 
 
 @dataclass(frozen=True)
+class AllowedContacts:
+    """Contacts that a grasp may have: parts of the hand, and a region of the object."""
+
+    parts: NDArray[np.int32] | None = None
+    """(L,) `Part` of each body that may touch; None: all."""
+    region: ContactRegion = WHOLE
+
+    def points(self, hand: HandModel, points: SurfacePoints) -> NDArray[np.bool_]:
+        return np.ones(len(points), bool) if self.parts is None else points_of_parts(hand, self.parts, points)
+
+    def regions(self, origin: Floats) -> Any:
+        """Upload the regions relative to `origin` (3,) to the current device."""
+        out = surface.ContactRegions()
+        for name, planes in (("allowed", self.region.touch), ("forbidden", self.region.avoid)):
+            planes = np.zeros((0, 4)) if planes is None else planes - [0, 0, 0, 1] * (planes[:, :3] @ origin)[:, None]
+            setattr(out, name, wp.array(planes, dtype=wp.vec4, ndim=1))
+        out.clearance = 0.0 if self is ANYWHERE else NO_CONTACT_M
+        return out
+
+
+ANYWHERE: Final = AllowedContacts()
+
+
+@dataclass(frozen=True)
 class Model:
     """A hand with one set of points, an object on a device, and the options of their simulation."""
 
@@ -67,6 +95,7 @@ class Model:
     self_scale: float  # weight of one body point
     physics: Any
     motions: Any  # (M,) free motions of the object
+    regions: Any  # `surface.ContactRegions`
 
     @staticmethod
     def create(
@@ -76,11 +105,16 @@ class Model:
         self_points: SurfacePoints,
         options: LossOptions,
         obstacles: DeviceObstacles | None = None,
+        allowed: AllowedContacts = ANYWHERE,
     ) -> Model:
-        """Create the model with arrays on the hand's device; raise InputError for an unknown contact solver."""
+        """Create the model with arrays on the hand's device.
+        Raises InputError: unknown contact solver, or limits on contacts for another solver than `direct`."""
         if options.contact_solver not in SOLVERS:
             raise InputError(f"unknown contact solver {options.contact_solver!r}; choose one of {', '.join(SOLVERS)}")
+        if allowed is not ANYWHERE and options.contact_solver != "direct":
+            raise InputError(f"contact solver {options.contact_solver} allows contact anywhere: use direct")
         weight = points.area * (REFERENCE_POINTS / points.area.sum())
+        weight = np.where(allowed.points(hand.model, points), weight, -weight)
         motions = initial_motions(options.velocities, options.step, obj.model.gyration_radius)
         with wp.ScopedDevice(hand.device):
             return Model(
@@ -96,6 +130,7 @@ class Model:
                 self_scale=REFERENCE_SELF_POINTS / max(len(self_points), 1),
                 physics=_physics(obj, options),
                 motions=wp.array(motions, dtype=contact.vec6),
+                regions=allowed.regions(obj.model.centre_of_mass),
             )
 
     @property

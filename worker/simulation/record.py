@@ -66,7 +66,7 @@ def add_distances(out: Launches, m: Model, d: Data, *, within: float | None = No
     o = m.options
     nearness = [o.band, o.exact_below, o.band] if within is None else [o.band, within, within]
     points = [m.point_body, m.point_position, m.point_weight]
-    inputs = [m.obj.surface, *nearness, NEAR_GAP, m.lane, *points, d.schedule.dilation, d.hands]
+    inputs = [m.obj.surface, m.regions, *nearness, NEAR_GAP, m.lane, *points, d.schedule.dilation, d.hands]
     out.add(surface.gather, (d.capacity, m.lanes), inputs=inputs, outputs=[d.marked or d.contacts])
     if (marked := d.marked) is not None:
         counts = d.chunk_counts

@@ -31,7 +31,7 @@ from graspd.service.model.transforms import (
     spread_directions,
 )
 from graspd.worker.hands.flat_pinches import HEIGHTS_M, flat_pinches
-from graspd.worker.hands.grasp_widths import Size, largest_width, postures_for_size
+from graspd.worker.hands.grasp_widths import Size, largest_width, postures_between, postures_for_size
 from graspd.worker.hands.jaws import thinnest_fingertip
 from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
@@ -39,7 +39,9 @@ from graspd.worker.hands.pinch_postures import Oppositions, oppositions_of
 from graspd.worker.hands.surface import sample_surface
 from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.objects.model import ObjectModel
-from graspd.worker.planners.fitting import even_points, surface_of
+from graspd.worker.objects.region import WHOLE, ContactRegion
+from graspd.worker.planners.fitting import region_points, surface_of
+from graspd.worker.planners.requirements import INNER, NOTHING, Requirements
 from graspd.worker.simulation.data import HandState
 from graspd.worker.simulation.device import to_wxyz, to_xyzw
 from graspd.worker.simulation.environment import CLEAR_M, Environment
@@ -49,10 +51,8 @@ from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.mounting import OUTERMOST, points_of
 from graspd.worker.simulation.obstacles import MARGIN_M
 
-#: Number of surface samples that form pairs, and least cosine between a pair's line and its normals. Such lines are
-#: inside the friction cones at half friction. Share of grasps on six objects that lift at half friction, with a cosine
+#: Least cosine between a pair's line and its normals. Such lines are inside the friction cones at half friction. Share of grasps on six objects that lift at half friction, with a cosine
 #: of 0.9: Allegro .39, Shadow .30; with 0.96: Allegro .42, Shadow .39.
-SAMPLES: Final = 500
 ACROSS: Final = 0.96
 #: Least distance of the two points [m].
 THINNEST_M: Final = 0.002
@@ -95,8 +95,8 @@ class Crossings:
 
 
 @cached_by_content(16)
-def crossings_of(obj: ObjectModel) -> Crossings:
-    place, face = even_points(obj, SAMPLES, np.random.default_rng(0))
+def crossings_of(obj: ObjectModel, region: ContactRegion = WHOLE) -> Crossings:
+    place, face = region_points(obj, region)
     normal = surface_of(obj)[1][face]
     line = place[None] - place[:, None]
     width = np.linalg.norm(line, axis=-1)
@@ -122,13 +122,22 @@ class Openings:
     within_reach: bool
     """Whether a pair is nearly level, clear of obstacles, and no wider than the hand opens.
     This is the geometric condition for a grasp between opposed fingers from above or from the side."""
+    at_pads: bool = False
+    """Whether all pairs are between the pads, never nearer to the palm."""
 
     @classmethod
     def of(
-        cls, known: Oppositions, obj: ObjectModel, scene: Environment, *, tip: float = 0.0, upright: bool = False
+        cls,
+        known: Oppositions,
+        obj: ObjectModel,
+        scene: Environment,
+        *,
+        tip: float = 0.0,
+        upright: bool = False,
+        wanted: Requirements = NOTHING,
     ) -> Openings:
         """Select pairs narrow enough for the hand; favour pairs with space for fingertips `tip` thick [m]."""
-        pairs = crossings_of(obj)
+        pairs = crossings_of(obj, wanted.region)
         level = np.abs(pairs.axis @ scene.up) < STEEP
         fits = pairs.width + 2 * ROOM_M[0] <= known.widest
         if upright:
@@ -136,7 +145,7 @@ class Openings:
             length = np.linalg.norm(flat, axis=1, keepdims=True)
             pairs, fits = replace(pairs, axis=flat / np.maximum(length, 1e-9)), fits & level
         if not fits.any():
-            return cls(pairs, np.zeros(0), known, scene.up, upright, False)
+            return cls(pairs, np.zeros(0), known, scene.up, upright, False, wanted.by_pads)
         aside = pairs.middle - obj.centre_of_mass
         aside = aside - (aside @ scene.up)[:, None] * scene.up
         chance = np.exp(-((np.linalg.norm(aside, axis=1) / BESIDE_M) ** 2)) + FAR
@@ -147,15 +156,17 @@ class Openings:
         easy = (room >= MARGIN_M) & (end_clearance(pairs, scene, tip) >= 0.0)
         chance *= np.where(level, 1.0, SELDOM) * np.where(easy, 1.0, SELDOM) * fits
         within_reach = bool((fits & easy & level).any())
-        return cls(pairs, np.cumsum(chance) / chance.sum(), known, scene.up, upright, within_reach)
+        return cls(pairs, np.cumsum(chance) / chance.sum(), known, scene.up, upright, within_reach, wanted.by_pads)
 
     @classmethod
-    def in_scene(cls, hand: HandModel, obj: ObjectModel, scene: Environment) -> Openings:
+    def in_scene(
+        cls, hand: HandModel, obj: ObjectModel, scene: Environment, wanted: Requirements = NOTHING
+    ) -> Openings:
         """Select pairs for fingertips that rest beside a flat object; if none fits, for the pads."""
         ends = flat_pinches(hand, float(np.ptp(obj.hull_vertices @ scene.up)))
         tip = thinnest_fingertip(hand)
-        flat = cls.of(ends, obj, scene, tip=tip, upright=True)
-        return flat if len(flat.sums) else cls.of(oppositions_of(hand), obj, scene, tip=tip)
+        flat = cls.of(ends, obj, scene, tip=tip, upright=True, wanted=wanted)
+        return flat if len(flat.sums) else cls.of(oppositions_of(hand), obj, scene, tip=tip, wanted=wanted)
 
 
 def end_clearance(pairs: Crossings, scene: Environment, width: float) -> Floats:
@@ -221,7 +232,7 @@ def place_antipodal_hands(
     away = -np.einsum("nij,nj->ni", turn, palm)
     reach = known.middle[posture] - hand.palm.centre
     # The depth ranges from a fingertip grasp to a palm in contact with the object.
-    deep = np.maximum(np.einsum("ni,ni->n", reach, palm), 0.0) * uniform[:, 5]
+    deep = np.maximum(np.einsum("ni,ni->n", reach, palm), 0.0) * uniform[:, 5] * (not opening.at_pads)
     pivot = opening.pairs.middle[pair] - np.einsum("nij,nj->ni", turn, reach) - deep[:, None] * away
     return AntipodalHands(known, posture, pivot - obj.centre_of_mass, turn, away, deep)
 
@@ -386,9 +397,9 @@ class ReachSampling:
     Starts with the palm towards a random point then rarely succeed."""
 
     @classmethod
-    def of(cls, model: Model) -> ReachSampling | None:
+    def of(cls, model: Model, wanted: Requirements = NOTHING) -> ReachSampling | None:
         """Create the sampling; None without opposed fingers, or if the object is too wide everywhere."""
-        known = _grips(model.hand.model, model.obj.model, model.device)
+        known = _grips(model.hand.model, model.obj.model, model.device, wanted)
         return None if known is None else cls(model, *known)
 
     def starts(self, seeds: NDArray[np.int32], first: NDArray[np.int32], retreats: Floats) -> tuple[HandState, Any]:
@@ -426,11 +437,14 @@ def _postures(hand: HandModel, width: Floats, size: Size | None) -> Oppositions:
 
 
 @cached_by_content(8)
-def _grips(hand: HandModel, obj: ObjectModel, device: str) -> tuple[Any, bool] | None:
+def _grips(hand: HandModel, obj: ObjectModel, device: str, wanted: Requirements) -> tuple[Any, bool] | None:
     """Return `ReachSampling.grips` and `.only`; None if no posture fits a pair."""
-    pairs, out = crossings_of(obj), kernels.Grips()
+    pairs, out = crossings_of(obj, wanted.region), kernels.Grips()
     size = classify_size(hand, pairs.width)
-    known = _postures(hand, pairs.width, size)
+    if (parts := wanted.opposed_parts(hand)) is not None:
+        known, size = postures_between(hand, *parts), "small"
+    else:
+        known = _postures(hand, pairs.width, size)
     if not len(known):
         return None
     kept = np.flatnonzero(pairs.width + 2 * ROOM_M[0] <= known.widest)
@@ -451,8 +465,11 @@ def _grips(hand: HandModel, obj: ObjectModel, device: str) -> tuple[Any, bool] |
         out.balls = wp.array(balls, dtype=wp.vec3)
         out.radius = BALL_M - SLACK_M
         # Objects that are too small or too wide are held between the pads, never nearer to the palm.
-        out.deep = 0.0 if size else 1.0
+        at_pads = bool(size) or wanted.by_pads
+        out.deep = 0.0 if at_pads else 1.0
+        out.cone_axis = wp.vec3(*(np.zeros(3) if wanted.approach is None else wanted.approach))
+        out.cone_cos = -1.0 if wanted.approach is None else float(np.cos(INNER * wanted.cone))
         out.palm = wp.vec3(*hand.palm.approach)
         out.noise = wp.array(NOISE * hand.span, dtype=wp.float32)
         out.lower, out.upper = wp.array(hand.lower, dtype=wp.float32), wp.array(hand.upper, dtype=wp.float32)
-    return out, size is not None
+    return out, at_pads

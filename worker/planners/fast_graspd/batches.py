@@ -13,6 +13,7 @@ from graspd.service.model.errors import InputError, TaskCancelled
 from graspd.service.model.fidelity import Fidelity
 from graspd.service.model.transforms import Floats
 from graspd.worker.grasps import GraspSet
+from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners.fast_graspd.scene_starts import free_directions
 from graspd.worker.planners.fast_graspd.schedule import WarmStart, fidelity_in_scenes
@@ -27,11 +28,18 @@ Rows = NDArray[np.intp]
 class Batches:
     """Grasps of several batches, one batch after the other; a row is a grasp."""
 
-    def __init__(self, asked: Sequence[BatchRequest], obj: ObjectModel, warm: WarmStart | None = None) -> None:
+    def __init__(
+        self,
+        asked: Sequence[BatchRequest],
+        obj: ObjectModel,
+        warm: WarmStart | None = None,
+        hand: HandModel | None = None,
+    ) -> None:
         """All batches have one fidelity; all or none are in scenes, with the same supports and neighbours.
         In scenes, `warm` proposes the starts of hands; without it, `scene_starts` finds them."""
-        self.asked, self.warm = asked, warm
+        self.asked, self.warm, self.hand = asked, warm, hand
         wanted = [one.wanted for one in asked]
+        self.requirements = wanted[0].requirements
         self.fidelity = wanted[0].fidelity
         if wanted[0].placed is not None:
             self.fidelity = fidelity_in_scenes(self.fidelity)
@@ -59,7 +67,10 @@ class Batches:
         for owner, scenes in enumerate(placed):
             try:
                 # All batches have scenes here, so `owner` is the number of the batch.
-                self.ways += [free_directions(scene, obj) for scene in scenes.scenes]
+                self.ways += [
+                    self.requirements.retreats(free_directions(scene, obj), scenes, number)
+                    for number, scene in enumerate(scenes.scenes)
+                ]
             except InputError as error:
                 self.ways += [np.zeros((0, 3))] * len(scenes.scenes)
                 self.fail(owner, error)

@@ -13,7 +13,7 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners.fast_graspd.schedule import loss_options
 from graspd.worker.simulation import kernels
 from graspd.worker.simulation.device import DeviceHand, DeviceObject
-from graspd.worker.simulation.model import LossOptions, Model
+from graspd.worker.simulation.model import ANYWHERE, AllowedContacts, LossOptions, Model
 from graspd.worker.simulation.obstacles import DeviceObstacles
 from graspd.worker.simulation.sampling import object_samples
 
@@ -46,24 +46,35 @@ class Pair:
     fine: PhaseGeometry
     options: LossOptions
     hand: DeviceHand
+    allowed: AllowedContacts = ANYWHERE
 
     def model(self, side: PhaseGeometry, obstacles: DeviceObstacles | None = None, *, pulled: bool = True) -> Model:
         """Return the model of a phase; among obstacles, or unless `pulled`, it has no attraction term.
         The term would pull fingers that enclose the object into the table."""
         options = self.options if obstacles is None and pulled else replace(self.options, pull=0.0)
-        return Model.create(self.hand, side.obj, side.points, side.own, options, obstacles)
+        return Model.create(self.hand, side.obj, side.points, side.own, options, obstacles, self.allowed)
 
 
-def pair_of(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, device: str, *, in_scenes: bool = False) -> Pair:
+def pair_of(
+    hand: HandModel,
+    obj: ObjectModel,
+    fidelity: Fidelity,
+    device: str,
+    *,
+    in_scenes: bool = False,
+    allowed: AllowedContacts = ANYWHERE,
+) -> Pair:
     """Return the pair, cached. Projections around a free object use more samples than `fidelity` states."""
     count = fidelity.object_points
     if fidelity.polish_iterations and not in_scenes:
         count = max(count, min(DENSER * count, DENSEST))
-    return _pair(hand, obj, fidelity, count, device)
+    return _pair(hand, obj, fidelity, count, device, allowed)
 
 
 @cached_by_content(KEPT)
-def _pair(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, count: int, device: str) -> Pair:
+def _pair(
+    hand: HandModel, obj: ObjectModel, fidelity: Fidelity, count: int, device: str, allowed: AllowedContacts
+) -> Pair:
     kernels.load(device)
     samples = object_samples(obj, count)
     whole = DeviceObject.create(obj, device, samples=samples, phong_alpha=fidelity.phong_alpha, cell=FIELD_CELL)
@@ -78,4 +89,5 @@ def _pair(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, count: int, dev
         ),
         options=loss_options(fidelity),
         hand=DeviceHand.create(hand, device),
+        allowed=allowed,
     )

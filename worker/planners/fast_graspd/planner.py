@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from graspd.service.model.fidelity import Fidelity
 from graspd.service.model.transforms import Floats
-from graspd.worker.control.postures import close_fingers, fingers_off_object, touching_links
+from graspd.worker.control.postures import STANDS_OFF_M, close_fingers, fingers_off_object, touching_links
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet, join_grasp_sets
 from graspd.worker.hands.model import HandModel
@@ -73,6 +73,8 @@ FREE: Final = (GOOD, STANDS, *(FAILED,) * 18)
 #: exceeds only the first limit; a grasp that fails only at half friction exceeds the first five. Five attempts instead
 #: of two raise the share that lifts at half friction from .63 to .67 at 3 % more time (Allegro, 12 objects, own mass).
 IN_SCENES: Final = (GOOD_IN_SCENES, *(1.0,) * 4, FAILED)
+#: Range of the distance at which a digit that must touch is closed [m].
+MUST_TOUCH_M: Final = (0.001, 0.06)
 #: Largest number of attempts of one grasp at once.
 AHEAD: Final = 4
 
@@ -128,10 +130,11 @@ def plan_batches(
 ) -> list[GraspSet | Exception]:
     """Plan batches, see `worker.planners.BatchPlanner`; for `warm` see `Batches`."""
     began = time.perf_counter()
-    batches = Batches(asked, obj, warm)
+    whole, hand = hand, asked[0].wanted.requirements.hand(hand)
+    batches = Batches(asked, obj, warm, whole)
     run = asked[0].run
     try:
-        parts = optimise(_pair(hand, obj, asked[0].wanted, run), batches, run, postures=True)
+        parts = optimise(_pair(whole, obj, asked[0].wanted, run), batches, run, postures=True)
     except Exception:
         if len(batches.errors) < len(asked):
             raise
@@ -149,7 +152,8 @@ def plan_batches(
 
 
 def _pair(hand: HandModel, obj: ObjectModel, wanted: PlanRequest, run: ExecutionContext) -> Pair:
-    return pair_of(hand, obj, wanted.fidelity, run.device, in_scenes=wanted.placed is not None)
+    allowed, hand = wanted.requirements.allowed(hand), wanted.requirements.hand(hand)
+    return pair_of(hand, obj, wanted.fidelity, run.device, in_scenes=wanted.placed is not None, allowed=allowed)
 
 
 def optimise_batch(hand: HandModel, obj: ObjectModel, wanted: PlanRequest, run: ExecutionContext) -> list[LaunchPart]:
@@ -219,11 +223,15 @@ class _Launch:
         return merits(hand, obj, state, losses, depths, friction=friction, device=device)
 
     def closed(self, state: HandState, rows: Rows) -> HandState:
-        """In scenes, close fingers that stand off the object; `rows` (n,) are the grasps of the hands."""
-        if self.batches.placed is None:
+        """Close fingers that stand off the object; `rows` (n,) are the grasps of the hands.
+        Free grasps are closed only if a certain number of digits must touch."""
+        required = self.batches.requirements.links > MIN_CONTACT_LINKS
+        if self.batches.placed is None and not required:
             return state
         hand, obj, device = self.pair_on_device()
-        grasp = close_fingers(hand, obj, posture_of(hand, obj, state), self.batches.placed.take(rows), device=device)
+        off_m = MUST_TOUCH_M if required else STANDS_OFF_M
+        posture = posture_of(hand, obj, state)
+        grasp = close_fingers(hand, obj, posture, self.placed(rows), off_m=off_m, device=device)
         return HandState(state.pivot, state.rotation, hand.reduce(grasp.joint_positions))
 
     def stand_off(self, state: HandState) -> NDArray[np.bool_]:
@@ -233,13 +241,19 @@ class _Launch:
         hand, obj, device = self.pair_on_device()
         return fingers_off_object(hand, obj, posture_of(hand, obj, state), device=device)
 
-    def infeasible(self, state: HandState, depths: Floats) -> NDArray[np.bool_]:
-        """Return a mask (n,) of hands that get no rollout, as they fail the geometric gate; `depths` (n,) [m]."""
+    def infeasible(self, state: HandState, depths: Floats, rows: Rows) -> NDArray[np.bool_]:
+        """Return a mask (n,) of hands of grasps `rows` that get no rollout; `depths` (n,) [m].
+        They fail the geometric gate or the requirements."""
         if not self.batches.has_rollout:
             return np.zeros(len(depths), bool)
         hand, obj, device = self.pair_on_device()
-        links = touching_links(hand, obj, posture_of(hand, obj, state), device=device)
-        return (depths > 1e-3 * MAX_PENETRATION_MM) | (links < MIN_CONTACT_LINKS)
+        posture, wanted = posture_of(hand, obj, state), self.batches.requirements
+        links = touching_links(hand, obj, posture, device=device)
+        bad = (depths > 1e-3 * MAX_PENETRATION_MM) | (links < max(MIN_CONTACT_LINKS, wanted.links))
+        if wanted.is_set and not bad.all():
+            fair = np.flatnonzero(~bad)
+            bad[fair] = ~wanted.fulfilled(self.batches.hand or hand, obj, posture.take(fair), self.placed(rows[fair]))
+        return bad
 
 
 @dataclass(frozen=True)
@@ -279,14 +293,16 @@ def _draw_starts(launch: _Launch, rows: Rows, attempt: Rows) -> _Starts:
     batches, coarse = launch.batches, launch.coarse
     fidelity, placed, generators = batches.fidelity, launch.placed(rows), batches.generators(rows, attempt)
     if placed is None:
-        state, depth = starts.clear_starts(coarse, generators, each=fidelity.starts)
+        state, depth = starts.clear_starts(coarse, generators, each=fidelity.starts, wanted=batches.requirements)
         # Only grasps that opened further in their first attempt may do so later; the others have clear starts.
         may_open = np.repeat(batches.opened[rows] | (attempt == 0), fidelity.starts)
-        opened = starts.open_further(coarse, generators, state, depth, may_open)
+        opened = starts.open_further(coarse, generators, state, depth, may_open, batches.requirements)
         batches.opened[rows] |= opened.reshape(len(rows), -1).any(axis=1)
     else:
         starts_of = batches.warm or scene_starts.clear_scene_starts
-        state, depth = starts_of(coarse, generators, each=fidelity.starts, placed=placed, ways=batches.ways)
+        state, depth = starts_of(
+            coarse, generators, each=fidelity.starts, placed=placed, ways=batches.ways, wanted=batches.requirements
+        )
     touch = Probe(coarse, len(state.pivot)).nearest(state) / DILATION if fidelity.dilation == "touch" else None
     return _Starts(rows, state, depth, touch)
 
@@ -425,7 +441,13 @@ class _FinePhase:
         # Without iterations the projection only measures the depth of each hand.
         state, depths = Projection(launch.fine, data, options).run(state, fidelity.polish_iterations)
         merit = launch.merits(state, losses, depths) if rows.shape[1] > 1 else np.zeros(len(flat))
-        return Refinements(state, losses, merit, launch.infeasible(state, depths), launch.stand_off(state))
+        return Refinements(
+            state,
+            losses,
+            merit,
+            launch.infeasible(state, depths, np.repeat(mine, rows.shape[1])),
+            launch.stand_off(state),
+        )
 
 
 def _set_scenes(data: Data, placed: PlacedGrasps | None, each: int) -> Data:

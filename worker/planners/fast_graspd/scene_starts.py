@@ -24,6 +24,7 @@ from graspd.service.model.transforms import (
     quat_rotate,
     spread_directions,
 )
+from graspd.worker.hands.digits import finger_of_body
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.mesh_geometry import points_on_triangles
 from graspd.worker.objects.model import ObjectModel
@@ -44,9 +45,9 @@ from graspd.worker.planners.fast_graspd.starts import (
     hands_at_distances,
     store_states,
 )
-from graspd.worker.planners.fitting import surface_of
+from graspd.worker.planners.fitting import region_points, surface_of
 from graspd.worker.planners.port import NoStartFound
-from graspd.worker.quality.contact import finger_of_body
+from graspd.worker.planners.requirements import NOTHING, Requirements
 from graspd.worker.simulation.data import HandState
 from graspd.worker.simulation.environment import RISE_M, STANDOFF_M, Environment, PlacedGrasps
 from graspd.worker.simulation.model import Model
@@ -104,7 +105,13 @@ def no_start_error(model: Model) -> NoStartFound:
 
 
 def clear_scene_starts(
-    model: Model, generators: list[np.random.Generator], *, each: int, placed: PlacedGrasps, ways: Sequence[Floats]
+    model: Model,
+    generators: list[np.random.Generator],
+    *,
+    each: int,
+    placed: PlacedGrasps,
+    ways: Sequence[Floats],
+    wanted: Requirements = NOTHING,
 ) -> tuple[HandState, Floats]:
     """Return a start for each generator, `each` per grasp, and its depth (n,) [m].
     The start is the first clear draw, or the least deep one; an antipodal start is the clear draw with its pair nearest
@@ -113,21 +120,22 @@ def clear_scene_starts(
     hand, obj = model.hand.model, model.obj.model
     probe = Probe(model, len(generators), room=ROOM)
     used = set(placed.index.tolist())
-    openings = {s: Openings.in_scene(hand, obj, scene) for s, scene in enumerate(placed.scenes) if s in used}
+    openings = {s: Openings.in_scene(hand, obj, scene, wanted) for s, scene in enumerate(placed.scenes) if s in used}
     scene = np.repeat(placed.index, each)
-    reaching = np.arange(len(scene)) % each % EVERY < REACHING
+    reaching = (np.arange(len(scene)) % each % EVERY < REACHING) | wanted.by_pads
+    reaching &= not wanted.by_palm
     reaching &= np.array([len(openings[s].sums) > 0 for s in scene.tolist()], bool)
-    count, around = len(scene), _SceneDraws(hand, obj, ways, openings)
+    count, around = len(scene), _SceneDraws(hand, obj, ways, openings, wanted)
     uniform = np.array([g.random((DRAWS, _UNIFORM)) for g in generators])
     normal = np.zeros((count, 0, 2 + hand.dofs))
     best = HandState(np.zeros((count, 3)), np.tile([1.0, 0, 0, 0], (count, 1)), np.zeros((count, hand.dofs)))
     depth, beside = np.full(count, np.inf), np.where(reaching, np.inf, 0.0)
     order, least_beside = around.select_draws(uniform, scene, reaching, placed)
     for number in range(DRAWS):
-        wanted = depth > CLEAR
+        redraw = depth > CLEAR
         if number < REACHES:
-            wanted |= reaching & (beside > NEAR_M) & (least_beside[:, number] < beside)
-        rows = np.flatnonzero(wanted)
+            redraw |= reaching & (beside > NEAR_M) & (least_beside[:, number] < beside)
+        rows = np.flatnonzero(redraw)
         if not len(rows):
             break
         if number == normal.shape[1]:
@@ -224,6 +232,7 @@ class _SceneDraws:
     obj: ObjectModel
     ways: Sequence[Floats]
     openings: Mapping[int, Openings]
+    wanted: Requirements = NOTHING
 
     def select_draws(
         self, uniform: Floats, scene: NDArray[np.intp], reaching: NDArray[np.bool_], placed: PlacedGrasps
@@ -267,6 +276,10 @@ class _SceneDraws:
         corners, normals, sums = surface_of(obj)
         face = np.minimum(np.searchsorted(sums, uniform[:, 0]), len(sums) - 1)
         point = points_on_triangles(corners[face], uniform[:, 1:2], uniform[:, 2:3])
+        if not self.wanted.region.is_whole:
+            places, faces = region_points(obj, self.wanted.region)
+            chosen = (uniform[:, 0] * len(places)).astype(int)
+            point, face = places[chosen], faces[chosen]
         away = _tilted(normals[face], TILT * normal[:, :2])
         away = np.array([_turned(a, ways, t) for a, t in zip(away, uniform[:, 5:7], strict=True)])
         align = frames_about(-away) @ frames_about(hand.palm.approach).T

@@ -31,7 +31,8 @@ from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.mesh_geometry import points_on_triangles
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners.fast_graspd.antipodal_starts import LOOKS, ReachSampling
-from graspd.worker.planners.fitting import Pairs, fitting_pairs
+from graspd.worker.planners.fitting import Pairs, fitting_pairs, region_points
+from graspd.worker.planners.requirements import INNER, NOTHING, Requirements
 from graspd.worker.simulation.data import Data, HandState
 from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.record import record_placement
@@ -71,12 +72,19 @@ def frames_about(z: Floats) -> Floats:
 class _Pair:
     """Data that all draws of a hand around an object share; `gap` [m] is the range of the palm's distance."""
 
-    def __init__(self, hand: HandModel, obj: ObjectModel, gap: tuple[float, float] = GAP) -> None:
-        self.hand, self.centre, self.gap = hand, obj.centre_of_mass, gap
+    def __init__(
+        self, hand: HandModel, obj: ObjectModel, gap: tuple[float, float] = GAP, wanted: Requirements = NOTHING
+    ) -> None:
+        self.hand, self.centre, self.gap, self.wanted = hand, obj.centre_of_mass, gap, wanted
         self.corners = obj.vertices[obj.faces]
         #: Normals (F, 3) of the faces; their length is twice the area [m^2].
         self.across = np.cross(self.corners[:, 1] - self.corners[:, 0], self.corners[:, 2] - self.corners[:, 0])
         self.area = np.linalg.norm(self.across, axis=1)
+        self.places: tuple[Floats, Floats] | None = None
+        """Points (P, 3) that grasps may touch and their normals (P, 3), with a contact region."""
+        if not wanted.region.is_whole:
+            point, face = region_points(obj, wanted.region)
+            self.places = point, self.across[face] / self.area[face, None]
         share = np.cumsum(self.area / self.area.sum())
         self.share = share / share[-1]
         self.palm = frames_about(hand.palm.approach).T
@@ -101,17 +109,36 @@ def draw_starts(pair: _Pair, generators: list[np.random.Generator]) -> tuple[Han
     face = pair.share.searchsorted(uniform[:, 0], side="right")
     point = points_on_triangles(pair.corners[face], uniform[:, 1:2], uniform[:, 2:3])
     normal = pair.across[face] / pair.area[face, None]
+    if pair.places is not None:
+        chosen = (uniform[:, 0] * len(pair.places[0])).astype(int)
+        point, normal = pair.places[0][chosen], pair.places[1][chosen]
+    if pair.wanted.approach is not None:
+        normal = -into_cone(-normal, pair.wanted.approach, pair.wanted.cone)
     tilt = np.einsum("nij,nj->ni", frames_about(normal)[..., :2], noise[:, :2])
     length = np.linalg.norm(tilt, axis=1, keepdims=True)
     angle = np.where(length * TILT > 1e-9, length * TILT, 0.0)
     normal = normal * np.cos(angle) + cross(tilt / np.maximum(length, 1e-12), normal) * np.sin(angle)
     approach = -normal
+    if pair.wanted.approach is not None:
+        approach = into_cone(approach, pair.wanted.approach, INNER * pair.wanted.cone)
     roll = quat_from_axis_angle(approach, 2 * np.pi * uniform[:, 3])
     rotation = quat_multiply(roll, quat_from_matrix(frames_about(approach) @ pair.palm))
     q = hand.preshape + POSTURE_NOISE * (hand.upper - hand.lower) * noise[:, 2:]
     near, far = pair.gap
     pivot = point - pair.centre - approach * (near + (far - near) * uniform[:, 4:])
     return HandState(pivot, rotation, np.clip(q, hand.lower, hand.upper)), approach
+
+
+def into_cone(approach: Floats, axis: Floats, angle: float) -> Floats:
+    """Return unit vectors (n, 3); those outside the cone about `axis` (3,) are turned to an angle inside [rad].
+    An angle of a above `angle` becomes `angle` a / pi, so that the directions stay different from each other."""
+    cosine = approach @ axis
+    between = np.arccos(np.clip(cosine, -1.0, 1.0))
+    aside = approach - cosine[:, None] * axis
+    length = np.linalg.norm(aside, axis=1, keepdims=True)
+    aside = np.where(length > 1e-9, aside / np.maximum(length, 1e-9), frames_about(axis)[:, 0])
+    turned = np.where(between > angle, angle * between / np.pi, between)[:, None]
+    return np.asarray(np.cos(turned) * axis + np.sin(turned) * aside)
 
 
 def _retreats(state: HandState, approach: Floats) -> HandState:
@@ -171,18 +198,21 @@ def no_start_error(model: Model) -> InputError:
     )
 
 
-def clear_starts(model: Model, generators: list[np.random.Generator], *, each: int = 1) -> tuple[HandState, Floats]:
+def clear_starts(
+    model: Model, generators: list[np.random.Generator], *, each: int = 1, wanted: Requirements = NOTHING
+) -> tuple[HandState, Floats]:
     """Return each generator's first clear start, or else its least deep one, and their depths (n,) [m].
     The second, fourth, ... of the `each` starts of a grasp are antipodal if possible. All are antipodal if the object
     is too small or too wide for the hand's pads."""
     hand, obj = model.hand.model, model.obj.model
-    count, jaws = len(generators), JawStarts.of(hand, obj)
+    count, jaws = len(generators), JawStarts.of(hand, obj, wanted)
     retreats = RETREATS if jaws is None else JAW_RETREATS
     probe = Probe(model, count * len(retreats))
-    pair = _Pair(hand, obj)
+    pair = _Pair(hand, obj, wanted=wanted)
     best = HandState(np.zeros((count, 3)), np.tile([1.0, 0, 0, 0], (count, 1)), np.zeros((count, hand.dofs)))
     deepest = np.full(count, np.inf)
-    if jaws is None and each > 1 and (reaching := ReachSampling.of(model)) is not None:
+    antipodal = jaws is None and each > 1 and not wanted.by_palm
+    if antipodal and (reaching := ReachSampling.of(model, wanted)) is not None:
         rows = np.arange(count)
         _draw_antipodal(
             reaching, generators, rows if reaching.only else rows[rows % each % 2 == 1], probe, best, deepest
@@ -198,13 +228,18 @@ def clear_starts(model: Model, generators: list[np.random.Generator], *, each: i
 
 
 def open_further(
-    model: Model, generators: list[np.random.Generator], state: HandState, depth: Floats, wanted: NDArray[np.bool_]
+    model: Model,
+    generators: list[np.random.Generator],
+    state: HandState,
+    depth: Floats,
+    redraw: NDArray[np.bool_],
+    wanted: Requirements = NOTHING,
 ) -> NDArray[np.bool_]:
-    """Redraw `wanted` starts (n,) deeper than `NO_PLACE` with hands further open; return their mask (n,).
+    """Redraw starts `redraw` (n,) deeper than `NO_PLACE` with hands further open; return their mask (n,).
     The pre-shape of some hands leaves no gap as wide as the object. `generators` continue from
     `clear_starts`. Better starts replace those in `state`, and their depths those in `depth`."""
     hand, obj = model.hand.model, model.obj.model
-    lost = wanted & (depth > NO_PLACE)
+    lost = redraw & (depth > NO_PLACE)
     if not lost.any() or JawStarts.of(hand, obj) is not None:
         return np.zeros(len(depth), bool)
     rows = np.flatnonzero(lost)
@@ -212,7 +247,7 @@ def open_further(
     ends = np.where(hand.closing > 0, hand.lower, np.where(hand.closing < 0, hand.upper, hand.preshape))
     for share in OPENED:
         wider = replace(hand, preshape=hand.preshape + share * (ends - hand.preshape))
-        pair = _Pair(wider, obj, OPENED_GAP)
+        pair = _Pair(wider, obj, OPENED_GAP, wanted)
 
         def drawn(rows: NDArray[np.intp], pair: _Pair = pair) -> HandState:
             return _retreats(*draw_starts(pair, [generators[i] for i in rows]))
@@ -302,17 +337,24 @@ class JawStarts:
     jaws: Jaws
     pairs: Pairs
     sums: Floats
+    wanted: Requirements = NOTHING
 
     @classmethod
-    def of(cls, hand: HandModel, obj: ObjectModel) -> JawStarts | None:
-        """Return the starts of a gripper, else None; raise InputError if the object does not fit the jaws."""
+    def of(cls, hand: HandModel, obj: ObjectModel, wanted: Requirements = NOTHING) -> JawStarts | None:
+        """Return the starts of a gripper, else None.
+        Raises InputError: the object does not fit the jaws, or no pair is in the required region."""
         jaws, pairs = jaws_of(hand), fitting_pairs(hand, obj)
         if jaws is None or pairs is None:
             return None
+        if not wanted.region.is_whole:
+            inside = wanted.region.contains(pairs.start) & wanted.region.contains(pairs.end)
+            if not inside.any():
+                raise InputError(f"{obj.name} has no two opposite sides in the required region")
+            pairs = Pairs(pairs.start[inside], pairs.end[inside])
         way = (pairs.end - pairs.start) / pairs.width[:, None]
         aside = np.linalg.norm(np.cross(pairs.start - obj.centre_of_mass, way), axis=1)
         weight = np.exp(-0.5 * (aside / (CENTRAL * obj.radius)) ** 2) + 1e-3
-        return cls(hand, obj, jaws, pairs, np.cumsum(weight) / weight.sum())
+        return cls(hand, obj, jaws, pairs, np.cumsum(weight) / weight.sum(), wanted)
 
     def draw(self, uniform: Floats) -> HandState:
         """Return hands (n * len(JAW_RETREATS)) at each retreat, from random numbers (n, `UNIFORM`) in [0, 1)."""
@@ -324,6 +366,10 @@ class JawStarts:
         q, middle, axis = self.jaws.nearest_postures(np.minimum(self.pairs.width[pick] + 2 * room, self.jaws.opening))
         line = (end - start) / self.pairs.width[pick][:, None]
         ahead = _across(line, uniform[:, 2])
+        if self.wanted.approach is not None:
+            ahead = into_cone(ahead, self.wanted.approach, INNER * self.wanted.cone)
+            ahead = ahead - np.einsum("ni,ni->n", ahead, line)[:, None] * line
+            ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-6)
         own = _frames(axis, np.tile(self.hand.palm.approach, (len(q), 1)))
         rotation = quat_from_matrix(_frames(line, ahead) @ own.transpose(0, 2, 1))
         length = float(np.clip(self.jaws.length, *LENGTH_M))

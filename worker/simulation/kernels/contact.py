@@ -175,7 +175,7 @@ def direct(
             u = point_motion(s, p)
             c = r - rho + wp.dot(n, u)
             if c > 0.0:
-                kw = k * contacts_in.weight[b, i]
+                kw = k * wp.max(contacts_in.weight[b, i], 0.0)
                 tangent = u - wp.dot(n, u) * n
                 slide = wp.min(kw, kw * physics_in.friction * c / wp.max(wp.length(tangent), 1.0e-9))
                 j = row(n, p)
@@ -212,7 +212,7 @@ def direct_gradient(
         n = contacts_inout.normal[b, i]
         p = contacts_inout.point[b, i]
         j = row(n, p)
-        kw = physics_in.stiffness * contacts_inout.weight[b, i]
+        kw = physics_in.stiffness * wp.max(contacts_inout.weight[b, i], 0.0)
         fade = physics_in.leak * wp.exp((r - rho) / physics_in.leak_length)
         total = float(0.0)
         for m in range(end_in.shape[1]):

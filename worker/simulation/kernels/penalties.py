@@ -30,10 +30,10 @@ def points_to_bodies(
         rho = contacts_in.distance[b, i]
         g = contacts_in.gradient[b, i]
         if rho < 0.0:
-            g += penetration * contacts_in.weight[b, i] * rho
+            g += penetration * wp.abs(contacts_in.weight[b, i]) * rho
             wp.atomic_max(depth_inout, b, -rho)
         elif pull_in > 0.0:
-            g += penetration * pull_in * contacts_in.weight[b, i] * wp.exp(-rho / pull_length_in)
+            g += penetration * pull_in * wp.max(contacts_in.weight[b, i], 0.0) * wp.exp(-rho / pull_length_in)
         if g != 0.0:
             f = g * contacts_in.normal[b, i]
             add_wrench(hands_inout.wrench, b, contacts_in.body[b, i], f, wp.cross(contacts_in.point[b, i], f))
@@ -72,7 +72,7 @@ def near_share(
     total = float(0.0)
     for i in range(contacts_in.count[b]):
         if contacts_in.distance[b, i] < reach_in:
-            total += contacts_in.weight[b, i]
+            total += wp.max(contacts_in.weight[b, i], 0.0)
     share_out[b] = total / whole_in
 
 

@@ -84,7 +84,7 @@ def point_residuals(
         rho = c.distance[b, i]
         if rho < near_in:
             emit(residuals_out, b, c.body[b, i], -1, c.point[b, i], c.normal[b, i], rho - target_in, 1.0)
-        elif rho < hold_in:
+        elif rho < hold_in and c.weight[b, i] > 0.0:
             gap = rho - hold_target_in
             emit(residuals_out, b, c.body[b, i], -1, c.point[b, i], c.normal[b, i], gap, hold_weight_in)
 

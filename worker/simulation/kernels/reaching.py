@@ -28,6 +28,8 @@ class Grips:
     radius: wp.float32
     deep: wp.float32  # largest shift of the pair from the pads to the palm, as a share of their distance
     palm: wp.vec3  # unit, direction that the palm faces
+    cone_axis: wp.vec3  # cone of the palm's approach
+    cone_cos: wp.float32  # cosine of its angle; -1 without a cone
     noise: wp.array(dtype=wp.float32)  # (D,) standard deviation of dofs
     lower: wp.array(dtype=wp.float32)
     upper: wp.array(dtype=wp.float32)
@@ -68,6 +70,15 @@ def clear_of(surface: Surface, grips: Grips, posture: wp.int32, pivot: wp.vec3, 
 
 
 @wp.func
+def into_cone(direction: wp.vec3, axis: wp.vec3, cosine: wp.float32):
+    """Return a unit vector in the cone about `axis`; directions uniform on the sphere become uniform in the cone."""
+    along = wp.dot(direction, axis)
+    aside = direction - along * axis
+    height = cosine + (1.0 - cosine) * 0.5 * (along + 1.0)
+    return height * axis + wp.sqrt(wp.max(1.0 - height * height, 0.0)) * wp.normalize(aside)
+
+
+@wp.func
 def drawn(
     surface: Surface,
     grips: Grips,
@@ -91,6 +102,8 @@ def drawn(
     least = float(2.0)
     for _k in range(WAYS):
         tried = wp.normalize(wp.vec3(wp.randn(state), wp.randn(state), wp.randn(state)))
+        if grips.cone_cos > -1.0:
+            tried = -into_cone(tried, grips.cone_axis, grips.cone_cos)
         if wp.abs(wp.dot(tried, line)) < least:
             least = wp.abs(wp.dot(tried, line))
             way = tried
@@ -101,6 +114,8 @@ def drawn(
     turn = wp.quat_from_matrix(wp.matrix_from_cols(line, y, wp.cross(line, y)))
     out.rotation = wp.normalize(turn * wp.quat_inverse(grips.frame[out.posture]))
     away = -wp.quat_rotate(out.rotation, grips.palm)
+    if grips.cone_cos > -1.0 and -wp.dot(away, grips.cone_axis) < grips.cone_cos:
+        return out
     reach = grips.between[out.posture]
     # The depth ranges from a fingertip grasp to a palm in contact with the object.
     ahead = wp.max(wp.dot(reach, grips.palm), 0.0) * deep * grips.deep

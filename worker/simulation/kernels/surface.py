@@ -30,6 +30,15 @@ class Surface:
 
 
 @wp.struct
+class ContactRegions:
+    """Regions of the object, each an intersection of half-spaces (K,): n.x <= d as (n, d), origin: centre of mass."""
+
+    allowed: wp.array(dtype=wp.vec4)  # contact only inside; empty: everywhere
+    forbidden: wp.array(dtype=wp.vec4)  # no contact inside; empty: nowhere
+    clearance: wp.float32  # distance that points without contact keep from the surface [m]
+
+
+@wp.struct
 class SurfaceSample:
     """Distance and outward unit normal of the object at a point."""
 
@@ -232,9 +241,27 @@ def sample_field(
     field_out[i, j, k] = mesh_distance(surface_in, point, reach_in).distance
 
 
+@wp.func
+def is_inside(planes: wp.array(dtype=wp.vec4), x: wp.vec3):
+    for k in range(planes.shape[0]):
+        plane = planes[k]
+        if plane[0] * x[0] + plane[1] * x[1] + plane[2] * x[2] > plane[3]:
+            return False
+    return True
+
+
+@wp.func
+def is_forbidden(regions: ContactRegions, x: wp.vec3):
+    """Check whether a place on the surface must not be touched."""
+    if regions.allowed.shape[0] > 0 and not is_inside(regions.allowed, x):
+        return True
+    return regions.forbidden.shape[0] > 0 and is_inside(regions.forbidden, x)
+
+
 @wp.kernel
 def gather(
     surface_in: Surface,
+    regions_in: ContactRegions,
     band_in: wp.float32,
     exact_in: wp.float32,
     keep_in: wp.float32,
@@ -249,7 +276,8 @@ def gather(
 ):
     """Pack each grasp's candidate contacts: points closer than dilation + keep. Launch over (B, N / lane).
     `near` lists contacts with a gap of at most `near_gap`. If `mark` is not empty, each point is written with a mark
-    to its own index, for `packing.pack`."""
+    to its own index, for `packing.pack`. Points that must not touch keep the clearance of `regions`: their weights are
+    negative, and their distances are those from the surface moved outwards by the clearance."""
     b, part = wp.tid()
     if hands_in.active[b] == 0:
         return
@@ -260,9 +288,15 @@ def gather(
     for i in range(part * lane_in, wp.min((part + 1) * lane_in, body_in.shape[0])):
         body = body_in[i]
         point = hands_in.body_p[b, body] + wp.quat_rotate(hands_in.body_q[b, body], position_in[i])
-        sample = distance(surface_in, point, reach, exact_in, keep)
+        sample = distance(surface_in, point, reach, wp.max(exact_in, regions_in.clearance), keep + regions_in.clearance)
         kept = sample.distance < keep
-        near = kept and sample.distance - dilation <= near_gap_in
+        weight = weight_in[i]
+        if weight > 0.0 and is_forbidden(regions_in, point - sample.distance * sample.normal):
+            weight = -weight
+        if weight < 0.0:
+            kept = sample.distance < wp.min(reach, keep + regions_in.clearance)
+            sample.distance = sample.distance - regions_in.clearance
+        near = kept and weight > 0.0 and sample.distance - dilation <= near_gap_in
         k = i
         if apart:
             contacts_inout.mark[b, i] = wp.int32(kept) + wp.int32(near)
@@ -275,5 +309,5 @@ def gather(
             contacts_inout.point[b, k] = point
             contacts_inout.normal[b, k] = sample.normal
             contacts_inout.distance[b, k] = sample.distance
-            contacts_inout.weight[b, k] = weight_in[i]
+            contacts_inout.weight[b, k] = weight
             contacts_inout.gradient[b, k] = 0.0

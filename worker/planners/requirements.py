@@ -1,0 +1,210 @@
+"""Requirements on the grasps of a job: type, digits, contact region and approach direction.
+
+Requirements act on all steps of planning: starts, contacts of the optimisation, and selection of candidates."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graspd.service.model.contact_region import parse_cone, parse_region
+from graspd.service.model.domain import JobOptions
+from graspd.service.model.errors import InputError
+from graspd.service.model.grasp_types import BALANCED, TAXONOMY
+from graspd.service.model.metrics import GraspType
+from graspd.service.model.transforms import Floats, quat_conjugate, quat_rotate
+from graspd.worker.grasps import Posture
+from graspd.worker.hands.digits import NAMES, Part, digit_names, digit_order, finger_of_body, hand_with_digits
+from graspd.worker.hands.model import HandModel
+from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.region import WHOLE, ContactRegion
+from graspd.worker.planners.fitting import region_points
+from graspd.worker.quality.grasp_type import RULES, Rule, pattern_of
+from graspd.worker.quality.probe import probe_of
+from graspd.worker.simulation.environment import PlacedGrasps
+from graspd.worker.simulation.model import ANYWHERE, AllowedContacts
+
+#: Share of the cone's angle within which hands start: the optimisation turns them.
+INNER: Final = 0.6
+#: Least share of the contact area in the required region.
+LEAST_SHARE: Final = 0.95
+#: Largest angle between a direction and the nearest free direction that is tested [rad].
+_SPACING: Final = 0.16
+#: Number of hand points that decide the type of a candidate, and reach of their distances [m].
+_POINTS: Final = 1000
+_REACH_M: Final = 0.004
+
+
+@dataclass(frozen=True)
+class Requirements:
+    type: str = "any"
+    digits: tuple[str, ...] = ()
+    """Digits that may touch; empty: all."""
+    region: ContactRegion = WHOLE
+    approach: Floats | None = None
+    """(3,) axis of the cone of palm approaches; scene frame in scenes, else object frame. None: any approach."""
+    cone: float = np.pi
+    """Largest angle between a palm's approach and `approach` [rad]."""
+
+    @classmethod
+    def of(cls, request: JobOptions, batch: int = 0, *, origin: Floats | None = None) -> Requirements:
+        """Return the requirements of a batch; `origin` (3,) is that of the planner's frame in the object frame [m]."""
+        kind = BALANCED[batch % len(BALANCED)] if request.type == "balanced" else request.type
+        rule, digits = RULES.get(kind), request.digits
+        if rule is not None and rule.digits and not digits:
+            digits = NAMES[1:3] if rule.contact == "between_sides" else NAMES[: rule.digits]
+        texts = (request.touch_region, request.avoid_region)
+        planes = [np.array(parse_region(text)) if text else None for text in texts]
+        for half_spaces in planes:
+            if half_spaces is not None and origin is not None:
+                half_spaces[:, 3] -= half_spaces[:, :3] @ origin
+        found = cls(kind, digits, ContactRegion(*planes) if any(texts) else WHOLE)
+        if request.approach_cone:
+            axis, degrees = parse_cone(request.approach_cone)
+            found = replace(found, approach=np.array(axis) / np.linalg.norm(axis), cone=float(np.deg2rad(degrees)))
+        return found if found.is_set else NOTHING
+
+    @property
+    def is_set(self) -> bool:
+        return self.type != "any" or bool(self.digits) or not self.region.is_whole or self.approach is not None
+
+    @property
+    def rule(self) -> Rule | None:
+        return RULES.get(self.type)
+
+    @property
+    def by_pads(self) -> bool:
+        """Whether only fingertips may touch."""
+        return self.rule is not None and self.rule.kind == GraspType.PRECISION
+
+    @property
+    def by_palm(self) -> bool:
+        """Whether the palm must touch, so that all starts have the palm near the object."""
+        return False
+
+    @property
+    def links(self) -> int:
+        """Least number of bodies in contact."""
+        return max(2, self.rule.digits if self.rule else 0)
+
+    def check(self, hand: HandModel, obj: ObjectModel) -> None:
+        """Raise InputError if the hand has too few digits, or the object no surface in the region."""
+        rule, names = self.rule, digit_names(hand)
+        if rule is not None and not names and (rule.digits or rule.kind == GraspType.LATERAL):
+            raise InputError(f"{hand.name} is a gripper: its grasps are of type precision or power, not {self.type}")
+        if rule is not None and rule.digits > len(names) > 0:
+            raise InputError(
+                f"type {self.type} needs {rule.digits} digits; {hand.name} has {len(names)}: choose another type"
+            )
+        self.hand(hand)
+        if not self.region.is_whole:
+            region_points(obj, self.region)
+
+    def hand(self, hand: HandModel) -> HandModel:
+        """Return the hand that is planned with; see `hand_with_digits`."""
+        return hand_with_digits(hand, self.digits) if self.digits else hand
+
+    def allowed(self, hand: HandModel) -> AllowedContacts:
+        """Return the allowed contacts of the whole hand."""
+        rule, finger, names = self.rule, finger_of_body(hand), digit_names(hand)
+        no_palm = rule is not None and rule.palm is False
+        if not (self.by_pads or self.digits or no_palm or not self.region.is_whole):
+            return ANYWHERE
+        parts = np.full(hand.bodies, Part.WHOLE, np.int32)
+        if self.by_pads:
+            parts[:] = Part.NONE
+            parts[list(hand.fingertips)] = Part.END if rule is not None and rule.contact == "end" else Part.WHOLE
+        elif no_palm:
+            parts[finger < 0] = Part.NONE
+        if self.digits:
+            idle = [k for k, name in enumerate(names) if name not in self.digits]
+            parts[np.isin(finger, idle)] = Part.NONE
+        if rule is not None and rule.contact in ("thumb_to_side", "between_sides"):
+            thumb = finger == names.index("thumb")
+            parts[~thumb & (parts != Part.NONE)] = Part.SIDES
+            parts[thumb] = Part.NONE
+            if rule.contact == "thumb_to_side":
+                parts[hand.fingertips[names.index("thumb")]] = Part.PAD
+        return AllowedContacts(parts, self.region)
+
+    def opposed_parts(self, hand: HandModel) -> tuple[NDArray[np.int32], NDArray[np.int32]] | None:
+        """Return the two parts of a hand between which it holds the object, as the `Part` (L,) of each body.
+        None: the pads of the digits."""
+        rule, finger = self.rule, finger_of_body(hand)
+        if rule is None or rule.contact not in ("end", "thumb_to_side", "between_sides"):
+            return None
+        allowed = self.allowed(hand).parts
+        assert allowed is not None
+        digit = digit_names(hand).index("index" if rule.contact == "between_sides" else "thumb")
+        return np.where(finger == digit, allowed, Part.NONE), np.where(finger == digit, Part.NONE, allowed)
+
+    def axes(self, placed: PlacedGrasps | None, count: int) -> Floats | None:
+        """Return the cone's axis (N, 3) of each of `count` grasps in the object frame; None without a cone."""
+        if self.approach is None:
+            return None
+        if placed is None:
+            return np.tile(self.approach, (count, 1))
+        turned = quat_rotate(quat_conjugate(np.asarray(placed.object_pose, float)[:, 3:]), self.approach)
+        return np.asarray(turned[placed.index])
+
+    def retreats(self, ways: Floats, scenes: PlacedGrasps, scene: int) -> Floats:
+        """Select the free directions of retreat (K, 3) of a scene with approaches in the inner part of the cone.
+        Raises InputError: obstacles block the cone."""
+        if self.approach is None:
+            return ways
+        (axis,) = self.axes(replace(scenes, index=np.array([scene])), 1)  # type: ignore[misc]
+        inside = -ways @ axis >= np.cos(max(INNER * self.cone, _SPACING))
+        if not inside.any():
+            raise InputError("obstacles block every approach in the cone: choose another axis or a larger angle")
+        return np.asarray(ways[inside])
+
+    def fulfilled(
+        self, hand: HandModel, obj: ObjectModel, grasp: Posture, placed: PlacedGrasps | None
+    ) -> NDArray[np.bool_]:
+        """Return a mask (N,) of grasps of the whole hand with the required type and approach."""
+        out = np.ones(len(grasp), bool)
+        if (axes := self.axes(placed, len(grasp))) is not None:
+            out &= _cosine(hand, grasp, axes) >= np.cos(self.cone)
+        if self.rule is not None:
+            probe = probe_of(hand, obj, hand_points=_POINTS, object_points=64)
+            out &= self.rule.applies(pattern_of(hand, probe, probe.touch(grasp, reach=_REACH_M)))
+        return out
+
+    def failed(
+        self, hand: HandModel, grasp: Posture, placed: PlacedGrasps | None, columns: Mapping[str, NDArray[Any]]
+    ) -> NDArray[np.object_]:
+        """Return the first requirement that each of N grasps fails; empty for a grasp that fulfils all.
+        `columns` are those of `quality.table.measure`. Names are those of `service.model.planning.OUTCOMES`."""
+        out = np.full(len(grasp), "", object)
+        if (axes := self.axes(placed, len(grasp))) is not None:
+            out[_cosine(hand, grasp, axes) < np.cos(self.cone)] = "other_approach"
+        if not self.region.is_whole:
+            out[~(columns["quality/region_share"] >= LEAST_SHARE)] = "outside_region"
+        mask = np.asarray(columns["quality/digits"], int)
+        if self.digits:
+            order = [digit_names(hand)[k] for k in digit_order(hand)]
+            others = sum(1 << k for k, name in enumerate(order) if name not in self.digits)
+            out[(mask & others) != 0] = "other_digits"
+        if self.rule is not None:
+            right = np.asarray(columns["quality/grasp_type"]) == self.rule.kind
+            if self.type in TAXONOMY:
+                right = np.asarray(columns["quality/taxonomy_type"]) == TAXONOMY[self.type]
+            elif self.rule.digits:
+                right &= (mask & 1 == 1) & (count_bits(mask) == self.rule.digits)
+            out[~right] = "other_type"
+        return out
+
+
+def count_bits(numbers: NDArray[np.intp]) -> NDArray[np.intp]:
+    return (numbers[:, None] >> np.arange(8) & 1).sum(axis=1)
+
+
+def _cosine(hand: HandModel, grasp: Posture, axes: Floats) -> Floats:
+    return np.asarray(np.einsum("ni,ni->n", quat_rotate(grasp.hand_pose[:, 3:], hand.palm.approach), axes))
+
+
+NOTHING: Final = Requirements()
