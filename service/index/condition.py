@@ -1,4 +1,4 @@
-"""Condition of an index, read without opening the index, because opening changes it."""
+"""Condition of an index database, read without changes: `Database` would make or alter its tables."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class IndexCondition:
 
 
 def read_condition(url: str | URL) -> IndexCondition | None:
-    """Return the condition of an index, None if it has no file; errors as in `Database`, or IndexDamaged."""
+    """Return the condition of an index, None if its file is missing; errors as in `Database`, or IndexDamaged."""
     try:
         parsed = make_url(url)
         if parsed.get_backend_name() == "sqlite":
@@ -58,9 +58,8 @@ def _file_condition(path: Path) -> IndexCondition | None:
         return None
     try:
         with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True, timeout=_TIMEOUT_S)) as connection:
-            said = connection.execute("PRAGMA quick_check(1)").fetchone()[0]
-            if said != "ok":
-                raise IndexDamaged(f"the index {path} is damaged: {said}")
+            if (result := connection.execute("PRAGMA quick_check(1)").fetchone()[0]) != "ok":
+                raise IndexDamaged(f"the index {path} is damaged: {result}")
             tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
             query = f"SELECT version_num FROM {REVISION_TABLE}"
             rows = connection.execute(query).fetchall() if REVISION_TABLE in tables else []
