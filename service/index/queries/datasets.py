@@ -69,9 +69,8 @@ class Datasets(IndexPart):
             )
             if state is not None:
                 query = query.where(now == state.value)
-            rows, following = page_rows(
-                connection, query, dataset_cells.c.position, limit=limit, cursor=cursor, descending=False
-            )
+            key = dataset_cells.c.position
+            rows, following = page_rows(connection, query, key, limit=limit, cursor=cursor, descending=False)
             views = _cell_views(connection, rows, JobOptions.model_validate(dataset["options"]))
         return Page(items=views, next=following)
 
@@ -110,8 +109,8 @@ def _dataset_row(connection: Connection, name: str, scope: ProjectScope = EVERYT
 
 
 def _cell_state(cancelled: bool) -> ColumnElement[str]:
-    """Return the state of a cell: its job's, or the dataset's if the cell has no job."""
-    # A literal, because PostgreSQL does not match an expression with a parameter to its GROUP BY.
+    """Return the state of a cell: that of its job, or without a job queued or cancelled."""
+    # A literal: PostgreSQL does not match an expression with parameters to the same expression in GROUP BY.
     unplanned = literal((State.CANCELLED if cancelled else State.QUEUED).value, literal_execute=True)
     return func.coalesce(jobs.c.state, unplanned)
 
@@ -146,9 +145,9 @@ def _dataset_view(connection: Connection, row: Any) -> DatasetView:
 def _state(row: Any, states: dict[State, int]) -> State:
     state = job_state(state for state, count in states.items() if count)
     if row["cancelled"]:
-        # A cancelled dataset has no pending work: its jobs stop, or continue for another dataset.
+        # Jobs of a cancelled dataset stop, or continue for another dataset.
         return state if state.is_final else State.CANCELLED
-    # An ended dataset is queued again until its jobs have received its last event, a retry.
+    # After a retry, a dataset counts as queued until its jobs have received that event.
     return State.QUEUED if state.is_final and row["applied"] < row["events"] else state
 
 
@@ -166,7 +165,7 @@ def _states(connection: Connection, row: Any) -> dict[State, int]:
 
 
 def _count_tasks_of_cell(options: JobOptions, span: int | None) -> int:
-    """Return the number of tasks of a cell; `span` is batches per task, None (used as 1) without a job."""
+    """Return the number of tasks of a cell; `span` is the number of batches per task, None (as 1) without a job."""
     return count_ranges(options.grasps, span or 1) * len(stages_of(options))
 
 
@@ -181,9 +180,9 @@ def _task_counts(connection: Connection, where: ColumnElement[bool]) -> dict[str
     query = (
         select(
             func.count().label("tasks"),
-            _count(tasks.c.state == State.SUCCEEDED.value).label("done"),
-            _count(tasks.c.state == State.FAILED.value).label("failed"),
-            _count(tasks.c.state == State.RUNNING.value).label("running"),
+            _sum_where(tasks.c.state == State.SUCCEEDED.value, 1).label("done"),
+            _sum_where(tasks.c.state == State.FAILED.value, 1).label("failed"),
+            _sum_where(tasks.c.state == State.RUNNING.value, 1).label("running"),
             func.coalesce(func.sum(cast(SHARE_DONE, Float)), 0.0).label("share"),
             func.max(tasks.c.finished).label("finished"),
         )
@@ -220,10 +219,8 @@ def _cell_views(connection: Connection, rows: Sequence[Any], options: JobOptions
         found = yields.get("valid" if options.counted == "valid" else "grasps", 0)
         reason = row["reason"]
         if row["state"] == State.SUCCEEDED.value and options.want == "valid" and found < options.grasps:
-            lost = outcomes_of(connection, tasks.c.job_id == job)
-            reason = explain_shortfall(
-                found, options.grasps, options.counted, yields.get("candidates", 0), options.budget, lost
-            )
+            rejected, candidates = outcomes_of(connection, tasks.c.job_id == job), yields.get("candidates", 0)
+            reason = explain_shortfall(found, options.grasps, options.counted, candidates, options.budget, rejected)
         views.append(
             CellView(
                 **{name: row[name] for name in ("position", "hand", "object", "job_id", "state", "planned", "choice")},
@@ -266,20 +263,14 @@ def _grasp_counts_by_job(connection: Connection, ids: Sequence[str]) -> dict[str
     return {row["job_id"]: {k: row[k] for k in row if k != "job_id"} for row in connection.execute(query).mappings()}
 
 
-def _count(condition: ColumnElement[bool]) -> ColumnElement[int]:
-    return func.coalesce(func.sum(case((condition, 1), else_=0)), 0)
-
-
-def _sum_over_base(column: ColumnElement[int]) -> ColumnElement[int]:
-    return func.coalesce(func.sum(case((_IS_BASE, column), else_=0)), 0)
+def _sum_where(condition: ColumnElement[bool], value: ColumnElement[int] | int) -> ColumnElement[int]:
+    return func.coalesce(func.sum(case((condition, value), else_=0)), 0)
 
 
 _MADE: Final = (
     func.count().label("shards"),
     func.coalesce(func.sum(shards.c.size_bytes), 0).label("size_bytes"),
     func.coalesce(func.sum(shards.c.seconds), 0.0).label("seconds"),
-    _sum_over_base(shards.c.count).label("grasps"),
-    _sum_over_base(shards.c.valid).label("valid"),
-    _sum_over_base(shards.c.candidates).label("candidates"),
-    _sum_over_base(shards.c.validated).label("validated"),
+    _sum_where(_IS_BASE, shards.c.count).label("grasps"),
+    *(_sum_where(_IS_BASE, shards.c[name]).label(name) for name in ("valid", "candidates", "validated")),
 )

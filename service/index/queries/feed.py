@@ -1,4 +1,4 @@
-"""Queries of the controller: tasks to queue, tasks marked as queued, cells of datasets to plan."""
+"""Queries of the controller: tasks to queue, tasks marked as queued, cells of datasets without a job."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from graspd.service.model.states import AssetKind, Priority, Stage, State
 
 @dataclass(frozen=True)
 class ReadyTask:
-    """Task that is ready to start, with the content of its message."""
+    """Task to queue, with the content of its message."""
 
     job: JobRecord
     task: PlannedTask
@@ -40,22 +40,16 @@ class ReadyCheck:
 
 class Feed(IndexPart):
     def waiting_jobs(self, priority: Priority, *, now: float) -> list[WaitingJob]:
-        due = _due(tasks.c.not_before, now)
-        waiting = exists().where(tasks.c.job_id == jobs.c.id, *_WAITING, due)
-        query = (
-            select(jobs.c.id, jobs.c.origin, jobs.c.project)
-            .where(
-                jobs.c.state.in_((State.QUEUED.value, State.RUNNING.value)), jobs.c.priority == priority.value, waiting
-            )
-            .order_by(jobs.c.created, jobs.c.id)
-        )
-        rows = self.database.rows(query)
-        return [
-            WaitingJob(row["id"], queue_owner(row["project"], (row["origin"] or {}).get("key", ""))) for row in rows
-        ]
+        """Return the jobs with a task to queue at `now` [Unix time, s], the oldest first."""
+        unfinished = jobs.c.state.in_((State.QUEUED.value, State.RUNNING.value))
+        waiting = exists().where(tasks.c.job_id == jobs.c.id, *_WAITING, _due(tasks.c.not_before, now))
+        query = select(jobs.c.id, jobs.c.origin, jobs.c.project).order_by(jobs.c.created, jobs.c.id)
+        rows = self.database.rows(query.where(unfinished, jobs.c.priority == priority.value, waiting))
+        keys = [(row["origin"] or {}).get("key", "") for row in rows]
+        return [WaitingJob(row["id"], queue_owner(row["project"], key)) for row, key in zip(rows, keys, strict=True)]
 
     def ready_tasks(self, priority: Priority, turns: RoundRobin, *, now: float, limit: int) -> list[ReadyTask]:
-        """Return at most `limit` tasks to queue: round-robin over projects or keys, then over their jobs."""
+        """Return at most `limit` tasks to queue, round-robin over projects or keys, then over their jobs."""
         of_key: dict[str, list[list[tuple[WaitingJob, ReadyTask]]]] = defaultdict(list)
         for job, share in turns.order(self.waiting_jobs(priority, now=now), limit):
             of_key[job.key].append([(job, task) for task in self.ready_tasks_of_job(job.id, limit=share, now=now)])
@@ -64,7 +58,7 @@ class Feed(IndexPart):
         return [task for _, task in chosen]
 
     def ready_tasks_of_job(self, job_id: str, *, limit: int, now: float | None = None) -> list[ReadyTask]:
-        """Return the first tasks of one job that are ready to queue; without `now`, ignore back-offs."""
+        """Return the first tasks of a job to queue; without `now`, back-offs are ignored."""
         due = () if now is None else (_due(tasks.c.not_before, now),)
         query = (
             select(tasks, *(jobs.c[name] for name in _OF_THE_JOB))
@@ -86,7 +80,7 @@ class Feed(IndexPart):
         ]
 
     def queued_tasks_and_checks(self) -> tuple[set[str], set[tuple[AssetKind, str]]]:
-        """Return unfinished tasks and checks of assets that the index marks as queued."""
+        """Return the unfinished tasks and asset checks that the index marks as queued."""
         unfinished = tasks.c.state.in_((State.QUEUED.value, State.RUNNING.value))
         of_tasks = select(tasks.c.id).where(tasks.c.ready.is_(True), tasks.c.queued.is_(True), unfinished)
         of_checks = select(assets.c.kind, assets.c.digest).where(assets.c.queued.is_(True), assets.c.verdict.is_(None))
@@ -118,20 +112,17 @@ _WAITING = (tasks.c.ready.is_(True), tasks.c.queued.is_(False))
 
 
 def _due(not_before: Column[float], now: float) -> ColumnElement[bool]:
-    # A wait longer than any back-off means that the clock was set back: the task is due at once.
+    # A due time further away than any back-off means that the clock was set back: the task is due at once.
     return or_(not_before <= now, not_before > now + 2 * MAX_BACKOFF_S)
 
 
 def _record(row: Any) -> JobRecord:
-    return JobRecord(
-        id=row["job_id"], **{name: row[name] for name in _OF_THE_JOB}, priority=row["priority"], created=row["created"]
-    )
+    return JobRecord(id=row["job_id"], **{name: row[name] for name in (*_OF_THE_JOB, "priority", "created")})
 
 
 def _ready_task(row: Any, record: JobRecord) -> ReadyTask:
-    task = PlannedTask(
-        row["id"], Stage(row["stage"]), row["batch"], row["count"], tuple(row["inputs"]), row["shard_id"]
-    )
+    stage, inputs = Stage(row["stage"]), tuple(row["inputs"])
+    task = PlannedTask(row["id"], stage, row["batch"], row["count"], inputs, row["shard_id"])
     return ReadyTask(record, task, Priority(row["priority"]), row["last_attempt"], row["retried_upto"])
 
 
@@ -186,7 +177,7 @@ class DatasetFeed(IndexPart):
     ) -> list[tuple[int, str]]:
         """Return positions and jobs of the next cells in these states, after position `after`.
 
-        `unshared` omits jobs that another key submitted, and jobs that another uncancelled dataset needs.
+        `unshared` omits jobs submitted by another key, and jobs that another dataset in progress needs.
         """
         query = (
             select(dataset_cells.c.position, dataset_cells.c.job_id)

@@ -100,13 +100,13 @@ def _job_views(connection: Connection, rows: Sequence[Any]) -> list[JobView]:
 
 
 def _with_pending_tasks(stage: StageProgress, tasks: int) -> StageProgress:
-    """Add the tasks of a large job that are not yet entered."""
+    """Count the tasks of a large job that the index does not have yet as queued."""
     more = max(0, tasks - stage.tasks)
     return stage.model_copy(update={"tasks": stage.tasks + more, "queued": stage.queued + more}) if more else stage
 
 
 def _progress(connection: Connection, ids: Sequence[str]) -> dict[str, list[StageProgress]]:
-    # A shard that is older than its task was reused; both times are texts of one format.
+    # The shard of a task is reused if it is older than the task; both times are texts of one format.
     reused = and_(tasks.c.done, tasks.c.finished < tasks.c.created)
     query = (
         select(
@@ -124,11 +124,10 @@ def _progress(connection: Connection, ids: Sequence[str]) -> dict[str, list[Stag
     )
     stages: dict[str, dict[int, dict[str, Any]]] = defaultdict(dict)
     for row in connection.execute(query).mappings():
-        stage = stages[row["job_id"]].setdefault(
-            row["position"], {"stage": row["stage"], "tasks": 0, "done": 0.0, "seconds": 0.0, "reused": 0}
-        )
+        sums = {"tasks": 0, "done": 0.0, "seconds": 0.0, "reused": 0}
+        stage = stages[row["job_id"]].setdefault(row["position"], {"stage": row["stage"], **sums})
         stage[row["state"]] = row["tasks"]
-        for name in ("tasks", "done", "seconds", "reused"):
+        for name in sums:
             stage[name] += row[name]
     return {job: [StageProgress(**stages[job][position]) for position in sorted(stages[job])] for job in ids}
 
@@ -152,7 +151,7 @@ def _task_view(row: Any) -> TaskView:
     return TaskView.model_validate({**row, **progress, "attempt": attempt})
 
 
-#: Maximum number of shards to read: enough to show the reasons, and few enough for a fast page.
+#: Maximum number of shards to read for outcomes, which keeps a page fast.
 MOST_SHARDS: Final = 1000
 
 
@@ -178,9 +177,8 @@ class Shards(IndexPart):
         scope: ProjectScope = EVERYTHING,
     ) -> Page[ShardView]:
         """Return a page of shards, newest first, without their manifests."""
-        query = select(shards).where(
-            *shard_scope_conditions(scope, shards.c.id), *_equality_conditions({shards.c.kind: kind})
-        )
+        query = select(shards).where(*shard_scope_conditions(scope, shards.c.id))
+        query = query.where(*_equality_conditions({shards.c.kind: kind}))
         if job is not None:
             query = query.where(shards.c.id.in_(select(tasks.c.shard_id).where(tasks.c.job_id == job)))
         with self.database.read_transaction() as connection:
@@ -194,10 +192,8 @@ class Shards(IndexPart):
 
     def job_of(self, shard_id: str, *, scope: ProjectScope = EVERYTHING) -> str | None:
         """Return a job in scope that requested this shard; None if the index has none."""
-        query = (
-            select(tasks.c.job_id).where(tasks.c.shard_id == shard_id, *scope_conditions_by_job(scope, tasks)).limit(1)
-        )
-        found: str | None = self.database.value(query)
+        query = select(tasks.c.job_id).where(tasks.c.shard_id == shard_id, *scope_conditions_by_job(scope, tasks))
+        found: str | None = self.database.value(query.limit(1))
         return found
 
     def get(self, shard_id: str, *, scope: ProjectScope = EVERYTHING) -> ShardView:
