@@ -13,11 +13,10 @@ from sqlalchemy import URL, make_url, text
 from graspd.service.index.database import (
     REVISION,
     REVISION_TABLE,
-    UNUSABLE,
     connect_postgres,
     convert_errors,
+    convert_url_errors,
     revision_of,
-    url_error,
 )
 from graspd.service.model.errors import IndexDamaged, IndexUnavailable
 
@@ -43,14 +42,11 @@ class IndexCondition:
 
 
 def read_condition(url: str | URL) -> IndexCondition | None:
-    """Return the condition of an index, None if its file is missing; errors as in `Database`, or IndexDamaged."""
-    try:
-        parsed = make_url(url)
-        if parsed.get_backend_name() == "sqlite":
+    """Return the condition of an index, None without a file; errors of `Database`, or IndexDamaged."""
+    with convert_url_errors():
+        if (parsed := make_url(url)).get_backend_name() == "sqlite":
             return _file_condition(Path(str(parsed.database)))
         return _postgres_condition(url)
-    except UNUSABLE as error:
-        raise url_error(error) from None
 
 
 def _file_condition(path: Path) -> IndexCondition | None:

@@ -64,7 +64,6 @@ _BUSY_TIMEOUT_S: Final = 20.0
 _TABLES_LOCK: Final = 0x67727370
 #: Key of the advisory lock that a process holds until its write transaction ends: "grsq" in ASCII.
 _TURN_LOCK: Final = 0x67727371
-UNUSABLE: Final = (ArgumentError, NoSuchModuleError, ModuleNotFoundError, ValueError)
 #: Codes of SQLite for a file with invalid content.
 _DAMAGED: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 
@@ -105,7 +104,7 @@ class Database:
 
     @contextmanager
     def write_transaction(self, within: Connection | None = None) -> Iterator[Connection]:
-        """Yield the given transaction, or a new one, committed as a whole or not at all. Only one can run at a time."""
+        """Yield the given transaction, or a new one, committed as a whole; only one runs at a time."""
         if within is not None:
             yield within
             return
@@ -134,7 +133,7 @@ class Database:
             return list(connection.scalars(query))
 
     def matching_rows(self, query: Select[Any], column: ColumnElement[Any], wanted: Iterable[Any]) -> list[Any]:
-        """Return the rows of a query whose column has one of the wanted values, of which there may be any number."""
+        """Return the rows whose column has one of the wanted values, which may be any number of values."""
         with self.read_transaction() as connection:
             return list(rows_in(connection, query, column, wanted))
 
@@ -199,7 +198,7 @@ class IndexPart:
 
 
 def chunks(ids: Sequence[T], size: int = 1000) -> Iterable[Sequence[T]]:
-    """Yield parts of `ids` small enough for one statement, because databases limit the number of parameters."""
+    """Yield parts of `ids` for one statement each, because databases limit the number of parameters."""
     return (ids[start : start + size] for start in range(0, len(ids), size))
 
 
@@ -212,28 +211,28 @@ def rows_in(
 
 def _file_of(url: str | URL) -> SqliteFile | None:
     """Return the file of an SQLite index, None if it has no file; InputError for an invalid URL."""
-    try:
+    with convert_url_errors():
         parsed = make_url(url)
         is_file = parsed.get_backend_name() == "sqlite" and parsed.database and parsed.database != ":memory:"
-    except UNUSABLE as error:
-        raise url_error(error) from None
     return SqliteFile(Path(str(parsed.database))) if is_file else None
 
 
 def _engine(url: str | URL) -> Engine:
-    try:
+    with convert_url_errors():
         return _sqlite_engine(url) if make_url(url).get_backend_name() == "sqlite" else connect_postgres(url)
-    except UNUSABLE as error:
-        raise url_error(error) from None
 
 
-def url_error(error: Exception) -> InputError:
-    """Return the error for an unusable index URL, without SQLAlchemy's text, which may contain a password."""
-    why = f" ({_error_line(error)})" if isinstance(error, NoSuchModuleError | ModuleNotFoundError) else ""
-    return InputError(
-        f"the index URL (GRASPD_INDEX_URL) cannot be used{why}; give sqlite:///PATH or "
-        "postgresql+psycopg://HOST/NAME; in a password, write %2F for / and %40 for @"
-    )
+@contextmanager
+def convert_url_errors() -> Iterator[None]:
+    """Convert errors of an unusable index URL to InputError, without a text that may contain a password."""
+    try:
+        yield
+    except (ArgumentError, NoSuchModuleError, ModuleNotFoundError, ValueError) as error:
+        why = f" ({_error_line(error)})" if isinstance(error, NoSuchModuleError | ModuleNotFoundError) else ""
+        raise InputError(
+            f"the index URL (GRASPD_INDEX_URL) cannot be used{why}; give sqlite:///PATH or "
+            "postgresql+psycopg://HOST/NAME; in a password, write %2F for / and %40 for @"
+        ) from None
 
 
 def connect_postgres(url: str | URL) -> Engine:
@@ -301,7 +300,7 @@ def _revision_mismatch(found: str) -> str:
 
 @contextmanager
 def _schema_transaction(engine: Engine) -> Iterator[Connection]:
-    """Yield a transaction during which no other process makes tables; it is committed as a whole or not at all."""
+    """Yield a transaction, committed as a whole or not at all, while no other process makes tables."""
     with engine.connect() as connection:
         if connection.dialect.name == "postgresql":
             connection.execute(text("SELECT pg_advisory_lock(:key)"), {"key": _TABLES_LOCK})
@@ -365,7 +364,7 @@ class SqliteFile:
         self.path = path
 
     def identity(self) -> Identity:
-        """Return device and inode of the file, None if absent. They change if another process replaces the file."""
+        """Return device and inode of the file, None if absent; another process may replace the file."""
         try:
             facts = self.path.stat()
         except FileNotFoundError:
@@ -405,7 +404,7 @@ Row = Mapping[str, Any]
 
 
 def upsert(connection: Connection, table: Table, rows: Sequence[Row], *, keep: Sequence[str] = ()) -> None:
-    """Insert or update rows, all with the same columns; the last row of a key counts. `keep` is never updated."""
+    """Insert or update rows of equal columns; the last row of a key counts. `keep` is never updated."""
     if not rows:
         return
     keys = [column.name for column in table.primary_key]

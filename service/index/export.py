@@ -21,9 +21,9 @@ GROUP: Final = 20_000
 
 
 def export(database: Database, folder: Path) -> dict[str, int]:
-    """Write `TABLES` as `folder/NAME.parquet`, ordered by primary key; return row counts. InputError: no pyarrow.
+    """Write `TABLES` as `folder/NAME.parquet`; return their row counts; InputError without pyarrow.
 
-    All tables are of one snapshot. Integers are int64, other numbers float64, JSON is text.
+    Rows are of one snapshot, ordered by primary key. Integers are int64, other numbers float64, JSON is text.
     """
     # The schemas need pyarrow: a missing package is reported before any query.
     schemas = {name: schema_of({c.name: _type_name(c) for c in table.columns}) for name, table in TABLES.items()}

@@ -1,4 +1,4 @@
-"""Notes of the index: completeness, mark, service id, progress of the integrity scan; damaged stored objects."""
+"""Notes of the index: completeness, mark, service id, integrity scan, damaged stored objects."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class IndexCompleteness:
 
 @dataclass(frozen=True)
 class StoreMark:
-    """Mark for the detection of an older copy of index or store; `changes` is the number of changes so far."""
+    """Mark that detects an older copy of index or store, and the number of changes so far."""
 
     mark: str = ""
     """Mark that index and store share; empty before the first mark."""
@@ -99,7 +99,7 @@ class Notes(IndexPart):
         self._set(_SCAN, asdict(note))
 
     def pause_scan(self, lasts_s: float, *, begin: bool = False) -> bool:
-        """Pause the integrity scan for `lasts_s`; return False if `begin` is true and a pause is already active."""
+        """Pause the integrity scan for `lasts_s` [s]; with `begin`, return False if a pause is active."""
         with self.database.write_transaction() as connection:
             if begin and self.is_scan_paused(within=connection):
                 return False
@@ -119,7 +119,7 @@ class Notes(IndexPart):
 
 @dataclass(frozen=True)
 class Damage:
-    """Damage of a stored object. `found` is the time of detection; `shard` is empty for objects that are no shards."""
+    """Damage of a stored object, its time of detection, and the shard to which the object belongs."""
 
     key: str
     what: str
@@ -136,7 +136,7 @@ class KnownDamage(IndexPart):
         with self.database.read_transaction() as connection:
             count = int(connection.scalar(select(func.count()).select_from(damage)) or 0)
             rows = connection.execute(query).mappings()
-            return count, [Damage(row["key"], row["what"], row["shard"], row["found"]) for row in rows]
+            return count, [Damage(**row) for row in rows]
 
     def update(self, found: Sequence[Damage], *, intact: Sequence[str] = ()) -> None:
         rows = [{"key": one.key, "what": one.what, "shard": one.shard, "found": timestamp()} for one in found]

@@ -82,14 +82,9 @@ class Outbox(IndexPart):
             connection.execute(delete(webhooks).where(webhooks.c.id == webhook))
 
     def log(self, webhook: str, *, limit: int = 50) -> list[DeliveryView]:
-        query = (
-            select(deliveries, ends.c.kind, ends.c.subject, ends.c.state.label("ended"))
-            .join(ends, ends.c.seq == deliveries.c.seq)
-            .where(deliveries.c.webhook == webhook)
-            .order_by(deliveries.c.seq.desc())
-            .limit(limit)
-        )
-        return [DeliveryView(**row) for row in self.database.rows(query)]
+        query = select(deliveries, ends.c.kind, ends.c.subject, ends.c.state.label("ended"))
+        query = query.join(ends, ends.c.seq == deliveries.c.seq).where(deliveries.c.webhook == webhook)
+        return [DeliveryView(**row) for row in self.database.rows(query.order_by(deliveries.c.seq.desc()).limit(limit))]
 
     def create_deliveries(self) -> None:
         """Create deliveries of new ends; those above `MOST_WAITING` of a webhook fail at once."""
@@ -115,17 +110,11 @@ class Outbox(IndexPart):
     def due_deliveries(self, now: float) -> list[DueDelivery]:
         """Return the oldest due delivery of each webhook."""
         hooks = {hook.id: hook for hook in self.webhooks()}
-        first = (
-            select(func.min(deliveries.c.seq).label("seq"), deliveries.c.webhook)
-            .where(deliveries.c.state == "waiting", deliveries.c.due <= now)
-            .group_by(deliveries.c.webhook)
-            .subquery()
-        )
-        query = (
-            select(ends, deliveries.c.webhook, deliveries.c.attempts)
-            .join(first, first.c.seq == ends.c.seq)
-            .join(deliveries, (deliveries.c.seq == first.c.seq) & (deliveries.c.webhook == first.c.webhook))
-        )
+        oldest = select(func.min(deliveries.c.seq).label("seq"), deliveries.c.webhook).group_by(deliveries.c.webhook)
+        first = oldest.where(deliveries.c.state == "waiting", deliveries.c.due <= now).subquery()
+        is_first = (deliveries.c.seq == first.c.seq) & (deliveries.c.webhook == first.c.webhook)
+        query = select(ends, deliveries.c.webhook, deliveries.c.attempts)
+        query = query.join(first, first.c.seq == ends.c.seq).join(deliveries, is_first)
         return [
             DueDelivery(hooks[row["webhook"]], EndView(**row), row["attempts"])
             for row in self.database.rows(query)

@@ -1,4 +1,4 @@
-"""Tables of the index. `LIVE_COLUMNS` are current state (progress, queue marks); all others are derived from the store.
+"""Tables of the index, derived from the store except for `LIVE_COLUMNS` and `LIVE_TABLES`.
 
 Each change needs another `REVISION` in `database`, except for new metrics of grasps; a test enforces this.
 """

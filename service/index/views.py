@@ -43,7 +43,7 @@ class Validated(View):
 
 
 class StageProgress(View):
-    """Number of tasks of a stage of a job, by state. `done` counts finished tasks and shares of running ones."""
+    """Tasks of one stage of a job, by state. `done` counts finished tasks and shares of running ones."""
 
     stage: Stage
     tasks: int

@@ -64,7 +64,7 @@ def password_file(data_dir: Path) -> Path:
 
 
 def socket_path(data_dir: Path) -> Path:
-    """Return the socket of a data folder's Redis: in that folder, or in a private one if the path is too long."""
+    """Return the socket of a data folder's Redis: in that folder, or if too long in a private one."""
     path = data_dir.resolve() / "redis" / "redis.sock"
     if len(os.fsencode(path)) <= _MAX_SOCKET_PATH:
         return path

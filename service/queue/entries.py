@@ -88,7 +88,7 @@ def parse_events(reply: Any) -> list[tuple[str, Event | None]]:
 
 
 def remove_mistyped_keys(connection: Any, kinds: Mapping[str, str], stream: str) -> None:
-    """Remove keys whose type differs from `kinds`, and the event stream `stream` if it rejects new entries."""
+    """Remove keys whose type differs from `kinds`, and the event stream if it rejects new entries."""
     with connection.pipeline(transaction=False) as pipe:
         for name in kinds:
             pipe.type(name)
@@ -149,7 +149,7 @@ def queue_name(priority: Priority, stage: Stage, need: Requirements | None = Non
 
 
 def queue_names(stages: Collection[Stage], taken: int = 0, *, ability: Capabilities | None = None) -> list[str]:
-    """Return a worker's queues in reading order after `taken` tasks; separate lists come before common ones."""
+    """Return a worker's queues in reading order after `taken` tasks, separate lists before common ones."""
     return [
         queue_name(priority, stage, need)
         for priority in priority_order(taken)

@@ -14,8 +14,6 @@ from graspd.service.model.messages import Amount, Count, HostWord, IngestMessage
 from graspd.service.model.states import Priority, Stage
 
 Message = TaskMessage | IngestMessage
-
-
 #: For every n-th task, a worker reads bulk lists first, so that steady interactive work does not block bulk work.
 BULK_EVERY: Final = 4
 

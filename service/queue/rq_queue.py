@@ -71,7 +71,7 @@ class RqQueue:
     def enqueue(
         self, messages: Sequence[Message], priority: Priority, *, again: bool = False, apart: bool = False
     ) -> int:
-        """Append tasks to the lists of a priority, except waiting and running ones; return the number appended.
+        """Append tasks that neither wait nor run to the lists of a priority; return their number.
 
         `again` first deletes the data that missing tasks left in Redis. `apart` selects the separate lists.
         """
@@ -122,7 +122,7 @@ class RqQueue:
             return dict(depths)
 
     def clear_untaken(self, present: Collection[WorkerBeat]) -> None:
-        """Remove separate lists that no worker in `present` can serve; the controller queues their tasks again."""
+        """Remove separate lists that no worker can serve; the controller queues their tasks again."""
         abilities = [(stage, beat.capabilities) for beat in present for stage in beat.stages]
         with _convert_errors(), self.connection.pipeline(transaction=False) as pipe:
             for name in entries.unserved_lists(entries.list_names(self.connection), abilities):
@@ -181,7 +181,7 @@ class RqQueue:
             pipe.execute()
 
     def consume(self, *, limit: int, wait_s: float) -> list[tuple[str, Event]]:
-        """Return the next events with their ids, oldest first; a new controller gets unacknowledged ones again."""
+        """Return the next events with their ids, oldest first, after those an earlier controller left."""
         with _convert_errors():
             while self._unread != ">":
                 pending = self._read_group(self._unread, limit, 0.0)
@@ -248,7 +248,7 @@ class RqQueue:
             self.connection.lock(LEAD).do_release(holder)
 
     def status(self, *, lease_s: float) -> QueueStatus:
-        """Return queue lengths, ages [s] and workers for the metrics; the cost does not depend on queue lengths."""
+        """Return queue lengths, ages [s] and workers for the metrics, in constant time per list."""
         beats = self.workers()
         with _convert_errors(), self.connection.pipeline(transaction=False) as pipe:
             lists = entries.list_names(self.connection)
@@ -264,9 +264,8 @@ class RqQueue:
             # A name may have a forged value of any type, which must not hide the others.
             since = [None if isinstance(one, Exception) else one for one in pipe.execute(raise_on_error=False)]
         depth, running, oldest = Counter[Place](), Counter[Place](), dict[Place, float]()
-        for place, waiting, held, when in zip(
-            map(entries.priority_and_stage_of, lists), found[0::3], found[2::3], since, strict=False
-        ):
+        places = map(entries.priority_and_stage_of, lists)
+        for place, waiting, held, when in zip(places, found[0::3], found[2::3], since, strict=False):
             depth[place] += waiting
             running[place] += held
             if (age := age_of(entries.decode_text(when))) is not None:
@@ -293,7 +292,7 @@ class RqQueue:
         return sums
 
     def tidy(self) -> None:
-        """Remove keys of wrong types and the registrations of dead workers, which RQ's disabled maintenance leaves."""
+        """Remove keys of wrong types, and the registrations of dead workers, which RQ leaves."""
         with _convert_errors(), self.connection.pipeline(transaction=False) as pipe:
             lists = entries.list_names(self.connection)
             entries.remove_mistyped_keys(self.connection, {**_KINDS, **entries.key_types(lists)}, EVENTS)

@@ -116,7 +116,7 @@ def sanitize(text: str, length: int | None = None) -> str:
 
 
 def row_from(table: Table, record: object, **others: Any) -> Row:
-    """Return a row with a record's attributes, some replaced by `others`; text is cut to the column's length."""
+    """Return a row of a record's attributes; `others` replace some. Text is cut to the column's length."""
     row = {column.name: getattr(record, column.name) for column in table.columns if column.name not in others} | others
     lengths = {column.name: getattr(column.type, "length", None) for column in table.columns}
     return {name: sanitize(value, lengths[name]) if isinstance(value, str) else value for name, value in row.items()}
@@ -306,7 +306,7 @@ class Changes(IndexPart):
         return [name.removeprefix(ENTERING) for name in self.database.column(query)]
 
     def enter_more(self, job_id: str, record: JobRecord | None) -> None:
-        """Add the next tasks of a large job; None instead of its record ends this, for example after a deletion."""
+        """Add the next tasks of a large job; without a record (None), for example after a deletion, stop."""
         with self.database.write_transaction() as connection:
             exists_now = connection.scalar(select(jobs.c.id).where(jobs.c.id == job_id)) is not None
             note: Any = connection.scalar(select(notes.c.value).where(notes.c.name == ENTERING + job_id))
@@ -336,10 +336,7 @@ class Changes(IndexPart):
     def add_attempt(
         self, attempt: AttemptRecord, *, not_before: float = 0.0, within: Connection | None = None
     ) -> State | None:
-        """Add a failed attempt; the next one is due at `not_before` [Unix time, s]. Return the job's state.
-
-        Return None if the task is unknown or done, or if a later attempt is known.
-        """
+        """Add a failed attempt; the next is due at `not_before` [s]. Return the job's state, if changed."""
         with self.database.write_transaction(within) as connection:
             if connection.scalar(select(tasks.c.id).where(tasks.c.id == attempt.task_id)) is None:
                 return None  # The job was deleted, or the attempt is forged.
@@ -386,7 +383,7 @@ class Changes(IndexPart):
         upsert(connection, tasks, rows, keep=[name for name in rows[0] if name != "priority"])
 
     def _enter(self, connection: Connection, record: JobRecord, first: int, *, goes_on: bool) -> None:
-        """Add up to `RANGES_AT_ONCE` ranges from `first`; with `goes_on`, a note stores the next range, if any."""
+        """Add up to `RANGES_AT_ONCE` ranges from `first`; with `goes_on`, note the next range, if any."""
         number = count_ranges(record.request.grasps, record.span)
         some = range(first, min(number, first + RANGES_AT_ONCE))
         self._upsert_tasks(connection, list(task_rows(record, some)))
@@ -529,7 +526,7 @@ class Live(IndexPart):
             connection.execute(update(assets).where(assets.c.digest.in_(list(digests))).values(**values))
 
     def set_workers(self, beats: Sequence[WorkerBeat], *, forget_before: str, lost_before: str = "9999") -> None:
-        """Record living workers; mark others as lost, or delete them, by the time at which they were last seen."""
+        """Record living workers; mark others as lost or delete them, according to their last report."""
         rows = [
             row_from(workers, beat, stages=[stage.value for stage in beat.stages], task_id=beat.task_id or None)
             for beat in beats

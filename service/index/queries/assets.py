@@ -41,7 +41,7 @@ class Assets(IndexPart):
         return Page(items=[AssetView(**row) for row in rows], next=following)
 
     def get(self, kind: AssetKind, name_or_digest: str, *, scope: ProjectScope = EVERYTHING) -> AssetView:
-        """Return an asset by digest or name: preferably not refused, then own, then newest; NotFoundError if none."""
+        """Return an asset by digest or name, if possible not refused, own, newest; NotFoundError if none."""
         named = and_(assets.c.kind == kind.value, assets.c.name == name_or_digest)
         by_digest = and_(assets.c.kind == kind.value, assets.c.digest == name_or_digest)
         refused_last = case((assets.c.verdict == "refuse", 1), else_=0)

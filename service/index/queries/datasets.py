@@ -62,11 +62,8 @@ class Datasets(IndexPart):
             dataset = _dataset_row(connection, name, scope)
             now = _cell_state(dataset["cancelled"])
             planned = jobs.c.id.is_not(None).label("planned")
-            query = (
-                select(dataset_cells, now.label("state"), planned, jobs.c.reason, jobs.c.span)
-                .outerjoin(jobs, jobs.c.id == dataset_cells.c.job_id)
-                .where(dataset_cells.c.dataset == name)
-            )
+            query = select(dataset_cells, now.label("state"), planned, jobs.c.reason, jobs.c.span)
+            query = query.outerjoin(jobs, jobs.c.id == dataset_cells.c.job_id).where(dataset_cells.c.dataset == name)
             if state is not None:
                 query = query.where(now == state.value)
             key = dataset_cells.c.position
@@ -76,13 +73,10 @@ class Datasets(IndexPart):
 
     def shards(self, name: str) -> list[SnapshotShard]:
         """Return all shards of a dataset, ordered by cell, batch and stage."""
-        query = (
-            select(*(shards.c[field] for field in SnapshotShard.model_fields))
-            .join(tasks, tasks.c.shard_id == shards.c.id)
-            .join(dataset_cells, dataset_cells.c.job_id == tasks.c.job_id)
-            .where(dataset_cells.c.dataset == name)
-            .order_by(dataset_cells.c.position, tasks.c.batch, tasks.c.position)
-        )
+        query = select(*(shards.c[field] for field in SnapshotShard.model_fields))
+        query = query.join(tasks, tasks.c.shard_id == shards.c.id).where(dataset_cells.c.dataset == name)
+        query = query.join(dataset_cells, dataset_cells.c.job_id == tasks.c.job_id)
+        query = query.order_by(dataset_cells.c.position, tasks.c.batch, tasks.c.position)
         with self.database.read_transaction() as connection:
             _dataset_row(connection, name)
             return [SnapshotShard(**row) for row in connection.execute(query).mappings()]
@@ -153,19 +147,14 @@ def _state(row: Any, states: dict[State, int]) -> State:
 
 def _states(connection: Connection, row: Any) -> dict[State, int]:
     now = _cell_state(row["cancelled"])
-    query = (
-        select(now, func.count())
-        .select_from(dataset_cells)
-        .outerjoin(jobs, jobs.c.id == dataset_cells.c.job_id)
-        .where(dataset_cells.c.dataset == row["name"])
-        .group_by(now)
-    )
+    query = select(now, func.count()).select_from(dataset_cells).where(dataset_cells.c.dataset == row["name"])
+    query = query.outerjoin(jobs, jobs.c.id == dataset_cells.c.job_id).group_by(now)
     found = {State(state): int(count) for state, count in connection.execute(query)}
     return {state: found.get(state, 0) for state in State}
 
 
 def _count_tasks_of_cell(options: JobOptions, span: int | None) -> int:
-    """Return the number of tasks of a cell; `span` is the number of batches per task, None (as 1) without a job."""
+    """Return the number of tasks of a cell; `span`: batches per task, None (used as 1) without a job."""
     return count_ranges(options.grasps, span or 1) * len(stages_of(options))
 
 
@@ -177,30 +166,21 @@ def _count_tasks_of_dataset(connection: Connection, name: str, options: JobOptio
 
 
 def _task_counts(connection: Connection, where: ColumnElement[bool]) -> dict[str, Any]:
-    query = (
-        select(
-            func.count().label("tasks"),
-            _sum_where(tasks.c.state == State.SUCCEEDED.value, 1).label("done"),
-            _sum_where(tasks.c.state == State.FAILED.value, 1).label("failed"),
-            _sum_where(tasks.c.state == State.RUNNING.value, 1).label("running"),
-            func.coalesce(func.sum(cast(SHARE_DONE, Float)), 0.0).label("share"),
-            func.max(tasks.c.finished).label("finished"),
-        )
-        .select_from(dataset_cells)
-        .join(tasks, tasks.c.job_id == dataset_cells.c.job_id)
-        .where(where)
+    query = select(
+        func.count().label("tasks"),
+        _sum_where(tasks.c.state == State.SUCCEEDED.value, 1).label("done"),
+        _sum_where(tasks.c.state == State.FAILED.value, 1).label("failed"),
+        _sum_where(tasks.c.state == State.RUNNING.value, 1).label("running"),
+        func.coalesce(func.sum(cast(SHARE_DONE, Float)), 0.0).label("share"),
+        func.max(tasks.c.finished).label("finished"),
     )
+    query = query.select_from(dataset_cells.join(tasks, tasks.c.job_id == dataset_cells.c.job_id)).where(where)
     return dict(connection.execute(query).mappings().one())
 
 
 def _grasp_counts(connection: Connection, where: ColumnElement[bool]) -> dict[str, Any]:
-    query = (
-        select(*_MADE)
-        .select_from(dataset_cells)
-        .join(tasks, tasks.c.job_id == dataset_cells.c.job_id)
-        .join(shards, shards.c.id == tasks.c.shard_id)
-        .where(where)
-    )
+    of_cells = dataset_cells.join(tasks, tasks.c.job_id == dataset_cells.c.job_id)
+    query = select(*_MADE).select_from(of_cells.join(shards, shards.c.id == tasks.c.shard_id)).where(where)
     return dict(connection.execute(query).mappings().one())
 
 
@@ -239,11 +219,8 @@ def _cell_views(connection: Connection, rows: Sequence[Any], options: JobOptions
 
 
 def _task_counts_by_job(connection: Connection, ids: Sequence[str]) -> dict[str, dict[str, float]]:
-    query = (
-        select(tasks.c.job_id, tasks.c.state, func.count(), func.sum(cast(SHARE_DONE, Float)))
-        .where(tasks.c.job_id.in_(ids))
-        .group_by(tasks.c.job_id, tasks.c.state)
-    )
+    query = select(tasks.c.job_id, tasks.c.state, func.count(), func.sum(cast(SHARE_DONE, Float)))
+    query = query.where(tasks.c.job_id.in_(ids)).group_by(tasks.c.job_id, tasks.c.state)
     found: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(int))
     for job, state, count, share in connection.execute(query):
         found[job][State(state)] += count
@@ -254,12 +231,8 @@ def _task_counts_by_job(connection: Connection, ids: Sequence[str]) -> dict[str,
 
 def _grasp_counts_by_job(connection: Connection, ids: Sequence[str]) -> dict[str, dict[str, Any]]:
     wanted = [column for column in _MADE if column.name in ("grasps", "valid", "candidates", "validated", "seconds")]
-    query = (
-        select(tasks.c.job_id, *wanted)
-        .join(shards, shards.c.id == tasks.c.shard_id)
-        .where(tasks.c.job_id.in_(ids))
-        .group_by(tasks.c.job_id)
-    )
+    query = select(tasks.c.job_id, *wanted).join(shards, shards.c.id == tasks.c.shard_id)
+    query = query.where(tasks.c.job_id.in_(ids)).group_by(tasks.c.job_id)
     return {row["job_id"]: {k: row[k] for k in row if k != "job_id"} for row in connection.execute(query).mappings()}
 
 

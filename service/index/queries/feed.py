@@ -60,14 +60,9 @@ class Feed(IndexPart):
     def ready_tasks_of_job(self, job_id: str, *, limit: int, now: float | None = None) -> list[ReadyTask]:
         """Return the first tasks of a job to queue; without `now`, back-offs are ignored."""
         due = () if now is None else (_due(tasks.c.not_before, now),)
-        query = (
-            select(tasks, *(jobs.c[name] for name in _OF_THE_JOB))
-            .join(jobs, jobs.c.id == tasks.c.job_id)
-            .where(tasks.c.job_id == job_id, *_WAITING, *due)
-            .order_by(tasks.c.batch)
-            .limit(limit)
-        )
-        rows = self.database.rows(query)
+        query = select(tasks, *(jobs.c[name] for name in _OF_THE_JOB)).join(jobs, jobs.c.id == tasks.c.job_id)
+        query = query.where(tasks.c.job_id == job_id, *_WAITING, *due).order_by(tasks.c.batch)
+        rows = self.database.rows(query.limit(limit))
         record = _record(rows[0]) if rows else None
         return [_ready_task(row, record) for row in rows if record is not None]
 
@@ -141,11 +136,8 @@ class DatasetWork:
 class DatasetFeed(IndexPart):
     def pending_datasets(self) -> list[DatasetWork]:
         """Return datasets with cells to plan or with events for their jobs, the oldest first."""
-        query = (
-            select(datasets)
-            .where(or_(datasets.c.planned.is_(False), datasets.c.applied < datasets.c.events))
-            .order_by(datasets.c.created, datasets.c.name)
-        )
+        pending = or_(datasets.c.planned.is_(False), datasets.c.applied < datasets.c.events)
+        query = select(datasets).where(pending).order_by(datasets.c.created, datasets.c.name)
         plain = ("name", "revisions", "cancelled", "events", "applied", "owner", "project")
         return [
             DatasetWork(options=JobOptions.model_validate(row["options"]), **{name: row[name] for name in plain})
@@ -153,13 +145,10 @@ class DatasetFeed(IndexPart):
         ]
 
     def cells_to_plan(self, name: str, *, after: int, limit: int) -> list[Cell]:
-        query = (
-            select(dataset_cells)
-            .outerjoin(jobs, jobs.c.id == dataset_cells.c.job_id)
-            .where(dataset_cells.c.dataset == name, dataset_cells.c.position > after, jobs.c.id.is_(None))
-            .order_by(dataset_cells.c.position)
-            .limit(limit)
-        )
+        """Return the next cells without a job, after position `after`."""
+        query = select(dataset_cells).outerjoin(jobs, jobs.c.id == dataset_cells.c.job_id)
+        query = query.where(dataset_cells.c.dataset == name, dataset_cells.c.position > after, jobs.c.id.is_(None))
+        query = query.order_by(dataset_cells.c.position).limit(limit)
         return [
             Cell(
                 row["position"],
@@ -179,14 +168,10 @@ class DatasetFeed(IndexPart):
 
         `unshared` omits jobs submitted by another key, and jobs that another dataset in progress needs.
         """
-        query = (
-            select(dataset_cells.c.position, dataset_cells.c.job_id)
-            .join(jobs, jobs.c.id == dataset_cells.c.job_id)
-            .where(dataset_cells.c.dataset == name, dataset_cells.c.position > after)
-            .where(jobs.c.state.in_([state.value for state in states]))
-            .order_by(dataset_cells.c.position)
-            .limit(limit)
-        )
+        in_states = jobs.c.state.in_([state.value for state in states])
+        query = select(dataset_cells.c.position, dataset_cells.c.job_id)
+        query = query.join(jobs, jobs.c.id == dataset_cells.c.job_id).order_by(dataset_cells.c.position).limit(limit)
+        query = query.where(dataset_cells.c.dataset == name, dataset_cells.c.position > after, in_states)
         if unshared:
             query = query.join(datasets, datasets.c.name == dataset_cells.c.dataset)
             query = query.where(jobs.c.owner == datasets.c.owner)

@@ -15,21 +15,7 @@ from dataclasses import dataclass
 from typing import Any, Final, Literal
 
 from pydantic import Field
-from sqlalchemy import (
-    ColumnElement,
-    Connection,
-    Float,
-    Select,
-    String,
-    Subquery,
-    and_,
-    exists,
-    func,
-    not_,
-    or_,
-    select,
-    tuple_,
-)
+from sqlalchemy import ColumnElement, Connection, Float, Select, String, Subquery, and_, func, not_, or_, select, tuple_
 from sqlalchemy.sql.operators import in_op, is_
 
 from graspd.service.index.database import (
@@ -52,6 +38,8 @@ from graspd.service.model.states import Stage
 from graspd.service.model.where import Connective, Flag, MetricComparison, Negation, Node, TypeComparison, parse_where
 
 Metric = SortedName
+#: Key of the grasp before a page (metric, shard id and row), None for the first page.
+Start = tuple[Any, ...] | None
 
 
 class GraspSort(Model):
@@ -133,7 +121,7 @@ class Condition:
     value: Any
 
     def sql(self, groups: Sequence[str] | None) -> ColumnElement[bool]:
-        """Return the test in SQL; it uses a database index only if its group is in `groups` (None: all groups)."""
+        """Return the test in SQL, which uses an index only if its group is in `groups` (None: all groups)."""
         return self._of(self.column if groups is None or self.group in groups else _without_index(self.column))
 
     def sql_for_rows(self, rows: Subquery) -> ColumnElement[bool]:
@@ -160,7 +148,7 @@ class Tagged:
 
     def _of(self, columns: Any) -> ColumnElement[bool]:
         same = (tagged.c.tag == self.tag, tagged.c.shard_id == columns.shard_id, tagged.c.row == columns.row)
-        return exists().where(*same)
+        return select(tagged.c.tag).where(*same).exists()
 
 
 @dataclass(frozen=True)
@@ -222,10 +210,8 @@ def sql_conditions(where: GraspFilter | None) -> list[ColumnElement[bool]]:
     return [condition.sql(None) for condition in conditions(where)]
 
 
-def search(
-    connection: Connection, where: GraspFilter | None, sort: GraspSort, size: int, start: tuple[Any, ...] | None
-) -> list[Any]:
-    """Return the first `size` rows after `start`, the key of a grasp: metric, shard id and row."""
+def search(connection: Connection, where: GraspFilter | None, sort: GraspSort, size: int, start: Start) -> list[Any]:
+    """Return the first `size` rows after `start`."""
     wanted = conditions(where)
     few = _selective_group(connection, where, wanted)
     rows: list[Any] = []
@@ -242,12 +228,7 @@ def search(
 
 
 def _with_metric(
-    connection: Connection,
-    wanted: Sequence[Test],
-    few: str | None,
-    sort: GraspSort,
-    size: int,
-    start: tuple[Any, ...] | None,
+    connection: Connection, wanted: Sequence[Test], few: str | None, sort: GraspSort, size: int, start: Start
 ) -> list[Any]:
     by = grasps.c[sort.by]
     if few is not None and few != sort.by:
@@ -273,11 +254,7 @@ def _with_metric(
 
 
 def _sorted_rows(
-    connection: Connection,
-    tests: Sequence[ColumnElement[bool]],
-    sort: GraspSort,
-    size: int,
-    start: tuple[Any, ...] | None,
+    connection: Connection, tests: Sequence[ColumnElement[bool]], sort: GraspSort, size: int, start: Start
 ) -> list[Any]:
     """Return the matching rows, sorted without an index."""
     by = _without_index(grasps.c[sort.by])
@@ -332,7 +309,7 @@ def _count(connection: Connection, rows: Subquery) -> int:
 
 
 def _slice(
-    query: Select[Any], key: tuple[ColumnElement[Any], ...], sort: GraspSort, size: int, start: tuple[Any, ...] | None
+    query: Select[Any], key: tuple[ColumnElement[Any], ...], sort: GraspSort, size: int, start: Start
 ) -> Select[Any]:
     if start is not None:
         position = tuple_(*key)
@@ -347,7 +324,7 @@ def _without_index(column: ColumnElement[Any]) -> ColumnElement[Any]:
 
 
 def sql_condition(node: Node, grasps: Columns) -> ColumnElement[bool]:
-    """Translate a grasp expression to SQL that is never NULL; InputError for a column that the index lacks."""
+    """Translate a grasp expression to SQL that is never NULL; InputError for a missing column."""
     if isinstance(node, Connective):
         return (or_ if node.word == "or" else and_)(*(sql_condition(part, grasps) for part in node.parts))
     if isinstance(node, Negation):
@@ -374,7 +351,7 @@ def _missing_column_error(name: str) -> InputError:
 
 
 class GraspFilter(Model):
-    """Filters that all must match. `at_least` and `at_most` are inclusive bounds, which missing values do not meet."""
+    """Filters, all of which must match; `at_least` and `at_most` are inclusive bounds of metrics."""
 
     hand: str | None = None
     object: str | None = None

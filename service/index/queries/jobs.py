@@ -108,20 +108,15 @@ def _with_pending_tasks(stage: StageProgress, tasks: int) -> StageProgress:
 def _progress(connection: Connection, ids: Sequence[str]) -> dict[str, list[StageProgress]]:
     # The shard of a task is reused if it is older than the task; both times are texts of one format.
     reused = and_(tasks.c.done, tasks.c.finished < tasks.c.created)
-    query = (
-        select(
-            tasks.c.job_id,
-            tasks.c.position,
-            tasks.c.stage,
-            tasks.c.state,
-            func.count().label("tasks"),
-            func.sum(cast(SHARE_DONE, Float)).label("done"),
-            func.sum(case((reused, 0.0), else_=func.coalesce(tasks.c.seconds, 0.0))).label("seconds"),
-            func.sum(case((reused, 1), else_=0)).label("reused"),
-        )
-        .where(tasks.c.job_id.in_(ids))
-        .group_by(tasks.c.job_id, tasks.c.position, tasks.c.stage, tasks.c.state)
+    group = (tasks.c.job_id, tasks.c.position, tasks.c.stage, tasks.c.state)
+    query = select(
+        *group,
+        func.count().label("tasks"),
+        func.sum(cast(SHARE_DONE, Float)).label("done"),
+        func.sum(case((reused, 0.0), else_=func.coalesce(tasks.c.seconds, 0.0))).label("seconds"),
+        func.sum(case((reused, 1), else_=0)).label("reused"),
     )
+    query = query.where(tasks.c.job_id.in_(ids)).group_by(*group)
     stages: dict[str, dict[int, dict[str, Any]]] = defaultdict(dict)
     for row in connection.execute(query).mappings():
         sums = {"tasks": 0, "done": 0.0, "seconds": 0.0, "reused": 0}
@@ -135,12 +130,9 @@ def _progress(connection: Connection, ids: Sequence[str]) -> dict[str, list[Stag
 def _grasp_counts(connection: Connection, ids: Sequence[str]) -> dict[str, dict[str, int]]:
     same = ("valid", "candidates", "validated", "rechecked", "recheck_held")
     columns = {"grasps": "count", **{name: name for name in same}}
-    query = (
-        select(tasks.c.job_id, *(func.sum(shards.c[column]).label(name) for name, column in columns.items()))
-        .join(shards, shards.c.id == tasks.c.shard_id)
-        .where(tasks.c.job_id.in_(ids), tasks.c.stage == Stage.SYNTHESIZE.value)
-        .group_by(tasks.c.job_id)
-    )
+    sums = (func.sum(shards.c[column]).label(name) for name, column in columns.items())
+    query = select(tasks.c.job_id, *sums).join(shards, shards.c.id == tasks.c.shard_id).group_by(tasks.c.job_id)
+    query = query.where(tasks.c.job_id.in_(ids), tasks.c.stage == Stage.SYNTHESIZE.value)
     rows = connection.execute(query).mappings()
     return {row["job_id"]: {name: int(row[name]) for name in columns} for row in rows}
 
@@ -157,12 +149,8 @@ MOST_SHARDS: Final = 1000
 
 def outcomes_of(connection: Connection, of_jobs: ColumnElement[bool]) -> dict[str, int]:
     """Count rejected candidates by outcome in at most `MOST_SHARDS` shards of the selected jobs."""
-    query = (
-        select(shards.c.manifest["info"]["outcomes"])
-        .join(tasks, tasks.c.shard_id == shards.c.id)
-        .where(of_jobs, tasks.c.stage == Stage.SYNTHESIZE.value)
-        .limit(MOST_SHARDS)
-    )
+    query = select(shards.c.manifest["info"]["outcomes"]).join(tasks, tasks.c.shard_id == shards.c.id)
+    query = query.where(of_jobs, tasks.c.stage == Stage.SYNTHESIZE.value).limit(MOST_SHARDS)
     return sum_outcomes(one for one in connection.scalars(query) if isinstance(one, dict))
 
 

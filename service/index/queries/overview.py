@@ -67,13 +67,8 @@ class Overview(IndexPart):
         """Return failed attempts grouped by stage and error, the most frequent first."""
         number, newest = func.count().label("attempts"), func.max(attempts.c.ended).label("last_seen")
         in_scope, group = scope_conditions_by_job(scope, attempts), (attempts.c.stage, attempts.c.kind)
-        query = (
-            select(*group, number, func.count(attempts.c.task_id.distinct()).label("tasks"), newest)
-            .where(*in_scope)
-            .group_by(*group)
-            .order_by(number.desc(), newest.desc())
-            .limit(page_size(limit))
-        )
+        query = select(*group, number, func.count(attempts.c.task_id.distinct()).label("tasks"), newest)
+        query = query.where(*in_scope).group_by(*group).order_by(number.desc(), newest.desc()).limit(page_size(limit))
         groups = []
         with self.database.read_transaction() as connection:
             for row in connection.execute(query).mappings().all():
@@ -85,11 +80,8 @@ class Overview(IndexPart):
 
     def matrix(self, *, scope: ProjectScope = EVERYTHING) -> list[MatrixCell]:
         of_tasks = select(tasks.c.job_id, tasks.c.state, func.count()).group_by(tasks.c.job_id, tasks.c.state)
-        made = (
-            select(shards.c.hand, shards.c.object, *_MADE)
-            .where(shards.c.kind == "base", *shard_scope_conditions(scope, shards.c.id))
-            .group_by(shards.c.hand, shards.c.object)
-        )
+        made = select(shards.c.hand, shards.c.object, *_MADE).group_by(shards.c.hand, shards.c.object)
+        made = made.where(shards.c.kind == "base", *shard_scope_conditions(scope, shards.c.id))
         cells: dict[tuple[str, str], dict[str, int]] = {}
         with self.database.read_transaction() as connection:
             pairs = {}
@@ -165,13 +157,8 @@ class Usage(IndexPart):
     def days(self, since: str, until: str, *, scope: ProjectScope = EVERYTHING) -> list[UsageDay]:
         """Return the usage of each project by day (2026-11-22), without empty days, newest first."""
         day = func.substr(shards.c.created, 1, 10).label("day")
-        sums = (
-            _sum_over_base(shards.c.count),
-            _sum_over_base(shards.c.valid),
-            func.count(),
-            func.sum(shards.c.seconds),
-        )
-        made = select(shards.c.charged, day, shards.c.device, *sums)
+        base = (_sum_over_base(column) for column in (shards.c.count, shards.c.valid))
+        made = select(shards.c.charged, day, shards.c.device, *base, func.count(), func.sum(shards.c.seconds))
         made = made.where(shards.c.created >= since, shards.c.created < f"{until}T99")
         gone = select(spent).where(spent.c.day >= since, spent.c.day <= until, *scope_conditions(scope, spent))
         if not scope.everything:
@@ -232,11 +219,7 @@ class BatchCost:
 class Costs(IndexPart):
     def of_batches(self, stage: Stage, *, limit: int = _NEWEST, scope: ProjectScope = EVERYTHING) -> list[BatchCost]:
         columns = [shards.c[name] for name in BatchCost.__dataclass_fields__ if name != "request"]
-        query = (
-            select(*columns, shards.c.manifest["request"].label("request"))
-            .where(shards.c.kind == SHARD_KINDS[stage], *shard_scope_conditions(scope, shards.c.id))
-            .order_by(shards.c.created.desc(), shards.c.id.desc())
-            .limit(limit)
-        )
-        rows = self.database.rows(query)
+        query = select(*columns, shards.c.manifest["request"].label("request"))
+        query = query.where(shards.c.kind == SHARD_KINDS[stage], *shard_scope_conditions(scope, shards.c.id))
+        rows = self.database.rows(query.order_by(shards.c.created.desc(), shards.c.id.desc()).limit(limit))
         return [BatchCost(**{**row, "request": JobRequest.model_validate(row["request"])}) for row in rows]

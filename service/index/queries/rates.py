@@ -1,9 +1,8 @@
 """Seconds and bytes of a batch: measured on finished batches of this service, else stored values.
 
-The nearest measurement counts: of the same hand and object, else of the same hand, else of any hand. Method, fidelity,
-validation and device are always the same. After the first measurement, one factor (seconds of this machine / stored
-seconds) scales all stored values. Every rate has an interval: the scatter of measured batches, or the observed error
-of a stored value.
+The nearest measurement counts: of the same hand and object, else of the same hand, else of any hand; always with the
+same method, fidelity, validation and device. After the first measurement, one factor (seconds on this machine / stored
+seconds) scales all stored values. A rate's interval is the scatter of batches, or the error of a stored value.
 """
 
 from __future__ import annotations
@@ -73,13 +72,12 @@ MEASURED_SPREAD: Final = (0.8, 1.25)
 SCALED_SPREAD: Final = (0.5, 2.0)
 #: Interval of a stored rate on an unknown machine; a small shared machine was ten times as slow.
 STORED_SPREAD: Final = (1 / 3, 10.0)
-#: Origin of the stored numbers: CPU times and sizes of graspd 0.1, for a worker with two cores that are busy for 90 % of
-#: the time.
+#: Origin of the stored numbers: graspd 0.1, for a worker that keeps two CPU cores busy for 90 % of the time.
 ORIGIN: Final = "stored default: 2 CPU cores, docs/explanation/scaling.md"
 #: Seconds per candidate (with postures, metrics and validation), and yield: that of `standard`, 1,785 of 2,542.
 STORED: Final[dict[str, tuple[float, float]]] = {"draft": (0.13, 0.7), "standard": (0.16, 0.7), "fine": (0.24, 0.7)}
-#: The same of other methods at their published budget: time and success of the planner (docs/results/chart.md), plus the
-#: cost of postures, metrics and validation.
+#: The same of other methods at their published budget: time and success of the planner (docs/results/chart.md), plus
+#: postures, metrics and validation.
 STORED_METHODS: Final[dict[str, tuple[float, float]]] = {
     "graspit": (1.5, 0.2),
     "graspd2022": (0.75, 0.4),

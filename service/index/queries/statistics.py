@@ -24,13 +24,9 @@ class MetricSummary:
 
 
 @dataclass(frozen=True)
-class Distribution:
+class Distribution(MetricSummary):
     """Histogram of one metric over the sampled grasps: equal bins from `low` to `high`, inclusive."""
 
-    count: int
-    mean: float
-    low: float
-    high: float
     counts: list[int]
 
 
@@ -57,7 +53,7 @@ class Statistics(IndexPart):
         }
 
     def histogram(self, where: GraspFilter, metric: Metric, low: float, high: float, bins: int) -> list[int]:
-        """Return the number of grasps in each of `bins` equal bins of [low, high]; the last one includes `high`."""
+        """Return the number of grasps in each of `bins` equal bins of [low, high], both ends included."""
         counts = [0] * bins
         value = grasps.c[metric]
         width = (high - low) / bins
