@@ -52,7 +52,7 @@ def has_packs(store: Store) -> bool:
 def unpack_all(store: Store) -> Iterator[ShardManifest]:
     """Replace each pack by a file and a manifest per shard; yield the manifests.
 
-    An interrupted call can be repeated. Damaged packs are moved to `damaged/`. The manifest of a damaged file is stored,
+    An interrupted call can be repeated. Damaged packs move to `damaged/`. The manifest of a damaged file is stored,
     so that its replacement must match the checksum.
     """
     keys = sorted(entry.key for entry in store.list(_FOLDER))
