@@ -50,8 +50,9 @@ def insert_fields(**parts: Mapping[str, Any]) -> Callable[[type[M]], type[M]]:
         for name, field in model.model_fields.items():
             if name not in base.model_fields:
                 fields |= {**parts.get(name, {}), name: (field.annotation, field)}
-        facts = {"__cls_kwargs__": dict(model.model_config), "__module__": model.__module__, "__doc__": model.__doc__}
-        new = create_model(model.__name__, __base__=base, **facts, **fields, **parts.get("last", {}))
+        options: dict[str, Any] = {"__cls_kwargs__": dict(model.model_config), "__doc__": model.__doc__}
+        fields |= parts.get("last", {})
+        new = create_model(model.__name__, __base__=base, __module__=model.__module__, **options, **fields)
         return cast(type[M], new)
 
     return decorate

@@ -200,8 +200,8 @@ def _seed_words(place: PictureAddress) -> tuple[int, int]:
 def graspness(points: NDArray[Any], hands: NDArray[Any], *, touch_m: float = TOUCH_M) -> Floats:
     """Compute the share of the grasps whose hand touches each point.
 
-    Wang et al. 2021 (Graspness Discovery in Clutters, eq. 1) count sampled poses of a parallel gripper around a point that
-    hold and are clear. Here graspness counts the valid grasps of a scene that touch the point, because grasps of a
+    Wang et al. 2021 (Graspness Discovery in Clutters, eq. 1) count sampled poses of a parallel gripper around a point
+    that hold and are clear. Here graspness counts the valid grasps of a scene that touch the point, because grasps of a
     multi-finger hand touch several places and are optimised.
 
     Args:
