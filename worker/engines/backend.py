@@ -91,10 +91,8 @@ def kernel_cache() -> Path | None:
     return folder
 
 
-#: Environment variable with the folder of precompiled kernels.
-VARIABLE: Final = "GRASPD_KERNELS"
-#: Compute capabilities, times ten, of A100, H100 and H200, and B200.
-ARCHITECTURES: Final = (80, 90, 100)
+VARIABLE: Final = "GRASPD_KERNELS"  # environment variable with the folder of precompiled kernels
+ARCHITECTURES: Final = (80, 90, 100)  # compute capabilities, times ten, of A100, H100 and H200, and B200
 
 
 def kernel_modules() -> list[str]:

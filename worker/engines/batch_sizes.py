@@ -14,12 +14,10 @@ GRASPS_PER_MULTIPROCESSOR: Final = 8
 #: Largest memory of a grasp, at fidelity `paper` [bytes], and the used share of the free memory.
 BYTES_PER_GRASP: Final = 2.5 * 2**20
 MEMORY_SHARE: Final = 0.5
-#: Largest number of batches per launch: the queue seldom has more batches of one pair.
-MOST: Final = 64
+MOST: Final = 64  # largest number of batches per launch: the queue seldom has more batches of one pair
 #: Largest memory of a process with the models of its cached pairs [bytes]; see docs/explanation/performance.md.
 BYTES_PER_PROCESS: Final = 400 * 2**20
-#: Share of the machine's memory for these processes.
-PROCESS_SHARE: Final = 0.25
+PROCESS_SHARE: Final = 0.25  # share of the machine's memory for these processes
 
 
 def batches_at_once(device: str, join: int | None) -> int:

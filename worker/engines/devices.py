@@ -23,10 +23,8 @@ from graspd.service import user_cache
 from graspd.service.model.errors import GraspdError, InputError
 
 log = logging.getLogger(__name__)
-#: Largest number of processes counted per GPU; more make no difference.
-_MOST: Final = 64
-#: Locks of this process, held until it ends.
-_held: list[IO[bytes]] = []
+_MOST: Final = 64  # largest number of processes counted per GPU; more make no difference
+_held: list[IO[bytes]] = []  # locks of this process, held until it ends
 
 
 class Device:
@@ -92,10 +90,8 @@ def visible_gpus() -> list[Gpu]:
 
 @dataclass(frozen=True)
 class Gpu:
-    name: str
-    """Warp name: cuda:0, ..."""
-    id: str
-    """Identifier common to all processes and containers of the machine."""
+    name: str  # Warp name: cuda:0, ...
+    id: str  # identifier common to all processes and containers of the machine
     model: str = ""
 
 

@@ -27,8 +27,7 @@ from graspd.worker.process.selfcheck import EngineError
 log = logging.getLogger(__name__)
 Check = Callable[[Collection[Stage]], None]  # check of the engine for some stages; raises EngineError
 PAUSES_S: Final = (2.0, 5.0, 10.0, 20.0)  # pauses before the checks of a worker in quarantine [s]
-#: Least number of tasks that failed here and succeeded elsewhere at which a worker is unfit.
-_DONE_ELSEWHERE: Final = 2
+_DONE_ELSEWHERE: Final = 2  # least number of tasks that failed here and succeeded elsewhere at which a worker is unfit
 _REMEMBERED: Final = 16
 _LOSSES_BYTES: Final = 2**16
 _LOOK_S: Final = 0.1

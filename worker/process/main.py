@@ -41,8 +41,7 @@ from graspd.worker.stages.context import StopReason
 log = logging.getLogger(__name__)
 _PATIENCE: Final = 60  # reconnection attempts of a worker, for about a minute: longer than a restart of Redis
 _WORKER_TTL_S: Final = 20  # RQ's `worker_ttl` [s]: RQ waits this time less 15 s for a task before its maintenance
-#: RQ's maintenance is off: see docs/adr/0003-silence-is-measured-by-one-clock.md.
-_NEVER_S: Final = 10**9
+_NEVER_S: Final = 10**9  # RQ's maintenance is off: see docs/adr/0003-silence-is-measured-by-one-clock.md
 _REFUSED_PAUSE_S: Final = 0.5
 _LONGEST_RETRY_S: Final = 2.0  # longest wait between two attempts to reach Redis [s]
 _LOOK_S: Final = 0.1  # longest delay until a worker notices a request to stop [s]

@@ -14,10 +14,8 @@ from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.surface import sample_surface
 
-#: Number of surface points of the hand for the comparison of two postures, spread evenly.
-POINTS: Final = 64
-#: Pairs of grasps compared at a time.
-_PAIRS: Final = 4096
+POINTS: Final = 64  # number of surface points of the hand for the comparison of two postures, spread evenly
+_PAIRS: Final = 4096  # pairs of grasps compared at a time
 
 
 def explained_variance(posture: Posture) -> Floats:

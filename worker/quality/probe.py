@@ -30,14 +30,10 @@ from graspd.worker.simulation.sampling import object_samples
 #: Number of hand points that measure contact area and penetration; the optimiser uses other points.
 HAND_POINTS: Final = 2000
 OBJECT_POINTS: Final = 3000
-#: Seed of a held-out sample, since metrics must not be measured at the points of the optimisation.
-SEED: Final = 7919
-#: Distances are capped at this [m].
-REACH_M: Final = 0.012
-#: Number of cells along the longest side of a coarse grid; the grid finds points beyond reach.
-COARSE_CELLS: Final = 32
-#: Hand and object normals of a contact are opposite to within 60 degrees.
-FACING_COS: Final = -0.5
+SEED: Final = 7919  # seed of a held-out sample, since metrics must not be measured at the points of the optimisation
+REACH_M: Final = 0.012  # distances are capped at this [m]
+COARSE_CELLS: Final = 32  # number of cells along the longest side of a coarse grid; the grid finds points beyond reach
+FACING_COS: Final = -0.5  # hand and object normals of a contact are opposite to within 60 degrees
 
 
 @dataclass(frozen=True)
@@ -46,24 +42,18 @@ class NearestPoints:
 
     bodies: Floats
     hand_points: Floats
-    hand_normals: Floats
-    """(B, N, 3) outward unit normals of the hand at its points."""
-    distance: Floats
-    """(B, N) signed distance of hand points to the object, at most the requested reach."""
-    closest: Floats
-    """(B, N, 3) closest points on the object."""
-    normal: Floats
-    """(B, N, 3) gradient of the distance: the object's outward unit normal at the point; 0 beyond reach."""
+    hand_normals: Floats  # (B, N, 3) outward unit normals of the hand at its points
+    distance: Floats  # (B, N) signed distance of hand points to the object, at most the requested reach
+    closest: Floats  # (B, N, 3) closest points on the object
+    normal: Floats  # (B, N, 3) gradient of the distance: the object's outward unit normal at the point; 0 beyond reach
 
 
 @dataclass(frozen=True)
 class Distances(NearestPoints):
     """Nearest points, the distances of P pieces from the object, and the depth of the hand in itself."""
 
-    piece_distance: Floats
-    """(B, P) least distance of an object point to each piece, at most `REACH_M`; negative inside."""
-    self_depth: Floats
-    """(B,) depth of the deepest hand point inside another, non-neighbouring body."""
+    piece_distance: Floats  # (B, P) least distance of an object point to each piece, at most `REACH_M`; negative inside
+    self_depth: Floats  # (B,) depth of the deepest hand point inside another, non-neighbouring body
 
 
 class Probe:

@@ -53,8 +53,7 @@ Columns = dict[str, NDArray[np.generic]]
 #: Contact thresholds [m]: a small one from the literature, that of the paper (Table 2), and that of DDGC.
 DEFAULT_THRESHOLDS_M: Final = (0.002, 0.005, 0.009)
 DEFAULT_FRICTION: Final = 1.0
-#: Grasps per thread at a time: few enough for a quick cancellation, enough to fill a kernel launch.
-CHUNK: Final = 16
+CHUNK: Final = 16  # grasps per thread at a time: few enough for a quick cancellation, enough to fill a kernel launch
 
 
 class _Pair:
@@ -206,8 +205,7 @@ MEASURES: Final[dict[str, Callable[[_Chunk], NDArray[np.generic]]]] = {
 
 #: Cosine between a digit's surface normal and its axis of flexion above which the surface is a side: 45 degrees.
 SIDE_COS: Final = float(np.sqrt(0.5))
-#: Least number of wrapping digits of a power grasp if the palm does not touch.
-ENVELOPING: Final = 2
+ENVELOPING: Final = 2  # least number of wrapping digits of a power grasp if the palm does not touch
 
 
 def grasp_types(probe: Probe, found: Distances) -> NDArray[np.int32]:

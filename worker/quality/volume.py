@@ -21,8 +21,7 @@ from graspd.worker.simulation.device import to_xyzw
 from graspd.worker.simulation.kernels import crossing as kernels
 from graspd.worker.simulation.launches import launch
 
-#: Edge of a voxel [m]: the error is at most half an edge times the surface of the shared volume.
-VOXEL_M: Final = 5e-4
+VOXEL_M: Final = 5e-4  # edge of a voxel [m]: the error is at most half an edge times the surface of the shared volume
 #: Solids are built in millimetres: the tolerance of manifold3d's single precision suits numbers around 100.
 _UNIT: Final = 1e3
 
@@ -98,8 +97,7 @@ def _solid(vertices: Floats, faces: NDArray[np.int32]) -> m3d.Manifold | None:
     return solid if feasible else None
 
 
-#: Planes that are equal in this many decimals (offsets [m] and unit normals) count as one.
-_DIGITS: Final = 7
+_DIGITS: Final = 7  # planes that are equal in this many decimals (offsets [m] and unit normals) count as one
 
 
 class Overlap:

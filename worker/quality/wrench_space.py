@@ -21,10 +21,8 @@ from graspd.worker.simulation.kernels import hull as kernels
 from graspd.worker.simulation.launches import launch
 
 EDGES: Final = 8
-#: Ratio of least to largest singular value below which a set of wrenches is flat.
-FLATNESS: Final = 1e-7
-#: Number of points from which this module's hull is faster than Qhull.
-MANY: Final = 24
+FLATNESS: Final = 1e-7  # ratio of least to largest singular value below which a set of wrenches is flat
+MANY: Final = 24  # number of points from which this module's hull is faster than Qhull
 
 
 def tangents(normals: Floats) -> tuple[Floats, Floats]:
@@ -100,17 +98,14 @@ def _flat(points: Floats) -> bool:
 #: Random shift of the points, as a share of the largest coordinate, so that no 7 of them lie in one hyperplane. Smaller
 #: shifts leave slivers with planes dominated by rounding; larger ones distort. On cubes the volume is off by 4e-8.
 JOGGLE: Final = 1e-8
-#: Largest number of simultaneous facets: 160 random points have some 13,000.
-CAPACITY: Final = 40_000
-#: Entries of the hash table of ridges; inserting one point creates some thousands at most.
-_TABLE: Final = 1 << 16
+CAPACITY: Final = 40_000  # largest number of simultaneous facets: 160 random points have some 13,000
+_TABLE: Final = 1 << 16  # entries of the hash table of ridges; inserting one point creates some thousands at most
 MAX_POINTS: Final = 512
 _DIMENSION: Final = 6
 #: A point above a plane by less than this share of the largest coordinate counts as on it. Products of coordinates have
 #: rounding errors of some 1e-15; the error of ε is not larger than this share.
 _ROUNDING: Final = 1e-13
-#: Ratio of least to greatest distance in the initial simplex below which points count as flat.
-_FLAT: Final = 1e-6
+_FLAT: Final = 1e-6  # ratio of least to greatest distance in the initial simplex below which points count as flat
 _LAST_STAMP: Final = 2**31 - 2 * MAX_POINTS
 
 

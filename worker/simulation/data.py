@@ -89,8 +89,7 @@ class Data:
         self.end, self.adjoint = (wp.zeros((B, M), dtype=contact.vec6) for _ in range(2))
         self.gradient, self.first, self.second = (wp.zeros((B, 6 + D), dtype=wp.float32) for _ in range(3))
         self.best, self.waited = wp.zeros(B, dtype=wp.float32), wp.zeros(B, dtype=wp.int32)
-        #: The arrays `_HANDS` as a struct for kernels.
-        self.hands = kinematics.Hands()
+        self.hands = kinematics.Hands()  # the arrays `_HANDS` as a struct for kernels
         for name in _HANDS:
             setattr(self.hands, name, getattr(self, name))
 

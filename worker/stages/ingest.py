@@ -36,8 +36,7 @@ _OUT_OF_MEMORY: Final = ("MemoryError", "bad_alloc", "Cannot allocate", "failed 
 _FINDING_BYTES: Final = 2**20
 _MODEL: Final = "model.glb"
 _MODEL_BYTES: Final = 2**24
-#: CPU time of a check [s] above which the first task with the asset makes its 3D model.
-_MODEL_CPU_S: Final = 8.0
+_MODEL_CPU_S: Final = 8.0  # CPU time of a check [s] above which the first task with the asset makes its 3D model
 
 
 def run(message: IngestMessage, context: TaskContext) -> None:

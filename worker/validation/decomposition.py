@@ -36,8 +36,7 @@ log = logging.getLogger(__name__)
 
 #: Pieces with at most this mean excess are good [m]: a smaller excess hardly changes verdicts.
 GOOD_EXCESS_M: Final = 8.5e-4
-#: Largest accepted mean excess [m].
-MAX_EXCESS_M: Final = 2e-3
+MAX_EXCESS_M: Final = 2e-3  # largest accepted mean excess [m]
 #: CoACD's concavity thresholds from coarse to fine; the first that gives good pieces is used.
 THRESHOLDS: Final = (0.1, 0.05, 0.03)
 MAX_PIECES: Final = 64
@@ -50,24 +49,18 @@ _COACD: Final = {
     "max_convex_hull": MAX_PIECES,
     "seed": 1,
 }
-#: CPU time limit of one CoACD run [s]; beyond it the coarser result is used and a warning is logged.
-CPU_S: Final = 300
-#: Pieces below this volume are splinters that MuJoCo cannot build [m^3].
-_MIN_VOLUME: Final = 1e-9
+CPU_S: Final = 300  # CPU time limit of one CoACD run [s]; beyond it the coarser result is used and a warning is logged
+_MIN_VOLUME: Final = 1e-9  # pieces below this volume are splinters that MuJoCo cannot build [m^3]
 
 
 @dataclass(frozen=True)
 class ConvexPieces:
     """Convex decomposition of an object."""
 
-    vertices: tuple[Floats, ...]
-    """One (V, 3) array of corners per piece, object frame [m]."""
-    volume_ratio: float
-    """Ratio of the union's volume to the object's volume."""
-    excess_m: float
-    """Mean height of the union above the object's surface [m]."""
-    digest: str
-    """Digest of the pieces' corners: part of a verdict's key."""
+    vertices: tuple[Floats, ...]  # one (V, 3) array of corners per piece, object frame [m]
+    volume_ratio: float  # ratio of the union's volume to the object's volume
+    excess_m: float  # mean height of the union above the object's surface [m]
+    digest: str  # digest of the pieces' corners: part of a verdict's key
 
     def __len__(self) -> int:
         return len(self.vertices)

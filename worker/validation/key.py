@@ -21,8 +21,7 @@ from graspd.worker.validation.decomposition import ConvexPieces
 
 Level = Literal["dexgraspbench", "standard", "fast"]
 
-#: Revision of the code of protocol and scene; increase it if code (not a constant) changes verdicts.
-REVISION: Final = 6
+REVISION: Final = 6  # revision of the code of protocol and scene; increase it if code (not a constant) changes verdicts
 
 _EARLY: Final = ("FIRST_LOOK_S", "INTERVAL_S", "SURE", "AHEAD", "LOST_ROTATION")
 #: Constants that affect verdicts, by module; `LEVEL_MOVES` has constants that not all levels use. Other constants of

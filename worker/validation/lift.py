@@ -28,8 +28,7 @@ from graspd.worker.validation.protocol import MAX_PENETRATION_M, MAX_ROTATION, S
 #: Largest displacement [m] and tilt [rad] of a neighbour; rotation about the vertical is allowed.
 NEIGHBOUR_MOVED_M: Final = 0.02
 NEIGHBOUR_TILTED: Final = MAX_ROTATION
-#: Number of postures checked between two waypoints of an approach.
-LOOKS: Final = 4
+LOOKS: Final = 4  # number of postures checked between two waypoints of an approach
 #: Largest penetration of the open hand into the object's convex pieces on its approach [m]. The pieces protrude by up
 #: to this much from a surface that the hand does not touch. Supports are exact.
 OVERHANG_M: Final = 0.002
@@ -38,8 +37,7 @@ OVERHANG_M: Final = 0.002
 #: test has 25 m/s2.
 RISING: Final = 100
 RISING_S: Final = 0.008
-#: Steps of the rise between two checks for a lost object.
-LOSSES: Final = 5
+LOSSES: Final = 5  # steps of the rise between two checks for a lost object
 SMOOTHLY: Final = np.asarray(np.polyval([6, -15, 10, 0, 0, 0], np.linspace(0, 1, RISING + 1)[1:]), float)
 
 

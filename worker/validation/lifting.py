@@ -25,11 +25,9 @@ from graspd.worker.validation.lift import Lift, LiftOutcome, LiftTest
 from graspd.worker.validation.model import TOUCH_ROUNDING_M, MujocoOptions, scene_of
 
 LiftLevel = Literal["dexgraspbench", "lift"]
-#: Finished lifts, by `lift_digest`.
-KnownLifts = dict[str, LiftTest]
+KnownLifts = dict[str, LiftTest]  # finished lifts, by `lift_digest`
 LEVELS: Final[tuple[LiftLevel, ...]] = get_args(LiftLevel)
-#: Revision of the lift test's code; increase it if code (not a constant) changes verdicts.
-REVISION: Final = 5
+REVISION: Final = 5  # revision of the lift test's code; increase it if code (not a constant) changes verdicts
 _MOVES: Final = {surroundings: ("RISE_M",), protocol: ("LOOKS", "OVERHANG_M", "LOSSES"), postures: ("ROOM_M", "WIDE")}
 
 
@@ -37,14 +35,12 @@ _MOVES: Final = {surroundings: ("RISE_M",), protocol: ("LOOKS", "OVERHANG_M", "L
 class LiftVerdicts:
     """Verdicts of the lift test on N grasps."""
 
-    success: NDArray[np.int8]
-    """(N,) 1 lifted and held, 0 not."""
+    success: NDArray[np.int8]  # (N,) 1 lifted and held, 0 not
     outcome: NDArray[np.uint8]
     margin: NDArray[np.float64]
     level: LiftLevel
     hard: bool
-    terms: str
-    """Digest of everything that affects a verdict except the grasp and its scene."""
+    terms: str  # digest of everything that affects a verdict except the grasp and its scene
     seconds: float
 
     @property

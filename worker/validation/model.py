@@ -27,8 +27,7 @@ from graspd.worker.validation.decomposition import ConvexPieces
 #: Sliding and torsional friction; `hard` scales them by `HARD`.
 FRICTION: Final = (SLIDING, 0.02)
 HARD: Final = (0.5, 0.1)
-#: Joint damping over position gain [s]: 0.1 N m s/rad at the protocol's gain of 5.
-DAMPING_TIME: Final = 0.02
+DAMPING_TIME: Final = 0.02  # joint damping over position gain [s]: 0.1 N m s/rad at the protocol's gain of 5
 HAND_SOLIMP: Final = (0.5, 0.99, 1e-4, 0.5, 2.0)
 HAND_SOLREF: Final = (0.005, 1.0)
 #: Time constant [s] and damping ratio of couplings. They are stiffer than contacts: otherwise a pressed finger would
@@ -41,8 +40,7 @@ NOT_IN_3_3_2: Final = int(mujoco.mjtDisableBit.mjDSBL_MULTICCD) | int(mujoco.mjt
 #: Least number of dofs for sparse Jacobians; MuJoCo's own rule is 60. Lift time, sparse over dense Jacobians:
 #: .77 for 28 dofs (Allegro), .73 for 34 (Shadow), 1.09 for 20 (Barrett). Verdicts differ only by rounding.
 SPARSE: Final = 24
-#: A body without geometry has the inertia of a ball of this radius [m].
-_BARE_RADIUS: Final = 0.01
+_BARE_RADIUS: Final = 0.01  # a body without geometry has the inertia of a ball of this radius [m]
 _MIN_MASS: Final = 1e-3
 #: Numerical tolerance of fingertips that may touch a support [m]: the trajectory is checked in steps.
 TOUCH_ROUNDING_M: Final = 1e-4
@@ -90,17 +88,13 @@ class Scene:
     hand_geoms: NDArray[np.bool_]
     object_body: int
     object_qpos: int
-    root_qpos: int
-    """-1 if the root is fixed."""
-    joint_qpos: NDArray[np.intp]
-    """(J,) in `HandModel.joint_names` order."""
-    dof_gain: Floats
-    """(D,) `dof_gain * q + dof_shift` is the position of each dof's leading joint."""
+    root_qpos: int  # -1 if the root is fixed
+    joint_qpos: NDArray[np.intp]  # (J,) in `HandModel.joint_names` order
+    dof_gain: Floats  # (D,) `dof_gain * q + dof_shift` is the position of each dof's leading joint
     dof_shift: Floats
     pulls: Floats | None
     """(A, D) matrix from positions of leading joints to the actuators' controls; None if both are equal."""
-    centre: Floats
-    """(3,) the object's centre of mass in the object frame."""
+    centre: Floats  # (3,) the object's centre of mass in the object frame
     mass: float
     support_geoms: NDArray[np.bool_]
     """(G,) geoms of the scene's supports and neighbours; the scene frame is the mocap body 1."""
@@ -177,8 +171,7 @@ def build(
     )
 
 
-#: `build`, cached. Threads share the scene: its model is read-only.
-scene_of = cached_by_content(8)(build)
+scene_of = cached_by_content(8)(build)  # cached `build`; threads share the read-only scene
 
 
 def _pressing(model: Any, supports: Sequence[Obstacle]) -> Floats:

@@ -49,20 +49,15 @@ PUSHED: Final = 2
 HANGS: Final = 0.8
 HANGS_WHOLE: Final = 1.3
 PULL: Final = 1.8
-#: Ratio of motion to its limit from which on the object is lost.
-GONE: Final = 1.5
+GONE: Final = 1.5  # ratio of motion to its limit from which on the object is lost
 #: Push directions of a free object: every direction is within 71 degrees of one of them.
 CORNERS: Final = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]) / np.sqrt(3.0)
-#: Distance by which supports are removed [m]: more than the height of any scene.
-AWAY_M: Final = 10.0
-#: Added to the score of grasps that hold only at full friction.
-SLIPS: Final = 1.0
-#: Score of grasps that start in deep penetration.
-DEEP: Final = 20.0
+AWAY_M: Final = 10.0  # distance by which supports are removed [m]: more than the height of any scene
+SLIPS: Final = 1.0  # added to the score of grasps that hold only at full friction
+DEEP: Final = 20.0  # score of grasps that start in deep penetration
 
 
-#: Scenes compiled at half and at full friction; everything else is the same.
-Frictions = tuple[Scene, Scene]
+Frictions = tuple[Scene, Scene]  # scenes compiled at half and at full friction; everything else is the same
 
 
 class LiftRollout(Lift):
@@ -170,8 +165,7 @@ class ShortTests:
         return np.array(evaluate_rows(range(len(grasps)), make, score, threads=self.threads, name="short-test"), float)
 
 
-#: Number of stages of closing and of squeezing.
-HANGING_CLOSING: Final = 4
+HANGING_CLOSING: Final = 4  # number of stages of closing and of squeezing
 #: Pull on a hanging object, in weights: mean over the accelerating part of a smooth rise (`lift.SMOOTHLY`).
 RISING: Final = 1.06
 #: Duration of a load change [s], and number of its steps; a sudden change would act like up to twice the load.

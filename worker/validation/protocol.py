@@ -39,10 +39,8 @@ INTERVAL_S: Final = 0.04
 #: present rate and half of the limits accepts as many, but simulates 1.7 times as long.
 SURE: Final = 0.8
 AHEAD: Final = 2.0
-#: Share of the limits for extrapolated motion in a short test; below it the object counts as still.
-STILL: Final = 0.5
-#: Ratio of motion to its limit that stands for a state with numbers that are not finite.
-LOST: Final = 10.0
+STILL: Final = 0.5  # share of the limits for extrapolated motion in a short test; below it the object counts as still
+LOST: Final = 10.0  # ratio of motion to its limit that stands for a state with numbers that are not finite
 #: Rotation during closing or rising above which the object is lost [rad]; no passing grasp reached half of it.
 LOST_ROTATION: Final = math.radians(30.0)
 #: Coarse physics are trusted if their largest ratio of displacement or rotation to its limit is outside this band.
@@ -70,8 +68,7 @@ class ValidatedBy(IntEnum):
 @dataclass
 class Rollout:
     outcomes: list[Outcome] = field(default_factory=lambda: [Outcome.NOT_TRIED] * len(DIRECTIONS))
-    margin: float = 0.0
-    """Largest ratio of displacement or rotation to its limit, after the end of the squeeze."""
+    margin: float = 0.0  # largest ratio of displacement or rotation to its limit, after the end of the squeeze
     penetration_m: float = 0.0
     self_penetration_m: float = 0.0
     steps: int = 0

@@ -19,13 +19,10 @@ from graspd.worker.hands.primitives import hull, sample, signed_distance, tessel
 
 Fit = Literal["own", "hull", "primitive", "capsule"]
 
-#: A piece with a larger ratio of width to thickness than this is not replaced by a capsule.
-WIDE: Final = 1.5
-#: A shrunk piece keeps at least this share of its half thickness.
-_LEFT: Final = 0.5
+WIDE: Final = 1.5  # a piece with a larger ratio of width to thickness than this is not replaced by a capsule
+_LEFT: Final = 0.5  # a shrunk piece keeps at least this share of its half thickness
 _SAMPLES: Final = 400
-#: Least length of a capsule over its radius.
-_SHORTEST: Final = 1e-3
+_SHORTEST: Final = 1e-3  # least length of a capsule over its radius
 _PRIMITIVES: Final = ("box", "cylinder", "capsule")
 
 

@@ -29,8 +29,7 @@ from graspd.worker.validation.model import MujocoOptions
 from graspd.worker.validation.variant import Models, Variant, draw_variant, first_axes
 
 NOT_VALIDATED: Final = -1
-#: Numerical tolerance of wanted shares: 0.9 of 10 models is exactly 9.
-_EXACT: Final = 1e-9
+_EXACT: Final = 1e-9  # numerical tolerance of wanted shares: 0.9 of 10 models is exactly 9
 
 
 @dataclass(frozen=True)

@@ -29,8 +29,7 @@ from graspd.worker.validation.refit import Fit, fits_of, refit_hand
 
 Vector = tuple[float, float, float]
 
-#: Ranges of the axes. Growth or shrinkage of shapes [m].
-GROWTH_M: Final = 1e-3
+GROWTH_M: Final = 1e-3  # growth or shrinkage of collision shapes [m]
 #: Largest factor on damping, gains, `ARMATURE`, `DRY_FRICTION` and the object's mass; the least is its inverse.
 FACTOR: Final = 2.0
 #: Armature [kg m^2] and dry friction [N m] of DexGraspBench's Shadow hand, which the protocol omits for other hands.
@@ -41,8 +40,7 @@ FRICTIONS: Final = (0.4 / 0.6, 0.8 / 0.6)
 CENTRE_M: Final = 5e-3
 SHIFT_M: Final = 2e-3
 TURN: Final = float(np.radians(2.0))
-#: Latest start of a finger after the first one, as a share of the closing time (0.8 s).
-LATEST: Final = 0.25
+LATEST: Final = 0.25  # latest start of a finger after the first one, as a share of the closing time (0.8 s)
 
 Coupling = Literal["own", "compliant", "separate", "ratio"]
 
@@ -51,30 +49,20 @@ Coupling = Literal["own", "compliant", "separate", "ratio"]
 class Variant:
     """A model near the nominal one (the default). Lengths in m; factors apply to the model's own values."""
 
-    fit: Fit = "own"
-    """Replacement of the hand's collision shapes, see `refit`."""
+    fit: Fit = "own"  # replacement of the hand's collision shapes, see `refit`
     grown_m: float = 0.0
-    armature: float | None = None
-    """Armature of every joint [kg m^2 or kg]; None for the model's own."""
-    dry_friction: float | None = None
-    """Dry friction of every joint [N m or N]; None for the model's own."""
+    armature: float | None = None  # armature of every joint [kg m^2 or kg]; None for the model's own
+    dry_friction: float | None = None  # dry friction of every joint [N m or N]; None for the model's own
     damping: float = 1.0
-    gain: float = 1.0
-    """Factor on the position gain; torque limits are unchanged."""
-    coupling: Coupling = "own"
-    """compliant: couplings yield under load; separate, ratio: see `replace_coupling`."""
+    gain: float = 1.0  # factor on the position gain; torque limits are unchanged
+    coupling: Coupling = "own"  # compliant: couplings yield under load; separate, ratio: see `replace_coupling`
     friction: float = 1.0
-    mass: float = 1.0
-    """Factor on the object's mass; pushes equal its weight and grow with it."""
+    mass: float = 1.0  # factor on the object's mass; pushes equal its weight and grow with it
     centre_m: Vector = (0.0, 0.0, 0.0)
-    object_shift_m: Vector = (0.0, 0.0, 0.0)
-    """Shift of the object, in its frame [m]."""
-    object_turn: Vector = (0.0, 0.0, 0.0)
-    """Rotation vector of the object about its centre of mass [rad]."""
-    hand_shift_m: Vector = (0.0, 0.0, 0.0)
-    """Constant offset of the hand's root, in its own frame [m]."""
-    lags: tuple[float, ...] = ()
-    """Delay of each fingertip's finger after the first one, as a share of the closing time."""
+    object_shift_m: Vector = (0.0, 0.0, 0.0)  # shift of the object, in its frame [m]
+    object_turn: Vector = (0.0, 0.0, 0.0)  # rotation vector of the object about its centre of mass [rad]
+    hand_shift_m: Vector = (0.0, 0.0, 0.0)  # constant offset of the hand's root, in its own frame [m]
+    lags: tuple[float, ...] = ()  # delay of each fingertip's finger after the first one, as a share of the closing time
 
 
 NOMINAL: Final = Variant()

@@ -39,14 +39,11 @@ from graspd.worker.validation.protocol import INTERVAL_S, Outcome, Rollout, Vali
 
 log = logging.getLogger(__name__)
 
-#: One clear verdict in this many is also validated on the CPU.
-RECHECK_ONE_IN: Final = 50
-#: Revision of the prefilter's code; increase it if code (not a constant) changes verdicts.
-REVISION: Final = 1
+RECHECK_ONE_IN: Final = 50  # one clear verdict in this many is also validated on the CPU
+REVISION: Final = 1  # revision of the prefilter's code; increase it if code (not a constant) changes verdicts
 #: Pool sizes, for few grasps and for many; with arbitrary sizes nearly every launch would build a new pool.
 WORLDS: Final = {"cuda": (256, 1024), "cpu": (8, 32)}
-#: Number of cached pools (model, arrays, graph): those that were used last.
-_KEPT_POOLS: Final = 4
+_KEPT_POOLS: Final = 4  # number of cached pools (model, arrays, graph): those that were used last
 #: The prefilter is trusted while the CPU contradicts at most this share of the rechecked verdicts, or only one verdict.
 _MOST_CONTRADICTED: Final = 0.05
 
@@ -55,16 +52,12 @@ _MOST_CONTRADICTED: Final = 0.05
 class PrefilterOutcomes:
     """Outcomes of N grasps in the worlds."""
 
-    outcome: NDArray[np.uint8]
-    """(N, 6) `Outcome` of each push; an undecided grasp has pushes without a simulation."""
-    margin: Floats
-    """(N,) largest ratio of displacement or rotation to its limit."""
+    outcome: NDArray[np.uint8]  # (N, 6) `Outcome` of each push; an undecided grasp has pushes without a simulation
+    margin: Floats  # (N,) largest ratio of displacement or rotation to its limit
     penetration_m: Floats
     self_penetration_m: Floats
-    overflow: NDArray[np.bool_]
-    """(N,) whether contacts or constraints were dropped for lack of memory."""
-    ticks: NDArray[np.int32]
-    """(N,) simulated ticks, of `protocol.INTERVAL_S` each."""
+    overflow: NDArray[np.bool_]  # (N,) whether contacts or constraints were dropped for lack of memory
+    ticks: NDArray[np.int32]  # (N,) simulated ticks, of `protocol.INTERVAL_S` each
 
     @property
     def held(self) -> NDArray[np.bool_]:
@@ -100,8 +93,7 @@ class WorldPool:
         self._engine = mujoco_warp()
         self._steps = round(protocol.INTERVAL_S / scene.physics.timestep)
         self._doublings, self._capacity = 0, 0
-        self.launches = 0
-        """Ticks of the last `validate`."""
+        self.launches = 0  # ticks of the last `validate`
         voiding = (getattr(self._engine.OverflowType, name) for name in _VOIDING)
         self._voiding = int(sum(int(bit) for bit in voiding))
         with wp.ScopedDevice(device):
@@ -258,10 +250,8 @@ _pools: OrderedDict[tuple[str, str, int], WorldPool] = OrderedDict()
 class PrefilterVerdicts:
     """Verdicts of the prefilter on N grasps."""
 
-    stands: dict[int, Rollout]
-    """Final verdicts, by row. The CPU validates all other rows."""
-    rechecked: dict[int, bool]
-    """Clear verdicts that the CPU rechecks, by row; True if the prefilter held the grasp."""
+    stands: dict[int, Rollout]  # final verdicts, by row; the CPU validates all other rows
+    rechecked: dict[int, bool]  # clear verdicts that the CPU rechecks, by row; True if the prefilter held the grasp
 
     def count_contradicted(self, rollouts: dict[int, Rollout]) -> int:
         return sum(rollouts[row].success != held for row, held in self.rechecked.items())
@@ -345,8 +335,7 @@ def _rollout(found: PrefilterOutcomes, row: int, scene: Scene) -> Rollout:
 #: Initial capacity of contacts and constraint rows per world: twice the observed need of grasps of three hands.
 CONTACTS: Final = 96
 ROWS: Final = 256
-#: Largest number of times that the capacity is doubled when it overflows.
-DOUBLINGS: Final = 3
+DOUBLINGS: Final = 3  # largest number of times that the capacity is doubled when it overflows
 #: Overflows that drop contacts or constraints. Other overflows are iteration limits, which MuJoCo also has.
 _VOIDING: Final = ("NEFC", "NJMAX_NNZ", "BROADPHASE", "NARROWPHASE", "CCD", "EPA_HORIZON")
 
