@@ -19,6 +19,7 @@ from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.simulation.device import DeviceHand, chain_of, posed_bodies, to_xyzw
 from graspd.worker.simulation.environment import CLEAR_M, Environment, Obstacle
 from graspd.worker.simulation.kernels import chain as chain_kernels
+from graspd.worker.simulation.kernels import kinematics
 from graspd.worker.simulation.kernels import obstacles as kernels
 from graspd.worker.simulation.kernels import solids as solid_kernels
 from graspd.worker.simulation.launches import launch
@@ -59,10 +60,11 @@ def _solid_distances(hand: HandModel, postures: Posture, scene: Environment) -> 
     device = _device_hand(hand)
     obstacles = DeviceObstacles.create(hand, [scene], np.zeros(3), "cpu")
     with wp.ScopedDevice("cpu"):
-        position: Any = wp.array(bodies[..., :3], dtype=wp.vec3)
-        rotation: Any = wp.array(to_xyzw(bodies[..., 3:]), dtype=wp.quat)
+        hands = kinematics.Hands()
+        hands.body_p = wp.array(bodies[..., :3], dtype=wp.vec3)
+        hands.body_q = wp.array(to_xyzw(bodies[..., 3:]), dtype=wp.quat)
         least = wp.full((len(bodies), hand.bodies), FAR_M, dtype=wp.float32)
-        inputs = [obstacles.features, device.pieces, obstacles.solids, position, rotation, FAR_M]
+        inputs = [obstacles.features, device.pieces, obstacles.solids, hands, FAR_M]
         launch(solid_kernels.distances, (len(bodies), len(hand.pieces)), inputs=inputs, outputs=[least], device="cpu")
     return least.numpy().astype(float)
 

@@ -201,10 +201,8 @@ def take_next(
 
 @wp.kernel
 def begin(
-    # Model:
     terms_in: TestConstants,
     grasps_in: GraspCommands,
-    # Data out:
     worlds_out: Worlds,
     engine_out: Engine,
     state_out: wp.array(dtype=wp.int32),
@@ -214,10 +212,8 @@ def begin(
 
 @wp.kernel
 def check_state(
-    # Model:
     terms_in: TestConstants,
     grasps_in: GraspCommands,
-    # Data out:
     worlds_out: Worlds,
     engine_out: Engine,
     found_out: WorldVerdicts,
@@ -289,13 +285,7 @@ def check_state(
 
 
 @wp.kernel
-def place(
-    # Model:
-    first_in: wp.int32,
-    states_in: wp.array2d(dtype=wp.float32),
-    # Data out:
-    engine_out: Engine,
-):
+def place(first_in: wp.int32, states_in: wp.array2d(dtype=wp.float32), engine_out: Engine):
     """Set the states from row `first_in` on, at rest."""
     w = wp.tid()
     row = wp.min(first_in + w, states_in.shape[0] - 1)
@@ -307,15 +297,12 @@ def place(
 
 @wp.kernel
 def depths(
-    # Model:
     first_in: wp.int32,
     of_hand_in: wp.array(dtype=wp.int32),
-    # Data in:
     contacts_in: wp.array(dtype=wp.int32),
     world_in: wp.array(dtype=wp.int32),
     geom_in: wp.array(dtype=wp.vec2i),
     distance_in: wp.array(dtype=wp.float32),
-    # Data out:
     depth_out: wp.array2d(dtype=wp.float32),
 ):
     """Compute the deepest penetration [m] of hand and object, and within the hand, from row `first_in` on."""
