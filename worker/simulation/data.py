@@ -53,16 +53,16 @@ class Data:
     """Arrays for up to `capacity` hands of a model; `worker.simulation.record` has the operations."""
 
     def __init__(self, model: Model, capacity: int, *, serial: bool | None = None) -> None:
-        """`serial`: threads of a launch run in order; by default on a CPU.
-        Otherwise contacts are first packed in the order of their points, so that sums are the same bit for bit."""
+        """`serial`: whether threads of a launch run in order, by default on a CPU.
+        Otherwise contacts are packed in the order of their points, so that their sums do not depend on threads."""
         self.device, self.capacity = model.device, capacity
         self.serial = not wp.get_device(model.device).is_cuda if serial is None else serial
         self.unit = joint_units(model.hand.model)
         with wp.ScopedDevice(self.device):
             self.contacts = allocate_contacts(capacity, model.count)
             self.marked = None if self.serial else allocate_contacts(capacity, model.count, marked=True)
-            #: Number of contacts, and number of near contacts, in every chunk of marks (B, N / chunk).
             chunks = (capacity, -(-model.count // packing.CHUNK))
+            #: Number of contacts, and number of near contacts, in every chunk of marks (B, N / chunk).
             self.chunk_counts = [wp.zeros(chunks, dtype=wp.int32) for _ in range(2)]
             self.depths = kinematics.Depths()
             for kind in _DEPTHS:
@@ -94,24 +94,19 @@ class Data:
             setattr(self.hands, name, getattr(self, name))
 
     def set_state(self, state: HandState, *, dilation: Floats | None = None) -> None:
-        """Load n hands, at most `capacity`; switch off all others, and clear the optimiser's moments.
+        """Load n hands, at most `capacity`; switch off all others, and reset the optimiser.
         `dilation` (n,) multiplies the schedule's dilation for each hand; by default 1."""
         n = len(state.pivot)
         scale = np.ones(self.capacity, dtype=np.float32)
-        if dilation is not None:
-            scale[:n] = dilation
+        scale[:n] = 1.0 if dilation is None else dilation
         self.dilation_scale.assign(scale)
-        mask = np.zeros(self.capacity, dtype=np.int32)
-        mask[:n] = 1
         self._assign(self.pivot, state.pivot)
         self._assign(self.rotation, to_xyzw(state.rotation))
         self._assign(self.q, state.q)
-        self.active.assign(mask)
-        self.iteration.zero_()
-        self.first.zero_()
-        self.second.zero_()
+        self.active.assign((np.arange(self.capacity) < n).astype(np.int32))
         self.best.fill_(1e9)
-        self.waited.zero_()
+        for array in (self.iteration, self.first, self.second, self.waited):
+            array.zero_()
 
     def deactivate(self, hands: NDArray[np.bool_]) -> None:
         """Switch off the hands of a mask (n,): kernels skip them from the next iteration on."""
@@ -132,6 +127,7 @@ class Data:
             self.schedule = Tables(schedule, self.unit)
 
     def deepest(self, n: int) -> Floats:
+        """Return the deepest penetration (n,) of the first n hands, as last evaluated [m]."""
         return np.max([getattr(self.depths, kind).numpy()[:n] for kind in _DEPTHS], axis=0)
 
     def near_share(self, reach: float, n: int) -> Floats:
@@ -143,6 +139,7 @@ class Data:
         return share.numpy().astype(float)
 
     def state(self, n: int) -> HandState:
+        """Download the first n hands."""
         pivot, rotation, q = (array.numpy()[:n].astype(float) for array in (self.pivot, self.rotation, self.q))
         return HandState(pivot, to_wxyz(rotation), q)
 

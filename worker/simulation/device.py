@@ -71,7 +71,6 @@ def _add_joints(out: Any, hand: HandModel, vector: Any, quaternion: Any, number:
 def _device_pieces(hand: HandModel) -> Any:
     out = pieces.Pieces()
     size, position, rotation, half, planes = zip(*map(_piece_row, hand.pieces), strict=True)
-    starts = np.concatenate([[0], np.cumsum([len(p) for p in planes])])
     apart = np.ones((hand.bodies, hand.bodies), dtype=np.int32) - np.eye(hand.bodies, dtype=np.int32)
     for a, b in hand.neighbours:
         apart[a, b] = apart[b, a] = 0
@@ -81,7 +80,7 @@ def _device_pieces(hand: HandModel) -> Any:
     out.pose_p = wp.array(np.array(position), dtype=wp.vec3)
     out.pose_q = wp.array(to_xyzw(np.array(rotation)), dtype=wp.quat)
     out.half = wp.array(np.array(half), dtype=wp.vec3)
-    out.first_plane = wp.array(starts, dtype=wp.int32)
+    out.first_plane = wp.array(np.cumsum([0, *map(len, planes)]), dtype=wp.int32)
     out.planes = wp.array(np.concatenate([*planes, np.zeros((1, 4))]), dtype=wp.vec4)
     out.apart = wp.array(apart, dtype=wp.int32)
     return out
@@ -108,8 +107,7 @@ def _piece_row(piece: ConvexPiece) -> tuple[Floats, Floats, Floats, Floats, Floa
 
 
 def face_planes(vertices: Floats, faces: NDArray[np.integer[Any]]) -> Floats:
-    """Return distinct face planes (K, 4) of a convex solid: outward unit normal and offset.
-    Coplanar faces are merged."""
+    """Return the planes (K, 4) of a convex solid's sides: outward unit normal and offset [m]."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
     length = np.linalg.norm(normal, axis=1)
@@ -152,15 +150,7 @@ class DeviceObject:
                 add_grid(skin, obj, mesh, cell)
             centred = wp.array(samples - obj.centre_of_mass, dtype=wp.vec3)
             cells = sorted_samples(samples - obj.centre_of_mass)
-        return cls(
-            model=obj,
-            device=device,
-            surface=skin,
-            mesh=mesh,
-            samples=centred,
-            bvh=wp.Bvh(centred, centred),
-            sorted_samples=cells,
-        )
+        return cls(obj, device, skin, mesh, centred, wp.Bvh(centred, centred), cells)
 
     def thinned(self, count: int) -> DeviceObject:
         """Return the object with its first `count` samples; farthest-point order keeps them evenly spread."""
@@ -214,21 +204,25 @@ def chain_of(hand: HandModel, device: str) -> Any:
     """Return the hand on a device as `kernels.chain.Chain`, cached in memory."""
     # Loading here prevents threads from compiling the same module at once.
     wp.load_module(module=kernels, device=device)
-    with wp.ScopedDevice(device):
-        return _chain(hand)
-
-
-def _chain(hand: HandModel) -> Any:
     out, features = kernels.Chain(), hand.features
     joint = np.zeros(hand.bodies, np.int32)
     joint[hand.joint_body] = np.arange(len(hand.joint_body))
     order = np.argsort(features.body, kind="stable")
-    _add_joints(out, hand, wp.vec3d, wp.quatd, wp.float64)
-    out.joint = wp.array(joint, dtype=wp.int32)
-    out.turns = wp.array(hand.joint_type == JointType.REVOLUTE, dtype=wp.int32)
-    out.tip = wp.array(np.isin(np.arange(hand.bodies), hand.fingertips), dtype=wp.int32)
-    out.first = wp.array(np.searchsorted(features.body[order], np.arange(hand.bodies + 1)), dtype=wp.int32)
-    out.centre = wp.array(features.centre[order], dtype=wp.vec3d)
-    out.about = wp.array(features.axis[order], dtype=wp.vec3d)
-    out.radius = wp.array(features.radius[order], dtype=wp.float64)
+    with wp.ScopedDevice(device):
+        _add_joints(out, hand, wp.vec3d, wp.quatd, wp.float64)
+        out.joint = wp.array(joint, dtype=wp.int32)
+        out.turns = wp.array(hand.joint_type == JointType.REVOLUTE, dtype=wp.int32)
+        out.tip = wp.array(np.isin(np.arange(hand.bodies), hand.fingertips), dtype=wp.int32)
+        out.first = wp.array(np.searchsorted(features.body[order], np.arange(hand.bodies + 1)), dtype=wp.int32)
+        out.centre = wp.array(features.centre[order], dtype=wp.vec3d)
+        out.about = wp.array(features.axis[order], dtype=wp.vec3d)
+        out.radius = wp.array(features.radius[order], dtype=wp.float64)
     return out
+
+
+def bounding_ball(points: Floats) -> tuple[Floats, float]:
+    """Return centre and radius [m] of a ball around points (N, 3) and their box; zeros without points."""
+    if not len(points):
+        return np.zeros(3), 0.0
+    centre = (points.min(axis=0) + points.max(axis=0)) / 2
+    return centre, float(np.linalg.norm(points - centre, axis=1).max())

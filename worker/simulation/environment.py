@@ -6,7 +6,7 @@ piece has one per face of its hull. An `Environment` is in the object frame, `Sc
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Final
@@ -138,7 +138,7 @@ class PlacedGrasps:
         """The S scenes in the object frame."""
         return tuple(
             Environment(
-                tuple(o.in_frame(pose) for o in self.supports) + self._neighbour_obstacles(number),
+                (*(o.in_frame(pose) for o in self.supports), *self._neighbour_obstacles(number)),
                 quat_rotate(quat_conjugate(pose[3:]), UP),
             )
             for number, pose in enumerate(np.asarray(self.object_pose, float))
@@ -147,13 +147,13 @@ class PlacedGrasps:
     @cached_property
     def fixed(self) -> str:
         """Digest of what all grasps have in common: supports and neighbours, without poses of objects."""
-        told = hashlib.sha256()
+        digest = hashlib.sha256()
         solids = [solid for one in self.neighbours for solid in one.solids]
         for body in (*self.supports, *solids):
-            told.update(f"{body.planes.shape} {body.corners.shape} {body.tips_m} ".encode())
-            told.update(body.planes.tobytes() + body.corners.tobytes())
-        told.update(" ".join(one.obj.content for one in self.neighbours).encode())
-        return told.hexdigest()
+            digest.update(f"{body.planes.shape} {body.corners.shape} {body.tips_m} ".encode())
+            digest.update(body.planes.tobytes() + body.corners.tobytes())
+        digest.update(" ".join(one.obj.content for one in self.neighbours).encode())
+        return digest.hexdigest()
 
     @property
     def everywhere(self) -> Scenes:
@@ -164,16 +164,14 @@ class PlacedGrasps:
         return self.everywhere.centred(obj).placed(self.index)
 
     def neighbours_of(self, scene: int) -> Floats:
-        """Return poses (M, 7) of the neighbours in the object frame."""
+        """Return poses (M, 7) of the neighbours in the object frame of a scene."""
         if not self.neighbours:
             return np.zeros((0, 7))
         return np.asarray(compose(invert(self.object_pose[scene]), np.asarray(self.neighbour_pose[scene], float)))
 
-    def _neighbour_obstacles(self, scene: int) -> tuple[Obstacle, ...]:
-        poses = self.neighbours_of(scene)
-        return tuple(
-            solid.moved(pose) for one, pose in zip(self.neighbours, poses, strict=True) for solid in one.solids
-        )
+    def _neighbour_obstacles(self, scene: int) -> Iterator[Obstacle]:
+        for neighbour, pose in zip(self.neighbours, self.neighbours_of(scene), strict=True):
+            yield from (solid.moved(pose) for solid in neighbour.solids)
 
     def take(self, rows: NDArray[np.intp] | slice) -> PlacedGrasps:
         taken = replace(self, index=self.index[rows])

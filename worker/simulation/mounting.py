@@ -125,6 +125,5 @@ def wrist_clearance(
     steps = poses.shape[1]
     joints = np.repeat(mounting.expand(wrist), steps, axis=0)
     postures = Posture(poses.reshape(-1, 7), joints)
-    return (
-        obstacle_clearance(mounting, postures, scenes, np.repeat(which, steps)).reshape(len(poses), steps).min(axis=1)
-    )
+    clearance = obstacle_clearance(mounting, postures, scenes, np.repeat(which, steps))
+    return clearance.reshape(len(poses), steps).min(axis=1)

@@ -16,7 +16,7 @@ from graspd.worker.hands.kinematics import body_poses
 from graspd.worker.hands.model import HandModel
 from graspd.worker.hands.primitives import HandFeatures
 from graspd.worker.objects.memory_cache import cached_by_content
-from graspd.worker.simulation.device import DeviceHand, chain_of, posed_bodies, to_xyzw
+from graspd.worker.simulation.device import DeviceHand, bounding_ball, chain_of, posed_bodies, to_xyzw
 from graspd.worker.simulation.environment import CLEAR_M, Environment, Obstacle
 from graspd.worker.simulation.kernels import chain as chain_kernels
 from graspd.worker.simulation.kernels import kinematics
@@ -107,7 +107,7 @@ def _half_space_clearance(
     flat, count = [o for one in every for o in one], len(postures)
     bodies, spaces = posed_bodies(hand, postures.hand_pose, postures.joint_positions), chain_kernels.HalfSpaces()
     with wp.ScopedDevice("cpu"):
-        spaces.first = wp.array(_starts([len(one) for one in every]), dtype=wp.int32)
+        spaces.first = wp.array(np.cumsum([0, *map(len, every)]), dtype=wp.int32)
         spaces.planes = wp.array(np.concatenate([np.zeros((0, 4)), *(o.planes for o in flat)]), dtype=wp.vec4d)
         spaces.more = wp.array([_extra_margin(o) for o in flat], dtype=wp.float64)
         room = wp.full((count, hand.bodies), np.inf, dtype=wp.float64)
@@ -167,36 +167,24 @@ class DeviceObstacles:
             features.end = wp.array(found.edges[:, 1], dtype=wp.vec3)
             features.thickness = wp.array(found.thickness, dtype=wp.float32)
             solids = kernels.Obstacles()
-            first = _starts([len(one) for one in sorted_])
+            first = np.cumsum([0, *map(len, sorted_)])
             solids.first = wp.array(first, dtype=wp.int32)
-            solids.first_solid = wp.array(first[:-1] + np.array(endless, np.int32), dtype=wp.int32)
-            solids.first_plane = wp.array(_starts([len(o.planes) for o in obstacles]), dtype=wp.int32)
+            solids.first_solid = wp.array(first[:-1] + np.array(endless, int), dtype=wp.int32)
+            solids.first_plane = wp.array(np.cumsum([0, *(len(o.planes) for o in obstacles)]), dtype=wp.int32)
             solids.planes = wp.array(planes, dtype=wp.vec4)
             solids.tips = wp.array([FAR_M if o.tips_m is None else o.tips_m for o in obstacles], dtype=wp.float32)
-            spheres = [_sphere(o.corners - centre) for o in obstacles]
+            spheres = [bounding_ball(o.corners - centre) for o in obstacles]
             solids.centre = wp.array(np.array([s[0] for s in spheres]).reshape(-1, 3), dtype=wp.vec3)
             solids.radius = wp.array(np.array([s[1] for s in spheres]), dtype=wp.float32)
             edges = np.concatenate([np.zeros((0, 2, 3)), *(o.corners[o.edges] for o in obstacles)]) - centre
-            solids.first_edge = wp.array(_starts([len(o.edges) for o in obstacles]), dtype=wp.int32)
+            solids.first_edge = wp.array(np.cumsum([0, *(len(o.edges) for o in obstacles)]), dtype=wp.int32)
             solids.start, solids.end = (wp.array(edges[:, k], dtype=wp.vec3) for k in (0, 1))
         return cls(features, solids, any(len(o.corners) for o in obstacles))
-
-
-def _starts(lengths: Sequence[int]) -> NDArray[np.int32]:
-    return np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
 
 
 def _feature_ball(features: HandFeatures, piece: int) -> tuple[Floats, float]:
     """Return centre (body frame) and radius [m] of a ball around the features of a piece."""
     rows = slice(features.first[piece], features.first[piece + 1])
-    middle, radius = _sphere(features.centre[rows])
+    middle, radius = bounding_ball(features.centre[rows])
     # Slightly larger, since kernels round.
     return middle, radius + float(features.radius[rows].max(initial=0.0)) + 1e-6
-
-
-def _sphere(corners: Floats) -> tuple[Floats, float]:
-    """Return centre and radius [m] of a bounding sphere; radius 0 for no corners."""
-    if not len(corners):
-        return np.zeros(3), 0.0
-    centre = (corners.min(axis=0) + corners.max(axis=0)) / 2
-    return centre, float(np.linalg.norm(corners - centre, axis=1).max())

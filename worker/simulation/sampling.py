@@ -22,10 +22,8 @@ CANDIDATES, FEWER_CANDIDATES, MANY = 6, 3, 8_000
 def object_samples(obj: ObjectModel, count: int, *, seed: int = 0) -> Floats:
     """Return evenly spread points (count, 3) of the surface, its sharp edges included [m]; deterministic."""
     code = (sys.modules[__name__], mesh_geometry, surface)
-    kept = cached_arrays(
-        "object_samples", (obj.content, count, seed), code, lambda: {"points": _sampled(obj, count, seed)}
-    )
-    return kept["points"]
+    terms = (obj.content, count, seed)
+    return cached_arrays("object_samples", terms, code, lambda: {"points": _sampled(obj, count, seed)})["points"]
 
 
 def _sampled(obj: ObjectModel, count: int, seed: int) -> Floats:
