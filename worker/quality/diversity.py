@@ -25,11 +25,9 @@ def explained_variance(posture: Posture) -> Floats:
     DexGraspBench."""
     if len(posture) < 2:
         return np.zeros(0)
-    features = np.hstack(
-        [posture.hand_pose[:, :3], _rotation_vector(posture.hand_pose[:, 3:]), posture.joint_positions]
-    )
-    singular = np.linalg.svd(features - features.mean(axis=0), compute_uv=False)
-    variance = singular**2
+    translation, quaternion = posture.hand_pose[:, :3], posture.hand_pose[:, 3:]
+    features = np.hstack([translation, _rotation_vector(quaternion), posture.joint_positions])
+    variance = np.linalg.svd(features - features.mean(axis=0), compute_uv=False) ** 2
     total = float(variance.sum())
     return variance / total if total > 0 else np.zeros(len(variance))
 

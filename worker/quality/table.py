@@ -61,8 +61,8 @@ class _Pair:
         hand, obj = terms.hand, terms.obj
         self.obj, self.friction = obj, terms.friction
         self.thresholds = np.array(terms.thresholds)
-        told = int(np.argmin(np.abs(self.thresholds - INDEX_THRESHOLD_M)))
-        self.with_volume = (np.arange(len(self.thresholds)) == told) | terms.every_volume
+        indexed = np.argmin(np.abs(self.thresholds - INDEX_THRESHOLD_M))
+        self.with_volume = (np.arange(len(self.thresholds)) == indexed) | terms.every_volume
         self.probe = probe_of(hand, obj, hand_points=HAND_POINTS, object_points=OBJECT_POINTS)
         self.volume = SharedVolume(hand, obj)
         self.overlap = Overlap(hand, self.probe)
@@ -100,9 +100,8 @@ def measure(
         run: receives the number of finished grasps; polled for cancellation between chunks."""
     thresholds = np.asarray(thresholds_m, float)
     if thresholds.ndim != 1 or not len(thresholds) or (thresholds <= 0).any() or (thresholds > REACH_M).any():
-        raise InputError(
-            f"contact thresholds must be above 0 and at most {REACH_M * 1e3:g} mm; got {list(thresholds_m)}"
-        )
+        limit = f"above 0 and at most {REACH_M * 1e3:g} mm"
+        raise InputError(f"contact thresholds must be {limit}; got {list(thresholds_m)}")
     terms = _Terms(hand, obj, friction, tuple(thresholds.tolist()), every_volume)
     chunks = [slice(i, min(i + CHUNK, len(grasps))) for i in range(0, len(grasps), CHUNK)]
     postures = [Posture(grasps.grasp.hand_pose[chunk], grasps.grasp.joint_positions[chunk]) for chunk in chunks]
@@ -209,6 +208,7 @@ ENVELOPING: Final = 2  # least number of wrapping digits of a power grasp if the
 
 
 def grasp_types(probe: Probe, found: Distances) -> NDArray[np.int32]:
+    """Return the `GraspType` (B,) of each grasp, as defined in the docstring of the module."""
     hand = probe.hand
     finger = finger_of_body(hand)
     touching = probe.body_distance(found) < LINK_CONTACT_M
@@ -221,9 +221,9 @@ def grasp_types(probe: Probe, found: Distances) -> NDArray[np.int32]:
     count = touches.sum(axis=1)
     lateral = sides.any(axis=1) & (2 * sides.sum(axis=1) >= count)
     power = palm | ((wraps & ~sides).sum(axis=1) >= ENVELOPING)
-    told = np.where(lateral, GraspType.LATERAL, GraspType.PRECISION)
-    told = np.where(power, GraspType.POWER, told)
-    return np.where(count + palm < 2, GraspType.NONE, told).astype(np.int32)
+    kind = np.where(lateral, GraspType.LATERAL, GraspType.PRECISION)
+    kind = np.where(power, GraspType.POWER, kind)
+    return np.where(count + palm < 2, GraspType.NONE, kind).astype(np.int32)
 
 
 def _touching_with_sides(

@@ -131,15 +131,10 @@ class Overlap:
         given = np.concatenate([poses[:, :3] - centre, to_xyzw(poses[:, 3:])], axis=1)
         with wp.ScopedDevice("cpu"):
             crossed = wp.zeros(len(piece), dtype=wp.int32)
-            inputs = [
-                self._probe.mesh.id,
-                self._solids,
-                wp.array(piece, dtype=wp.int32),
-                wp.array(given, dtype=wp.transform),
-            ]
+            inputs = [wp.array(piece, dtype=wp.int32), wp.array(given, dtype=wp.transform)]
+            inputs = [self._probe.mesh.id, self._solids, *inputs]
             launch(kernels.faces_in_solids, len(piece), inputs=inputs, outputs=[crossed], device="cpu")
-            found: NDArray[np.bool_] = crossed.numpy() != 0
-        return found
+        return np.asarray(crossed.numpy() != 0)
 
 
 def _solids(pieces: tuple[ConvexPiece, ...]) -> Any:

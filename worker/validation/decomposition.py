@@ -123,9 +123,8 @@ def _make(obj: ObjectModel) -> tuple[Floats, ...]:
         try:
             made = coacd_parts(obj.vertices, obj.faces, {"threshold": threshold, **_COACD}, CPU_S)
         except WorkLimitExceeded as error:
-            log.warning(
-                "%s: more than %d pieces need %s; the coarser ones are used", obj.name or "an object", len(best), error
-            )
+            name = obj.name or "an object"
+            log.warning("%s: more than %d pieces need %s; the coarser ones are used", name, len(best), error)
             break
         parts = tuple(part for part in made if len(part) >= 4 and union_volume((part,)) > _MIN_VOLUME)
         found = _excess(union_volume(parts), obj)

@@ -36,18 +36,12 @@ class ForeignVerdicts:
         validation_hand: name of the other model. fingertips_mm: largest distance between fingertips of both models.
         foreign_key: terms of the verdicts in the other model."""
         a, b = self.nominal.success == 1, self.foreign.success == 1
+        held = {"both": a & b, "nominal": a & ~b, "foreign": ~a & b, "neither": ~a & ~b}
         return {
             "validation_hand": self.same.theirs.name,
             "fingertips_mm": round(1e3 * self.same.fingertips_m, 6),
             "foreign_key": self.foreign.terms,
-            **share_counts(
-                {
-                    "both": int((a & b).sum()),
-                    "nominal": int((a & ~b).sum()),
-                    "foreign": int((~a & b).sum()),
-                    "neither": int((~a & ~b).sum()),
-                }
-            ),
+            **share_counts({models: int(mask.sum()) for models, mask in held.items()}),
         }
 
 

@@ -182,6 +182,19 @@ def _pressing(model: Any, supports: Sequence[Obstacle]) -> Floats:
     return out
 
 
+def empty_spec(timestep: float) -> Any:
+    """Return a spec without bodies, with the protocol's solver and a time step [s]."""
+    spec = mujoco.MjSpec()
+    # MJCF angles are degrees by default: limits in radians would lock every finger without an error.
+    spec.compiler.degree = False
+    spec.memory = ARENA
+    spec.option.timestep = timestep
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.impratio = 10.0
+    return spec
+
+
 def scene_spec(
     hand: HandModel,
     obj: ObjectModel,
@@ -192,23 +205,18 @@ def scene_spec(
 ) -> Any:
     """Return the spec that `build` compiles.
     Names: `body0` ..., `joint1` ..., `dof0` ... (actuators), object, supports, `neighbour0` ..."""
-    spec = mujoco.MjSpec()
-    # MJCF angles are degrees by default: limits in radians would lock every finger without an error.
-    spec.compiler.degree = False
-    option = spec.option
-    option.timestep = physics.timestep
-    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    option.impratio = 10.0
-    option.noslip_iterations = physics.noslip_iterations
-    spec.memory = ARENA
-    option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_GRAVITY) | (NOT_IN_3_3_2 & ~multi_contact_flags(hand))
+    spec = empty_spec(physics.timestep)
+    spec.option.noslip_iterations = physics.noslip_iterations
+    spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_GRAVITY) | (NOT_IN_3_3_2 & ~multi_contact_flags(hand))
     slide, twist = (coefficient * obj.friction / SLIDING for coefficient in physics.friction)
     friction = [slide, twist, 1e-4]
     _add_hand(spec, hand, friction, physics.root)
     add_object(spec, obj, pieces.vertices, friction, obj.mass)
     if supports:
-        _add_supports(spec, supports, friction)
+        # The scene's pose in the object frame is that of this mocap body.
+        body = spec.worldbody.add_body(name="supports", mocap=True)
+        for i, support in enumerate(supports):
+            add_support(spec, body.add_geom(condim=4, friction=friction, name=f"support{i}"), support)
     for k, one in enumerate(neighbours):
         add_object(spec, one.obj, one.pieces, friction, one.obj.mass, name=f"neighbour{k}")
     return spec
@@ -362,13 +370,6 @@ def add_object(
     for i, corners in enumerate(pieces):
         geom = body.add_geom(condim=4, friction=friction, name=f"{name}-{i}")
         add_mesh(spec, geom, corners - obj.centre_of_mass, f"{name}-{i}")
-
-
-def _add_supports(spec: Any, supports: Sequence[Obstacle], friction: list[float]) -> None:
-    """Add planes and convex solids to a mocap body, placed at the scene's pose in the object frame."""
-    body = spec.worldbody.add_body(name="supports", mocap=True)
-    for i, support in enumerate(supports):
-        add_support(spec, body.add_geom(condim=4, friction=friction, name=f"support{i}"), support)
 
 
 def add_support(spec: Any, geom: Any, support: Obstacle) -> None:

@@ -317,8 +317,8 @@ def capacities(hand: HandModel, obj: ObjectModel, grasp: Posture, against: Float
         moments = cross((points - obj.centre_of_mass)[:, None] / obj.radius, forces)
         # Torque limits of each dof, for its positive and then its negative direction; unlimited at a stop.
         near, rest = AT_STOP * hand.span, q[row]
-        bounds = (np.where(stop, np.inf, hand.effort) for stop in (rest > hand.upper - near, rest < hand.lower + near))
-        efforts = np.concatenate([*bounds])
+        stops = (rest > hand.upper - near, rest < hand.lower + near)
+        efforts = np.concatenate([np.where(stop, np.inf, hand.effort) for stop in stops])
         loads = [
             _largest_load(forces.reshape(-1, 3), moments.reshape(-1, 3), torques.reshape(-1, hand.dofs), efforts, along)
             for along in against[row]

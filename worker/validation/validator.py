@@ -80,9 +80,9 @@ def validate(
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Verdicts:
     """Validate grasps by DexGraspBench's force-closure protocol; levels: see `worker.validation.protocol`.
-    MuJoCo releases the GIL while it steps, so threads can use a few cores; for many cores, `run` needs a process pool.
-    If `run` has a prefilter, it decides clear cases, see `worker.validation.prefilter.prefilter`. Raises InputError:
-    unknown level. MeshError: the object has no usable convex pieces. TaskCancelled: `run.cancelled()` returned True.
+    Threads can use a few cores, since MuJoCo releases the GIL while it steps; for many cores, `run` needs a pool. A
+    prefilter of `run` decides clear cases (`worker.validation.prefilter.prefilter`). Raises InputError: unknown level.
+    MeshError: the object has no usable convex pieces. TaskCancelled: `run.cancelled()` returned True.
 
     Args:
         hand: the hand; its stiffness and effort are the actuators' gains and limits.
@@ -106,17 +106,15 @@ def validate(
     first = prefilter or _run_prefilter(case, terms, grasps, level, run if prefilter_terms else None)
     rollouts = dict(first.stands)
     left = [row for row in range(len(grasps)) if row not in rollouts]
-    keys = {} if known is None else {row: postures_key(terms, grasps.take(slice(row, row + 1))) for row in left}
-    if known is not None:
-        rollouts |= {row: known[key] for row, key in keys.items() if key in known}
+    keys = {row: postures_key(terms, grasps.take(slice(row, row + 1))) for row in left}
+    known = {} if known is None else known
+    rollouts |= {row: known[key] for row, key in keys.items() if key in known}
     _run_tests(case, grasps, [row for row in left if row not in rollouts], rollouts, run)
-    if known is not None:
-        known |= {key: rollouts[row] for row, key in keys.items()}
+    known |= {key: rollouts[row] for row, key in keys.items()}
     contradicted = first.count_contradicted(rollouts)
     if not first.is_trusted(contradicted):
-        log.warning(
-            "%d of %d rechecked verdicts are wrong: the CPU validates all grasps", contradicted, len(first.rechecked)
-        )
+        counts = (contradicted, len(first.rechecked))
+        log.warning("%d of %d rechecked verdicts are wrong: the CPU validates all grasps", *counts)
         _run_tests(case, grasps, list(first.stands), rollouts, run)
     ordered = [rollouts[row] for row in range(len(grasps))]
     return Verdicts(

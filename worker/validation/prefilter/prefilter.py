@@ -94,8 +94,7 @@ class WorldPool:
         self._steps = round(protocol.INTERVAL_S / scene.physics.timestep)
         self._doublings, self._capacity = 0, 0
         self.launches = 0  # ticks of the last `validate`
-        voiding = (getattr(self._engine.OverflowType, name) for name in _VOIDING)
-        self._voiding = int(sum(int(bit) for bit in voiding))
+        self._voiding = sum(int(getattr(self._engine.OverflowType, name)) for name in _VOIDING)
         with wp.ScopedDevice(device):
             self._model = self._engine.put_model(scene.model)
             self._model.opt.warn_overflow = 0
@@ -144,8 +143,8 @@ class WorldPool:
         at_start, short_too = self._depths(starts)
         inside = at_start.max(axis=1) > protocol.MAX_PENETRATION_M
         queue, found = np.flatnonzero(~inside), self._found
-        for name in ("outcome", "margin", "ticks", "overflow"):
-            getattr(found, name).zero_()
+        for array in (found.outcome, found.margin, found.ticks, found.overflow):
+            array.zero_()
         self._upload(grasps, starts, queue)
         self._simulate(len(queue), run)
         outcome = found.outcome.numpy()[:n].astype(np.uint8)
@@ -266,9 +265,7 @@ def prefilter_key_terms(hand: HandModel, level: str, run: ExecutionContext) -> l
     The prefilter is not used for grippers: their flat pads touch over an area, where the engines distribute contacts
     differently. It is not used for hands with tendons: the engines differ on a tenth of Shadow's grasps
     (docs/explanation/quality.md). Raises InputError: the prefilter is required but not installed."""
-    if run.prefilter == "off" or level not in ("standard", "fast"):
-        return []
-    if jaws_of(hand) is not None or hand.tendons:
+    if run.prefilter == "off" or level not in ("standard", "fast") or jaws_of(hand) is not None or hand.tendons:
         return []
     if run.prefilter == "auto" and not (run.device.startswith("cuda") and has_mujoco_warp()):
         return []
