@@ -96,17 +96,15 @@ ARCHITECTURES: Final = (80, 90, 100)  # compute capabilities, times ten, of A100
 
 
 def kernel_modules() -> list[str]:
+    """Return the names of all modules with kernels."""
     names = [
         info.name
         for package in map(import_module, ("graspd.worker", "graspd.baselines", "graspd.studies"))
         for info in pkgutil.walk_packages(package.__path__, f"{package.__name__}.")
         if not info.ispkg
     ]
-    return [name for name in names if (".kernels." in name or name.endswith(".kernels")) and _has_kernels(name)]
-
-
-def _has_kernels(name: str) -> bool:
-    return any(isinstance(value, wp.Kernel) for value in vars(import_module(name)).values())
+    candidates = (name for name in names if "kernels" in name.split("."))
+    return [name for name in candidates if any(isinstance(v, wp.Kernel) for v in vars(import_module(name)).values())]
 
 
 def compile_modules(

@@ -117,11 +117,10 @@ def _lock(file: Path) -> bool:
     opened = file.open("ab")
     try:
         fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
+    except OSError as error:
         opened.close()
-        return False
-    except OSError:
-        opened.close()
+        if isinstance(error, BlockingIOError):
+            return False
         raise
     _held.append(opened)
     return True

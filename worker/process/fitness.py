@@ -102,10 +102,7 @@ class Fitness:
 
     def _done_elsewhere(self, *, except_for: str) -> list[str]:
         try:
-            return [
-                task
-                for task, (stage, output) in self._failed.items()
-                if task != except_for and shard_exists(self._store, stage, output)
-            ]
+            others = [(task, made) for task, made in self._failed.items() if task != except_for]
+            return [task for task, made in others if shard_exists(self._store, *made)]
         except UnavailableError:
             return []

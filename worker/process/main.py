@@ -250,12 +250,8 @@ def run_worker(
             return False
         worker.check_service()  # an empty Redis may belong to another service by now
         patient = burst and idle_s > 0
-        worker.work(
-            burst=burst and not patient,
-            max_jobs=max_tasks,
-            max_idle_time=idle_s if patient else None,
-            logging_level="WARNING",
-        )
+        wait = {"burst": burst and not patient, "max_idle_time": idle_s if patient else None}
+        worker.work(**wait, max_jobs=max_tasks, logging_level="WARNING")
     except EngineLost as error:
         log.error("this worker ends: %s", error)
         return False

@@ -57,9 +57,8 @@ def _check_synthesis(run: ExecutionContext) -> None:
 
     request = JobRequest(hand=_HAND, object="ball", grasps=1, fidelity="draft", want="candidates")
     found = validated_grasps(hand_from_path(_HAND), _ball(), request, count=1, run=run)
-    _expect(
-        len(found.grasps) == 1 and np.isfinite(found.grasps.grasp.hand_pose).all(), "a grasp of a ball is not finite"
-    )
+    finite = np.isfinite(found.grasps.grasp.hand_pose).all()
+    _expect(len(found.grasps) == 1 and finite, "a grasp of a ball is not finite")
 
 
 def _check_scene(run: ExecutionContext) -> None:

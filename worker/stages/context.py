@@ -65,9 +65,11 @@ class TaskContext:
             self._tell(done, total, message)
 
     def cancelled(self) -> bool:
+        """Check whether the task should stop."""
         return self._stop.is_set()
 
     def check(self) -> None:
+        """Raise TaskCancelled if the task should stop."""
         if self._stop.is_set():
             raise TaskCancelled(f"stopped: {self.stop_reason}")
 

@@ -61,8 +61,7 @@ class BestGrasp:
 
 @dataclass(frozen=True)
 class SelfTest:
-    """Result of the test; `gsr` is the share of candidates that hold at level standard.
-    `table` is the share of the `table_n` grasps on a table that lift the object."""
+    """Result of the test: shares `gsr` of n free grasps that hold, `table` of `table_n` grasps on a table that lift."""
 
     gsr: float
     n: int
@@ -183,10 +182,7 @@ def _drive_deflection(hand: HandModel) -> float:
 
 def _batches(hand: HandModel, obj: ObjectModel, count: int, run: ExecutionContext) -> list[ValidatedBatch]:
     sizes = [min(BATCH_SIZE, count - first) for first in range(0, count, BATCH_SIZE)]
-    return [
-        validated_grasps(hand, obj, _request(size), count=size, batch=batch, run=run)
-        for batch, size in enumerate(sizes)
-    ]
+    return [validated_grasps(hand, obj, _request(n), count=n, batch=batch, run=run) for batch, n in enumerate(sizes)]
 
 
 def _request(count: int) -> JobOptions:

@@ -68,7 +68,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
             raise SceneError(str(error)) from None
         raise
     made = [_output(one, part) for one, part in zip(found, columns or [{}] * len(found), strict=True)]
-    said = base_attributes(
+    attributes = base_attributes(
         hand,
         obj,
         message.request,
@@ -78,7 +78,7 @@ def run(message: TaskMessage, context: TaskContext) -> Output:
     )
     of_scenes: dict[str, Attribute] = {"scene_shard": message.inputs[0]} if scenes else {}
     whole = join_outputs(message, made)
-    return replace(whole, attributes={**whole.attributes, **said, **of_scenes, **neighbour_attributes(message)})
+    return replace(whole, attributes={**whole.attributes, **attributes, **of_scenes, **neighbour_attributes(message)})
 
 
 def _output(found: ValidatedBatch, columns: Mapping[str, NDArray[Any]]) -> Output:
