@@ -29,8 +29,7 @@ log = logging.getLogger(__name__)
 
 def _set_thread_defaults() -> None:
     """Give every thread its own default device, since Warp has one for the process.
-    A `ScopedDevice` would move another thread's arrays to its device and leave it as the default. This access to Warp's
-    internals is needed until every array names its device."""
+    Otherwise a `ScopedDevice` would move another thread's arrays to its device. Warp offers no public API for this."""
     from warp._src.context import Runtime, runtime  # noqa: TID251
 
     first, own = runtime.default_device, threading.local()

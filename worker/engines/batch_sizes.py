@@ -22,7 +22,7 @@ PROCESS_SHARE: Final = 0.25  # share of the machine's memory for these processes
 
 def batches_at_once(device: str, join: int | None) -> int:
     """Return the batches per launch on a Warp device: `join` if given, else 1 on the CPU.
-    On a GPU the default fills the GPU within its free memory. On the CPU larger launches gain nothing."""
+    On a GPU the default fills the GPU within its free memory."""
     if join is not None or not device.startswith("cuda"):
         return join or 1
     import warp as wp
@@ -40,8 +40,8 @@ def batches_that_fit(multiprocessors: int, free_bytes: int) -> int:
 
 def processes_at_once(device: str, wanted: int, *, threads: int = 0, workers: int = 1, root: Path = ROOT) -> int:
     """Return how many processes validate and measure: `wanted` if not 0; 1 for the worker's threads alone.
-    By default a worker on a GPU has one process fewer than its share of the cores. All `workers` together use at most a
-    quarter of the memory. On a CPU the planner needs all cores, so the default is 1."""
+    On a GPU the default is one less than the worker's share of the cores, within a quarter of the memory for all
+    `workers`. On a CPU the planner needs all cores, so the default is 1."""
     if wanted or not device.startswith("cuda"):
         return wanted or 1
     room = int(PROCESS_SHARE * available_memory(root) / workers / BYTES_PER_PROCESS)

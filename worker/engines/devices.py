@@ -1,8 +1,8 @@
 """Warp devices: their names, the default GPU of a process, and GPU errors.
 
-Worker number k takes the k-th GPU that `CUDA_VISIBLE_DEVICES` shows, cyclically. A process without a number takes the
-GPU with the fewest processes. File locks count these processes: the n-th process on a GPU holds lock n. Locks are in
-the user's cache, which containers of one machine share. The kernel releases them at the end of the process.
+Worker number k takes the k-th GPU that `CUDA_VISIBLE_DEVICES` shows, cyclically; a process without a number the GPU
+with the fewest processes. The n-th process on a GPU holds file lock n in the user's cache, which containers of one
+machine share. The kernel releases locks at the end of a process.
 
 After an illegal access, a reset or a bus error Warp writes a line to stderr and continues with undefined memory.
 Results therefore leave the process only after synchronisation of the device."""

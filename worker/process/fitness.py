@@ -1,11 +1,10 @@
 """Fitness of a worker: an unfit worker returns tasks, which lose no attempt, and goes into quarantine.
 
-A worker is unfit in two cases. Its engine fails the check, before the first task or after a task failed for another
-reason than its input. Or several different tasks fail here in a row, while other workers completed two of them.
+A worker is unfit if its engine fails the check, before the first task or after a failure not due to the task's input.
+It is also unfit if several tasks fail here in a row, of which other workers completed two.
 
 A worker in quarantine is listed with the reason and gets no tasks. It repeats its check after increasing pauses and
-resumes when the check passes. If the check never passes, or cannot find the fault, the process ends and a fresh one
-starts with a check."""
+resumes when the check passes. If it never passes, or cannot find the fault, the process ends and a fresh one starts."""
 
 from __future__ import annotations
 

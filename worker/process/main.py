@@ -1,8 +1,8 @@
 """Worker process: RQ's worker, which renews the lease of a task while a separate engine runs it.
 
-The engine (`worker.process.engine`) is its own process and lives as long as the worker: a CUDA context does not survive
-a fork. A new process for each task would load kernels and meshes every time. The worker shares no interpreter lock with
-the engine, so neither a kernel compilation nor a busy machine can prevent the renewal of the lease."""
+The engine (`worker.process.engine`) lives as long as the worker: a CUDA context does not survive a fork, and a process
+per task would load kernels and meshes every time. Worker and engine share no interpreter lock, so no kernel compilation
+prevents the renewal of the lease."""
 
 from __future__ import annotations
 

@@ -1,16 +1,14 @@
 """The quality table: every metric of every grasp of one hand on one object, and the grasp types.
 
-Types are those of Napier (1956) and of the GRASP taxonomy (Feix et al., IEEE THMS 2016), by opposition (Iberall 1987):
+Types are those of Napier (1956) and of the GRASP taxonomy (Feix et al., IEEE THMS 2016), by opposition (Iberall 1987),
+tested in this order:
 
-- power, palm opposition: the palm touches, or at least two digits wrap. A wrapping digit touches with more than its
-last link, and not by a side;
+- power, palm opposition: the palm touches, or at least two digits wrap: with more than their last link, not by a side;
 - lateral, side opposition: at least half of the touching digits touch by a side;
-- precision, pad opposition: two digits touch, and neither other type applies.
+- precision, pad opposition: two digits touch.
 
-They are tested in this order. A *digit* is a chain of bodies that ends in a fingertip; all other bodies are palm. A
-digit touches *by a side* if most of its surface within 2 mm of the object faces along its axis of flexion. The
-tolerance is 45 degrees. A jaw has no side, so a gripper's grasps are of type precision, or power where its palm
-touches."""
+A *digit* is a chain of bodies that ends in a fingertip; all other bodies are palm. It touches *by a side* if most of
+its surface within 2 mm of the object faces along its axis of flexion, within 45 degrees. A jaw has no side."""
 
 from __future__ import annotations
 

@@ -102,8 +102,8 @@ _DIGITS: Final = 7  # planes that are equal in this many decimals (offsets [m] a
 
 class Overlap:
     """Conservative overlap test of a hand's pieces with a closed object.
-    A piece is excluded only if no face of the object reaches into it and neither body contains a part of the other. A
-    face also counts as reaching in if only a plane through an edge of each separates face and piece."""
+    A piece is excluded only if no face of the object may reach into it and neither body contains a part of the
+    other."""
 
     def __init__(self, hand: HandModel, probe: Probe) -> None:
         self._probe = probe
@@ -164,8 +164,6 @@ def _planes(piece: ConvexPiece) -> Floats:
 
 
 def penetration_depth(found: Distances) -> Floats:
-    """Return the deepest penetration (B,) of hand points in the object or object points in the hand [m].
-    One direction alone is not enough: a thin wall passes between hand points, a small fingertip between object
-    points."""
+    """Return the deepest penetration (B,) of hand points in the object or object points in the hand [m]."""
     hand_in_object = np.maximum(0.0, -found.distance).max(axis=1)
     return np.asarray(np.maximum(hand_in_object, np.maximum(0.0, -found.piece_distance).max(axis=1)))

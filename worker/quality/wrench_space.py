@@ -148,11 +148,10 @@ _workspace = _Workspace()
 
 
 def measure_hulls(clouds: Floats, count: NDArray[np.integer], whole: NDArray[np.bool_]) -> tuple[Floats, Floats]:
-    """Compute inner radius and volume of many hulls, in one launch.
-    Each hull uses the first `count` (H,) of its points `clouds` (H, P, 6), P at most `MAX_POINTS`. Where `whole` (H,)
-    is false, only the hull's part nearest to the origin is built. The radius is equally exact, in a tenth of the time.
-    Return the distance (H,) from the origin to the nearest facet, at most 0 for an outside origin. Also return the
-    volume (H,), nan for a part. Both are nan where there is no closed hull of at most `CAPACITY` facets."""
+    """Compute inner radius and volume (H,) of many hulls, in one launch; nan where a hull fails.
+    Each hull uses the first `count` (H,) of its points `clouds` (H, P, 6), P at most `MAX_POINTS`. The radius is the
+    distance from the origin to the nearest facet, at most 0 for an outside origin. Where `whole` (H,) is false, only
+    the part nearest to the origin is built: a tenth of the time, equally exact, without a volume."""
     radius, volume = np.full((2, len(clouds)), np.nan)
     some = np.flatnonzero(np.asarray(count) > _DIMENSION)
     if not len(some):

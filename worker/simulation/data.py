@@ -1,7 +1,7 @@
 """Data of a simulation on its device: states of up to `capacity` hands, contacts, and schedules.
 
-All per-iteration values (dilation, weights, rates) are in tables on the device. A counter on the device selects the
-row, so every iteration is the same list of launches."""
+Values of an iteration (dilation, weights, rates) are rows of tables on the device, which a counter there selects. Every
+iteration is therefore the same list of launches."""
 
 from __future__ import annotations
 
@@ -121,8 +121,7 @@ class Data:
         self.scene.assign(padded)
 
     def set_schedule(self, schedule: Schedule) -> None:
-        """Upload the per-iteration tables, with dilations up to `MAX_DILATION`.
-        Launches recorded before still read the former tables."""
+        """Upload a schedule, dilations up to `MAX_DILATION`; launches recorded before keep the former one."""
         with wp.ScopedDevice(self.device):
             self.schedule = Tables(schedule, self.unit)
 
@@ -151,12 +150,11 @@ class Data:
 
 @dataclass
 class HandState:
-    """State of B hands: pivot (B, 3), rotation (B, 4) w x y z, q (B, D).
-    The pivot is the palm centre relative to the object's centre of mass."""
+    """State of B hands."""
 
-    pivot: Floats
-    rotation: Floats
-    q: Floats
+    pivot: Floats  # (B, 3) palm centre relative to the object's centre of mass [m]
+    rotation: Floats  # (B, 4) w x y z
+    q: Floats  # (B, D)
 
     def __getitem__(self, index: Any) -> HandState:
         return HandState(self.pivot[index], self.rotation[index], self.q[index])

@@ -135,7 +135,7 @@ class DeviceObject:
     def create(cls, obj: ObjectModel, device: str, *, samples: Floats, phong_alpha: float, cell: float) -> DeviceObject:
         """Upload an object with `samples` (S, 3) of its surface, object frame [m].
         `phong_alpha` is 0 for flat faces, 1 for full Phong projection. `cell` is the cell size of the distance grid
-        [m]; with 0 there is no grid, and all distances are computed from the mesh."""
+        [m]; with 0 there is no grid."""
         with wp.ScopedDevice(device):
             points = wp.array(obj.vertices - obj.centre_of_mass, dtype=wp.vec3)
             mesh = wp.Mesh(points=points, indices=wp.array(obj.faces.ravel(), dtype=wp.int32))

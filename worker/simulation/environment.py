@@ -1,7 +1,7 @@
 """Environment of an object: the convex obstacles of a scene that a hand must avoid.
 
-An obstacle is an intersection of half-spaces: one for a table top, six for a board or a wall. A neighbour's convex
-piece has one per face of its hull. An `Environment` is in the object frame, `Scenes` are in the scene frame."""
+An obstacle is an intersection of half-spaces: one for a table top, six for a board or wall, and one per face for a
+neighbour's convex piece. An `Environment` is in the object frame, `Scenes` are in the scene frame."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Distance grid of an object, and lists of the faces near each cell; both are cached on disk.
+"""Distance grid of an object, and lists of the faces near each cell.
 
-Both depend on the object, the cell size and `phong_alpha`, not on the hand. They take a fifth of the time until a
-process's first grasp, so later processes on a CPU read a file. A GPU computes them faster than a file is read."""
+They depend on the object, the cell size and `phong_alpha`, not on the hand. Processes on a CPU cache them on disk,
+since they take a fifth of the time until a first grasp. A GPU computes them faster than a file is read."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def faces_of(obj: ObjectModel) -> Any:
 
 def feature_normals(vertices: Floats, faces: NDArray[np.integer[Any]]) -> Floats:
     """Return unnormalised angle-weighted normals (F, 7, 3): inside, edges ab, bc, ca, corners a, b, c.
-    Vertices at the same place count as one. Faces without an area are ignored."""
+    Vertices at the same place count as one; faces without an area are ignored."""
     places, same = np.unique(vertices, axis=0, return_inverse=True)
     faces = same.reshape(-1)[faces]
     corner = places[faces]
@@ -133,8 +133,7 @@ def _summed(group: NDArray[np.integer[Any]], rows: Floats) -> Floats:
 
 
 def list_cells(faces: Any, mesh: Any, field: Any, low: Any, size: float, within: float) -> Any:
-    """Return `nearest.Cells` of `faces`, for grid cells closer to the surface than `within` [m].
-    `low` is the first corner of the grid `field`."""
+    """Return `nearest.Cells`: lists for cells of grid `field`, first corner `low`, within `within` [m]."""
     cells = nearest.Cells()
     cells.faces = faces
     shape = [n - 1 for n in field.shape]

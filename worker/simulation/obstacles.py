@@ -80,10 +80,10 @@ def body_clearance(
     hand: HandModel, postures: Posture, scenes: Sequence[Environment], which: NDArray[np.integer[Any]] | None = None
 ) -> Floats:
     """Return signed distances (P, L) of the hand's bodies from the nearest obstacle [m]; inf if none.
-    Posture i is in the scene `which[i]`, by default in the first one. Fingertips may be closer to some supports than
-    `CLEAR_M`. Their distance from such a support is increased by the difference, so a hand is clear if no distance is
-    below `CLEAR_M`. Distances are exact from half-spaces, and from solids that the hand does not penetrate. Near edges
-    and corners of solids, distances of links with hulls are lower bounds. Distances from solids are at most `FAR_M`."""
+    Posture i is in the scene `which[i]`, by default in the first one. A hand is clear if no distance is below
+    `CLEAR_M`: where fingertips may be closer to a support, their distance is increased by the difference. Distances are
+    exact from half-spaces, and from solids that the hand does not penetrate; near edges and corners of solids, those of
+    links with hulls are lower bounds. Distances from solids are at most `FAR_M`."""
     which = np.zeros(len(postures), np.int32) if which is None else np.asarray(which, np.int32)
     out = _half_space_clearance(hand, postures, scenes, which)
     tips = np.isin(np.arange(hand.bodies), hand.fingertips)
@@ -141,8 +141,8 @@ class DeviceObstacles:
         *,
         margin: float | Floats = MARGIN_M,
     ) -> DeviceObstacles:
-        """Upload obstacles in the object frame.
-        `centre` (3,) is the object's centre of mass. `margin` is the clearance of features [m], or (L,) per body."""
+        """Upload obstacles in the object frame, in which `centre` (3,) is the centre of mass.
+        `margin` is the clearance of features [m], or (L,) per body."""
         found = hand.features
         kept = np.broadcast_to(np.asarray(margin, float), hand.bodies)[found.body]
         sorted_ = [sorted(scene.obstacles, key=lambda o: len(o.corners) > 0) for scene in scenes]

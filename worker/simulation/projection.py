@@ -53,8 +53,7 @@ def _residuals(capacity: int) -> Any:
 
 
 class Projection:
-    """Projection of a model's hands, which selects the least penetrating state of each.
-    No data leaves the device between two steps."""
+    """Projection of a model's hands that selects the least penetrating state of each on the device."""
 
     def __init__(self, model: Model, data: Data, options: ProjectionOptions) -> None:
         self.model, self.data, self.options = model, data, options

@@ -91,9 +91,8 @@ class Output:
 def shard_of(
     message: TaskMessage, output: Output, *, device: str, seconds: float, worker: str, lost: ShardManifest | None = None
 ) -> tuple[ShardManifest, bytes]:
-    """Build the shard of a stage: its manifest and its HDF5 bytes.
-    The new file keeps times and package version of `lost`, the manifest of the file that it replaces. Raises
-    InputError: the columns do not fit the schema."""
+    """Build a stage's manifest and HDF5 bytes. Raises InputError: the columns do not fit the schema.
+    A file that replaces a lost one keeps the times and package version of the manifest `lost`."""
     kind = SHARD_KINDS[message.stage]
     request = message.request
     attributes: dict[str, Attribute] = {
@@ -123,9 +122,8 @@ def shard_of(
 
 
 def batch_seed(message: TaskMessage) -> int:
-    """Compute the seed of this stage for this batch.
-    Batches, hands and objects must not repeat each other's materials, lamps and cameras. Methods share them: with
-    identical pictures, networks trained on grasps of two methods can be compared."""
+    """Compute the seed of this stage for this batch of a hand and an object.
+    Methods share it: networks trained on grasps of two methods see the same pictures."""
     pair = [message.hand_digest, message.object_digest]
     return int(digest_json([message.request.seed, message.stage, message.batch, *pair])[:8], 16) % 2**31
 

@@ -2,10 +2,9 @@
 
 ``python -m graspd.worker.stages.models`` writes the models of built-in hands and objects to `service/builtin/models/`.
 
-Node `extras` contain the joint tree, so a viewer can pose the hand from the joint positions of a shard. A node's pose
-is parent * rest pose * motion about `axis`. Points of the hand's surface are POINTS primitives. For a body drawn with
-visual meshes, `extras` name the mesh of its collision shapes, which no node draws. The document's `extras` contain
-facts, link frames, joint drives and pads of the hand."""
+Node `extras` contain the joint tree: a node's pose is parent * rest pose * motion about `axis`. Points of the hand's
+surface are POINTS primitives. For a body drawn with visual meshes, `extras` name the mesh of its collision shapes,
+which no node draws. The document's `extras` contain facts, link frames, joint drives and pads of the hand."""
 
 from __future__ import annotations
 

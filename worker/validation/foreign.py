@@ -47,8 +47,8 @@ class ForeignVerdicts:
 
 def share_counts(held: Mapping[str, int]) -> dict[str, Any]:
     """Return shares from numbers of grasps held in both models, one, or neither; None without grasps.
-    foreign_held: the counts. agreement: share of grasps with equal verdicts in both models. foreign_share: share of
-    nominally held grasps that hold in the other model. foreign_gsr: share of all grasps that hold in it."""
+    foreign_held: the counts. agreement: share with equal verdicts. foreign_share: share of nominally held grasps that
+    hold in the other model. foreign_gsr: share of all grasps that hold in it."""
     n, nominal = sum(held.values()), held["both"] + held["nominal"]
 
     def share(part: int, whole: int) -> float | None:
@@ -80,9 +80,9 @@ def foreign_verdicts(
 
 def with_drives_of(same: HandMatch) -> HandModel:
     """Return the other model with the gains and limits of `same.ours`.
-    Let a dof with gain k and limit e move n joints by m_i. Each joint then gets the gain k / (n m_i^2) and the limit e
-    / (n |m_i|). Conversely, a dof's gain and limit are sum(m_i^2 k_i) and sum(|m_i| e_i) of its joints. The drive along
-    the joints' common motion is thus the same in a model that couples them and in a model with a tendon."""
+    Joint i of the n joints of a dof with gain k and limit e, moved by m_i, gets the gain k / (n m_i^2) and the limit e
+    / (n |m_i|). Conversely, a dof has gain sum(m_i^2 k_i) and limit sum(|m_i| e_i). Coupled joints and tendons thus
+    have the same drive along their common motion."""
     ours, theirs = same.ours, same.theirs
     dof, rate = ours.dof[ours.joint_body], ours.multiplier[ours.joint_body]
     joints = np.bincount(dof, minlength=ours.dofs)[dof]

@@ -70,9 +70,7 @@ def verdict_key(
     hand: HandModel, obj: ObjectModel, level: Level, hard: bool, *, pieces: ConvexPieces, prefilter: Sequence[Any] = ()
 ) -> str:
     """Return the digest of a verdict's terms: everything that determines it except the grasp's postures.
-    Terms are level, friction, masses, gains, torque limits, shapes of the hand, convex pieces of the object, and the
-    rules of pregrasp and squeeze. Further terms are the constants of `MOVES` and of the level, the version of the
-    engine, and `prefilter`: the prefilter's terms if it is used."""
+    `prefilter` has the prefilter's terms if it is used."""
     shapes = b"".join(np.round(p.vertices, 9).tobytes() + np.round(p.pose, 9).tobytes() for p in hand.pieces)
     return digest_json(
         {

@@ -1,11 +1,11 @@
 """The lift test: the object rests in its scene; the hand closes, squeezes, lifts and holds it.
 
-dexgraspbench: DexGraspBench's tabletop test as published. From the pregrasp on, the object's weight (published: 1 N)
-acts down. After the squeeze the hand rises 10 cm in 0.4 s, without a hold.
-lift: the hand starts at its standoff and must touch nothing on its approach. Fingertips may touch supports, or press
-into them as deep as the scene allows. The hand rises smoothly in 0.8 s and holds for 2 s, with early termination as at
-level standard. Neighbours are free bodies on the table; they must not move by 2 cm or topple.
-The world frame of the simulation is the object frame at rest; the scene is placed around it accordingly."""
+dexgraspbench: DexGraspBench's published tabletop test. From the pregrasp on, the object's weight acts down (published:
+1 N). After the squeeze the hand rises 10 cm in 0.4 s, without a hold.
+lift: the hand starts at its standoff and must touch nothing on its approach, except supports by fingertips as the scene
+allows. It rises smoothly in 0.8 s and holds for 2 s, with early termination as at level standard. Neighbours are free
+bodies on the table, which must not move by 2 cm or topple. The world frame of the simulation is the object frame at
+rest."""
 
 from __future__ import annotations
 
@@ -192,8 +192,8 @@ class Lift(Test):
 
     def _root_deviation(self) -> tuple[Floats, Floats] | None:
         """Return the root's position (3,) and its rotation (4,) relative to the command.
-        None if the root is fixed, or motion is measured in the world. Unlike an arm, the protocol's weld yields by 10
-        degrees under the weight of a hammer. An object that only follows this deviation has not moved in the hand."""
+        None if the root is fixed, or motion is measured in the world. The protocol's weld yields by 10 degrees under a
+        hammer; an object that follows this deviation has not moved in the hand."""
         at = self.scene.root_qpos
         if at < 0 or not self._in_hand:
             return None

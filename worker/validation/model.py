@@ -224,7 +224,7 @@ def scene_spec(
 
 def multi_contact_flags(hand: HandModel) -> int:
     """Return the flags of `NOT_IN_3_3_2` that a gripper needs: flat pads touch flat sides over an area.
-    With a single contact point the object would rotate unrealistically. The protocol was made for rounded fingers."""
+    The protocol is for rounded fingers; at a single contact point the object would rotate unrealistically."""
     return int(mujoco.mjtDisableBit.mjDSBL_MULTICCD) if jaws_of(hand) is not None else 0
 
 

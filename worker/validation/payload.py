@@ -1,17 +1,17 @@
 """Payload of grasps: heaviest mass that each lifts or holds; shake test; limit and load capacity.
 
-The hand closes once around the object at its own mass. Then the mass is varied: the object hangs, or is pushed, until
-its motion decides. The search begins near the mass that the contact forces of the closed hand bear. Each hanging test
-starts from the final state of the heaviest mass that passed, each push from the closed hand.
+Payload: the hand closes once around the object at its own mass. Then the object hangs, or is pushed, at other masses.
+The search begins near the mass that the contact forces of the closed hand bear. A hanging test starts from the final
+state of the heaviest mass that passed, a push from the closed hand.
 
-The shake moves a lifted object to and fro, first along x of the scene, then along y. In the simulation the hand is at
-rest and the inertial force of the motion acts on the object. Accelerations begin at zero; the constant velocity that
-this adds to the hand has no effect (Galilean invariance).
+Shake: a lifted object is moved to and fro, first along x of the scene, then along y. In the simulation the hand is at
+rest and the inertial force acts on the object. Accelerations begin at zero; the constant velocity that this adds has no
+effect (Galilean invariance).
 
-Load capacity: the heaviest object that contact forces could bear within actuator limits and friction. Each direction of
-the weight has one linear program. Contact forces inside friction pyramids balance the weight and all torques about the
-centre of mass, and no drive exceeds its effort. The result is an upper bound: maybe no controller can exert the forces,
-and pyramids enclose the cones. Forces on the palm, along joint axes, or towards a joint's stop cost no effort."""
+Load capacity: the heaviest object that contact forces could bear within actuator limits and friction, by one linear
+program per direction of the weight. Forces inside friction pyramids balance the weight and all torques about the centre
+of mass, and no drive exceeds its effort. The result is an upper bound: maybe no controller can exert the forces, and
+pyramids enclose the cones. Forces on the palm, along joint axes, or towards a joint's stop cost no effort."""
 
 from __future__ import annotations
 

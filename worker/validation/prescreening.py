@@ -1,10 +1,9 @@
-"""Short tests with coarse physics: rollouts that rank a planner's candidates.
+"""Short tests with coarse physics that rank a planner's candidates at a fifth of a verdict's cost.
 
-The hand closes and squeezes around the object in a fraction of the time of the full test. In a scene the support is
-then removed, and most of the object's weight pulls for a moment. A free object is pushed towards the corners of a
-tetrahedron, with nearly twice its weight. Friction is halved in these tests. Objects that slip are tested once more
-from the same closed hand at full friction; in a scene the pull is then 30 % above the weight. The result is not a
-verdict: it ranks candidates at a fifth of a verdict's cost, and the full test still validates the selected ones."""
+The hand closes and squeezes around the object. In a scene the support is then removed, and most of the object's weight
+pulls for a moment. A free object is pushed towards the corners of a tetrahedron, with nearly twice its weight. Friction
+is halved. Objects that slip are tested once more from the same closed hand at full friction; in a scene the pull is
+then 30 % above the weight. The full test still validates the selected candidates."""
 
 from __future__ import annotations
 
@@ -102,8 +101,7 @@ class PushRollout(Test):
 
     def score(self, grasps: GraspSet, row: int, beat: float = np.inf) -> float:
         """Return the largest ratio of motion to its limit in pushes at half friction; below 1 if held.
-        Otherwise return the ratio at full friction plus `SLIPS`.
-        Return inf as soon as the score cannot be below `beat`; if `beat` is below 1 + `SLIPS`, skip full friction."""
+        Otherwise return the ratio at full friction plus `SLIPS`, or inf as soon as the score cannot be below `beat`."""
         self.scene = self._half
         if self._start(grasps, row).outcomes[0] is Outcome.PENETRATION:
             return DEEP
@@ -132,8 +130,7 @@ class PushRollout(Test):
 
 
 class ShortTests:
-    """Short tests of one hand and one object; thread-safe. Scenes are compiled on first use.
-    All grasps must have the same supports and neighbours."""
+    """Short tests of one hand and one object with common supports and neighbours; thread-safe."""
 
     def __init__(
         self, hand: HandModel, obj: ObjectModel, pieces: Callable[[], ConvexPieces], *, threads: int = 1
@@ -144,8 +141,7 @@ class ShortTests:
 
     def scores(self, grasps: GraspSet, placed: PlacedGrasps | None, beat: Floats | None = None) -> Floats:
         """Return scores (N,) (`worker.planners.Rollout`), by lifts if `placed` is given, else by pushes.
-        Scores are below 1 for grasps that hold at half friction, and below 2 for grasps that hold at full friction.
-        Each call uses `threads`; planners on the CPU already call from all their threads."""
+        Scores are below 1 for grasps that hold at half friction, and below 2 for those that hold at full friction."""
         with self._lock:
             if self._scenes is None:
                 around = (placed.supports, placed.neighbours) if placed is not None else ()

@@ -1,8 +1,8 @@
 """Robustness: verdicts in other models of the same hand and object, and with the object displaced.
 
-A grasp is validated in k models. Each model differs from the nominal model along one axis (`variant`); axes alternate
-in random order. Models depend only on the seed and the grasp's own numbers. A grasp therefore gets the same models in
-any set, and the first 8 of 16 models equal those of a test with 8."""
+Each of k models differs from the nominal one along one axis (`variant`); axes alternate in random order. Models depend
+only on the seed and the grasp's own numbers. A grasp therefore gets the same models in any set, and the first 8 of 16
+models equal those of a test with 8."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Variants of the validator's model: other plausible shapes, drives, tendons, masses and poses.
 
-A `Variant` describes how a model departs from the nominal one. `draw_variant` draws one, and `Models` validates in it:
-new shapes are recompiled, other numbers are changed in a copy."""
+`draw_variant` draws a `Variant`, and `Models` validates in it: new shapes are recompiled, other numbers changed in a
+copy."""
 
 from __future__ import annotations
 
@@ -227,8 +227,7 @@ class Models:
         self, grasps: GraspSet, row: int, placed: PlacedGrasps, variant: Variant, *, dexgraspbench: bool = False
     ) -> LiftTest:
         """Lift a grasp in a variant; for the nominal variant the result equals `validate_lifts` bit for bit.
-        `grasps` need an approach, except for `dexgraspbench`. `placed` has the scenes of all grasps, with the supports
-        and neighbours of these models. `dexgraspbench`: run the published test instead of the full one."""
+        `placed` has the scenes of all grasps. `dexgraspbench`: run the published test, which needs no approach."""
         number = int(placed.index[row])
         variant = restrict_to_support(variant, placed.scenes[number].up)
         one, where = displaced_grasp(self.obj, grasps, row, variant), placed.take(slice(row, row + 1))
@@ -376,8 +375,7 @@ def motion_of(obj: ObjectModel, variant: Variant) -> Floats:
 
 
 def restrict_to_support(variant: Variant, up: Floats) -> Variant:
-    """Restrict a variant to an object on a support: shifts along the support, turns about the vertical.
-    `up` (3,) is the direction against gravity, in the object frame."""
+    """Keep shifts along a support and turns about the vertical `up` (3,), object frame, of a variant."""
     if not moves_object(variant):
         return variant
     shift, turn = np.array(variant.object_shift_m), np.array(variant.object_turn)

@@ -1,8 +1,7 @@
 """Schedule of level standard for many worlds: close, push six ways, check, take the next grasp.
 
-A tick is the simulation between two checks (`protocol.INTERVAL_S`). After each tick every world checks its own object.
-Worlds do not wait for each other; a world takes the next grasp of the queue when its verdict is decided. Quaternions
-are w x y z, stored in `wp.quat` in this order as in MuJoCo Warp."""
+A tick is the simulation between two checks (`protocol.INTERVAL_S`), after which each world checks its own object.
+Worlds do not wait for each other. Quaternions are w x y z in `wp.quat`, as in MuJoCo Warp."""
 
 from typing import Final
 

@@ -1,12 +1,10 @@
 """The GPU prefilter in MuJoCo Warp: it decides clear verdicts.
 
-MuJoCo on the CPU decides all other verdicts, and rechecks a sample of the clear ones. At level `standard` the prefilter
-only rejects: clear failures are final, all other grasps are validated on the CPU. At level `fast` clear verdicts of
-both kinds are final. The prefilter is not used at level `dexgraspbench` or for lifts.
+MuJoCo on the CPU decides all other verdicts, and rechecks a sample of the clear ones. At level `standard` only clear
+failures are final, at level `fast` clear verdicts of both kinds. Other levels and lifts do not use the prefilter.
 
-The model is the validator's own, compiled once; data that differ between grasps (postures, commands, pushes) are
-arrays. A pool of worlds takes grasps from a queue on the device. All worlds are busy until the queue is empty, and one
-graph serves any number of grasps."""
+The validator's model is compiled once; postures, commands and pushes are arrays. Worlds take grasps from a queue on the
+device until it is empty, and one graph serves any number of grasps."""
 
 from __future__ import annotations
 
@@ -262,9 +260,9 @@ class PrefilterVerdicts:
 
 def prefilter_key_terms(hand: HandModel, level: str, run: ExecutionContext) -> list[Any]:
     """Return the prefilter's terms for `verdict_key`; empty if it is not used for verdicts of this level.
-    The prefilter is not used for grippers: their flat pads touch over an area, where the engines distribute contacts
-    differently. It is not used for hands with tendons: the engines differ on a tenth of Shadow's grasps
-    (docs/explanation/quality.md). Raises InputError: the prefilter is required but not installed."""
+    Grippers do without it, since the engines distribute contacts of flat pads differently, and hands with tendons,
+    since the engines differ on a tenth of Shadow's grasps (docs/explanation/quality.md). Raises InputError: the
+    prefilter is required but not installed."""
     if run.prefilter == "off" or level not in ("standard", "fast") or jaws_of(hand) is not None or hand.tendons:
         return []
     if run.prefilter == "auto" and not (run.device.startswith("cuda") and has_mujoco_warp()):
