@@ -128,8 +128,6 @@ def _lock(file: Path) -> bool:
 
 #: Messages of Warp and the driver about insufficient GPU memory.
 _NO_MEMORY: Final = re.compile(r"Failed to allocate \d+ bytes.*'cuda:\d+'|CUDA error 2\b|out of memory", re.DOTALL)
-
-
 #: Held during a launch on a GPU that another thread may use: a graph under capture must contain no other launches.
 exclusive: Final = threading.RLock()
 

@@ -47,10 +47,8 @@ def is_first_loss(task: str) -> bool:
 class Fitness:
     def __init__(self, store: Store, check: Check | None = None) -> None:
         """Without `check`, only results of other workers decide."""
-        self._store = store
-        self._check = check
+        self._store, self._check, self._can_pass = store, check, True
         self._failed: dict[str, tuple[Stage, str]] = {}
-        self._can_pass = True
         self.reason = ""  # reason why the worker is unfit; "" while it is fit
 
     def try_engine(self, stages: Collection[Stage]) -> bool:

@@ -61,11 +61,8 @@ class Runner:
         check_device: Callable[[str], None] = check_device,
     ) -> None:
         """`check_device` raises DeviceLost once a device no longer works."""
-        self._stages = stages
-        self._worker = worker
-        self._publish = publish
-        self._fitness = fitness
-        self._check_device = check_device
+        self._stages, self._worker, self._publish = stages, worker, publish
+        self._fitness, self._check_device = fitness, check_device
         self.device_lost = ""  # reason why this process can run no more tasks on its device; "" while it can
 
     def run(self, raw: Mapping[str, Any], context: TaskContext) -> Event | None:

@@ -17,11 +17,10 @@ from graspd.service.model.domain import JobRequest
 from graspd.service.model.errors import GraspdError
 from graspd.service.model.libraries import pause_garbage_collection
 from graspd.service.model.states import Stage
+from graspd.worker.execution_context import ExecutionContext
 
 if TYPE_CHECKING:
     from graspd.worker.objects.model import ObjectModel
-
-from graspd.worker.execution_context import ExecutionContext
 
 log = logging.getLogger(__name__)
 _RADIUS_M: Final = 0.03

@@ -16,6 +16,7 @@ from graspd.service.model.transforms import Floats, apply, pose_to_matrix
 from graspd.worker.hands.model import ConvexPiece, HandModel
 from graspd.worker.hands.surface import piece_distance
 from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.topology import face_vectors
 from graspd.worker.quality.probe import Distances, Probe
 from graspd.worker.simulation.device import to_xyzw
 from graspd.worker.simulation.kernels import crossing as kernels
@@ -153,8 +154,7 @@ def _solids(pieces: tuple[ConvexPiece, ...]) -> Any:
 
 def _planes(piece: ConvexPiece) -> Floats:
     """Return the distinct planes (F, 4) n x <= d of a piece's faces; every corner is below all of them."""
-    a, b, c = (piece.vertices[piece.faces[:, k]] for k in range(3))
-    normal = np.cross(b - a, c - a)
+    normal = face_vectors(piece.vertices, piece.faces)
     length = np.linalg.norm(normal, axis=1)
     normal = normal[length > 0] / length[length > 0, None]
     offset = (normal @ piece.vertices.T).max(axis=1)

@@ -14,6 +14,7 @@ from graspd.worker.hands.jaws import prismatic_dofs
 from graspd.worker.hands.model import ConvexPiece, HandModel, JointType
 from graspd.worker.objects.memory_cache import cached_by_content
 from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.topology import face_vectors
 from graspd.worker.simulation.grids import add_grid, faces_of
 from graspd.worker.simulation.kernels import chain as kernels
 from graspd.worker.simulation.kernels import kinematics, nearest, pieces, surface
@@ -108,12 +109,11 @@ def _piece_row(piece: ConvexPiece) -> tuple[Floats, Floats, Floats, Floats, Floa
 
 def face_planes(vertices: Floats, faces: NDArray[np.integer[Any]]) -> Floats:
     """Return the planes (K, 4) of a convex solid's sides: outward unit normal and offset [m]."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    normal = np.cross(b - a, c - a)
+    normal = face_vectors(vertices, faces)
     length = np.linalg.norm(normal, axis=1)
     keep = length > 1e-14
     normal = normal[keep] / length[keep, None]
-    planes = np.column_stack([normal, np.einsum("ij,ij->i", normal, a[keep])])
+    planes = np.column_stack([normal, np.einsum("ij,ij->i", normal, vertices[faces[keep, 0]])])
     # Planes closer than 1e-4 rad and 1 um are one plane: hulls of boxes have two triangles a side.
     _, first = np.unique(np.round(planes / np.array([1e-4, 1e-4, 1e-4, 1e-6])), axis=0, return_index=True)
     return planes[np.sort(first)]

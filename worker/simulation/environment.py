@@ -33,10 +33,8 @@ class Obstacle:
 
     planes: Floats  # (K, 4) outward unit normal and offset [m]
     corners: Floats  # (V, 3) corners [m]; none for an unbounded body such as a half-space
-    edges: NDArray[np.intp] = field(default_factory=lambda: np.zeros((0, 2), np.intp))
-    """(E, 2) indices of corners that an edge connects."""
-    tips_m: float | None = None
-    """Clearance of fingertips [m], negative if they may press into the body; None for that of the hand."""
+    edges: NDArray[np.intp] = field(default_factory=lambda: np.zeros((0, 2), np.intp))  # (E, 2) corners of each edge
+    tips_m: float | None = None  # clearance of fingertips [m], below 0 if they may press; None for that of the hand
 
     @classmethod
     def half_space(cls, normal: Sequence[float] | Floats, offset: float) -> Obstacle:
@@ -105,8 +103,7 @@ class Scenes:
     supports: tuple[Obstacle, ...]  # tables, boards and walls in the scene frame, z up
     object_pose: Floats  # (S, 7) of the object in the scene frame
     neighbours: tuple[Neighbour, ...] = ()
-    neighbour_pose: Floats = field(default_factory=lambda: np.zeros((0, 0, 7)))
-    """(S, M, 7) of the neighbours in the scene frame."""
+    neighbour_pose: Floats = field(default_factory=lambda: np.zeros((0, 0, 7)))  # (S, M, 7) in the scene frame
 
     def centred(self, obj: ObjectModel) -> Scenes:
         """Return the scenes with the frames of the object `obj` and of all neighbours moved to their centres."""
@@ -130,8 +127,7 @@ class PlacedGrasps:
     object_pose: Floats  # (S, 7) of the object in the scene frame
     index: NDArray[np.intp]  # (N,) scene of each grasp
     neighbours: tuple[Neighbour, ...] = ()
-    neighbour_pose: Floats = field(default_factory=lambda: np.zeros((0, 0, 7)))
-    """(S, M, 7) of the neighbours in the scene frame."""
+    neighbour_pose: Floats = field(default_factory=lambda: np.zeros((0, 0, 7)))  # (S, M, 7) in the scene frame
 
     @cached_property
     def scenes(self) -> tuple[Environment, ...]:

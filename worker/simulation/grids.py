@@ -18,6 +18,7 @@ from graspd.service.model.transforms import Floats
 from graspd.worker.engines.backend import binary_name
 from graspd.worker.objects.disk_cache import cached_arrays
 from graspd.worker.objects.model import ObjectModel
+from graspd.worker.objects.topology import edge_faces, face_vectors
 from graspd.worker.simulation.kernels import nearest, surface
 
 Arrays = Mapping[str, NDArray[Any]]
@@ -109,14 +110,12 @@ def feature_normals(vertices: Floats, faces: NDArray[np.integer[Any]]) -> Floats
     places, same = np.unique(vertices, axis=0, return_inverse=True)
     faces = same.reshape(-1)[faces]
     corner = places[faces]
-    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    normal = face_vectors(places, faces)
     length = np.linalg.norm(normal, axis=1, keepdims=True)
     normal = np.divide(normal, length, out=np.zeros_like(normal), where=length > 1e-14)
     out = np.empty((len(faces), nearest.FEATURES, 3))
     out[:, 0] = normal
-    ends = np.stack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]], axis=1)
-    _, edge = np.unique(np.sort(ends, axis=2).reshape(-1, 2), axis=0, return_inverse=True)
-    edge = edge.reshape(-1)
+    edge = edge_faces(faces.astype(np.int64))[0].reshape(3, -1).T.reshape(-1)
     out[:, 1:4] = _summed(edge, np.repeat(normal, 3, axis=0)).reshape(-1, 3, 3)
     side = np.roll(corner, -1, axis=1) - corner
     side /= np.maximum(np.linalg.norm(side, axis=2, keepdims=True), 1e-30)

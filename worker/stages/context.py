@@ -52,8 +52,7 @@ class TaskContext:
         """`join`: number of batches planned in one launch; `tell`: receives done, total and a message."""
         self.store, self.device, self.join = store, run.device, join
         self.run = replace(run, progress=self.progress, cancelled=self.cancelled)  # execution context for the engine
-        self._tell = tell
-        self._tell_again = 0.0
+        self._tell, self._tell_again = tell, 0.0
         self._stop = threading.Event()
         self.stop_reason: StopReason | None = None
 

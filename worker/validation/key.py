@@ -24,8 +24,7 @@ Level = Literal["dexgraspbench", "standard", "fast"]
 REVISION: Final = 6  # revision of the code of protocol and scene; increase it if code (not a constant) changes verdicts
 
 _EARLY: Final = ("FIRST_LOOK_S", "INTERVAL_S", "SURE", "AHEAD", "LOST_ROTATION")
-#: Constants that affect verdicts, by module; `LEVEL_MOVES` has constants that not all levels use. Other constants of
-#: these modules affect no verdict.
+#: All constants of these modules that affect verdicts; `LEVEL_MOVES` has those that not all levels use.
 MOVES: Final[dict[ModuleType, tuple[str, ...]]] = {
     protocol: ("DIRECTIONS", "MAX_DISPLACEMENT_M", "MAX_ROTATION", "MAX_PENETRATION_M", "STAGES", "STAGE_S", "HOLD_S"),
     matter: ("ACCELERATION",),

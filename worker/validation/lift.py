@@ -97,10 +97,8 @@ class Lift(Test):
             rollout.steps = self._steps
             return rollout
         self._rise(grasps, row)
-        inner = Rollout()
-        outcome = self._validate(inner)
-        if outcome is Outcome.HELD:
-            outcome = self._hold(inner)
+        if (outcome := self._validate(Rollout())) is Outcome.HELD:
+            outcome = self._hold(Rollout())
         rollout = self._result(rollout, outcome)
         if rollout.success and self._neighbours_moved():
             rollout.outcome = LiftOutcome.NEIGHBOUR_MOVED

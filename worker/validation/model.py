@@ -30,8 +30,7 @@ HARD: Final = (0.5, 0.1)
 DAMPING_TIME: Final = 0.02  # joint damping over position gain [s]: 0.1 N m s/rad at the protocol's gain of 5
 HAND_SOLIMP: Final = (0.5, 0.99, 1e-4, 0.5, 2.0)
 HAND_SOLREF: Final = (0.005, 1.0)
-#: Time constant [s] and damping ratio of couplings. They are stiffer than contacts: otherwise a pressed finger would
-#: stretch them. MuJoCo's minimum is 2 steps.
+#: Time constant [s] (at least 2 steps) and damping ratio of couplings: stiffer than contacts, which would stretch them.
 COUPLING_SOLREF: Final = (0.008, 1.0)
 COUPLING_SOLIMP: Final = (0.98, 0.999, 1e-4, 0.5, 2.0)
 #: Features of today's MuJoCo that version 3.3.2, pinned by DexGraspBench, lacks: several contacts per pair of convex

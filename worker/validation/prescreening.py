@@ -54,8 +54,6 @@ CORNERS: Final = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]) / 
 AWAY_M: Final = 10.0  # distance by which supports are removed [m]: more than the height of any scene
 SLIPS: Final = 1.0  # added to the score of grasps that hold only at full friction
 DEEP: Final = 20.0  # score of grasps that start in deep penetration
-
-
 Frictions = tuple[Scene, Scene]  # scenes compiled at half and at full friction; everything else is the same
 
 

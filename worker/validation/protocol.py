@@ -9,7 +9,7 @@ fast: coarser physics (fixed root, 6 ms). Where the margin is not clear, level s
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any, Final
@@ -92,8 +92,7 @@ class Test:
         self.scene = scene
         self.data: Any = mujoco.MjData(scene.model)
         self._steps = 0
-        size = mujoco.mj_stateSize(scene.model, mujoco.mjtState.mjSTATE_INTEGRATION)
-        self._saved = np.empty(size)
+        self._saved = np.empty(mujoco.mj_stateSize(scene.model, mujoco.mjtState.mjSTATE_INTEGRATION))
 
     def dexgraspbench(self, grasps: GraspSet, row: int) -> Rollout:
         """Run the protocol as published, up to the first push that fails."""
@@ -101,22 +100,7 @@ class Test:
         if rollout.outcomes[0] is Outcome.PENETRATION:
             return rollout
         self._close(grasps, row)
-        self._save()
-        for direction in range(len(DIRECTIONS)):
-            # The simulation is deterministic: closing again would give the same state, bit for bit.
-            self._restore()
-            self._push(direction)
-            outcome = Outcome.HELD
-            for _ in range(round(HOLD_S / DEXGRASPBENCH_INTERVAL_S)):
-                self._run(DEXGRASPBENCH_INTERVAL_S)
-                outcome = self._validate(rollout)
-                if outcome is not Outcome.HELD:
-                    break
-            rollout.outcomes[direction] = outcome
-            if outcome is not Outcome.HELD:
-                break
-        rollout.steps = self._steps
-        return rollout
+        return self._push_all(rollout, self._hold_as_published)
 
     def standard(self, grasps: GraspSet, row: int) -> Rollout:
         """Close once, start every push from that state, and end each push as soon as it is decided."""
@@ -128,11 +112,16 @@ class Test:
             rollout.margin = max(rollout.margin, self._excess())
             rollout.steps = self._steps
             return rollout.fail(Outcome.DIVERGED if is_invalid(self.data) else Outcome.LOST_WHILE_CLOSING)
+        return self._push_all(rollout, self._hold)
+
+    def _push_all(self, rollout: Rollout, hold: Callable[[Rollout], Outcome]) -> Rollout:
+        """Push in all directions from the present state, up to the first push that fails."""
         self._save()
         for direction in range(len(DIRECTIONS)):
+            # The simulation is deterministic: closing again would give the same state, bit for bit.
             self._restore()
             self._push(direction)
-            rollout.outcomes[direction] = self._hold(rollout)
+            rollout.outcomes[direction] = hold(rollout)
             if rollout.outcomes[direction] is not Outcome.HELD:
                 break
         rollout.steps = self._steps
@@ -198,6 +187,14 @@ class Test:
     def _push(self, direction: int) -> None:
         self.data.xfrc_applied[:] = 0.0
         self.data.xfrc_applied[self.scene.object_body, :3] = self.scene.push_force * np.array(DIRECTIONS[direction])
+
+    def _hold_as_published(self, rollout: Rollout) -> Outcome:
+        outcome = Outcome.HELD
+        for _ in range(round(HOLD_S / DEXGRASPBENCH_INTERVAL_S)):
+            self._run(DEXGRASPBENCH_INTERVAL_S)
+            if (outcome := self._validate(rollout)) is not Outcome.HELD:
+                break
+        return outcome
 
     def _hold(self, rollout: Rollout) -> Outcome:
         """Simulate a push: reject once a limit is exceeded, accept once faster motion would stay below it."""
