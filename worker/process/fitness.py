@@ -36,7 +36,7 @@ _OF_THE_TASK: Final = (InputError, TaskRefused, DamagedError)
 
 def is_first_loss(task: str) -> bool:
     """Check whether a task loses a GPU or pool process for the first time on this machine.
-    The first loss is no failed attempt of the task. Later losses count, so that a task that causes them ends."""
+    Only later losses count as failed attempts, so that a task that causes them ends."""
     file = user_cache.cache_folder("gpus") / f"{hashlib.sha256(task.encode()).hexdigest()[:32]}.lost"
     if user_cache.load(file) is not None:
         return False

@@ -153,7 +153,7 @@ class DeviceObject:
         return cls(obj, device, skin, mesh, centred, wp.Bvh(centred, centred), cells)
 
     def thinned(self, count: int) -> DeviceObject:
-        """Return the object with its first `count` samples; farthest-point order keeps them evenly spread."""
+        """Return the object with its first `count` samples, which are evenly spread."""
         if count >= len(self.samples):
             return self
         with wp.ScopedDevice(self.device):

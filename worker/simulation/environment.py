@@ -38,8 +38,7 @@ class Obstacle:
 
     @classmethod
     def half_space(cls, normal: Sequence[float] | Floats, offset: float) -> Obstacle:
-        """Return the half-space n.x <= offset; the normal need not have unit length.
-        Raises InputError: the normal is zero, or a number is not finite."""
+        """Return the half-space n.x <= offset, for any length of n. Raises InputError: zero or not finite."""
         n = np.asarray(normal, float)
         length = float(np.linalg.norm(n))
         if n.shape != (3,) or not np.isfinite(n).all() or not np.isfinite(offset) or length < 1e-9:

@@ -125,7 +125,7 @@ def feature_normals(vertices: Floats, faces: NDArray[np.integer[Any]]) -> Floats
 
 
 def _summed(group: NDArray[np.integer[Any]], rows: Floats) -> Floats:
-    """Return the sum of each row's group, for all rows (R, 3)."""
+    """Return the sum (R, 3) of each row's group."""
     total = np.zeros((int(group.max(initial=0)) + 1, 3))
     np.add.at(total, group, rows)
     return total[group]

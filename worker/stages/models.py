@@ -98,8 +98,7 @@ def hand_glb(hand: HandModel) -> bytes:
 
 
 def object_glb(obj: ObjectModel) -> bytes:
-    """Return the prepared mesh as glTF [m] in the object's own frame.
-    The node's translation is the middle of the mesh, since glTF coordinates have 32 bits."""
+    """Return the prepared mesh as glTF [m]; its node is translated to the middle, for 32-bit coordinates."""
     document = Document()
     primitive = document.add_triangles(obj.centred.vertices, obj.faces, obj.corner_normals)
     extras = {"kind": "object", "name": obj.name, "centre_of_mass": rounded_values(obj.centre_of_mass)}

@@ -21,14 +21,8 @@ from graspd.service.model.digests import digest_json
 from graspd.service.model.errors import MeshError
 from graspd.service.model.libraries import version_of
 from graspd.service.model.transforms import Floats
-from graspd.worker.objects.convex import (
-    WorkLimitExceeded,
-    coacd_parts,
-    default_cache,
-    load_parts,
-    save_parts,
-    union_volume,
-)
+from graspd.worker.objects import convex
+from graspd.worker.objects.convex import WorkLimitExceeded, union_volume
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.objects.topology import face_areas
 
@@ -96,15 +90,15 @@ def piece_file(obj: ObjectModel, cache: Path | None = None) -> Path:
     mesh = obj.centred
     shape = hashlib.sha256(mesh.vertices.tobytes() + mesh.faces.tobytes()).hexdigest()
     settings = [_COACD, THRESHOLDS, GOOD_EXCESS_M, version_of("coacd")]
-    return (cache or default_cache()) / f"{digest_json({'shape': shape, 'settings': settings})}.npz"
+    return (cache or convex.default_cache()) / f"{digest_json({'shape': shape, 'settings': settings})}.npz"
 
 
 @cached(LRUCache(64), key=lambda _, file: file, condition=Condition())
 def _load_or_make(obj: ObjectModel, file: Path) -> ConvexPieces:
-    parts = load_parts(file) if file.is_file() else None
+    parts = convex.load_parts(file) if file.is_file() else None
     if parts is None:
         parts = _make(obj)
-        save_parts(file, parts)
+        convex.save_parts(file, parts)
     volume = union_volume(parts)
     digest = digest_json([hashlib.sha256(np.round(part, 9).tobytes()).hexdigest() for part in parts])
     return ConvexPieces(parts, volume / obj.volume, _excess(volume, obj), digest)
@@ -121,7 +115,7 @@ def _make(obj: ObjectModel) -> tuple[Floats, ...]:
         if excess <= GOOD_EXCESS_M:
             break
         try:
-            made = coacd_parts(obj.vertices, obj.faces, {"threshold": threshold, **_COACD}, CPU_S)
+            made = convex.coacd_parts(obj.vertices, obj.faces, {"threshold": threshold, **_COACD}, CPU_S)
         except WorkLimitExceeded as error:
             name = obj.name or "an object"
             log.warning("%s: more than %d pieces need %s; the coarser ones are used", name, len(best), error)

@@ -89,9 +89,8 @@ def first_axes(hand: HandModel, models: int, seed: tuple[int, ...]) -> list[Axis
 
 
 def draw_variant(axis: Axis, hand: HandModel, rng: np.random.Generator) -> Variant:
-    """Draw a variant of a hand along one axis.
-    Directions are uniform on the sphere, sizes uniform in their range, factors log-uniform. Raises ValueError: no axis
-    is given, or the hand has no couplings."""
+    """Draw a variant of a hand along one axis. Raises ValueError: no axis, or the hand has no couplings.
+    Directions are uniform on the sphere, sizes uniform in their range, factors log-uniform."""
     match axis:
         case Axis.SHAPES:
             fits = {"own", *fits_of(hand)}
@@ -218,8 +217,7 @@ class Models:
         self._fingers = _fingers(hand)
 
     def standard(self, grasps: GraspSet, row: int, variant: Variant) -> Rollout:
-        """Return the verdict of level standard on one grasp in a variant.
-        For the nominal variant it equals the verdict of `validate` bit for bit."""
+        """Validate one grasp in a variant at level standard, for the nominal one bit for bit as `validate`."""
         test = VariantTest(self.scene(variant), variant, self._lags(variant))
         return test.standard(self._projected(test.scene, displaced_grasp(self.obj, grasps, row, variant)), 0)
 
