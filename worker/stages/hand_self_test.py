@@ -61,7 +61,7 @@ class BestGrasp:
 
 @dataclass(frozen=True)
 class SelfTest:
-    """Result of the test: shares `gsr` of n free grasps that hold, `table` of `table_n` grasps on a table that lift."""
+    """Shares `gsr` of n free grasps that hold, and `table` of `table_n` grasps on a table that lift."""
 
     gsr: float
     n: int

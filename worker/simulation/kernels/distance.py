@@ -1,4 +1,4 @@
-"""Distances of points from mesh and convex pieces, exact in sign and value, for metrics and validation.
+"""Distances of points from meshes and convex pieces, exact in sign and value, for metrics.
 
 The distances of `worker.simulation.kernels.surface`, for the optimiser, are smoothed and cheap."""
 

@@ -120,7 +120,7 @@ def required_clearance(features: Features, obstacles: Obstacles, i: wp.int32, k:
 
 @wp.func
 def is_near(features: Features, obstacles: Obstacles, hands: Hands, b: int, piece: int, more: float, room: float):
-    """Check whether the ball around a piece of hand b is closer to a half-space than its clearance plus `more`."""
+    """Check whether the ball around a piece is closer to a half-space than its clearance plus `more`."""
     if features.first[piece] == features.first[piece + 1]:
         return False
     i = features.first[piece]
