@@ -1,16 +1,14 @@
 """The quality table: every metric of every grasp of one hand on one object, and the grasp types.
 
-Types are those of Napier (1956) and of the GRASP taxonomy (Feix et al., IEEE THMS 2016), by opposition (Iberall 1987):
+Types are those of Napier (1956) and of the GRASP taxonomy (Feix et al., IEEE THMS 2016), by opposition (Iberall 1987),
+tested in this order:
 
-- power, palm opposition: the palm touches, or at least two digits wrap. A wrapping digit touches with more than its
-last link, and not by a side;
+- power, palm opposition: the palm touches, or at least two digits wrap: with more than their last link, not by a side;
 - lateral, side opposition: at least half of the touching digits touch by a side;
-- precision, pad opposition: two digits touch, and neither other type applies.
+- precision, pad opposition: two digits touch.
 
-They are tested in this order. A *digit* is a chain of bodies that ends in a fingertip; all other bodies are palm. A
-digit touches *by a side* if most of its surface within 2 mm of the object faces along its axis of flexion. The
-tolerance is 45 degrees. A jaw has no side, so a gripper's grasps are of type precision, or power where its palm
-touches."""
+A *digit* is a chain of bodies that ends in a fingertip; all other bodies are palm. It touches *by a side* if most of
+its surface within 2 mm of the object faces along its axis of flexion, within 45 degrees. A jaw has no side."""
 
 from __future__ import annotations
 
@@ -53,8 +51,7 @@ Columns = dict[str, NDArray[np.generic]]
 #: Contact thresholds [m]: a small one from the literature, that of the paper (Table 2), and that of DDGC.
 DEFAULT_THRESHOLDS_M: Final = (0.002, 0.005, 0.009)
 DEFAULT_FRICTION: Final = 1.0
-#: Grasps per thread at a time: few enough for a quick cancellation, enough to fill a kernel launch.
-CHUNK: Final = 16
+CHUNK: Final = 16  # grasps per thread at a time: few enough for a quick cancellation, enough to fill a kernel launch
 
 
 class _Pair:
@@ -62,8 +59,8 @@ class _Pair:
         hand, obj = terms.hand, terms.obj
         self.obj, self.friction = obj, terms.friction
         self.thresholds = np.array(terms.thresholds)
-        told = int(np.argmin(np.abs(self.thresholds - INDEX_THRESHOLD_M)))
-        self.with_volume = (np.arange(len(self.thresholds)) == told) | terms.every_volume
+        indexed = np.argmin(np.abs(self.thresholds - INDEX_THRESHOLD_M))
+        self.with_volume = (np.arange(len(self.thresholds)) == indexed) | terms.every_volume
         self.probe = probe_of(hand, obj, hand_points=HAND_POINTS, object_points=OBJECT_POINTS)
         self.volume = SharedVolume(hand, obj)
         self.overlap = Overlap(hand, self.probe)
@@ -101,9 +98,8 @@ def measure(
         run: receives the number of finished grasps; polled for cancellation between chunks."""
     thresholds = np.asarray(thresholds_m, float)
     if thresholds.ndim != 1 or not len(thresholds) or (thresholds <= 0).any() or (thresholds > REACH_M).any():
-        raise InputError(
-            f"contact thresholds must be above 0 and at most {REACH_M * 1e3:g} mm; got {list(thresholds_m)}"
-        )
+        limit = f"above 0 and at most {REACH_M * 1e3:g} mm"
+        raise InputError(f"contact thresholds must be {limit}; got {list(thresholds_m)}")
     terms = _Terms(hand, obj, friction, tuple(thresholds.tolist()), every_volume)
     chunks = [slice(i, min(i + CHUNK, len(grasps))) for i in range(0, len(grasps), CHUNK)]
     postures = [Posture(grasps.grasp.hand_pose[chunk], grasps.grasp.joint_positions[chunk]) for chunk in chunks]
@@ -206,11 +202,11 @@ MEASURES: Final[dict[str, Callable[[_Chunk], NDArray[np.generic]]]] = {
 
 #: Cosine between a digit's surface normal and its axis of flexion above which the surface is a side: 45 degrees.
 SIDE_COS: Final = float(np.sqrt(0.5))
-#: Least number of wrapping digits of a power grasp if the palm does not touch.
-ENVELOPING: Final = 2
+ENVELOPING: Final = 2  # least number of wrapping digits of a power grasp if the palm does not touch
 
 
 def grasp_types(probe: Probe, found: Distances) -> NDArray[np.int32]:
+    """Return the `GraspType` (B,) of each grasp, as defined in the docstring of the module."""
     hand = probe.hand
     finger = finger_of_body(hand)
     touching = probe.body_distance(found) < LINK_CONTACT_M
@@ -223,9 +219,9 @@ def grasp_types(probe: Probe, found: Distances) -> NDArray[np.int32]:
     count = touches.sum(axis=1)
     lateral = sides.any(axis=1) & (2 * sides.sum(axis=1) >= count)
     power = palm | ((wraps & ~sides).sum(axis=1) >= ENVELOPING)
-    told = np.where(lateral, GraspType.LATERAL, GraspType.PRECISION)
-    told = np.where(power, GraspType.POWER, told)
-    return np.where(count + palm < 2, GraspType.NONE, told).astype(np.int32)
+    kind = np.where(lateral, GraspType.LATERAL, GraspType.PRECISION)
+    kind = np.where(power, GraspType.POWER, kind)
+    return np.where(count + palm < 2, GraspType.NONE, kind).astype(np.int32)
 
 
 def _touching_with_sides(
