@@ -246,6 +246,6 @@ def close_hands_at(hand: HandModel, obj: ObjectModel, hand_pose: NDArray[np.floa
         pose = hand_pose[first : first + _AT_ONCE]
         palm = apply(pose, hand.palm.centre) - obj.centre_of_mass
         state = HandState(palm, pose[:, 3:], np.tile(hand.preshape, (len(pose), 1)))
-        closed = HandCloser(pair, len(pose)).close(state).state
+        closed = HandCloser(pair, len(pose)).close(state)
         joints[first : first + len(pose)] = posture_of(hand, obj, closed).joint_positions
     return Posture(hand_pose, joints)

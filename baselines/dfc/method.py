@@ -1,6 +1,6 @@
 """Differentiable force closure: DexGraspNet's starts around the convex hull, then annealed descent.
 
-All hands are returned; `info["passed"]` marks those that the published code would accept."""
+The planner returns all hands; `info["passed"]` marks those that the published code would accept."""
 
 from __future__ import annotations
 
@@ -69,10 +69,9 @@ class Dfc:
             descent.run(self.options.steps, steps)
             return descent.hands(), descent.energies()
 
-        found = run_parts(split_batch(wanted.count, run), work)
-        energies = np.concatenate([part[1] for part in found])
-        passed = (energies[:, :3] < np.array(PASSES)).all(axis=1)
-        return grasp_set(pair, HandState.joined([part[0] for part in found]), began, {"passed": passed.tolist()})
+        states, energies = zip(*run_parts(split_batch(wanted.count, run), work), strict=True)
+        passed = (np.concatenate(energies)[:, :3] < np.array(PASSES)).all(axis=1)
+        return grasp_set(pair, HandState.joined(states), began, {"passed": passed.tolist()})
 
 
 METHOD: Final = Method(
@@ -86,7 +85,7 @@ METHOD: Final = Method(
 
 
 def sample_starts(hand: HandModel, obj: ObjectModel, *, seed: int, batch: int, indices: range) -> HandState:
-    """Sample one start per grasp; each depends on its own index only."""
+    """Sample a start per index; it depends only on seed, batch and its index."""
     rows = [_start(hand, obj, np.random.default_rng([seed, batch, index])) for index in indices]
     return HandState(*(np.stack([row[k] for row in rows]) for k in range(3)))
 
@@ -137,7 +136,7 @@ def key_points(hand: HandModel) -> tuple[Ints, Floats, Ints, Ints]:
 
 
 class Descent:
-    """A batch of hands on one object."""
+    """Annealed descent of a batch of hands on one object."""
 
     def __init__(self, pair: Pair, starts: HandState, seeds: list[list[int]]) -> None:
         self.pair, self.n = pair, len(starts.pivot)
@@ -202,13 +201,14 @@ class Descent:
         return out
 
     def run(self, steps: int, tell: StepCounter) -> None:
-        """Make `steps` proposals; raises TaskCancelled through `tell`."""
+        """Make `steps` proposals. Raises TaskCancelled: through `tell`."""
         for first in range(0, steps, CHUNK):
             count = min(CHUNK, steps - first)
             self.launches.run(count)
             tell(self.n * count, "annealing")
 
     def hands(self) -> HandState:
+        """Return the accepted hands, with joints clipped to their limits."""
         for mine, other in zip(self._proposed(), self.state, strict=True):
             wp.copy(mine, other)
         found = self.proposal.state(self.n)

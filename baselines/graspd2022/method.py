@@ -1,6 +1,7 @@
 """Grasp'D: collision-free starts, descent with relaxed forces; no selection or repair, as published.
 
-The object is a grid of signed distances with trilinear interpolation. Its error is of second order in the cell size."""
+A grid of signed distances with trilinear interpolation represents the object; the error is of second order in the cell
+size."""
 
 from __future__ import annotations
 
@@ -49,7 +50,7 @@ class Search:
         self.points = sample_surface(pair.hand.model, POINTS)
 
     def run(self, starts: HandState, *, steps: int, tell: StepCounter) -> tuple[HandState, Floats]:
-        """Return hands after `steps` iterations, and their force residuals (n,); 1 without contact force."""
+        """Return hands after `steps` iterations, and their `residual` (n,). Raises TaskCancelled: through `tell`."""
         n = len(starts.pivot)
         back = quat_rotate(starts.rotation, self.pair.hand.model.palm.approach)
         batch = _Batch(self, replace(starts, pivot=starts.pivot - BACKOFF_M * back), steps)
@@ -75,11 +76,9 @@ class Graspd2022:
             steps(len(indices), "starts")
             return search.run(starts, steps=self.options.steps, tell=steps)
 
-        found = run_parts(split_batch(wanted.count, run), work)
-        residual = np.concatenate([part[1] for part in found])
-        return grasp_set(
-            pair, HandState.joined([part[0] for part in found]), began, {"residual": residual.round(4).tolist()}
-        )
+        states, residuals = zip(*run_parts(split_batch(wanted.count, run), work), strict=True)
+        info: dict[str, object] = {"residual": np.concatenate(residuals).round(4).tolist()}
+        return grasp_set(pair, HandState.joined(states), began, info)
 
 
 METHOD: Final = Method(
@@ -121,7 +120,7 @@ def schedule(steps: int) -> Schedule:
     at = np.arange(steps)
     dilation = MAX_DILATION * np.clip(1.0 - at / max(0.5 * steps, 1.0), 0.0, 1.0)
     rates = np.minimum(at / WARMUP, 1.0)[:, None] * np.array(RATES)
-    # Self-collisions use the same stiffness, squared as in the loss of the other forces.
+    # The stiffness is squared, as in the loss of the other forces.
     own = np.full(steps, STIFFNESS**2)
     zero = np.zeros(steps)
     return Schedule(dilation, zero, zero, own, rates)
@@ -145,11 +144,10 @@ class _Batch:
         self.device = self.model.device
         self.physics = physics_of(pair.fine.obj.model.gyration_radius)
         velocity = SPEED * np.array([[0.0, 0, 0], [1, 1, 1], [-1, -1, -1]])
-        wanted = np.concatenate([MASS / STEP_S * velocity, np.zeros((3, 3))], axis=1)
-        self.wanted = wanted
+        self.wanted = np.concatenate([MASS / STEP_S * velocity, np.zeros((3, 3))], axis=1)
         with wp.ScopedDevice(self.device):
             self.velocity = wp.array(velocity, dtype=wp.vec3)
-            self.task = wp.array(wanted, dtype=kernels.vec6)
+            self.task = wp.array(self.wanted, dtype=kernels.vec6)
             shape = (n, POINTS, 3)
             self.force, self.first, self.largest = (wp.zeros(shape, dtype=wp.vec3) for _ in range(3))
             self.total, self.pull = (wp.zeros((n, 3), dtype=kernels.vec6) for _ in range(2))
@@ -185,7 +183,8 @@ class _Batch:
         return out
 
     def residual(self) -> Floats:
-        """Return (n,) largest relative residuals over velocities of a moving object; 1 without contact force."""
+        """Return (n,) force residuals relative to the wanted force, the larger one of both velocities.
+        Without contact forces the residual is 1."""
         return self.gap.numpy()[:, 1:].max(axis=1).astype(float) / float(np.linalg.norm(self.wanted[1]))
 
 

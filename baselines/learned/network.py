@@ -41,7 +41,7 @@ _TINY: Final = 1e-6
 
 @dataclass(frozen=True)
 class Proposals:
-    """n grasps in the cloud's frame; joints may exceed their limits, because the network has no limits."""
+    """n grasps in the cloud's frame; joints may exceed their limits, which the network does not know."""
 
     hand_pose: Floats
     """(n, 7) pose of the hand's root link at the grasp: x y z [m], quaternion w x y z."""
@@ -59,7 +59,7 @@ class Proposals:
 
 
 def save(network: ProposalNetwork, path: Path) -> None:
-    """Write a network's file. Raises InputError: `service.store.network_file.from_bytes` would refuse it."""
+    """Write a network's file. Raises InputError: the network is invalid, see `to_bytes`."""
     path.write_bytes(to_bytes(network))
 
 
@@ -75,7 +75,7 @@ def propose(
     spread: float = 1.0,
 ) -> Proposals:
     """Propose grasps for one cloud. The first proposals do not depend on `count`.
-    Raises InputError: the cloud or the network's output is not finite.
+    Raises InputError: the cloud is empty or has another shape, or a number in it or in the output is not finite.
 
     Args:
         network: network of the hand.
@@ -137,7 +137,7 @@ def flow(network: ProposalNetwork, noise: Floats32, condition: Floats32) -> Floa
 
 
 def encode(proposals: Proposals, anchor: ArrayLike) -> Floats:
-    """Return grasp rows (n, D), not standardised: input of `decode`, and training target."""
+    """Return rows (n, D) of grasps before standardisation: input of `decode`, and training target."""
     position = proposals.hand_pose[:, :3] - np.asarray(anchor, float)
     rotation = quat_to_matrix(proposals.hand_pose[:, 3:])
     joints = proposals.joints
@@ -147,7 +147,7 @@ def encode(proposals: Proposals, anchor: ArrayLike) -> Floats:
 
 
 def decode(rows: ArrayLike, anchor: ArrayLike) -> Proposals:
-    """Return grasps of rows (n, D) with one anchor (3,) or one per row (n, 3). Rotations by Gram-Schmidt."""
+    """Return the grasps of rows (n, D); `anchor` (3,) or (n, 3). Gram-Schmidt makes rotations orthogonal."""
     x = np.asarray(rows, float)
     joints, opened, pressed = np.split(x[:, POSE:], 3, axis=1)
     first = _unit(x[:, 3:6], np.array([1.0, 0, 0]))
@@ -191,7 +191,7 @@ class _Layer:
 
 
 def _layers(network: ProposalNetwork) -> Mapping[str, _Layer]:
-    """Return the layers by name, split once per network."""
+    """Return the layers by name, cached in the network."""
     if "layers" not in vars(network):
         names = [name.removesuffix(".bias") for name in network.weights if name.endswith(".bias")]
         vars(network)["layers"] = {name: _Layer.of(network, name) for name in names}
