@@ -1,9 +1,5 @@
 """A folder for `datasets.load_dataset`: a table of grasps, and one of pictures with their grasps.
 
-    grasps/{train,test}-00000.parquet     one grasp per row: postures in the object's frame, verdict, quality
-    pictures/{train,test}-00000.parquet   one picture per row: colour, depth, labels, camera, grasps in its frame
-    README.md                             description of the files
-
 `GRASPS` and `PICTURES` list the columns; docs/how-to/exchange/huggingface.md describes them with units and frames."""
 
 from __future__ import annotations
@@ -79,7 +75,8 @@ _PICTURES_AT_ONCE: Final = 50
 def write(
     lots: Sequence[ExportPart], pictures: Pictures, folder: Path, out: frozenset[str], noise: DepthNoise | None = None
 ) -> ExportSummary:
-    """Write both tables, each with splits `train` and `test`; held-out objects are in `test`."""
+    """Write both tables, each with splits `train` and `test`; held-out objects are in `test`.
+    Raises InputError: `folder` has such tables already, or pyarrow is missing."""
     parquet.arrow()
     if (folder / "grasps").exists():
         raise InputError(f"{folder} holds a table of grasps already; give another folder as --output")
@@ -109,7 +106,7 @@ def write(
         }
         for table in (["grasps", "pictures"] if len(pictures) else ["grasps"])
     ]
-    # The head of a data set's card, as JSON, which is valid YAML.
+    # The YAML head of the card is JSON, which is valid YAML.
     (folder / "README.md").write_text(
         f"---\nconfigs: {json.dumps(tables)}\n---\n\n# Grasps made with graspd\n\n"
         "Columns, units and frames: docs/how-to/exchange/huggingface.md of graspd.\n"
@@ -186,14 +183,15 @@ def _picture(sample: Mapping[str, Any], name: str, depth: Floats) -> dict[str, A
 
 
 def png(pixels: NDArray[Any]) -> dict[str, Any]:
-    """Return a picture as a PNG file, in the form that Hugging Face's readers expect."""
+    """Return a picture (H, W) or (H, W, 3) as a PNG file, in the form that Hugging Face's readers expect."""
     data = io.BytesIO()
     Image.fromarray(np.ascontiguousarray(pixels)).save(data, format="PNG", compress_level=1)
     return {"bytes": data.getvalue(), "path": None}
 
 
 def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[ImportedGrasps]:
-    """Read a file, or `grasps/*.parquet` of a folder; free grasps and grasps on tables are separate sets."""
+    """Read a file, or `grasps/*.parquet` of a folder; free grasps and grasps on tables are separate sets.
+    Raises InputError: columns are missing or invalid, or `object_name` selects no single object."""
     files = [path] if path.is_file() else sorted((path / "grasps").glob("*.parquet"))
     columns: dict[str, list[Any]] = {}
     for file in files:
@@ -215,9 +213,9 @@ def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[Impo
         raise InputError(
             f"{path} has grasps for scenes of the kind {sorted(other)[0]!r}; only table and free are supported"
         )
-    apart = {kind: [k for k in rows if kinds[k] == kind] for kind in (FREE, TABLE)}
+    by_kind = {kind: [k for k in rows if kinds[k] == kind] for kind in (FREE, TABLE)}
     return [
-        _set(path, hand, obj, wanted, columns, some, on_table=kind == TABLE) for kind, some in apart.items() if some
+        _set(path, hand, obj, wanted, columns, some, on_table=kind == TABLE) for kind, some in by_kind.items() if some
     ]
 
 

@@ -33,7 +33,7 @@ def write_scored(
     run: ExecutionContext = DEFAULT_CONTEXT,
 ) -> Path:
     """Validate and measure a set of grasps; write a base shard and the object's mesh to `folder`.
-    Grasps in scenes are tested by a lift along a trajectory that is planned here."""
+    Grasps in scenes get a new trajectory and a lift test. Raises InputError: the file exists, or no such level."""
     name = plain_name(found.name)
     path = folder / f"{plain_name(found.hand.name)}-{name}-{ordinal:03}.h5"
     if path.exists():
@@ -67,7 +67,7 @@ def write_scored(
     if found.published is not None and (found.published >= 0).any():
         arrays["quality/published"] = found.published
     if scenes is not None:
-        # Imported grasps have no scene but a table.
+        # Importers support no other scene than a table.
         attributes["scene"] = json_attribute(SceneSpec(kind="table").model_dump(mode="json"))
         arrays["scene/object_pose"] = scenes.object_pose
         arrays["scene/rest_probability"] = np.full(len(scenes.object_pose), np.nan)

@@ -100,8 +100,7 @@ def _start(hand: HandModel, obj: ObjectModel, rng: np.random.Generator) -> tuple
     normal = normal * np.cos(angle) + np.cross(axis, normal) * np.sin(angle)
     align = frame_along(-normal) @ frame_along(hand.palm.approach).T
     roll = quat_from_axis_angle(-normal, np.array(rng.uniform(0.0, 2 * np.pi)))
-    span = hand.upper - hand.lower
-    q = np.clip(hand.preshape + POSTURE * span * rng.normal(size=hand.dofs), hand.lower, hand.upper)
+    q = np.clip(hand.preshape + POSTURE * hand.span * rng.normal(size=hand.dofs), hand.lower, hand.upper)
     pivot = points[0] + rng.uniform(*DISTANCE) * normal - obj.centre_of_mass
     return pivot, quat_multiply(roll, quat_from_matrix(align)), q
 

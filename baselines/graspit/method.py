@@ -27,7 +27,6 @@ from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import Floats, quat_from_matrix
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.grasps import GraspSet
-from graspd.worker.hands.kinematics import ancestors
 from graspd.worker.hands.model import HandModel
 from graspd.worker.objects.model import ObjectModel
 from graspd.worker.planners.fast_graspd.pairs import Pair
@@ -205,12 +204,9 @@ AMPLITUDE: Final = 4.0
 class Eigengrasps:
     """Postures q = origin + amplitudes @ directions, inside the joint limits."""
 
-    origin: Floats
-    """(D,)"""
-    directions: Floats
-    """(2, D)"""
-    limits: Floats
-    """(2, 2) least and largest amplitude of each direction, beyond which no joint moves"""
+    origin: Floats  # (D,)
+    directions: Floats  # (2, D)
+    limits: Floats  # (2, 2) least and largest amplitude of each direction, beyond which no joint moves
 
     def posture(self, amplitudes: Floats, hand: HandModel) -> Floats:
         return np.clip(self.origin + np.asarray(amplitudes) @ self.directions, hand.lower, hand.upper)
@@ -218,12 +214,11 @@ class Eigengrasps:
 
 def dof_ranks(hand: HandModel) -> NDArray[np.int32]:
     """Return (D,) numbers of closing dofs between each closing dof and the palm; -1 for other dofs."""
-    moved = ancestors(hand)
     first = [int(np.flatnonzero(hand.dof == d)[0]) for d in range(hand.dofs)]
     out = np.full(hand.dofs, -1, np.int32)
     for d, body in enumerate(first):
         if hand.closing[d]:
-            before = {int(hand.dof[k]) for k in np.flatnonzero(moved[body]) if k > 0} - {d}
+            before = {int(hand.dof[k]) for k in hand.chain(body)} - {d}
             out[d] = sum(hand.closing[e] != 0 for e in before)
     return out
 
@@ -239,7 +234,7 @@ def eigengrasps(hand: HandModel) -> Eigengrasps:
     else:
         row = np.clip(place, 0, 2)
         directions = np.array([closing * np.array(weights)[row] * closes for weights in (FLEXION, SECOND)])
-    opened, span = np.where(closing >= 0, hand.lower, hand.upper), hand.upper - hand.lower
+    opened, span = np.where(closing >= 0, hand.lower, hand.upper), hand.span
     origin = np.where(closes, opened + ORIGIN * span * np.where(closing >= 0, 1, -1), (hand.lower + hand.upper) / 2)
     limits = np.zeros((2, 2))
     for i, direction in enumerate(directions):

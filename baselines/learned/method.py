@@ -88,8 +88,7 @@ class Seeds:
     """A `WarmStart` from a network's proposals; starts of fast_graspd replace those without a free proposal."""
 
     network: ProposalNetwork
-    starts: int
-    """Starts per grasp."""
+    starts: int  # starts per grasp
 
     def adapted(self, fidelity: Fidelity) -> Fidelity:
         """See `WarmStart`."""
@@ -202,10 +201,8 @@ class SurfaceView:
     """Surface of an object for simulated cameras."""
 
     obj: ObjectModel
-    points: Floats
-    """(DENSE, 3) in the object frame [m]."""
-    normals: Floats
-    """(DENSE, 3) unit outward normals."""
+    points: Floats  # (DENSE, 3) in the object frame [m]
+    normals: Floats  # (DENSE, 3) unit outward normals
 
     @classmethod
     def of(cls, obj: ObjectModel) -> SurfaceView:

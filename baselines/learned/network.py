@@ -43,16 +43,11 @@ _TINY: Final = 1e-6
 class Proposals:
     """n grasps in the cloud's frame; joints may exceed their limits, which the network does not know."""
 
-    hand_pose: Floats
-    """(n, 7) pose of the hand's root link at the grasp: x y z [m], quaternion w x y z."""
-    approach: Floats
-    """(n, 3) unit direction of the approach, from the standoff to the pregrasp."""
-    joints: Floats
-    """(n, J) joint positions at the grasp [rad or m]."""
-    pregrasp: Floats
-    """(n, J)"""
-    squeeze: Floats
-    """(n, J)"""
+    hand_pose: Floats  # (n, 7) pose of the hand's root link at the grasp: x y z [m], quaternion w x y z
+    approach: Floats  # (n, 3) unit direction of the approach, from the standoff to the pregrasp
+    joints: Floats  # (n, J) joint positions at the grasp [rad or m]
+    pregrasp: Floats  # (n, J)
+    squeeze: Floats  # (n, J)
 
     def __len__(self) -> int:
         return len(self.hand_pose)

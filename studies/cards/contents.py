@@ -44,8 +44,7 @@ class AssetFacts:
     licence: str = ""
     source: str = ""
     description: str = ""
-    facts: Mapping[str, Any] = field(default_factory=dict)
-    """Measurements from its ingest check, SI units."""
+    facts: Mapping[str, Any] = field(default_factory=dict)  # measurements from its ingest check, SI units
 
 
 @dataclass(frozen=True)
@@ -60,8 +59,7 @@ class Contents:
     record: DatasetRecord | None = None
     gaps: Mapping[Pair, tuple[int, str]] = field(default_factory=dict)
     """For each cell, the number of batches missing in the snapshot, and the reason."""
-    root: Path | None = None
-    """Folder of the shards; None for shards in a store."""
+    root: Path | None = None  # folder of the shards; None for shards in a store
 
 
 def contents_of_store(store: Store, dataset: str, snapshot: str | None = None, cache: Path | None = None) -> Contents:
@@ -219,8 +217,7 @@ class ShardContents:
     said: Mapping[str, Any]
     """Root attributes; for a shard that is not opened, the manifest's fields of the same names."""
     size_bytes: int
-    rows: int
-    """Number of grasps, of pairs of grasp and scene, or of pictures."""
+    rows: int  # number of grasps, of pairs of grasp and scene, or of pictures
     info: Mapping[str, Any] = field(default_factory=dict)
     """Info of the stage: seconds of its parts, rejected candidates."""
     revision: int | None = None

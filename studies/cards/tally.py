@@ -34,8 +34,7 @@ class JointUse:
     names: tuple[str, ...]
     lower: Floats
     upper: Floats
-    counts: NDArray[np.int64]
-    """(J, BINS) counts of grasps."""
+    counts: NDArray[np.int64]  # (J, BINS) counts of grasps
 
     @classmethod
     def of(cls, names: tuple[str, ...], facts: Mapping[str, Any]) -> JointUse:
@@ -96,10 +95,8 @@ class CellTally:
     """Numbers of grasps and pairs.
     `validated`: candidates in validated shards. `placed`: valid grasps placed into scenes; `clear`: clear in at least
     one scene. `lift_tested`: valid grasps with a lift test at half friction; `lift_hard`: lifted in this test."""
-    seconds: float = 0.0
-    """Worker seconds over all stages."""
-    rejected: Counter[str] = field(default_factory=Counter)
-    """Rejected candidates by reason."""
+    seconds: float = 0.0  # worker seconds over all stages
+    rejected: Counter[str] = field(default_factory=Counter)  # rejected candidates by reason
     refused: Counter[int] = field(default_factory=Counter)
     """Number of pairs of grasp and scene by code of `grasp/rejection`."""
     columns: dict[str, list[Floats32]] = field(default_factory=dict)
@@ -146,16 +143,14 @@ class Tally:
     joints: dict[str, JointUse] = field(default_factory=dict)
     elevation: dict[str, dict[str, NDArray[np.int64]]] = field(default_factory=dict)
     """Numbers of pairs of grasp and scene of each hand, all and clear ones, by the palm's elevation."""
-    seconds: dict[str, float] = field(default_factory=dict)
-    """Worker seconds of each kind of shard."""
+    seconds: dict[str, float] = field(default_factory=dict)  # worker seconds of each kind of shard
     parts: Counter[str] = field(default_factory=Counter)
     bytes: Counter[str] = field(default_factory=Counter)
     shards: Counter[str] = field(default_factory=Counter)
     values: dict[str, Counter[Any]] = field(default_factory=dict)
     """Number of shards by values of attributes such as method, device, seed."""
     revisions: dict[str, Counter[int]] = field(default_factory=dict)
-    created: list[str] = field(default_factory=list)
-    """First and last time of a shard, RFC 3339."""
+    created: list[str] = field(default_factory=list)  # first and last time of a shard, RFC 3339
     threshold_m: Counter[float] = field(default_factory=Counter)
 
     def of_hand(self, hand: str) -> CellTally:

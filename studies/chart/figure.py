@@ -17,8 +17,10 @@ from graspd.studies.chart.statistics import valid_rate_bound
 Row = Mapping[str, Any]
 #: Function from a point's row and all rows to its label.
 PointLabel = Callable[[Row, Sequence[Row]], str]
+#: Colour and marker of each method.
+Styles = Mapping[str, tuple[str, str]]
 
-#: Title and key of each accuracy that is plotted over speed.
+#: Title and key of each accuracy of charts of free objects, and of charts of scenes.
 PANELS: Final = (
     ("Success under the DexGraspBench protocol", "dexgraspbench"),
     ("Success at half the friction", "hard"),
@@ -101,13 +103,7 @@ def _save(figure: Any, labels: Sequence[Label], files: Sequence[Path]) -> None:
 
 
 def _over_speed(
-    axes: Any,
-    rows: Sequence[Row],
-    styles: Mapping[str, tuple[str, str]],
-    key: str,
-    title: str,
-    words: str,
-    label: PointLabel | None = None,
+    axes: Any, rows: Sequence[Row], styles: Styles, key: str, title: str, words: str, label: PointLabel | None = None
 ) -> list[Label]:
     """Plot one accuracy over the speed, with the Pareto front; return the labels of the points."""
     known = [row for row in rows if row[key] is not None]
@@ -123,7 +119,7 @@ def _over_speed(
 
 
 def draw_scenes(rows: Sequence[Row], files: Sequence[Path], *, second: str) -> None:
-    """Plot shares of candidates over lifted grasps per `second`, and lifts over seconds to the first."""
+    """Plot shares of candidates over lifted grasps per `second` (the unit of time), and over time to the first."""
     figure = new_figure(15.5, 8.6)
     panels = figure.subplots(2, 3)
     styles = _styles(rows)
@@ -142,25 +138,19 @@ def draw_scenes(rows: Sequence[Row], files: Sequence[Path], *, second: str) -> N
     _save(figure, labels, files)
 
 
-def _styles(rows: Sequence[Row]) -> dict[str, tuple[str, str]]:
+def _styles(rows: Sequence[Row]) -> Styles:
     methods = list(dict.fromkeys(row["method"] for row in rows))
     return {m: (COLOURS[i % len(COLOURS)], MARKERS[i % len(MARKERS)]) for i, m in enumerate(methods)}
 
 
 def _panel(
-    axes: Any,
-    rows: Sequence[Row],
-    styles: Mapping[str, tuple[str, str]],
-    *,
-    x: str,
-    y: str,
-    label: PointLabel | None = None,
+    axes: Any, rows: Sequence[Row], styles: Styles, *, x: str, y: str, label: PointLabel | None = None
 ) -> list[Label]:
     shown: set[str] = set()
     labels = []
     for row in rows:
         colour, marker = styles[row["method"]]
-        # Without valid grasps the marker is hollow, at the upper bound, with an arrow to lower values.
+        # Without valid grasps a hollow marker with an arrow to lower values is at the upper bound.
         none = not row[x]
         at = valid_rate_bound(row) if none else row[x]
         bars: dict[str, Any] = {
@@ -254,7 +244,7 @@ def draw_sweeps(rows: Sequence[Row], file: Path) -> None:
 Boxes = NDArray[np.float64]
 
 SIZE_PT: Final = 8
-#: Distances of a label from its point [pt], preferred ones first. From the third on, a line connects both.
+#: Distances of a label from its point [pt], preferred ones first.
 _REACHES_PT: Final = (8.0, 15.0, 26.0, 38.0, 52.0)
 #: Directions from the point, preferred ones first [degrees].
 _TURNS: Final = (30, -30, 150, -150, 90, -90, 0, 180, 60, -60, 120, -120)
@@ -277,8 +267,7 @@ class Label:
     y: float
     text: str
     colour: str
-    x_bar: tuple[float, float] | None = None
-    """Ends of the point's error bars."""
+    x_bar: tuple[float, float] | None = None  # ends of the point's error bars
     y_bar: tuple[float, float] | None = None
 
 
@@ -313,7 +302,7 @@ def _place(axes: Any, pixels: float, labels: Sequence[Label]) -> list[Any]:
     made = []
     for index, at in chosen.items():
         box = offered[index][at]
-        # A label far from its point, or nearer to another point, would be ambiguous without a line.
+        # A line connects a label with its point if the label is far away or nearer to another point.
         led = at // len(_TURNS) > 1 or _is_nearer_to_another(box, points, index)
         made.append(_write(axes, labels[index], points[index], box, pixels, led=led))
     return made

@@ -152,11 +152,17 @@ def _run_setting(setting: Setting, way: str, hand: HandModel, place: ObjectScene
     row: Row = {"grasps": setting.batch, "seconds": 0.0, "end_seconds": 0.0, **_NOTHING}
     note, few = "", min(setting.run.cores, setting.batch)
     clock = clock_of(setting.run.device)
+    in_scene = way == IN_SCENE
+
+    def plan(placed: PlacedGrasps, seed: int, warm: bool = False) -> GraspSet:
+        there = {"placed": placed, "rollout": rollout} if in_scene else {}
+        return setting.grasps(hand, obj, len(placed.index), seed, warm=warm, **there)
+
     try:
-        rollout = lift_rollout(hand, obj, lambda: place.pieces) if way == IN_SCENE else None
-        _plan_grasps(setting, hand, obj, placed.take(slice(0, 1)), rollout, warm=True)
+        rollout = lift_rollout(hand, obj, lambda: place.pieces) if in_scene else None
+        plan(placed.take(slice(0, 1)), WARM_SEED, warm=True)
         began = clock()
-        grasps = _plan_grasps(setting, hand, obj, placed, rollout)
+        grasps = plan(placed, SEED)
         row["seconds"] = clock() - began
         validated = ValidatedGrasps(hand, place, grasps, placed)
         row["end_seconds"] = clock() - began
@@ -165,7 +171,7 @@ def _run_setting(setting: Setting, way: str, hand: HandModel, place: ObjectScene
         if each < _SHORT_S:
             began = clock()
             start = placed.take(slice(0, few))
-            ValidatedGrasps(hand, place, _plan_grasps(setting, hand, obj, start, rollout), start)
+            ValidatedGrasps(hand, place, plan(start, SEED), start)
             row["first_seconds"] = clock() - began
         row |= validated.counts(models)
     except InputError as error:
@@ -175,20 +181,6 @@ def _run_setting(setting: Setting, way: str, hand: HandModel, place: ObjectScene
     told = lift_figures([row])
     told["seconds_to_first"] = first_valid(told["lift"], [row["first_seconds"]], few)
     return {**row, **told, "scenes": len(place.scenes.object_pose), "note": note}
-
-
-def _plan_grasps(
-    setting: Setting,
-    hand: HandModel,
-    obj: ObjectModel,
-    placed: PlacedGrasps,
-    rollout: Rollout | None,
-    *,
-    warm: bool = False,
-) -> GraspSet:
-    """Plan grasps in the scenes with a rollout, or for a free object without one."""
-    seed, there = WARM_SEED if warm else SEED, placed if rollout else None
-    return setting.grasps(hand, obj, len(placed.index), seed, placed=there, rollout=rollout, warm=warm)
 
 
 class ValidatedGrasps:

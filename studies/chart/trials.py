@@ -49,17 +49,13 @@ class Setting:
     """A compared setting: a method with its options at a fidelity."""
 
     method: str
-    fidelity: str
-    """Label of the fidelity."""
+    fidelity: str  # label of the fidelity
     knobs: Fidelity
     options: Mapping[str, Any] = field(default_factory=dict)
-    batch: int = 32
-    """Number of grasps per call; a call is one repeat."""
-    warm: Mapping[str, Any] = field(default_factory=dict)
-    """Options of the call before the first timed one."""
+    batch: int = 32  # number of grasps per call; a call is one repeat
+    warm: Mapping[str, Any] = field(default_factory=dict)  # options of the call before the first timed one
     run: ExecutionContext = DEFAULT_CONTEXT
-    make: Make | None = None
-    """Alternative planner for sweeps of settings that are not part of a fidelity."""
+    make: Make | None = None  # alternative planner for sweeps of settings that are not part of a fidelity
 
     def grasps(
         self,
@@ -86,21 +82,16 @@ class Rollout:
 
     setting: Setting
     hand: HandModel
-    obj: ObjectModel
-    """Object for the planner."""
-    true: ObjectModel
-    """Object for metrics and validator, the same for all settings."""
-    pieces: ConvexPieces
-    """Convex pieces of `true`."""
+    obj: ObjectModel  # object for the planner
+    true: ObjectModel  # object for metrics and validator, the same for all settings
+    pieces: ConvexPieces  # convex pieces of `true`
     seconds: list[float] = field(default_factory=list)
     """Core-seconds of all threads on a CPU, independent of other load; wall-clock seconds on a GPU."""
     end_seconds: list[float] = field(default_factory=list)
     """Seconds end to end: planning, validation, and metrics of held grasps."""
     made: list[GraspSet] = field(default_factory=list)
-    success: list[NDArray[np.int8]] = field(default_factory=list)
-    """Verdicts of the standard level."""
-    kept: list[NDArray[np.int8]] = field(default_factory=list)
-    """1 if valid, that is, held and feasible."""
+    success: list[NDArray[np.int8]] = field(default_factory=list)  # verdicts of the standard level
+    kept: list[NDArray[np.int8]] = field(default_factory=list)  # 1 if valid, that is, held and feasible
     columns: list[dict[str, Floats]] = field(default_factory=list)
     first_calls: list[float] = field(default_factory=list)
     """Seconds of calls with `first_grasps` grasps, end to end."""

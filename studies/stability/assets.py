@@ -98,12 +98,10 @@ CLOSED: Final = tuple(name for name in DEFECTS if name != _ALLOW_OPEN)
 class MapOptions:
     """Settings of the jobs behind the cells of a map."""
 
-    count: int
-    """Number of grasps of each job."""
+    count: int  # number of grasps of each job
     fidelity: str = "draft"
     run: ExecutionContext = DEFAULT_CONTEXT
-    say: Callable[[str], None] = lambda line: None
-    """Receives a line per cell."""
+    say: Callable[[str], None] = lambda line: None  # receives a line per cell
 
 
 def shape_map(

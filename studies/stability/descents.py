@@ -42,10 +42,8 @@ RESIDUAL: Final = (0.35, 0.9)
 @dataclass(frozen=True)
 class Descent:
     state: HandState
-    depths: Floats
-    """(n,) deepest penetration after the projection, as in a job [m]."""
-    drift: float
-    """Largest deviation of a quaternion's norm from 1, before the projection normalises it."""
+    depths: Floats  # (n,) deepest penetration after the projection, as in a job [m]
+    drift: float  # largest deviation of a quaternion's norm from 1, before the projection normalises it
 
 
 def descend(

@@ -10,6 +10,7 @@ from typing import Any, Final
 from graspd.service.model.studies import StabilityMap, mark_reachable
 from graspd.studies.stability import assets, descents, gradients, integrators, model_errors, scenes
 from graspd.studies.stability.assets import BOUNDS, FAMILIES, MEASURE, SHOWS, MapOptions, shape_cell
+from graspd.studies.stability.descents import Say
 from graspd.worker.execution_context import ExecutionContext
 from graspd.worker.hands.load import hand_from_path
 from graspd.worker.hands.model import HandModel
@@ -24,16 +25,9 @@ ALL_HANDS: Final = ("allegro", "barrett", "shadow")
 
 
 def run(
-    names: Sequence[str],
-    hand: str,
-    obj: str,
-    *,
-    quick: bool,
-    long: bool,
-    work: ExecutionContext,
-    say: Callable[[str], None],
+    names: Sequence[str], hand: str, obj: str, *, quick: bool, long: bool, work: ExecutionContext, say: Say
 ) -> list[StabilityMap]:
-    """Return the maps of the named studies, in the order of the names."""
+    """Return the maps of the named studies; `say` receives a line per cell."""
     model, thing = hand_from_path(hand), object_from_path(obj)
 
     def few(values: Sequence[float]) -> Sequence[float]:
