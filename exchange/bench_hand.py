@@ -21,8 +21,7 @@ from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import IDENTITY_POSE, Floats, compose, invert
 from graspd.worker.hands.model import ConvexPiece, HandModel, JointType
 
-#: Joint damping over position gain [s], as in DexGraspBench's Allegro hand.
-_DAMPING_TIME: Final = 0.02
+_DAMPING_TIME: Final = 0.02  # joint damping over position gain [s], as in DexGraspBench's Allegro hand
 #: Stiffness of couplings: larger than that of contacts, so that contacts do not stretch couplings.
 _COUPLING: Final = {"solref": "0.008 1", "solimp": "0.98 0.999 0.0001 0.5 2"}
 #: Least mass of a body [kg], and radius of the ball that is the inertia of a body without pieces [m].

@@ -28,10 +28,8 @@ from graspd.worker.validation.decomposition import decompose
 
 Row = dict[str, Any]
 
-#: Folder of scenes with a table, and part of the names of their experiments.
-TABLETOP: Final = "tabletop"
-#: Tolerance of equal positions and of the table's height [m], and of equal quaternions.
-SAME: Final = 1e-9
+TABLETOP: Final = "tabletop"  # folder of scenes with a table, and part of the names of their experiments
+SAME: Final = 1e-9  # tolerance of equal positions and of the table's height [m], and of equal quaternions
 #: Folder of a set of objects in a checkout of DexGraspBench.
 SET: Final = Path("assets") / "object" / "graspd"
 SCALE: Final = "scale100"

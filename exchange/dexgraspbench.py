@@ -39,8 +39,7 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.simulation.environment import PlacedGrasps
 
 POSTURES: Final = ("pregrasp", "grasp", "squeeze")
-#: Prefix of the names of configurations and experiments.
-NAME: Final = "graspd"
+NAME: Final = "graspd"  # prefix of the names of configurations and experiments
 
 
 def read(path: Path, *, hand: str, obj: str) -> list[ImportedGrasps]:

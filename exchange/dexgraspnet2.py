@@ -17,7 +17,6 @@ import zipfile
 import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 
@@ -54,23 +53,19 @@ from graspd.worker.objects.model import ObjectModel
 from graspd.worker.rendering.annotate import OBJECT
 from graspd.worker.rendering.export import export_png
 
-#: Number of surface points that represent an object.
-SAMPLES: Final = 1000
+SAMPLES: Final = 1000  # number of surface points that represent an object
 #: Half the opening of a grasp's view cone [rad], and its depth beyond the first point [m].
 CONE: Final = np.pi / 6
 BAND_M: Final = 0.02
 #: Angle [rad] and distance beyond the first point [m] that each add 1 to the cost of a seen point.
 ANGLE_HALF: Final = np.pi / 18
 HEIGHT_HALF_M: Final = 0.015
-#: Powers of ten by which a grasp's weight falls per metre from its aim point [1/m].
-FALL_PER_M: Final = 150.0
+FALL_PER_M: Final = 150.0  # powers of ten by which a grasp's weight falls per metre from its aim point [1/m]
 #: Largest distance of a pixel from the point whose value it takes [m]. Their code documents 15 mm, but compares 0.015
 #: with the squared distance of pytorch3d's `knn_points`.
 REACH_M: Final = 0.015**0.5
-#: Largest distance of the cloud's points from the box around all objects [m].
-OUTLIER_M: Final = 0.02
-#: Number of grasps in a block of computation: about 6 MB per array.
-_AT_ONCE: Final = 256
+OUTLIER_M: Final = 0.02  # largest distance of the cloud's points from the box around all objects [m]
+_AT_ONCE: Final = 256  # number of grasps in a block of computation: about 6 MB per array
 
 
 def surface_samples(obj: ObjectModel) -> Floats:
@@ -177,10 +172,8 @@ def workspace_mask(cloud: Floats, depth: Floats, labels: NDArray[np.uint8], came
 
 
 CAMERA: Final = "realsense"
-#: Number of views of each scene; the loader samples among them.
-VIEWS: Final = 256
-#: Steps per metre in a depth picture: 16 bits reach 6.5 m.
-FACTOR: Final = 10000
+VIEWS: Final = 256  # number of views of each scene; the loader samples among them
+FACTOR: Final = 10000  # steps per metre in a depth picture: 16 bits reach 6.5 m
 #: Numbers of scenes for training (`train_1`, `part`), and for held-out objects (`val`, `test`).
 TRAIN: Final = (range(90), range(1000, 8500))
 HELD_OUT: Final = (range(90, 100), range(100, 190))
@@ -193,8 +186,7 @@ _NUMPYS: Final = ("file", "args", "kwds", "allow_pickle")
 _LARGEST_META: Final = 64 * 2**10
 #: Largest unpacked size of an `.npz` file [bytes]; the grasps of one object are far smaller.
 LARGEST: Final = 2**30
-#: Largest number of arrays in an `.npz` file.
-_MEMBERS: Final = 1024
+_MEMBERS: Final = 1024  # largest number of arrays in an `.npz` file
 
 
 def write(
@@ -214,7 +206,8 @@ def write(
             )
         raise InputError("no picture shows a scene with grasps; render views into the grasps' folder: graspd render")
     done = ExportSummary({"grasps": 0, "scenes": len(scenes), "views": 0, "files": len(scenes)})
-    numbers = {held: _numbers(held, scenes, known, out) for held in (False, True)}
+    held_out = sum(known[some[0].base].name in out for some in scenes)
+    numbers = {False: _scene_numbers(len(scenes) - held_out, TRAIN), True: _scene_numbers(held_out, HELD_OUT)}
     samples: dict[str, Floats] = {}
     for some in scenes:
         lot = known[some[0].base]
@@ -231,15 +224,12 @@ def write(
     return done
 
 
-def _numbers(
-    held: bool, scenes: list[list[PictureReference]], known: dict[str, ExportPart], out: frozenset[str]
-) -> Iterator[int]:
-    count = sum((known[some[0].base].name in out) is held for some in scenes)
-    room = [number for numbers in (HELD_OUT if held else TRAIN) for number in numbers]
-    if count > len(room):
-        what = "held-out objects" if held else "objects to train on"
-        raise InputError(f"there are {count} scenes of {what}, but DexGraspNet 2.0 has numbers for {len(room)}")
-    return islice(room, count)
+def _scene_numbers(count: int, ranges: Sequence[range]) -> Iterator[int]:
+    numbers = [number for some in ranges for number in some]
+    if count > len(numbers):
+        what = "held-out objects" if ranges is HELD_OUT else "objects to train on"
+        raise InputError(f"there are {count} scenes of {what}, but DexGraspNet 2.0 has numbers for {len(numbers)}")
+    return iter(numbers)
 
 
 def _write_scene(

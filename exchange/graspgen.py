@@ -36,16 +36,11 @@ from graspd.worker.simulation.data import HandState
 MEMBER: Final = "grasps.json"
 INDEX: Final = "uuid_index.json"
 POSTURES: Final = ("pregrasp", "grasp", "squeeze")
-#: Number of objects in a tar file.
-PER_SHARD: Final = 64
-#: Largest size of a record [bytes]; 2,000 grasps have half a megabyte.
-LARGEST: Final = 256 * 2**20
-#: Number of good grasps below which GraspGen's generator skips an object.
-FEWEST: Final = 5
-#: Tolerance of rotation matrices, which files have with six digits or more.
-_ROTATION: Final = 1e-3
-#: Number of hands in a batch of closing.
-_AT_ONCE: Final = 256
+PER_SHARD: Final = 64  # number of objects in a tar file
+LARGEST: Final = 256 * 2**20  # largest size of a record [bytes]; 2,000 grasps have half a megabyte
+FEWEST: Final = 5  # number of good grasps below which GraspGen's generator skips an object
+_ROTATION: Final = 1e-3  # tolerance of rotation matrices, which files have with six digits or more
+_AT_ONCE: Final = 256  # number of hands in a batch of closing
 
 
 def write(lots: Sequence[ExportPart], folder: Path, out: frozenset[str]) -> ExportSummary:

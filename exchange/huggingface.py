@@ -68,8 +68,7 @@ PICTURES: Final = {
     "hand_poses": "float64[7][]",
     "joint_positions": "float64[][]",
 }
-#: Number of pictures in a row group.
-_PICTURES_AT_ONCE: Final = 50
+_PICTURES_AT_ONCE: Final = 50  # number of pictures in a row group
 
 
 def write(

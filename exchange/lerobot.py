@@ -31,8 +31,7 @@ FPS: Final = 10
 STATE, ACTION = "observation.state", "action"
 OBJECT, PICTURE = "observation.environment_state", "observation.images.scene"
 EPISODE: Final = "episode_index"
-#: Column of verdicts in the list of episodes.
-VERDICT: Final = "graspd/verdict"
+VERDICT: Final = "graspd/verdict"  # column of verdicts in the list of episodes
 #: Times and indices that LeRobot stores for each frame.
 NUMBERS: Final = {
     "timestamp": "float32",
@@ -59,8 +58,7 @@ _INDEXED: Final = {
 
 def write(lots: Sequence[ExportPart], pictures: Pictures, folder: Path, out: frozenset[str]) -> ExportSummary:
     """Write an episode per grasp, with a picture of its scene (round-robin); held-out objects come last.
-    Raises InputError: no picture shows a grasp planned in a scene, hands or picture sizes differ, or pyarrow is
-    missing."""
+    Raises InputError: no picture shows a grasp planned in a scene, or hands or picture sizes differ."""
     parquet.arrow()
     if (folder / "meta").exists():
         raise InputError(f"{folder} holds a data set already; give another folder as --output")
@@ -219,21 +217,14 @@ def task_of(name: str) -> str:
 def _statistics(values: NDArray[Any], *, picture: bool) -> dict[str, Any]:
     """Return statistics: of shape (n,) for frames (F, n), of shape (3, 1, 1) for pixels (P, 3)."""
     values = np.asarray(values, float)
-    found = {
-        "min": values.min(axis=0),
-        "max": values.max(axis=0),
-        "mean": values.mean(axis=0),
-        "std": values.std(axis=0),
-    }
+    found = {name: getattr(values, name)(axis=0) for name in ("min", "max", "mean", "std")}
     found |= {name: np.quantile(values, share, axis=0) for name, share in _QUANTILES.items()}
     shaped = {name: (one[:, None, None] if picture else one).tolist() for name, one in found.items()}
     return shaped | {"count": [len(values)]}
 
 
-#: Number of postures at the end of a trajectory: pregrasp, grasp, squeeze, lift.
-_STOPS = 4
-#: Largest size of `info.json` [bytes].
-_LARGEST = 2**22
+_STOPS = 4  # number of postures at the end of a trajectory: pregrasp, grasp, squeeze, lift
+_LARGEST = 2**22  # largest size of `info.json` [bytes]
 
 
 def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[ImportedGrasps]:

@@ -77,8 +77,7 @@ def pictures_without_pixels(pictures: Pictures) -> Iterator[PictureReference]:
         yield PictureReference(index, found["base_id"], place.file.id, place.scene, extrinsics, pose, rows)
 
 
-#: Value of `camera/eye` for the right picture of a stereo pair.
-RIGHT: Final = 2
+RIGHT: Final = 2  # value of `camera/eye` for the right picture of a stereo pair
 
 
 def by_scene(pictures: Pictures) -> list[list[PictureReference]]:

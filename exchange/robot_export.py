@@ -120,20 +120,16 @@ def _plan_executions(
     rows = best_of(shard.arrays, len(mask), mask) if wishes.best else np.flatnonzero(mask)
     tool = tool_frame(wishes.tool, case.hand.root_link, description.links)
     grasps, placed = case.grasps.take(rows), None if case.placed is None else case.placed.take(rows)
-    quality = _quality(shard, rows)
+    valid = np.asarray(shard.arrays["quality/valid"])
+    success = np.asarray(shard.arrays.get("quality/success", np.full(len(valid), -1)))
+    epsilon = metric_at_threshold(shard.arrays, "quality/epsilon")
+    quality: dict[str, NDArray[Any]] = {"valid": valid[rows], "success": success[rows], "epsilon": epsilon[rows]}
     found = executions(case.hand, case.obj, grasps, rows=rows, tool=tool, quality=quality, placed=placed)
     if lost := len(rows) - len(found):
         written.notes.append(
             f"{lost} of {len(rows)} {word} are left out: no straight approach of 10 cm is free of the object"
         )
     return found
-
-
-def _quality(shard: Shard, rows: NDArray[np.intp]) -> dict[str, NDArray[Any]]:
-    arrays = shard.arrays
-    success = np.asarray(arrays.get("quality/success", np.full(len(arrays["quality/valid"]), -1)))
-    epsilon = metric_at_threshold(arrays, "quality/epsilon")[rows]
-    return {"valid": np.asarray(arrays["quality/valid"])[rows], "success": success[rows], "epsilon": epsilon}
 
 
 def _assumptions(limits: Limits) -> list[str]:

@@ -49,17 +49,18 @@ def write_scored(
     made = score_grasps(found.hand, obj, found.grasps, request, scenes=scenes, run=run)
     folder.mkdir(parents=True, exist_ok=True)
     mesh = mesh_file(found.obj, folder / f"{name}-{found.scale:g}.obj")
+    digest = digest_files(AssetKind.OBJECT, files_from_path(mesh)[1])
     attributes: dict[str, Attribute] = {
         "hand": found.hand.name,
         "hand_digest": found.hand.digest,
         "object": name,
-        "object_digest": _digest(mesh),
+        "object_digest": digest,
         "object_scale": found.scale,
         "method": f"imported:{origin.format}",
         "source": origin.source,
         "licence": origin.licence,
         "fidelity": json_attribute({"face_error_m": 0.0}),
-        "shard_id": digest_json([origin.source, found.hand.digest, _digest(mesh), ordinal, len(found.grasps)]),
+        "shard_id": digest_json([origin.source, found.hand.digest, digest, ordinal, len(found.grasps)]),
         "batch": ordinal,
     }
     attributes |= base_attributes(found.hand, obj, request, candidates=made.candidates, verdict_key=made.verdict_key)
@@ -73,7 +74,3 @@ def write_scored(
         arrays["scene/rest_probability"] = np.full(len(scenes.object_pose), np.nan)
     path.write_bytes(write_shard("base", arrays, attributes))
     return path
-
-
-def _digest(mesh: Path) -> str:
-    return digest_files(AssetKind.OBJECT, files_from_path(mesh)[1])

@@ -1,8 +1,7 @@
 """Export of shards as training folders of other projects: grasps, pictures, splits by object family.
 
 Objects of a family have similar distributions of the distance between two random surface points (D2 of Osada et al.,
-"Shape distributions", 2002), relative to its root mean square. Moved, mirrored, scaled and remeshed copies have equal
-distributions."""
+"Shape distributions", 2002), relative to its root mean square. Moved, mirrored, scaled or remeshed copies are equal."""
 
 from __future__ import annotations
 

@@ -31,8 +31,7 @@ from graspd.worker.simulation.launches import kernel_seconds
 from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.record import record_iteration
 
-#: Largest number of grasps in the measurement of host time.
-LARGE: Final = 1024
+LARGE: Final = 1024  # largest number of grasps in the measurement of host time
 
 
 def bench(
@@ -124,8 +123,7 @@ def _peak_memory_mb(device: str) -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
-#: Number of iterations that are timed launch by launch, in the middle of a phase.
-SAMPLED: Final = 12
+SAMPLED: Final = 12  # number of iterations that are timed launch by launch, in the middle of a phase
 
 
 def kernel_shares(pair: Pair, fidelity: Fidelity, count: int) -> dict[str, Any]:

@@ -37,8 +37,7 @@ from graspd.worker.validation.validator import Verdicts, validate
 
 Protocol = Literal["dexgraspbench", "displacement", "lift"]
 
-#: Contact threshold of contact area, epsilon and volume [m]: the paper's.
-THRESHOLD_M: Final = 0.005
+THRESHOLD_M: Final = 0.005  # contact threshold of contact area, epsilon and volume [m]: the paper's
 #: Keys of the row, and the metrics of grasps whose medians they contain.
 COLUMNS: Final = {
     "pd_mm": "penetration_depth_mm",
@@ -86,15 +85,8 @@ def evaluate(
         case = replace(case, obj=case.obj.for_dexgraspbench)
     mu = friction or case.friction or DEFAULT_FRICTION
     table = measure(case.hand, case.obj, case.grasps, friction=mu, thresholds_m=[THRESHOLD_M], run=run)
-    row: dict[str, Any] = {
-        "n": len(case.grasps),
-        "protocol": protocol,
-        "level": None,
-        "hard": hard,
-        "mu": mu,
-        "mass_kg": case.obj.mass,
-        "object_friction": case.obj.friction,
-    }
+    row: dict[str, Any] = {"n": len(case.grasps), "protocol": protocol, "level": None, "hard": hard, "mu": mu}
+    row |= {"mass_kg": case.obj.mass, "object_friction": case.obj.friction}
     row |= dict.fromkeys(("gsr", "osr", "sgs", "sgs_without_validation", "agreement_published"))
     try:
         pieces = decompose(case.obj, cache=cache)

@@ -67,12 +67,9 @@ METHOD: Final = Method(
     uses=("face_error_m",),
 )
 
-#: Largest distance of a contact: GraspIt!'s threshold layer [m].
-TOUCH_M: Final = 2e-4
-#: Largest distance that is computed [m]; larger ones are set to it.
-REACH_M: Final = 0.03
-#: Gap between two bodies below which it limits the steps of their dofs [m].
-MARGIN_M: Final = 0.005
+TOUCH_M: Final = 2e-4  # largest distance of a contact: GraspIt!'s threshold layer [m]
+REACH_M: Final = 0.03  # largest distance that is computed [m]; larger ones are set to it
+MARGIN_M: Final = 0.005  # gap between two bodies below which it limits the steps of their dofs [m]
 #: Share of a gap that one step crosses. Large distances come from a grid and have errors of up to a third.
 SHARE: Final = 0.6
 #: Longest closing step [rad], and largest number of steps.

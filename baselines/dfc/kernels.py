@@ -33,10 +33,8 @@ T0 = wp.constant(18.0)
 T_EVERY = wp.constant(30.0)
 COOL = wp.constant(0.95)
 MU = wp.constant(0.98)
-#: Probability that a proposal replaces a contact.
-SWAP = wp.constant(0.5)
-#: Largest distance that is computed [m].
-FAR = wp.constant(1.0)
+SWAP = wp.constant(0.5)  # probability that a proposal replaces a contact
+FAR = wp.constant(1.0)  # largest distance that is computed [m]
 
 
 @wp.func

@@ -39,14 +39,11 @@ from graspd.worker.simulation.launches import Launches
 from graspd.worker.simulation.model import Model
 from graspd.worker.simulation.record import add_poses, add_root_gradient
 
-#: Bounds of the published code on force closure, distance and penetration.
-PASSES: Final = (0.3, 0.005, 0.001)
+PASSES: Final = (0.3, 0.005, 0.001)  # bounds of the published code on force closure, distance and penetration
 #: Distance of the palm from the hull [m]. In the published code the root, one palm length behind, is at 0.2 to 0.3 m.
 DISTANCE: Final = (0.1, 0.2)
-#: Largest tilt of the approach from the hull's normal [rad].
-TILT: Final = np.pi / 6
-#: Standard deviation of joints about the pre-shape, as a share of their range.
-POSTURE: Final = 0.1
+TILT: Final = np.pi / 6  # largest tilt of the approach from the hull's normal [rad]
+POSTURE: Final = 0.1  # standard deviation of joints about the pre-shape, as a share of their range
 
 
 class DfcOptions(Options):
@@ -110,8 +107,7 @@ Ints = NDArray[np.int32]
 #: Number of contact candidates on each link and on the palm.
 EACH: Final = 12
 ON_PALM: Final = 24
-#: Number of object samples for penetration.
-SAMPLES: Final = 2000
+SAMPLES: Final = 2000  # number of object samples for penetration
 #: Energies: force closure, distance, penetration, self-penetration, joint limits.
 TERMS: Final = 5
 CHUNK: Final = 50
@@ -139,9 +135,8 @@ class Descent:
 
     def __init__(self, pair: Pair, starts: HandState, seeds: list[list[int]]) -> None:
         self.pair, self.n = pair, len(starts.pivot)
-        hand = pair.hand.model
         self.obj = pair.fine.obj.thinned(SAMPLES)
-        self.candidates = inner_side_points(hand, each=EACH, on_palm=ON_PALM)
+        self.candidates = inner_side_points(pair.hand.model, each=EACH, on_palm=ON_PALM)
         # Model of the proposals; only its kinematics is computed.
         self.model = Model.create(pair.hand, self.obj, pair.coarse.points, pair.coarse.own, pair.options)
         self.proposal = Data(self.model, self.n)
@@ -152,7 +147,6 @@ class Descent:
         with wp.ScopedDevice(self.device):
             self.rng = wp.array(random, dtype=wp.uint32)
             self._allocate(contacts)
-            self._upload(hand)
         self.proposal.set_state(starts)
         for mine, other in zip(self.state, self._proposed(), strict=True):
             wp.copy(mine, other)
@@ -167,11 +161,9 @@ class Descent:
         self.gradient = wp.zeros((n, 6 + dofs), dtype=wp.float32)
         self.moment = wp.zeros((n, 3), dtype=wp.float32)
         self.taken = wp.zeros(n, dtype=wp.int32)
-
-    def _upload(self, hand: HandModel) -> None:
         self.candidate_body = wp.array(self.candidates.body, dtype=wp.int32)
         self.candidate_position = wp.array(self.candidates.position, dtype=wp.vec3)
-        body, place, first, second = key_points(hand)
+        body, place, first, second = key_points(self.pair.hand.model)
         self.pairs = len(first)
         self.keys = [wp.array(v, dtype=wp.int32) for v in (first, second, body)] + [wp.array(place, dtype=wp.vec3)]
 

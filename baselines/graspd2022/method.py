@@ -89,8 +89,7 @@ METHOD: Final = Method(
     uses=("face_error_m",),
     quick={"steps": 60},
 )
-#: Number of hand points: the published hand has 778 vertices.
-POINTS: Final = 778
+POINTS: Final = 778  # number of hand points: the published hand has 778 vertices
 #: Published constants in SI units: stiffness, viscous friction, friction, time step, speed, mass.
 STIFFNESS: Final = 1e5
 VISCOUS: Final = 1e3
@@ -111,8 +110,7 @@ WARMUP: Final = 200
 APART_M: Final = 0.01
 BACKOFF_M: Final = 0.05
 CHUNK: Final = 25
-#: Margin of the grid around the object's box [m].
-PAD_M: Final = 0.10
+PAD_M: Final = 0.10  # margin of the grid around the object's box [m]
 
 
 def schedule(steps: int) -> Schedule:

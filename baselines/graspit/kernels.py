@@ -28,10 +28,8 @@ T0 = wp.constant(1e6)
 C = wp.constant(7.0)
 ROOT = wp.constant(1.0 / 8)
 SCALE = wp.constant(1e-6)
-#: Largest number of neighbours drawn per step; if all collide, the step does not count.
-TRIES = wp.constant(11)
-#: Largest number of draws of a variable until its value is inside its bounds.
-REDRAWS = wp.constant(100)
+TRIES = wp.constant(11)  # largest number of neighbours drawn per step; if all collide, the step does not count
+REDRAWS = wp.constant(100)  # largest number of draws of a variable until its value is inside its bounds
 #: Largest distance that is computed [m].
 FAR = wp.constant(1.0)
 vec8 = wp.types.vector(length=8, dtype=wp.float32)

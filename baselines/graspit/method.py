@@ -156,8 +156,7 @@ CLASH_M: Final = 2e-3
 #: Number of uniform draws for a legal start, and of rounds between two checks for cancellation.
 START_TRIES: Final = 5000
 ROUNDS: Final = 500
-#: Limit on rounds, as a multiple of the moves; rounds without a free neighbour count.
-PATIENCE: Final = 3
+PATIENCE: Final = 3  # limit on rounds, as a multiple of the moves; rounds without a free neighbour count
 #: Difference below which two states are near-duplicates, as in GraspIt!.
 ALIKE: Final = 0.2
 NOT_YET: Final = 1e9
@@ -196,8 +195,7 @@ FLEXION: Final = (1.0, 0.3, 0.15)
 SECOND: Final = (-1.0, 1.0, 0.3)
 #: Position of closing joints in the mean posture, as a share of their range (Barrett's origin: 0.79 of 2.44 rad).
 ORIGIN: Final = 0.33
-#: Largest amplitude.
-AMPLITUDE: Final = 4.0
+AMPLITUDE: Final = 4.0  # largest amplitude
 
 
 @dataclass(frozen=True)

@@ -45,11 +45,9 @@ class LearnedPlanner:
     options: LearnedOptions
 
     def __call__(self, hand: HandModel, obj: ObjectModel, wanted: PlanRequest, run: ExecutionContext) -> GraspSet:
-        """See `worker.planners.Planner`."""
         return plan(hand, obj, wanted, run, warm=self._seeds(hand))
 
     def joined(self, hand: HandModel, obj: ObjectModel, asked: Sequence[BatchRequest]) -> list[GraspSet | Exception]:
-        """See `worker.planners.port.BatchPlanner`."""
         return plan_batches(hand, obj, asked, warm=self._seeds(hand))
 
     def _seeds(self, hand: HandModel) -> Seeds:
@@ -77,10 +75,11 @@ METHOD: Final = Method(
 
 #: Retreats along the approach that are tested for a hand in collision [m].
 RETREATS: Final = (0.0, 0.01, 0.02, 0.035, 0.055, 0.08)
-#: Number of proposals per grasp, computed at once and divided among its starts.
-PROPOSALS: Final = 32
-#: Largest distance of a start's palm from the object's bounding ball [m].
-FAR_M: Final = 0.15
+PROPOSALS: Final = 32  # number of proposals per grasp, computed at once and divided among its starts
+FAR_M: Final = 0.15  # largest distance of a start's palm from the object's bounding ball [m]
+
+
+Generators = list[np.random.Generator]
 
 
 @dataclass(frozen=True)
@@ -91,18 +90,11 @@ class Seeds:
     starts: int  # starts per grasp
 
     def adapted(self, fidelity: Fidelity) -> Fidelity:
-        """See `WarmStart`."""
         finalists = min(fidelity.finalists, self.starts)
         return fidelity.model_copy(update={"starts": self.starts, "finalists": finalists})
 
     def __call__(
-        self,
-        model: Model,
-        generators: list[np.random.Generator],
-        *,
-        each: int,
-        placed: PlacedGrasps,
-        ways: Sequence[Floats],
+        self, model: Model, generators: Generators, *, each: int, placed: PlacedGrasps, ways: Sequence[Floats]
     ) -> tuple[HandState, Floats]:
         """Return starts and depths [m], see `clear_scene_starts`. Raises SceneError: the scenes have no table."""
         scene = np.repeat(placed.index, each)
@@ -117,7 +109,7 @@ class Seeds:
         return state, depth
 
     def _proposed(
-        self, model: Model, generators: list[np.random.Generator], each: int, placed: PlacedGrasps
+        self, model: Model, generators: Generators, each: int, placed: PlacedGrasps
     ) -> tuple[HandState, Floats]:
         """Return open hands (n * draws) and their retreat directions (n * draws, 3) by start; object frame."""
         hand, obj, table = model.hand.model, model.obj.model, table_height(placed.supports)

@@ -29,8 +29,7 @@ from graspd.service.model.errors import InputError
 from graspd.service.model.transforms import Floats, cross, quat_from_matrix, quat_to_matrix
 from graspd.service.store.network_file import BLOCKS, CONDITION, ENCODER, POSE, Floats32, ProposalNetwork, to_bytes
 
-#: Unit of lengths in the encoder's input and in the condition [m].
-LENGTH_M: Final = 0.1
+LENGTH_M: Final = 0.1  # unit of lengths in the encoder's input and in the condition [m]
 #: Matrix products are split into parts of 32 rows and at most this many multiplications. OpenBLAS computes such a part
 #: on one thread; other sizes or splits would round differently. A proposal is thus independent of the number of
 #: proposals and of the machine's cores.
@@ -72,15 +71,9 @@ def propose(
     """Propose grasps for one cloud. The first proposals do not depend on `count`.
     Raises InputError: the cloud is empty or has another shape, or a number in it or in the output is not finite.
 
-    Args:
-        network: network of the hand.
-        points: (P, 3) visible points of the object, in a frame with z up [m].
-        normals: (P, 3) unit normals, toward the camera.
-        table_height: z of the table [m].
-        count: number of proposals.
-        rng: source of the noise.
-        label: 1 for grasps that hold, 0 for grasps that fail.
-        spread: standard deviation of the noise; 1 as in training. Below 1, grasps are likelier and less diverse."""
+    `points` (P, 3) are visible points of the object [m] and `normals` (P, 3) unit normals toward the camera, in a frame
+    with z up; `table_height` is z of the table [m]. `label` is 1 for grasps that hold, 0 for grasps that fail. `spread`
+    is the standard deviation of the noise: 1 as in training, below 1 for likelier and less diverse grasps."""
     inputs, anchor = cloud_inputs(points, normals, table_height)
     condition = conditions(network, inputs[None], np.array([anchor[2] - table_height]), label)
     noise = (spread * rng.standard_normal((count, network.row_size))).astype(np.float32)

@@ -26,8 +26,7 @@ from graspd.worker.simulation.environment import STANDOFF_M, PlacedGrasps
 #: Postures of a grasp in order. The open hand moves from `standoff` to `arrival`, takes the shape of `pregrasp`, closes
 #: to `grasp`, is commanded to `squeeze`, and rises to `lift`.
 POSTURES: Final = ("standoff", "arrival", "pregrasp", "grasp", "squeeze", "lift")
-#: Motions between consecutive postures.
-PHASES: Final = ("approach", "shape", "close", "squeeze", "lift")
+PHASES: Final = ("approach", "shape", "close", "squeeze", "lift")  # motions between consecutive postures
 
 
 @dataclass(frozen=True)
@@ -101,15 +100,9 @@ def executions(
     else:
         frame, at = "scene", np.asarray(placed.object_pose, float)[placed.index]
         coming, ends, lift = grasps.coming, (grasps.approach[:, 0], grasps.approach[:, -1]), grasps.lift
-    found = {
-        "standoff": Posture(ends[0], coming),
-        "arrival": Posture(ends[1], coming),
-        "pregrasp": grasps.pregrasp,
-        "grasp": grasps.grasp,
-        "squeeze": grasps.squeeze,
-        "lift": lift,
-    }
-    postures = {name: Posture(compose(at, part.hand_pose), part.joint_positions) for name, part in found.items()}
+    parts = [*(Posture(end, coming) for end in ends), grasps.pregrasp, grasps.grasp, grasps.squeeze, lift]
+    placed_parts = (Posture(compose(at, part.hand_pose), part.joint_positions) for part in parts)
+    postures = dict(zip(POSTURES, placed_parts, strict=True))
     whole = Executions(hand, obj, tool, frame, np.asarray(rows, np.intp), at, postures, placed, dict(quality))
     if not free.any():
         raise InputError(
@@ -124,8 +117,7 @@ def posed_bodies(found: Executions, posture: str, row: int) -> Floats:
     return np.asarray(body_poses(found.hand, part.hand_pose[row], part.joint_positions[row])[0])
 
 
-#: Tolerance of a quaternion's length around 1.
-_SLACK = 1e-2
+_SLACK = 1e-2  # tolerance of a quaternion's length around 1
 
 
 def parse_pose(text: str, what: str) -> Floats:

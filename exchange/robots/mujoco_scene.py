@@ -25,8 +25,7 @@ from graspd.worker.validation.model import MujocoOptions, Scene, build, scene_sp
 
 #: Colours of the hand, the object, and everything else.
 _COLOURS: Final = ("0.36 0.45 0.58 1", "0.87 0.45 0.2 1", "0.75 0.75 0.72 1")
-#: Attributes of MJCF that have other names in `MjSpec`.
-_SPEC_NAMES: Final = {"vertex": "uservert"}
+_SPEC_NAMES: Final = {"vertex": "uservert"}  # attributes of MJCF that have other names in `MjSpec`
 
 
 def write(bundle: Bundle, folder: Path) -> list[Path]:

@@ -57,8 +57,7 @@ def _placed(pose: Floats | None) -> dict[str, Any]:
 Colour = tuple[float, float, float]
 OBJECT_COLOUR: Final[Colour] = (0.72, 0.2, 0.04)
 SUPPORT_COLOUR: Final[Colour] = (0.5, 0.5, 0.47)
-#: Width and thickness of the slab that shows a half-space [m].
-SLAB_M: Final = (1.0, 0.02)
+SLAB_M: Final = (1.0, 0.02)  # width and thickness of the slab that shows a half-space [m]
 
 
 @dataclass(frozen=True)
@@ -114,8 +113,7 @@ def _corners(support: Obstacle, middle: Floats) -> Floats:
     return np.array([foot + width * (a * across + b * beside) + thickness * c * normal for a, b, c in ends])
 
 
-#: Time codes per second.
-RATE: Final = 24.0
+RATE: Final = 24.0  # time codes per second
 
 
 def write_usd(bundle: Bundle, folder: Path) -> list[Path]:

@@ -243,8 +243,7 @@ class ReachSearch:
 #: Share of random postures from which on a pair in contact is excluded, because hulls exceed their meshes.
 ALWAYS: Final = 0.95
 SAMPLES: Final = 100
-#: Name of the frame that carries the hand.
-MOUNT: Final = "mount"
+MOUNT: Final = "mount"  # name of the frame that carries the hand
 #: Only pairs with the arm are tested, because trajectories are already free of other collisions.
 _ARM: Final = {"contype": 1, "conaffinity": 1}
 _OTHER: Final = {"contype": 0, "conaffinity": 1}

@@ -14,10 +14,8 @@ from graspd.studies.cards.tally import Tally, cell_counts
 Row = Mapping[str, Any]
 COLOURS: Final = ("#0f766e", "#b45309", "#4338ca", "#be123c", "#4d7c0f", "#6b7280", "#a21caf", "#0369a1")
 INK: Final = "#1f2937"
-#: Largest number of objects of a matrix that shows names and numbers.
-_NAMED: Final = 40
-#: Largest number of panels: the first hands get one each.
-_PANELS: Final = 6
+_NAMED: Final = 40  # largest number of objects of a matrix that shows names and numbers
+_PANELS: Final = 6  # largest number of panels: the first hands get one each
 #: Title, column, and whether the axis ends at the 99th percentile.
 _QUALITIES: Final = tuple(
     (metric.heading, metric.name, metric.plot == "cut") for metric in GRASP_METRICS if metric.plot != "no"
@@ -26,10 +24,7 @@ _DPI: Final = 110
 
 
 def draw(card: Row, tally: Tally, folder: Path) -> dict[str, str]:
-    """Write the plots that have data.
-
-    Returns:
-        file name -> caption, in the order of the card."""
+    """Write all plots that have data; return their captions by file name, in the order of the card."""
     plots: tuple[tuple[str, str, Callable[[Row, Tally], Any]], ...] = (
         ("yield.png", "Valid share of validated grasps, by hand and object", _yields),
         ("quality.png", "Distribution of each quality over the valid grasps, by hand", _qualities),
@@ -54,12 +49,8 @@ def _figure(width: float, height: float) -> Any:
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def _hands(card: Row) -> list[str]:
-    return [hand["name"] for hand in card["composition"]["hands"]]
-
-
-def _objects(card: Row) -> list[str]:
-    return [obj["name"] for obj in card["composition"]["objects"]]
+def _names(card: Row, what: str) -> list[str]:
+    return [asset["name"] for asset in card["composition"][what]]
 
 
 def _plain(axes: Any) -> None:
@@ -69,7 +60,7 @@ def _plain(axes: Any) -> None:
 
 
 def _yields(card: Row, tally: Tally) -> Any:
-    hands, objects = _hands(card), _objects(card)
+    hands, objects = _names(card, "hands"), _names(card, "objects")
     shares = np.full((len(objects), len(hands)), np.nan)
     rows = {(cell["hand"], cell["object"]): cell for cell in card["cells"] if cell["of_validated"] is not None}
     for (hand, obj), cell in rows.items():
@@ -96,7 +87,7 @@ def _yields(card: Row, tally: Tally) -> Any:
 
 
 def _qualities(card: Row, tally: Tally) -> Any:
-    hands = _hands(card)
+    hands = _names(card, "hands")
     shown = [entry for entry in _QUALITIES if any(entry[1] in card["quality"][hand] for hand in hands)]
     if not shown:
         return None
@@ -124,8 +115,8 @@ def _qualities(card: Row, tally: Tally) -> Any:
 
 
 def _directions(card: Row, tally: Tally) -> Any:
-    """Plot the palms' directions: in the top row in the object's frame, in the bottom row over the table."""
-    hands = [hand for hand in _hands(card) if card["directions"]["by_hand"][hand]][:_PANELS]
+    """Plot directions of palms: in the object's frame (top row) and by elevation over the table (bottom row)."""
+    hands = [hand for hand in _names(card, "hands") if card["directions"]["by_hand"][hand]][:_PANELS]
     if not hands:
         return None
     with_table = bool(card["elevation"])
@@ -158,7 +149,7 @@ def _elevations(axes: Any, sums: Mapping[str, Sequence[int]], *, first: bool) ->
     edges = np.linspace(-90, 90, len(sums["all"]) + 1)
     for name, colour, label in (("all", "#cbd5e1", "all pairs"), ("clear", COLOURS[0], "clear of the table")):
         axes.stairs(sums[name], edges, fill=True, color=colour, label=label)
-    # Expected counts per bin for directions drawn uniformly on the sphere:
+    # Expected counts per bin for directions drawn uniformly on the sphere.
     even = np.diff(np.sin(np.radians(edges))) / 2 * sum(sums["all"])
     axes.stairs(even, edges, color=INK, linestyle="--", linewidth=1, label="uniform directions")
     axes.set_xticks([-90, -45, 0, 45, 90], ["below", "-45°", "side", "45°", "above"], fontsize=8)
@@ -170,7 +161,7 @@ def _elevations(axes: Any, sums: Mapping[str, Sequence[int]], *, first: bool) ->
 
 
 def _table(card: Row, tally: Tally) -> Any:
-    hands, objects = _hands(card), _objects(card)
+    hands, objects = _names(card, "hands"), _names(card, "objects")
     rows = [cell for cell in card["cells"] if cell["clear_of_table"] is not None]
     if not rows:
         return None
@@ -192,7 +183,7 @@ def _table(card: Row, tally: Tally) -> Any:
 
 
 def _joints(card: Row, tally: Tally) -> Any:
-    hands = [hand for hand in _hands(card) if card["joints"].get(hand)][:_PANELS]
+    hands = [hand for hand in _names(card, "hands") if card["joints"].get(hand)][:_PANELS]
     if not hands:
         return None
     most = max(len(card["joints"][hand]) for hand in hands)
@@ -200,7 +191,7 @@ def _joints(card: Row, tally: Tally) -> Any:
     panels = figure.subplots(1, len(hands), squeeze=False)[0]
     for number, (axes, hand) in enumerate(zip(panels, hands, strict=True)):
         joints = card["joints"][hand]
-        colour = COLOURS[_hands(card).index(hand) % len(COLOURS)]
+        colour = COLOURS[_names(card, "hands").index(hand) % len(COLOURS)]
         for row, use in enumerate(joints.values()):
             axes.plot([0, 1], [row, row], color="#e2e8f0", linewidth=5, solid_capstyle="butt")
             axes.plot([use["p5"], use["p95"]], [row, row], color=colour, linewidth=5, solid_capstyle="butt")
@@ -224,7 +215,7 @@ def _sizes(card: Row, tally: Tally) -> Any:
     figure = _figure(9, 3.2)
     panels = figure.subplots(1, 3, sharey=True)
     for axes, place, what in zip(panels, range(3), ("smallest", "middle", "largest"), strict=True):
-        for number, hand in enumerate(_hands(card)):
+        for number, hand in enumerate(_names(card, "hands")):
             own = [cell for cell in rows if cell["hand"] == hand]
             extents = [1e3 * sizes[cell["object"]][place] for cell in own]
             shares = [100 * cell["of_validated"] for cell in own]

@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 from graspd.studies.chart.statistics import valid_rate_bound
 
 Row = Mapping[str, Any]
-#: Function from a point's row and all rows to its label.
-PointLabel = Callable[[Row, Sequence[Row]], str]
-#: Colour and marker of each method.
-Styles = Mapping[str, tuple[str, str]]
+Rows = Sequence[Row]
+PointLabel = Callable[[Row, Rows], str]  # function from a point's row and all rows to its label
+Styles = Mapping[str, tuple[str, str]]  # colour and marker of each method
 
 #: Title and key of each accuracy of charts of free objects, and of charts of scenes.
 PANELS: Final = (
@@ -55,7 +54,7 @@ def plain_axes(axes: Any) -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def draw(rows: Sequence[Row], files: Sequence[Path]) -> None:
+def draw(rows: Rows, files: Sequence[Path]) -> None:
     """Plot accuracies over valid grasps per second, and success over seconds to the first valid grasp."""
     figure = new_figure(15.5, 8.6)
     panels = figure.subplots(2, 3)
@@ -73,12 +72,7 @@ def draw(rows: Sequence[Row], files: Sequence[Path]) -> None:
 
 
 def draw_hands(
-    by_hand: Mapping[str, Sequence[Row]],
-    file: Path,
-    *,
-    key: str,
-    words: tuple[str, str],
-    label: PointLabel | None = None,
+    by_hand: Mapping[str, Rows], file: Path, *, key: str, words: tuple[str, str], label: PointLabel | None = None
 ) -> None:
     """Plot a panel per hand, accuracy over speed; `words` has the axis labels, `label` labels a point."""
     columns = min(3, len(by_hand))
@@ -103,7 +97,7 @@ def _save(figure: Any, labels: Sequence[Label], files: Sequence[Path]) -> None:
 
 
 def _over_speed(
-    axes: Any, rows: Sequence[Row], styles: Styles, key: str, title: str, words: str, label: PointLabel | None = None
+    axes: Any, rows: Rows, styles: Styles, key: str, title: str, words: str, label: PointLabel | None = None
 ) -> list[Label]:
     """Plot one accuracy over the speed, with the Pareto front; return the labels of the points."""
     known = [row for row in rows if row[key] is not None]
@@ -118,7 +112,7 @@ def _over_speed(
     return labels
 
 
-def draw_scenes(rows: Sequence[Row], files: Sequence[Path], *, second: str) -> None:
+def draw_scenes(rows: Rows, files: Sequence[Path], *, second: str) -> None:
     """Plot shares of candidates over lifted grasps per `second` (the unit of time), and over time to the first."""
     figure = new_figure(15.5, 8.6)
     panels = figure.subplots(2, 3)
@@ -138,14 +132,12 @@ def draw_scenes(rows: Sequence[Row], files: Sequence[Path], *, second: str) -> N
     _save(figure, labels, files)
 
 
-def _styles(rows: Sequence[Row]) -> Styles:
+def _styles(rows: Rows) -> Styles:
     methods = list(dict.fromkeys(row["method"] for row in rows))
     return {m: (COLOURS[i % len(COLOURS)], MARKERS[i % len(MARKERS)]) for i, m in enumerate(methods)}
 
 
-def _panel(
-    axes: Any, rows: Sequence[Row], styles: Styles, *, x: str, y: str, label: PointLabel | None = None
-) -> list[Label]:
+def _panel(axes: Any, rows: Rows, styles: Styles, *, x: str, y: str, label: PointLabel | None = None) -> list[Label]:
     shown: set[str] = set()
     labels = []
     for row in rows:
@@ -197,7 +189,7 @@ def _error(row: Row, key: str) -> list[list[float]]:
     return [[max(0.0, row[key] - row[f"{key}_low"])], [max(0.0, row[f"{key}_high"] - row[key])]]
 
 
-def _label(row: Row, rows: Sequence[Row]) -> str:
+def _label(row: Row, rows: Rows) -> str:
     """Return fidelity, and batch size if it varies; the method's name if it has only one setting."""
     own = [r for r in rows if r["method"] == row["method"]]
     if len(own) == 1:
@@ -206,12 +198,12 @@ def _label(row: Row, rows: Sequence[Row]) -> str:
     return f"{row['fidelity']}, {row['batch']}" if several else str(row["fidelity"])
 
 
-def fidelity_label(row: Row, rows: Sequence[Row]) -> str:
+def fidelity_label(row: Row, rows: Rows) -> str:
     """Return the fidelity if the method has several, else no text, because the legend has its name."""
     return str(row["fidelity"]) if sum(r["method"] == row["method"] for r in rows) > 1 else ""
 
 
-def draw_sweeps(rows: Sequence[Row], file: Path) -> None:
+def draw_sweeps(rows: Rows, file: Path) -> None:
     """Plot a panel per setting: success over speed, a point per value."""
     knobs = list(dict.fromkeys(row["knob"] for row in rows))
     columns = 3

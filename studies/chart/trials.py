@@ -1,4 +1,4 @@
-"""One cell of a chart: a method at a fidelity on a hand and an object, run repeatedly and validated."""
+"""Settings of a chart, and their repeated, validated runs on a hand and an object."""
 
 from __future__ import annotations
 
@@ -29,19 +29,17 @@ from graspd.worker.validation.displacement import simulated_displacement_cm
 from graspd.worker.validation.robust import validate_robustness
 from graspd.worker.validation.validator import validate
 
-#: Coulomb coefficient for epsilon and wrench volume: the paper's.
-FRICTION: Final = 1.0
+FRICTION: Final = 1.0  # Coulomb coefficient for epsilon and wrench volume: the paper's
 #: First seed, not used for tuning of any setting; repeats use the following seeds.
 SEED: Final = 4711
 WARM_SEED: Final = 1
 #: Seed of the models around the nominal one; neither jobs nor `graspd evaluate` use it.
 MODELS_SEED: Final = 2**31 + 1
-#: Number of best grasps by epsilon per pair, as in table 2 of the paper.
-BEST: Final = 10
+BEST: Final = 10  # number of best grasps by epsilon per pair, as in table 2 of the paper
 
 
+#: Function from hand, object, number of grasps and seed to grasps.
 Make = Callable[[HandModel, ObjectModel, int, int], GraspSet]
-"""Function from hand, object, number of grasps and seed to grasps."""
 
 
 @dataclass(frozen=True)
@@ -134,7 +132,8 @@ class Rollout:
         self.columns.append(columns)
 
     def _validate_and_measure(self, found: GraspSet) -> tuple[NDArray[np.int8], NDArray[np.int8], dict[str, Floats]]:
-        """Validate and measure grasps as in a job: return verdicts, valid flags, and columns of held grasps."""
+        """Validate grasps and measure held ones, as in a job.
+        Return verdicts (N,), valid flags (N,), and columns of held grasps."""
         success = validate(self.hand, self.true, found, pieces=self.pieces, run=self.setting.run).success
         held = np.flatnonzero(success == 1)
         table = self._measured(found.take(held))
@@ -161,7 +160,7 @@ class Rollout:
             self.shares.append(shares)
 
     def time_first(self, grasps: int) -> None:
-        """Time a call of a few grasps; above 1 s per grasp, scale the time of the whole batch instead."""
+        """Time a call of this many grasps; above 1 s per grasp, scale the time of the last batch instead."""
         self.first_grasps = grasps
         each = self.end_seconds[-1] / self.setting.batch
         if each > 1.0:

@@ -1,4 +1,4 @@
-"""Kernel gradients in float32, compared with central differences of the float64 reference."""
+"""Gradients of the float32 kernels, compared with central differences of the float64 reference."""
 
 from __future__ import annotations
 
@@ -20,12 +20,11 @@ from graspd.worker.simulation.model import initial_motions
 from graspd.worker.simulation.reference import Contacts, World
 
 PASSES: Final = 12
-#: Sizes of the held ball [m], and largest depth or gap of its contacts as a multiple of the step (1 mm).
+#: Radii of the held ball [m]; scale of its contacts' depths and gaps, as a multiple of the step.
 SIZES_M: Final = (0.0005, 0.002, 0.01, 0.04, 0.15, 0.5)
 GAPS: Final = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
 STEP_M: Final = 1e-3
-#: Sine of the angle between the two gradients that counts as weak and as broken.
-ANGLE: Final = (0.25, 0.7)
+ANGLE: Final = (0.25, 0.7)  # sine of the angle between the two gradients that counts as weak and as broken
 #: Kernel of each solver, and its step in the reference.
 SOLVERS: Final[dict[str, tuple[Any, Solver]]] = {
     "direct": (contact.direct, partial(reference.direct, passes=PASSES)),
@@ -94,8 +93,7 @@ def gradient_map(sizes: Sequence[float], gaps: Sequence[float], *, repeats: int)
         f"weak: {ANGLE[0]:g}; broken: {ANGLE[1]:g}",
         mark_reachable(cells, lambda cell: True),
         "the loss does not fall, even with more iterations",
-        "a descent that does not improve stops after `patience` iterations; the best of several starts is selected by "
-        "the balance of forces, not by the loss",
+        "a descent without progress stops after `patience` iterations; the balance of forces selects the best start",
         "tests/studies/test_stability.py::test_gradients_agree_at_the_sizes_of_hands_and_their_objects",
         reach="all: option `contact_solver` has each value, and objects have any size",
     )

@@ -101,15 +101,11 @@ ERRORS: Final[dict[str, _Error]] = {
 
 
 def model_error_map(
-    hands: Sequence[HandModel],
-    obj: ObjectModel,
-    options: MapOptions,
-    *,
-    errors: Sequence[str] = tuple(ERRORS),
-    every: int,
+    hands: Sequence[HandModel], obj: ObjectModel, options: MapOptions, *, errors: Sequence[str] = (), every: int
 ) -> StabilityMap:
-    """Map the share of valid grasps that hold despite an error; only each `every`-th amount is tested."""
-    cells = [cell for hand in hands for cell in _cells(hand, obj, options, errors, every)]
+    """Map the share of valid grasps that hold despite one of the named errors, or of all.
+    Only each `every`-th amount is tested."""
+    cells = [cell for hand in hands for cell in _cells(hand, obj, options, errors or tuple(ERRORS), every)]
     return StabilityMap(
         "model_errors",
         f"{options.count} valid grasps of {obj.name}, validated in models with errors",
