@@ -141,23 +141,21 @@ def _rows(file: Path) -> list[Row]:
     if "obj_pose" not in found and "scene_path" in found:
         found |= object_of_scene(file, str(found["scene_path"]))
     count = {len(found[f"{name}_qpos"]) if np.ndim(found[f"{name}_qpos"]) == 2 else 0 for name in POSTURES}
-    if count == {0}:
-        return [_scaled(found)]
-    if len(count) > 1 or 0 in count:
-        raise InputError(f"{file}: the numbers of pregrasps, grasps and squeezes differ")
-    return [_scaled({key: _part(value, k, count) for key, value in found.items()}) for k in range(min(count))]
+    rows = [found]
+    if count != {0}:
+        if len(count) > 1:
+            raise InputError(f"{file}: the numbers of pregrasps, grasps and squeezes differ")
+        rows = [{key: _part(value, k, count) for key, value in found.items()} for k in range(min(count))]
+    for row in rows:
+        if "scene_scale" in row:
+            row["obj_scale"] = _scale(row) * float(np.ravel(row["scene_scale"])[0])
+    return rows
 
 
 def _part(value: Any, k: int, count: set[int]) -> Any:
     """Return grasp k's part of a value (K, ...); all grasps share other values."""
     each = isinstance(value, np.ndarray) and value.ndim > 0 and {len(value)} == count and value.dtype != object
     return value[k] if each else value
-
-
-def _scaled(row: Row) -> Row:
-    if "scene_scale" not in row:
-        return row
-    return row | {"obj_scale": _scale(row) * float(np.ravel(row["scene_scale"])[0])}
 
 
 def _scale(row: Row) -> float:

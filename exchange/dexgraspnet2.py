@@ -171,6 +171,7 @@ def workspace_mask(cloud: Floats, depth: Floats, labels: NDArray[np.uint8], came
     return np.asarray(inside.reshape(depth.shape) & (depth > 0))
 
 
+Noise = DepthNoise | None
 CAMERA: Final = "realsense"
 VIEWS: Final = 256  # number of views of each scene; the loader samples among them
 FACTOR: Final = 10000  # steps per metre in a depth picture: 16 bits reach 6.5 m
@@ -190,7 +191,7 @@ _MEMBERS: Final = 1024  # largest number of arrays in an `.npz` file
 
 
 def write(
-    lots: Sequence[ExportPart], pictures: Pictures, folder: Path, out: frozenset[str], noise: DepthNoise | None = None
+    lots: Sequence[ExportPart], pictures: Pictures, folder: Path, out: frozenset[str], noise: Noise = None
 ) -> ExportSummary:
     """Write each scene with pictures and grasps. Raises InputError: there is none, or too many for the format."""
     top = folder / "data"
@@ -233,12 +234,7 @@ def _scene_numbers(count: int, ranges: Sequence[range]) -> Iterator[int]:
 
 
 def _write_scene(
-    some: list[PictureReference],
-    pictures: Pictures,
-    top: Path,
-    name: str,
-    noise: DepthNoise | None,
-    graspness: SceneGraspness,
+    some: list[PictureReference], pictures: Pictures, top: Path, name: str, noise: Noise, graspness: SceneGraspness
 ) -> None:
     path, values = top / "scenes" / name / CAMERA, top / "dex_graspness_new" / name / CAMERA
     kinds = ((path / "depth_gt", "png"), (path / "label_gt", "png"), (path / "meta", "mat"), (values, "npy"))

@@ -93,9 +93,7 @@ def _write_hand(hand: HandModel, lots: list[ExportPart], folder: Path, out: set[
     done.counts["grasps"] += sum(len(record["grasps"]["transforms"]) for record in records.values())
     done.counts["good"] += sum(good.values())
     if few := sorted(uuid for uuid, count in good.items() if count < FEWEST):
-        done.notes.append(
-            f"GraspGen's generator leaves out objects with fewer than {FEWEST} good grasps, such as {few[0]}"
-        )
+        done.notes.append(f"GraspGen's generator omits objects with fewer than {FEWEST} good grasps, such as {few[0]}")
 
 
 def _record(hand: HandModel, lots: list[ExportPart]) -> dict[str, Any]:

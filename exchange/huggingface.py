@@ -81,7 +81,6 @@ def write(
         raise InputError(f"{folder} holds a table of grasps already; give another folder as --output")
     done = ExportSummary({"grasps": 0, "pictures": 0, "files": 0})
     sides = {"train": {lot.name for lot in lots} - out, "test": set(out)}
-    names = {lot.id: lot.name for lot in lots}
     for split, some in sides.items():
         if not some:
             done.notes.append("only one object: all grasps are in train, and there is no test split")
@@ -92,8 +91,7 @@ def write(
         done.counts["files"] += 1
         if len(pictures):
             file = folder / "pictures" / f"{split}-00000.parquet"
-            shown = {shard: name for shard, name in names.items() if name in some}
-            groups = _groups(pictures, shown, noise)
+            groups = _groups(pictures, {lot.id: lot.name for lot in mine}, noise)
             done.counts["pictures"] += parquet.write(file, parquet.schema_of(PICTURES), groups)
             done.counts["files"] += 1
     splits = [split for split, some in sides.items() if some]
@@ -212,10 +210,8 @@ def read(path: Path, *, hand: str, obj: str, object_name: str = "") -> list[Impo
         raise InputError(
             f"{path} has grasps for scenes of the kind {sorted(other)[0]!r}; only table and free are supported"
         )
-    by_kind = {kind: [k for k in rows if kinds[k] == kind] for kind in (FREE, TABLE)}
-    return [
-        _set(path, hand, obj, wanted, columns, some, on_table=kind == TABLE) for kind, some in by_kind.items() if some
-    ]
+    sets = {kind: [k for k in rows if kinds[k] == kind] for kind in (FREE, TABLE)}
+    return [_set(path, hand, obj, wanted, columns, some, on_table=kind == TABLE) for kind, some in sets.items() if some]
 
 
 def _set(

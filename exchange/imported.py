@@ -63,9 +63,7 @@ def joints_by_name(hand: HandModel, names: Sequence[str], values: Any, *, what: 
     if given.shape[1] != len(names):
         raise InputError(f"{what}: {given.shape[1]} joint values for {len(names)} joints")
     if unknown := [name for name in names if name not in hand.joint_names]:
-        raise InputError(
-            f"{what}: {hand.name} has no joint {unknown[0]!r}; its joints are {', '.join(hand.joint_names)}"
-        )
+        raise InputError(f"{what}: {hand.name} has no joint {unknown[0]!r}; it has {', '.join(hand.joint_names)}")
     order = [hand.joint_names.index(name) for name in names]
     middle = hand.expand(0.5 * (hand.lower + hand.upper)[None])[0]
     out = np.tile(middle, (len(given), 1))

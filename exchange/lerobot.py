@@ -186,9 +186,7 @@ class _Writer:
             "features": self._features(),
         }
         (meta / "info.json").write_text(json.dumps(info, indent=4) + "\n")
-        stats = {
-            name: _statistics(np.concatenate(some), picture=name == PICTURE) for name, some in self._values.items()
-        }
+        stats = {key: _statistics(np.concatenate(some), picture=key == PICTURE) for key, some in self._values.items()}
         (meta / "stats.json").write_text(json.dumps(stats, indent=4) + "\n")
         schema = parquet.schema_of({"task_index": "int64", "task": "text"}, {"pandas": json.dumps(_INDEXED)})
         rows = [{"task_index": number, "task": task_of(name)} for name, number in self.tasks.items()]

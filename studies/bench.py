@@ -127,8 +127,7 @@ SAMPLED: Final = 12  # number of iterations that are timed launch by launch, in 
 
 
 def kernel_shares(pair: Pair, fidelity: Fidelity, count: int) -> dict[str, Any]:
-    """Return for each phase: time per iteration [ms], its shares by kernel, closest-point queries per second.
-    `count` grasps are planned at once, on one thread."""
+    """Return time per iteration [ms], shares of kernels and queries per second of each phase, for `count` grasps."""
     state = sample_starts(pair.model(pair.coarse), seed=0, batch=0, indices=range(count), each=1)
     phases: dict[str, Any] = {}
     for name, side, schedule in (
@@ -191,8 +190,7 @@ def _timed(
 
 
 def host_ms(hand: HandModel, obj: ObjectModel, fidelity: Fidelity, count: int) -> float:
-    """Return host time per candidate on the CPU [ms]: time of one thread outside the planner's kernels.
-    A first batch of `count` grasps fills the caches."""
+    """Return host time per candidate [ms]: time of one CPU thread outside the planner's kernels, with full caches."""
     run = ExecutionContext("cpu", threads=1)
     plan(hand, obj, PlanRequest(count, fidelity, seed=1), run)
     with kernel_seconds() as elsewhere:
@@ -264,9 +262,7 @@ def _plot(result: dict[str, Any], path: Path) -> None:
     batches = sorted({r["grasps"] for r in result["runs"]})
     axes.set_xscale("log", base=2)
     axes.set_xticks(batches, [str(batch) for batch in batches], minor=False)
-    axes.set_xlabel("grasps per call")
-    axes.set_ylabel("grasps per second")
-    axes.set_ylim(bottom=0)
+    axes.set(xlabel="grasps per call", ylabel="grasps per second", ylim=(0, None))
     axes.set_title(f"{result['hand']} on {result['object']}, {result['device']}", loc="left", fontsize=11)
     axes.grid(alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)

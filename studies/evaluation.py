@@ -243,8 +243,7 @@ def combine(rows: list[dict[str, Any]]) -> dict[str, Any]:
     out["agreement_published"] = _rate(validated, "agreement_published", "published")
     if any("robust_share" in row for row in rows):
         out |= _models([row for row in rows if "robust_share" in row])
-    counted = [row["foreign_held"] for row in rows if "foreign_held" in row]
-    if counted:
+    if counted := [row["foreign_held"] for row in rows if "foreign_held" in row]:
         out |= share_counts({key: sum(one[key] for one in counted) for key in counted[0]})
         out["fingertips_mm"] = max(row["fingertips_mm"] for row in rows if "foreign_held" in row)
     for key in ("sgs", "sgs_without_validation"):

@@ -1,7 +1,6 @@
 """Grasp'D: collision-free starts, descent with relaxed forces; no selection or repair, as published.
 
-A grid of signed distances with trilinear interpolation represents the object; the error is of second order in the cell
-size."""
+A grid of signed distances with trilinear interpolation represents the object."""
 
 from __future__ import annotations
 
@@ -181,8 +180,7 @@ class _Batch:
         return out
 
     def residual(self) -> Floats:
-        """Return (n,) force residuals relative to the wanted force, the larger one of both velocities.
-        Without contact forces the residual is 1."""
+        """Return (n,) force residuals over the wanted force, the larger of both; 1 without contact forces."""
         return self.gap.numpy()[:, 1:].max(axis=1).astype(float) / float(np.linalg.norm(self.wanted[1]))
 
 

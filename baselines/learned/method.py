@@ -218,8 +218,7 @@ class SurfaceView:
         return np.asarray(self._middle(pose) + distance * toward)
 
     def cloud(self, pose: Floats, camera: Floats, count: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
-        """Sample points [m] and normals, (count, 3) each, among all pixels' nearest points.
-        The object is at `pose` (7,); points are in the same frame."""
+        """Sample (count, 3) points [m] and normals among pixels' nearest points, with the object at `pose` (7,)."""
         points, normals = quat_rotate(pose[3:], self.points) + pose[:3], quat_rotate(pose[3:], self.normals)
         rays = points - camera
         facing = np.flatnonzero((normals * rays).sum(axis=1) < 0)

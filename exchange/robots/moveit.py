@@ -1,7 +1,6 @@
 """Grasps as `moveit_msgs/Grasp` and `RobotTrajectory` messages in YAML, with URDFs of hand and object.
 
-Poses are those of the tool frame, which is MoveIt's end-effector link. `effort` [N m or N] of the squeeze is stiffness
-times the distance from the grasp."""
+Poses are those of the tool frame, MoveIt's end-effector link. `effort` is stiffness times distance from the grasp."""
 
 from __future__ import annotations
 

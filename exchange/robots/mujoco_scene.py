@@ -45,9 +45,8 @@ def write(bundle: Bundle, folder: Path) -> list[Path]:
     site = {"name": "object_frame", "pos": element_text(-scene.centre), "size": "0.002", "group": "4"}
     SubElement(only_element(tree, ".//body[@name='object']"), "site", site)
     _set_physics(tree, found)
-    add_appearance(
-        tree, found, ("body0", "object", "supports", *(f"neighbour{k}" for k in range(len(scene.neighbours))))
-    )
+    neighbours = (f"neighbour{k}" for k in range(len(scene.neighbours)))
+    add_appearance(tree, found, ("body0", "object", "supports", *neighbours))
     keys = SubElement(tree, "keyframe")
     for row, posture in product(range(len(found)), POSTURES):
         SubElement(keys, "key", {"name": f"{bundle.name(row)}/{posture}", **_key_frame(found, scene, posture, row)})

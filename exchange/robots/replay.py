@@ -158,9 +158,8 @@ class Replay:
                 share = look / looks
                 qpos = (1 - share) * first.qpos + share * last.qpos
                 root = self.model.jnt_qposadr[self.model.joint("root").id]
-                qpos[root + 3 : root + 7] = slerp(
-                    first.qpos[root + 3 : root + 7], last.qpos[root + 3 : root + 7], share
-                )
+                turn = slice(root + 3, root + 7)
+                qpos[turn] = slerp(first.qpos[turn], last.qpos[turn], share)
                 self.data.qpos[:] = qpos
                 mujoco.mj_kinematics(self.model, self.data)
                 mujoco.mj_collision(self.model, self.data)

@@ -80,8 +80,7 @@ def contents_of_store(store: Store, dataset: str, snapshot: str | None = None, c
 
 def contents_of_folder(folder: Path) -> Contents:
     """Return the shards of a folder, such as an export; only built-in hands and objects have facts.
-    Raises NotFoundError: the folder contains no shard. InputError: a file is not a shard, or `snapshot.json` is
-    damaged."""
+    Raises NotFoundError: the folder contains no shard; InputError: a file is no shard or damaged."""
     shards = open_shards(folder)
     listed = folder / "snapshot.json"
     taken = parse_record(Snapshot, listed.read_bytes(), str(listed)) if listed.is_file() else None

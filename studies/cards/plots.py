@@ -75,11 +75,9 @@ def _yields(card: Row, tally: Tally) -> Any:
     axes.set_yticks(range(len(objects)) if named else [], objects if named else [])
     axes.set_title(f"{card['name']}: valid of validated (grasps)", loc="left", fontsize=10)
     for (hand, obj), cell in rows.items() if named else ():
-        x, y = hands.index(hand), objects.index(obj)
-        text = f"{100 * cell['of_validated']:.0f} %  ({cell['valid']})"
-        axes.text(
-            x, y, text, ha="center", va="center", fontsize=8, color="white" if cell["of_validated"] > 0.6 else INK
-        )
+        x, y, share = hands.index(hand), objects.index(obj), cell["of_validated"]
+        text, colour = f"{100 * share:.0f} %  ({cell['valid']})", "white" if share > 0.6 else INK
+        axes.text(x, y, text, ha="center", va="center", fontsize=8, color=colour)
     axes.spines[:].set_visible(False)
     axes.tick_params(length=0)
     figure.colorbar(image, ax=axes, label="valid share of validated grasps", shrink=0.8)
@@ -131,8 +129,7 @@ def _directions(card: Row, tally: Tally) -> Any:
         vectors = tally.of_hand(hand).directions()
         density = cell_counts(vectors, bands, sectors) * bands * sectors / len(vectors)
         mesh = axes.pcolormesh(longitudes, latitudes, density, cmap="magma", vmin=0, vmax=3, rasterized=True)
-        axes.set_xticklabels([])
-        axes.set_yticklabels([])
+        axes.set(xticklabels=[], yticklabels=[])
         axes.grid(alpha=0.2)
         axes.set_title(hand, fontsize=10)
         if with_table and hand in card["elevation"]:
@@ -222,8 +219,7 @@ def _sizes(card: Row, tally: Tally) -> Any:
             axes.scatter(extents, shares, s=22, color=COLOURS[number % len(COLOURS)], label=hand, alpha=0.85)
         axes.set_xlabel(f"{what} extent of the object, mm", fontsize=9)
         axes.tick_params(labelsize=8)
-        axes.set_xlim(0, None)
-        axes.set_ylim(0, 103)
+        axes.set(xlim=(0, None), ylim=(0, 103))
         _plain(axes)
     panels[0].set_ylabel("valid share of validated grasps, %", fontsize=9)
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper right", ncols=8, frameon=False)

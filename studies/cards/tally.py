@@ -52,17 +52,14 @@ class JointUse:
             self.counts[row] += np.bincount(places, minlength=BINS)
 
     def shares(self) -> dict[str, dict[str, float]]:
-        """Return percentiles of each joint as shares of its range, and shares of grasps at its limits.
-        `used` is the range from the 1st to the 99th percentile."""
+        """Return percentiles of each joint, the range `used` from the 1st to the 99th, and shares at its limits."""
         found = {}
         near = max(1, round(_AT * BINS))
         for name, counts in zip(self.names, self.counts, strict=True):
             if not (total := int(counts.sum())):
                 continue
             below = np.cumsum(counts) / total
-            low, p5, middle, p95, high = (
-                (np.searchsorted(below, q) + 0.5) / BINS for q in (0.01, 0.05, 0.5, 0.95, 0.99)
-            )
+            low, p5, middle, p95, high = (np.searchsorted(below, (0.01, 0.05, 0.5, 0.95, 0.99)) + 0.5) / BINS
             limits = {"at_lower": counts[:near].sum() / total, "at_upper": counts[-near:].sum() / total}
             shares = {"p5": p5, "median": middle, "p95": p95, "used": high - low} | limits
             found[name] = {key: float(value) for key, value in shares.items()}
@@ -269,8 +266,7 @@ ELEVATION_BINS: Final = 36  # number of bins of elevations from -90 to 90 degree
 
 
 def cell_counts(directions: NDArray[Any], bands: int = BANDS, sectors: int = SECTORS) -> NDArray[np.int64]:
-    """Return (bands, sectors) counts of unit vectors (N, 3) per cell.
-    Band 0 is the lowest; sector 0 begins at azimuth -180 degrees."""
+    """Return (bands, sectors) counts of unit vectors (N, 3), from the lowest band and azimuth -180 degrees on."""
     cells = cells_of(np.asarray(directions).reshape(-1, 3), bands, sectors)
     return np.bincount(cells, minlength=bands * sectors).reshape(bands, sectors)
 

@@ -64,9 +64,8 @@ def draw(rows: Rows, files: Sequence[Path]) -> None:
         labels += _over_speed(axes, rows, styles, key, title, words)
     last, timed = panels.flat[5], [row for row in rows if row["seconds_to_first_valid"]]
     labels += _panel(last, timed, styles, x="seconds_to_first_valid", y="dexgraspbench")
-    last.set_xlabel("seconds to the first valid grasp, end to end (less is better)")
+    last.set(xlabel="seconds to the first valid grasp, end to end (less is better)", ylim=(-0.07, 1.04))
     last.set_title("Success under the DexGraspBench protocol", loc="left", fontsize=11)
-    last.set_ylim(-0.07, 1.04)
     figure.legend(*panels.flat[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, frameon=False)
     _save(figure, labels, files)
 
@@ -124,9 +123,8 @@ def draw_scenes(rows: Rows, files: Sequence[Path], *, second: str) -> None:
     timed = [row for row in rows if row["seconds_to_first"]]
     last = panels.flat[4]
     labels += _panel(last, timed, styles, x="seconds_to_first", y="lift", label=fidelity_label)
-    last.set_xlabel(f"{second}s to the first that is lifted (less is better)")
+    last.set(xlabel=f"{second}s to the first that is lifted (less is better)", ylim=(-0.07, 1.07))
     last.set_title("Lifted, by settings with a lift in every pair", loc="left", fontsize=11)
-    last.set_ylim(-0.07, 1.07)
     panels.flat[5].set_visible(False)
     figure.legend(*panels.flat[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
     _save(figure, labels, files)

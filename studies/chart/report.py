@@ -195,9 +195,7 @@ def best_table(runs: Sequence[Row]) -> str:
         "| --- | --- | --- | --: | --: | --: | --: | --: |",
     ]
     for (hand, method, fidelity), rows in sorted(groups.items()):
-        mean = {
-            key: _mean([row[key] for row in rows]) for key in ("ca_cm2", "iv_cm3", "epsilon", "wrench_volume", "sd_cm")
-        }
+        mean = {key: _mean(rows, key) for key in ("ca_cm2", "iv_cm3", "epsilon", "wrench_volume", "sd_cm")}
         lines.append(
             f"| {hand} | {method} | {fidelity} | {mean['ca_cm2']:.1f} | {mean['iv_cm3']:.2f} | {mean['epsilon']:.3f} "
             f"| {mean['wrench_volume']:.2f} | {mean['sd_cm']:.2f} |"
@@ -205,8 +203,8 @@ def best_table(runs: Sequence[Row]) -> str:
     return "\n".join(lines)
 
 
-def _mean(values: Sequence[float | None]) -> float:
-    known = [value for value in values if value is not None]
+def _mean(rows: Sequence[Row], key: str) -> float:
+    known: list[float] = [row[key] for row in rows if row[key] is not None]
     return sum(known) / len(known) if known else float("nan")
 
 
@@ -242,9 +240,7 @@ def _scene_page(chart: Row) -> str:
         parts += [f"### {hand}\n\n{_summary(rows, time_unit(chart))}" for hand, rows in chart["by_hand"].items()]
     parts += ["## Each hand and object", _runs(chart["runs"], time_unit(chart))]
     if refused := [run for run in chart["runs"] if run["note"]]:
-        lines = [
-            f"- {run['method']} {run['fidelity']}, {run['hand']}, {run['object']}: {run['note']}" for run in refused
-        ]
+        lines = [f"- {r['method']} {r['fidelity']}, {r['hand']}, {r['object']}: {r['note']}" for r in refused]
         parts += ["## Refused", "\n".join(lines)]
     return "\n\n".join(parts)
 

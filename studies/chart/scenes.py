@@ -88,8 +88,7 @@ def scene_chart(
 ) -> Row:
     """Run all settings on all pairs; a setting's `batch` is its number of grasps per pair.
     Each lifted grasp is lifted again in `models` models around the nominal one. An interrupted run resumes from the
-    results in the folder `work`. `say` receives a line per cell, `keep` the partial result after each pair. The result
-    is that of `chart`, with a scene."""
+    results in the folder `work`. `say`, `keep` and the result are as in `chart`."""
     runs: list[Row] = []
     for thing in things:
         place = ObjectScenes(thing, spec)

@@ -138,8 +138,7 @@ def summarise_runs(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def mark_fronts(rows: Sequence[dict[str, Any]], metrics: Mapping[str, bool]) -> None:
-    """Add `front`: the accuracies in which no faster row (end to end) is better.
-    For each accuracy, `metrics` has True if more is better."""
+    """Add `front`: accuracies in which no faster row is better; `metrics` has True where more is better."""
     for row in rows:
         row["front"] = []
     for key, more in metrics.items():

@@ -132,8 +132,7 @@ class Rollout:
         self.columns.append(columns)
 
     def _validate_and_measure(self, found: GraspSet) -> tuple[NDArray[np.int8], NDArray[np.int8], dict[str, Floats]]:
-        """Validate grasps and measure held ones, as in a job.
-        Return verdicts (N,), valid flags (N,), and columns of held grasps."""
+        """Return verdicts (N,), valid flags (N,), and metrics of held grasps, as in a job."""
         success = validate(self.hand, self.true, found, pieces=self.pieces, run=self.setting.run).success
         held = np.flatnonzero(success == 1)
         table = self._measured(found.take(held))

@@ -117,8 +117,7 @@ def _panel(axes: Any, one: StabilityMap, panel: str) -> None:
         edge: dict[str, Any] = {"edgecolor": "#14191d", "linewidth": 1.4} if framed else {"linewidth": 0}
         axes.add_patch(Rectangle((at[0] - 0.46, at[1] - 0.46), 0.92, 0.92, facecolor=fill, **edge))
         axes.text(*at, cell.text, ha="center", va="center", color=ink)
-    axes.set_xlim(-0.5, len(xs) - 0.5)
-    axes.set_ylim(-0.5, len(ys) - 0.5)
+    axes.set(xlim=(-0.5, len(xs) - 0.5), ylim=(-0.5, len(ys) - 0.5))
     axes.set_xticks(range(len(xs)), [_wrapped(x) for x in xs], fontsize=8)
     axes.set_yticks(range(len(ys)), [_wrapped(y) for y in ys], fontsize=8)
     axes.set_xlabel(one.x, fontsize=9)
