@@ -231,7 +231,7 @@ REFUSED = {
     "no file of reference grasps: KeyError": lambda at: load_case(listed(at, "{}")),
     "cannot be read: No such file": lambda at: graspgen.read(at / "none.json", **GIVEN),
     "has no .npy files": lambda at: load_case(at, **GIVEN),
-    "holds no dictionary": lambda at: load_case(kept(at, np.zeros(3)), **GIVEN),
+    "is no dictionary": lambda at: load_case(kept(at, np.zeros(3)), **GIVEN),
     "has no pregrasp_qpos": lambda at: load_case(kept(at, {}), **GIVEN),
     "numbers of pregrasps, .* differ": lambda at: load_case(
         kept(at, QPOS | {"grasp_qpos": np.zeros((2, 15))}), **GIVEN
